@@ -26,7 +26,7 @@ from hrc_learn.dmp._arguments import Samples, Scalars, Times, to_tensor
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import ridge_inverse
 from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.dmp.orientation_dmp import FORMULATIONS, OrientationCoordinates
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
@@ -57,7 +57,7 @@ class UdeCoordinates(OrientationCoordinates):
         count = SAMPLES * motion.basis.count
         s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
         with torch.no_grad():
-            linear = motion.roll(ColumnEnds(velocity=_per_s(motion)), _one(motion), s)
+            linear = motion.roll(Ends(velocity=_per_s(motion)), _one(motion), s)
             e, rate, curvature = (
                 x.double() for x in (linear.position, linear.velocity, linear.acceleration)
             )
@@ -77,7 +77,7 @@ class UdeCoordinates(OrientationCoordinates):
     def roll(
         self,
         motion: LinearPrimitive,
-        ends: ColumnEnds,
+        ends: Ends,
         duration: Tensor,
         time: Times | None,
         forcing_gain: Scalars | None,
@@ -225,7 +225,7 @@ class UdeMotion:
 
     def _rolled(self, s: Tensor) -> Trajectory:
         # A duration of one: times are s, velocities per s.
-        ends = ColumnEnds(self._start, None, self._first)
+        ends = Ends(self._start, None, self._first)
         return self._motion.roll(ends, _one(self._motion), s, self._forcing_gain)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from hrc_learn.dmp._system.closed_forms import piecewise_quintic
 from hrc_learn.dmp._system.response import Response
 from hrc_learn.dmp.forcing_scale import Demonstrated
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 
 PER_FUNCTION = 8
 """Times per basis function at which curve and motion are compared: what moves within an eighth
@@ -109,7 +109,7 @@ def _change(
 def _missing(motion: LinearPrimitive, via: ViaPoints) -> Float[Tensor, "*batch n 2 D"]:
     """What position and rate by s lack at the via points; NaN where they are free."""
     still = motion.with_coordinates(motion.coordinates().detach()).requires_grad_(False)
-    now = still.roll(ColumnEnds(), still.duration, via.s * motion.duration.double()[..., None])
+    now = still.roll(Ends(), still.duration, via.s * motion.duration.double()[..., None])
     position = via.position - now.position
     rate = via.rate - now.velocity * motion.duration[..., None, None]
     # Where a position is asked for and no rate, the rate there is stays.

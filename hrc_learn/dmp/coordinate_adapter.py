@@ -12,16 +12,7 @@ from torch import Tensor
 
 from hrc_learn.dmp._arguments import Scalars, Times
 from hrc_learn.dmp._closed_loop_step import DMPState
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
-
-
-class Ends(NamedTuple):
-    """Ends of a motion as a caller gives them; None: those of the demonstration."""
-
-    start: Any = None
-    goal: Any = None
-    velocity: Any = None
-    """At the start, per second."""
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 
 
 class ColumnPoints(NamedTuple):
@@ -60,7 +51,7 @@ class CoordinateAdapter[Value, Path, State](ABC):
     @abstractmethod
     def ends(
         self, motion: LinearPrimitive, given: Ends, duration: Tensor, **others: Any
-    ) -> tuple[ColumnEnds, Any]:
+    ) -> tuple[Ends, Any]:
         """Ends of a motion in columns, and its frame.
 
         Args:
@@ -141,7 +132,7 @@ class CoordinateAdapter[Value, Path, State](ABC):
     def roll(
         self,
         motion: LinearPrimitive,
-        ends: ColumnEnds,
+        ends: Ends,
         duration: Tensor,
         time: Times | None,
         forcing_gain: Scalars | None,

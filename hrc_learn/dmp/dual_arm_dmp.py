@@ -21,10 +21,10 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
 from hrc_learn.dmp.coupling import velocity_coupling
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
 from hrc_learn.dmp.orientation_error import intrinsic_mean
 from hrc_learn.dmp.pose_dmp import PoseCoordinates, PoseDMP, PoseState, PoseTrajectory
@@ -93,7 +93,7 @@ class DualArmCoordinates(CoordinateAdapter[Pose, PoseTrajectory, DualArmState]):
         given: Ends,
         duration: Tensor,
         **body: Vectors | None,
-    ) -> tuple[ColumnEnds, Tensor]:
+    ) -> tuple[Ends, Tensor]:
         """Start of both hands, goal of the object."""
         goals = None if given.goal is None else self._goals(given.goal)
         return self.hands.ends(motion, given._replace(goal=goals), duration, **body)

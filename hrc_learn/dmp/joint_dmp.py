@@ -23,9 +23,9 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions, fit_motion
 from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
 from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive, check_names
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive, check_names
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
 from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel
@@ -34,12 +34,9 @@ from hrc_learn.model_files import SavedModel
 class JointCoordinates(CoordinateAdapter[Vectors, Trajectory, DMPState]):
     """Joints are columns as they are; there is no frame."""
 
-    def ends(
-        self, motion: LinearPrimitive, given: Ends, duration: Tensor
-    ) -> tuple[ColumnEnds, None]:
+    def ends(self, motion: LinearPrimitive, given: Ends, duration: Tensor) -> tuple[Ends, None]:
         """As given."""
-        # Not made anew as `ColumnEnds`, which takes a twentieth of a short rollout.
-        return given, None  # pyright: ignore[reportReturnType]
+        return given, None
 
     def trajectory(self, columns: Trajectory, frame: None) -> Trajectory:
         """Of the columns."""

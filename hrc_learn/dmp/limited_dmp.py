@@ -32,9 +32,9 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
 from hrc_learn.dmp.joint_dmp import JointDMP, points_as_given
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
 from hrc_learn.model_files import SavedModel
 
@@ -162,7 +162,7 @@ class LimitedCoordinates(CoordinateAdapter[Vectors, LimitedTrajectory, LimitedSt
 
     def ends(
         self, motion: LinearPrimitive, given: Ends, duration: Tensor
-    ) -> tuple[ColumnEnds, SoftLimits]:
+    ) -> tuple[Ends, SoftLimits]:
         """Released from the limits; a goal beyond one is taken to the nearest place within.
 
         Raises:
@@ -179,7 +179,7 @@ class LimitedCoordinates(CoordinateAdapter[Vectors, LimitedTrajectory, LimitedSt
         if velocity is not None:
             q, joint_rate = torch.broadcast_tensors(q, self._as_tensor(velocity))
             rate = torch.func.jvp(limits.release, (limits.clamp(q),), (joint_rate,))[1]
-        return ColumnEnds(x, None if goal is None else self._released(goal), rate), limits
+        return Ends(x, None if goal is None else self._released(goal), rate), limits
 
     def trajectory(self, columns: Trajectory, frame: SoftLimits) -> LimitedTrajectory:
         """Joints along the columns."""

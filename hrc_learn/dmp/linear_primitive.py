@@ -36,15 +36,16 @@ from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_s
 from hrc_learn.model_files import SavedModel
 
 
-class ColumnEnds(NamedTuple):
-    """Ends of a motion in columns; None: those of the demonstration."""
+class Ends(NamedTuple):
+    """Ends of a motion, in columns (*batch, D) or as a caller gives them.
 
-    start: Vectors | None = None
-    """(*batch, D)."""
-    goal: Vectors | None = None
-    """(*batch, D)."""
-    velocity: Vectors | None = None
-    """At the start, per second, (*batch, D)."""
+    None: those of the demonstration.
+    """
+
+    start: Any = None
+    goal: Any = None
+    velocity: Any = None
+    """At the start, per second."""
 
 
 class LinearPrimitive(nn.Module):
@@ -220,7 +221,7 @@ class LinearPrimitive(nn.Module):
 
     def roll(
         self,
-        ends: ColumnEnds,
+        ends: Ends,
         duration: Float[Tensor, "*#batch"],
         time: Times | None = None,
         forcing_gain: Scalars | None = None,
@@ -242,7 +243,7 @@ class LinearPrimitive(nn.Module):
         return Trajectory(coordinates=x, s=s, duration=duration, response=self.response)
 
     def _coordinates_between(
-        self, ends: ColumnEnds, duration: Tensor, forcing_gain: Scalars | None
+        self, ends: Ends, duration: Tensor, forcing_gain: Scalars | None
     ) -> Float[Tensor, "*batch D M"]:
         """What the response maps to the motion between `ends`."""
         start, goal, rate = self.boundary(ends, duration)
@@ -258,7 +259,7 @@ class LinearPrimitive(nn.Module):
         return torch.cat([weights, torch.stack([rate, start, goal], dim=-1)], dim=-1)
 
     def _coordinates_alone(
-        self, ends: ColumnEnds, duration: Tensor
+        self, ends: Ends, duration: Tensor
     ) -> Float[np.ndarray, "D M"] | None:
         """`_coordinates_between` for one motion, in NumPy: a third of the time.
 
@@ -295,7 +296,7 @@ class LinearPrimitive(nn.Module):
                 return None
         return x
 
-    def begin(self, ends: ColumnEnds, duration: Float[Tensor, "*#batch"]) -> DMPState:
+    def begin(self, ends: Ends, duration: Float[Tensor, "*#batch"]) -> DMPState:
         """State at the start of a motion [s], for `advance`."""
         start, goal, rate = self.boundary(ends, duration)
         self._motion_shape(rate=rate, start=start, goal=goal, duration=duration)
@@ -352,7 +353,7 @@ class LinearPrimitive(nn.Module):
         )
 
     def boundary(
-        self, ends: ColumnEnds, duration: Float[Tensor, "*#batch"]
+        self, ends: Ends, duration: Float[Tensor, "*#batch"]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Start, goal and dy/ds at the start, of a motion that lasts `duration` [s]."""
         start, goal, velocity = ends

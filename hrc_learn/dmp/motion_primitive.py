@@ -27,9 +27,9 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp._fitting import REGULARIZATION, fit_samples
 from hrc_learn.dmp._via_points import ViaPoints, through_via_points
 from hrc_learn.dmp.batching import select
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter
 from hrc_learn.dmp.forcing_scale import Demonstrated
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.model_files import SavedModel, write_model
 
 FINE = 20
@@ -339,7 +339,7 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         if others and not adapter.has_body:
             raise ValueError("only a pose has a body")
         duration = motion.duration.double()[..., None]
-        now = motion.roll(ColumnEnds(), motion.duration, moment.detach())
+        now = motion.roll(Ends(), motion.duration, moment.detach())
         now = ColumnPoints(*(x.detach().double() for x in (now.position, now.velocity)))
         via = adapter.via_points(motion, now, value, velocity, **others)
         rate = via.velocity * duration[..., None]
@@ -388,7 +388,7 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         s = torch.linspace(0, 1, FINE * motion.basis.count + 1, dtype=torch.float64)
         s = s.to(motion.start.device)
         with torch.no_grad():
-            shown = motion.roll(ColumnEnds(), motion.duration, s * motion.duration[..., None])
+            shown = motion.roll(Ends(), motion.duration, s * motion.duration[..., None])
             samples = check_samples(s, shown.position.double().flip(-2))
             weights, rate = fit_samples("trajectory", motion.response, samples, REGULARIZATION)
             first, last = samples.first, samples.last
@@ -441,7 +441,7 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
 
     def _columns(
         self, given: Ends, duration: Scalars | None, speed: Scalars | None, ends: dict[str, Any]
-    ) -> tuple[ColumnEnds, Tensor, Any]:
+    ) -> tuple[Ends, Tensor, Any]:
         """Ends of a motion in columns, its duration, and their frame."""
         each = self.adapter.each
         tau = self.motion.resolve_duration(each(duration), each(speed))

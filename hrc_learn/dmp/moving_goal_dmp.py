@@ -18,9 +18,9 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
 from hrc_learn.dmp.joint_dmp import JointDMP, points_as_given
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import WrappedPrimitive
 from hrc_learn.model_files import SavedModel
 
@@ -94,7 +94,7 @@ class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingG
         given: Ends,
         duration: Tensor,
         end_velocity: Vectors | None = None,
-    ) -> tuple[ColumnEnds, Tensor]:
+    ) -> tuple[Ends, Tensor]:
         """Start and rate as seen from a goal that moves so that `end_velocity` is met."""
 
         def known(value: Vectors | None, otherwise: Tensor) -> Tensor:
@@ -106,14 +106,14 @@ class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingG
         start, goal = known(given.start, motion.start), known(given.goal, motion.goal)
         rate = known(given.velocity, demonstrated)
         end = duration[..., None]
-        still = motion.roll(ColumnEnds(start, goal, rate), duration, end).velocity[..., 0, :]
+        still = motion.roll(Ends(start, goal, rate), duration, end).velocity[..., 0, :]
         # Per unit of v the start is seen shifted by v, its rate by -v.
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
         # Columns -2 and -3 of the response are the start and its rate; the goal's own is one.
         gain = 1 + at_end[-2] - at_end[-3]
         # Linear in v: one evaluation finds what makes up the difference.
         v = (known(end_velocity, still) - still) / gain.to(still)
-        return ColumnEnds(start + v * end, goal, rate - v), v
+        return Ends(start + v * end, goal, rate - v), v
 
     def trajectory(self, columns: Trajectory, frame: Tensor) -> MovingTrajectory:
         """What is seen from the goal, and the goal's motion."""

@@ -27,9 +27,9 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import ArrayOutputs
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
 from hrc_learn.dmp.joint_dmp import JointDMP, given_points
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import WrappedPrimitive
 from hrc_learn.dmp.orientation_error import (
     error_ends,
@@ -128,11 +128,11 @@ class OrientationCoordinates(
 
     def ends(
         self, motion: LinearPrimitive, given: Ends, duration: Tensor
-    ) -> tuple[ColumnEnds, Tensor]:
+    ) -> tuple[Ends, Tensor]:
         """Error at the start and its rate; the goal moves the reference, not the columns."""
         rate = motion.start_velocity * (motion.duration / duration)[..., None]
         error, rate, reference = error_ends(motion.start, rate, motion.goal, self.goal, *given)
-        return ColumnEnds(error, None, rate), reference
+        return Ends(error, None, rate), reference
 
     def trajectory(self, columns: Any, frame: Tensor) -> OrientationTrajectory:
         """Orientations along the error."""

@@ -23,10 +23,10 @@ from hrc_learn.dmp._arguments import (
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory, broadcast_shapes
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
 from hrc_learn.dmp.forcing_scale import find_scaling
 from hrc_learn.dmp.joint_dmp import JointDMP, given_points
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import WrappedPrimitive
 from hrc_learn.dmp.orientation_dmp import OrientationTrajectory, via_errors
 from hrc_learn.dmp.orientation_error import (
@@ -163,7 +163,7 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
         duration: Tensor,
         start_body: Vectors | None = None,
         goal_body: Vectors | None = None,
-    ) -> tuple[ColumnEnds, Tensor]:
+    ) -> tuple[Ends, Tensor]:
         """A new orientation moves the start's error or the reference, the rest its columns."""
         like, (start, goal, velocity) = motion.start, given
         check_pose("start", start)
@@ -199,7 +199,7 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
             linear = twist[..., :3]
         # The body goes on as demonstrated: a twist says nothing of it.
         velocity_columns = joined(linear, rate, demonstrated[..., BODY], like)
-        return ColumnEnds(start_columns, goal_columns, velocity_columns), reference
+        return Ends(start_columns, goal_columns, velocity_columns), reference
 
     def trajectory(self, columns: Trajectory, frame: Tensor) -> PoseTrajectory:
         """Poses along the columns."""

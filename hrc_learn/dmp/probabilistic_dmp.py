@@ -14,7 +14,7 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import Points, Scalars, Times, Vectors, to_tensor
 from hrc_learn.dmp._via_points import ViaPoints
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
 from hrc_learn.dmp.orientation_error import (
     intrinsic_mean,
@@ -95,7 +95,7 @@ def reference(primitive: Any) -> Float[Tensor, "*batch 4"]:
 
 def shown_columns(motion: LinearPrimitive) -> Float[Tensor, "*batch T D"]:
     """Columns along the demonstration."""
-    return motion.roll(ColumnEnds(), motion.duration).position
+    return motion.roll(Ends(), motion.duration).position
 
 
 def _goal_orientation(primitives: Any) -> Float[Tensor, "*batch 4"]:
