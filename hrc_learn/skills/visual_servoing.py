@@ -88,7 +88,7 @@ class VisualServoConfig:
     """Half angle of the tolerated cone of orientations [rad]. The paper's cone of 7.6 degrees
     would leave the marker 1 cm off its demonstrated place."""
     rate: float = 4.0
-    """How fast the end effector returns into the box vertically, and into the cone [1/s]."""
+    """How fast the end effector returns into the box and into the cone [1/s]."""
     drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
     """How what a person draws acts on the goals."""
 
@@ -108,20 +108,23 @@ class VisualServoConfig:
                 error may have put it outside.
             detected: Whether the end effector's marker has been detected yet.
         """
+        half_size = self.half_size if detected else self.acquisition_half_size
         goals = Goals.at(
             above.position,
             above.orientation,
             torch.from_numpy(self.within(target)),
-            half_size=self.half_size if detected else self.acquisition_half_size,
+            half_size=half_size,
         )
         # Near the border of a region its excess decays at 4 k_c / h^2 and k_o (alpha_o / 2)^2.
-        upright = self.rate / 4 * self.half_size[2] ** 2
+        # The paper's 4e-4 to the sides would let a marker that has left the image be followed
+        # until the arm is stretched.
+        walls = tuple(self.rate / 4 * h**2 for h in half_size)
         sharpness = 2 / self.angle
         return replace(
             goals,
             # Pulls from wherever the marker is seen; the paper's region may leave it outside.
             vision=replace(goals.vision, formulation="saturated"),
-            position=replace(goals.position, stiffness=(4e-4, 4e-4, upright)),
+            position=replace(goals.position, stiffness=walls),
             orientation=OrientationRegion(
                 goal=above.orientation,
                 sharpness=sharpness,
