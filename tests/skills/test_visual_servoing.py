@@ -50,6 +50,20 @@ def servo_in(cell):
     return servo, estimator
 
 
+@pytest.mark.parametrize("detected", [True, False])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_tool_that_has_left_its_box_returns_at_the_rate_to_any_side(detected, axis, side):
+    above = panda.forward(panda.ready)
+    goals = CONFIG.goals(above, np.array([700.0, 500.0]), detected=detected)
+    beyond = torch.zeros(3, dtype=torch.float64)
+    beyond[axis] = side * 1e-3 * float(goals.position.half_size[axis])
+    wall = above.position + 1e3 * beyond
+    _, gradient = goals.position.feedback(wall + beyond)
+    torch.testing.assert_close(-gradient, -CONFIG.rate * beyond, rtol=5e-3, atol=1e-9)
+    assert not goals.position.feedback(wall - beyond)[1].any()
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_the_image_jacobian_is_estimated_once_an_image_where_that_was_taken(known):
     cell = StillCell(panda.ready if known else None)
