@@ -47,6 +47,9 @@ _STARTUP = 60.0
 _STALE = 0.2
 """Age of a reading at which the loop counts as stalled [s]: ten times what the control box
 allows before it stops the arm by itself."""
+_STALE_IN_LOCKSTEP = 2.0
+"""The same of a simulator [s]: its machine may be busy with the task. libfranka itself gives a
+connection up after 1 s."""
 _REST = 3.0
 """Longest that coming to rest may take [s]: at the limits of the maker half a second, with a
 tenth of the acceleration three."""
@@ -232,11 +235,12 @@ class FrankaArm:
         """Return the newest state, by the clock of the robot.
 
         Raises:
-            DriverError: The loop has ended, or has read none for 0.2 s.
+            DriverError: The loop has ended, or has read none for 0.2 s (2 s in lockstep).
         """
         report = self._report()
         age = time.monotonic() - report.stamp
-        if age > _STALE and report.phase != Phase.RECOVERING:
+        longest = _STALE_IN_LOCKSTEP if self._config.lockstep else _STALE
+        if age > longest and report.phase != Phase.RECOVERING:
             raise DriverError(self._stalled(report, age))
         return ArmState(
             time=report.time,

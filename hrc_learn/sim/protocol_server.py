@@ -475,6 +475,11 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
                 super().send_state()
 
         def _handle_udp_command(self, command_data: bytes) -> None:
+            # An answer names its state. One to an earlier state comes too late: taken for this
+            # cycle's, each answer would be a cycle late from then on.
+            answered = int.from_bytes(command_data[:8], "little")
+            if answered != self._FrankaServer__message_id - 1:
+                return
             self.has_lost_answer = self.lose_answer
             if not self.lose_answer:
                 super()._handle_udp_command(command_data)

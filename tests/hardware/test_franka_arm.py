@@ -267,3 +267,26 @@ def pauses_missed(**settings) -> int:
 def test_in_lockstep_a_state_after_a_pause_is_not_taken_for_a_late_one():
     assert pauses_missed() > 20
     assert pauses_missed(lockstep=True) < 10
+
+
+def test_a_simulator_is_answered_smoothly_after_its_driver_was_held_up():
+    world, cycles = World(SceneConfig(objects=())), []
+    world.reset(panda.ready.numpy())
+    config = replace(CONFIG, gripper=False, lockstep=True)
+    with serve_world(world, on_cycle=cycles.append) as server:
+        with server.running():
+            driver = FrankaArm(server.address, panda, config)
+        with closing(ServedArm(driver, server)) as arm:
+            for k in range(60):
+                arm.command(np.full(7, 0.2 if k % 20 < 10 else -0.2))
+                if k % 6 == 3:
+                    os.kill(loop_of(driver), signal.SIGSTOP)
+                    server.advance(0.003)  # for each of which it waits longer than a cycle
+                    os.kill(loop_of(driver), signal.SIGCONT)
+                server.advance(0.01)
+            assert driver.faults == 0
+    answered = np.mean([cycle.answered for cycle in cycles])
+    assert 0.8 < answered < 0.98
+    velocity = np.array([cycle.velocity for cycle in cycles])
+    jerk = np.abs(np.diff(velocity, 2, axis=0)) / 1e-6
+    assert (jerk.max(axis=0) < panda.limits.jerk.numpy()).all()
