@@ -89,7 +89,7 @@ class Workplace:
     """How far the fingers reach beyond the tool centre point, in the middle of the pads [m]."""
     palm: float = 0.0374
     """How far the palm stands back from it [m]."""
-    hover_turns: tuple[float, float] = (np.deg2rad(-75.0), np.deg2rad(105.0))
+    hover_turns: tuple[float, float] = (np.deg2rad(-60.0), np.deg2rad(120.0))
     """Least and greatest turn of the end effector about the vertical there [rad]: half a turn,
     in which the forearm does not come between its marker and the camera."""
     shelf_x: float = 0.40
