@@ -9,7 +9,7 @@ import pytest
 import torch
 from bare_arm import bare
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
     ArmChoice,
     EquippedArm,
@@ -78,6 +78,34 @@ def test_above_the_table_it_turns_by_half_a_turn_with_its_marker_in_view(robot):
     plate = workplace.scene.arm.marker
     assert plate is not None
     assert marker_seen(robot, workplace.scene.camera, plate, workplace.hover_joints())
+
+
+def test_the_usual_hand_may_turn_a_little_further_with_its_marker_in_view():
+    """An arm that has yielded, or errs, stands otherwise than one that was led straight."""
+    workplace, plate = Workplace(), Workplace().scene.arm.marker
+    assert plate is not None
+    hover, room = workplace.hover(), np.deg2rad(15.0)
+    least, most = workplace.hover_turns
+    assert most - least == pytest.approx(np.pi)
+    aside = torch.tensor([[a, b, 0.0] for a in (-0.1, 0.1) for b in (-0.1, 0.1)]).double()
+    there = Pose(hover.position + aside, hover.orientation.expand(4, 4))
+    across = Pose(
+        torch.lerp(
+            hover.position, there.position, torch.linspace(0, 1, 9)[:, None, None].double()
+        ),
+        there.orientation.expand(9, 4, 4),
+    )
+    q, error = follow_poses(panda, across, workplace.hover_joints().expand(4, -1))
+    assert error.max() < 1e-3
+    for end in (least - room, most + room):
+        about = torch.zeros(40, 1, 3, dtype=torch.float64)
+        about[..., 2] = torch.linspace(0.0, end, 40, dtype=torch.float64)[:, None]
+        turned = quaternion.multiply(quaternion.exp(about), hover.orientation)
+        path = Pose(there.position.expand(40, 4, 3), turned.expand(40, 4, 4))
+        along, error = follow_poses(panda, path, q[-1])
+        assert error.max() < 1e-3
+        assert panda.limits.contain(along).all()
+        assert marker_seen(workplace.robot, workplace.scene.camera, plate, along).all()
 
 
 def test_a_marker_is_seen_where_no_ray_to_it_meets_a_link():
