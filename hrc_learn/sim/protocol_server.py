@@ -462,7 +462,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
             world.advance(CYCLE)
 
     class LossyServer(FrankaRobotServer):
-        """Loses the state of a cycle, or the answer to it, when told to."""
+        """Loses the state of a cycle, or the answer to it, when told to, and late answers."""
 
         lose_state = lose_answer = has_lost_answer = False
 

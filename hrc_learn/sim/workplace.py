@@ -91,7 +91,8 @@ class Workplace:
     """How far the palm stands back from it [m]."""
     hover_turns: tuple[float, float] = (np.deg2rad(-60.0), np.deg2rad(120.0))
     """Least and greatest turn of the end effector about the vertical there [rad]: half a turn,
-    in which the forearm does not come between its marker and the camera."""
+    in which the forearm does not come between its marker and the camera. It begins to at -80
+    degrees, by `marker_seen`; an arm that has yielded may stand less well."""
     shelf_x: float = 0.40
     """Where along the boards objects are put [m]."""
     shelf_depth: float = 0.10

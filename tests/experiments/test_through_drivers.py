@@ -72,22 +72,26 @@ def test_an_object_is_grasped(skills):
     assert untouched(grasp.world)
 
 
-@shapes_unchecked()
-@pytest.mark.parametrize("dynamics", [1.0, 0.3])
-def test_an_object_is_placed_also_by_a_gentle_driver(skills, dynamics):
-    config = FrankyConfig(realtime="ignore", grip_force=40.0, dynamics=dynamics)
+def place_on_shelf(skill, access):
     run = place(
-        skills[1],
+        skill,
         WORKPLACE,
         "upper",
         WORKPLACE.home_joints(),
         space="pose",
         speed=1.0,
-        access=through_franky(config),
+        access=access,
     )
     assert run.placed
     assert not run.contacts
     np.testing.assert_allclose(run.object_pose[:2, 3], run.goal.position[:2], atol=5e-3)
+
+
+@shapes_unchecked()
+@pytest.mark.parametrize("dynamics", [1.0, 0.3])
+def test_an_object_is_placed_also_by_a_gentle_driver(skills, dynamics):
+    config = FrankyConfig(realtime="ignore", grip_force=40.0, dynamics=dynamics)
+    place_on_shelf(skills[1], through_franky(config))
 
 
 @pytest.mark.skipif(not find_spec("pylibfranka"), reason="comes with the extra hardware")
@@ -101,18 +105,7 @@ def test_an_object_is_placed_by_our_loop_which_answers_each_cycle(skills):
             servers.append(server)
             yield server
 
-    run = place(
-        skills[1],
-        WORKPLACE,
-        "upper",
-        WORKPLACE.home_joints(),
-        space="pose",
-        speed=1.0,
-        access=through_franka(serve=serve),
-    )
-    assert run.placed
-    assert not run.contacts
-    np.testing.assert_allclose(run.object_pose[:2, 3], run.goal.position[:2], atol=5e-3)
+    place_on_shelf(skills[1], through_franka(serve=serve))
     # A state after a pause is none that comes late; a machine that is held up may miss some.
     (server,) = servers
     assert server.missed < 0.01 * server.cycles
