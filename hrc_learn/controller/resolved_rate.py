@@ -104,6 +104,32 @@ def _damped_gram(J: Float[Tensor, "*batch rows n"]) -> Float[Tensor, "*batch row
     return torch.addcmul(gram, eye, damping_square[..., None, None])
 
 
+def scale_task(
+    task: Float[Tensor, "*batch n"],
+    lower: Float[Tensor, "*#batch n"],
+    upper: Float[Tensor, "*#batch n"],
+    least: float,
+) -> Float[Tensor, "*batch n"]:
+    """Scale the task's velocity as a whole so that limits need not cut single joints.
+
+    A limit that cuts one of two joints which nearly undo each other's motion lets the other
+    swing the tool off its path. Slowed down as a whole the tool keeps its direction. Only so
+    far: cut at that pace, a task slides along a limit instead of stopping there.
+
+    Args:
+        task: Joint velocity of the task [rad/s].
+        lower: Lowest allowed velocity [rad/s].
+        upper: Highest allowed velocity [rad/s].
+        least: Least factor, 0 to 1.
+
+    Returns:
+        The scaled velocity [rad/s].
+    """
+    moving = torch.where(task == 0, torch.finfo(task.dtype).tiny, task)
+    factor = torch.maximum(lower / moving, upper / moving).amin(-1, keepdim=True)
+    return factor.clamp(least, 1) * task
+
+
 def scale_null_space(
     task: Float[Tensor, "*batch n"],
     null: Float[Tensor, "*batch n"],

@@ -231,6 +231,53 @@ def test_a_posture_far_away_begins_a_new_approach():
     assert 0.3 < (q - panda.ready).norm() <= 0.52
 
 
+def off_its_way(rng: torch.Generator, **options) -> tuple[Tensor, Tensor]:
+    """How far limits lead tools from the twist that is asked for [m], and the fastest turns.
+
+    From postures with a third of the joints near a limit to poses 0.15 m and 1 rad away.
+    """
+    n, dt = 60, 0.01
+    share = torch.rand(n, 7, generator=rng, dtype=DOUBLE)
+    q = torch.lerp(LIMITS.lower, LIMITS.upper, share)
+    edge = torch.where(share < 0.5, LIMITS.lower + 0.2, LIMITS.upper - 0.2)
+    q = torch.where(torch.rand(n, 7, generator=rng) < 0.3, edge, q)
+    start = panda.forward(q)
+    way, turn = (torch.randn(n, 3, generator=rng, dtype=DOUBLE) for _ in range(2))
+    goals = Goals.at(
+        start.position + 0.15 * way / way.norm(dim=-1, keepdim=True),
+        quaternion.multiply(
+            quaternion.exp(turn / turn.norm(dim=-1, keepdim=True)), start.orientation
+        ),
+        torch.full((n, 2), 500.0, dtype=DOUBLE),
+        half_size=(0.01, 0.01, 0.01),
+    )
+    J = torch.zeros(2, 6, dtype=DOUBLE)
+    config = ControllerConfig(**options)
+    controller = AdaptiveController(panda, FixedEstimator(network(J)), goals, config=config)
+    state = controller.initial_state(q)
+    off = fastest = torch.zeros(n, dtype=DOUBLE)
+    for _ in range(400):
+        unseen = torch.zeros(n, dtype=torch.bool)
+        command, state = controller.step(state, observe(q, dt=dt, feature_visible=unseen))
+        v, asked = command.joint_velocity, command.twist
+        moved = (panda.jacobian(q) @ v[..., None])[..., 0]
+        done = (moved * asked).sum(-1) / (asked * asked).sum(-1).clamp(min=1e-12)
+        aside = moved - done.clamp(0, 1)[..., None] * asked
+        off = off + dt * aside[:, :3].norm(dim=-1)
+        fastest = torch.maximum(fastest, moved[:, 3:].norm(dim=-1))
+        q = q + dt * v
+    return off, fastest
+
+
+def test_near_limits_the_tool_slows_down_rather_than_leaving_its_way():
+    cut, cut_turns = off_its_way(sampling.generator(11), task_slows=1.0)
+    slowed, slowed_turns = off_its_way(sampling.generator(11))
+    cap = ControllerConfig().angular_speed
+    assert slowed_turns.quantile(0.9) <= cap
+    assert cut_turns.quantile(0.9) > 1.5 * cap  # else the starts would test nothing
+    assert slowed.quantile(0.9) < 0.5 * cut.quantile(0.9)
+
+
 def violations(q: Tensor, v: Tensor, before: Tensor, dt: float) -> Tensor:
     """Whether position, velocity or acceleration limits are broken, or anything is NaN."""
     outside = (q > LIMITS.upper) | (q < LIMITS.lower)

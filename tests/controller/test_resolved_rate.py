@@ -2,7 +2,12 @@ import pytest
 import sampling
 import torch
 
-from hrc_learn.controller.resolved_rate import excess_speed, resolved_rate, scale_null_space
+from hrc_learn.controller.resolved_rate import (
+    excess_speed,
+    resolved_rate,
+    scale_null_space,
+    scale_task,
+)
 from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
 
 
@@ -136,3 +141,34 @@ class TestFitNullSpace:
         for k in range(50):
             one = scale_null_space(task[k], null[k], self.lower, self.upper)
             assert (one == whole[k]).all()
+
+
+class TestScaleTask:
+    lower = torch.tensor([-1.0, -2.0, 0.1], dtype=torch.float64)
+    upper = torch.tensor([1.0, 0.5, 1.0], dtype=torch.float64)
+    """The last joint is past its lower limit: all that it may do is return."""
+
+    def scaled(self, *task: float) -> list[float]:
+        task = torch.tensor(task, dtype=torch.float64)
+        return scale_task(task, self.lower, self.upper, 0.25).tolist()
+
+    def test_what_fits_is_left_alone(self):
+        assert self.scaled(-1.0, 0.5, 0.1) == [-1.0, 0.5, 0.1]
+        assert self.scaled(1.0, -2.0, 1.0) == [1.0, -2.0, 1.0]
+
+    def test_the_joint_that_would_be_cut_most_slows_all(self):
+        assert self.scaled(1.25, 1.0, 0.5) == [0.625, 0.5, 0.25]
+        assert self.scaled(-2.0, 0.5, 0.5) == [-1.0, 0.25, 0.25]
+
+    def test_it_slows_no_further_than_asked(self):
+        assert self.scaled(0.5, 5.0, 0.5) == [0.125, 1.25, 0.125]
+        assert self.scaled(0.4, 0.4, -0.4) == [0.1, 0.1, -0.1]
+
+    def test_rest_stays_rest(self):
+        assert self.scaled(0.0, 0.0, 0.0) == [0.0, 0.0, 0.0]
+
+    def test_a_batch_is_a_loop(self):
+        task = 2 * random(50, 3, rng=sampling.generator(7))
+        whole = scale_task(task, self.lower, self.upper, 0.25)
+        for k in range(50):
+            assert (scale_task(task[k], self.lower, self.upper, 0.25) == whole[k]).all()
