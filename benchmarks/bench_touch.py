@@ -82,8 +82,8 @@ def main(args: Args) -> None:
             listeners: list[Listener] = []
 
             def listen(world: World, cell: WorkCell, listeners: list = listeners) -> None:
-                listener = Listener(cell._human, Touch(panda, args.config))
-                cell._human = listener
+                listener = Listener(cell.human, Touch(panda, args.config))
+                cell.human = listener
                 listeners.append(listener)
 
             run = simulate_collaboration(

@@ -181,6 +181,7 @@ class WorkCell:
     Attributes:
         chain: Kinematics of the arm.
         gripper: Its gripper's driver.
+        human: The person beside the arm; may be another from the next step on.
         observation: Newest detection of markers that has arrived.
         watched: Where people beside the arm may be; None: nobody watches for them.
         load: What the arm holds, which people must not be hit with either.
@@ -242,7 +243,8 @@ class WorkCell:
         self.remarks: list[Event] = []
         self.region: PositionRegion | None = None
         self.plan: Float[np.ndarray, "steps joints"] | None = None
-        self._arm, self._human = arm, human
+        self._arm = arm
+        self.human = human
         self._advance, self._on_phase = advance, on_phase
         self.clearance = clearance
         safety = self.config.safety
@@ -658,13 +660,13 @@ class WorkCell:
             **columns,
         )
         self._arm.command(velocity.numpy())
-        self._human.tell(told)
+        self.human.tell(told)
         self._advance(self.config.dt)
         self._ticks += 1
         self._markers.remember(self.time, self.state.joint_position)
         self._reading = _Reading(self.chain, self._room, self._arm.read())
         self._look()
-        asked = self._human.read(self.state)
+        asked = self.human.read(self.state)
         way = self.config.way_making
         self._pushing = bool(asked.nullspace_input.any()) and (way is None or way.expert)
         push = smooth = self._nullspace_input(asked)

@@ -147,8 +147,8 @@ def test_the_gripper_moves_while_the_arm_is_read(arm):
 
 
 def test_cycles_are_counted(arm):
+    wait_until(lambda: arm.timing.answered > 300)
     timing = arm.timing
-    assert timing.answered > 300
     assert timing.cost.sum() > 300
     assert 0 < timing.percentile(50.0) <= timing.percentile(99.0) <= 2e-3
 

@@ -175,7 +175,7 @@ def test_a_jump_of_the_null_space_input_comes_smoothly(cell):
         def read(self, state):
             return HumanInput(nullspace_input=pull * (state.time < 0.5))
 
-    cell._human = Jump()
+    cell.human = Jump()
     cell.hold_pose(1.5)
     d = cell.log["nullspace_input"]
     acceleration = np.diff(d, axis=0) / cell.config.damping / cell.config.dt
