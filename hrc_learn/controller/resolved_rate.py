@@ -106,28 +106,39 @@ def _damped_gram(J: Float[Tensor, "*batch rows n"]) -> Float[Tensor, "*batch row
 
 def scale_task(
     task: Float[Tensor, "*batch n"],
+    J: Float[Tensor, "*batch 6 n"],
     lower: Float[Tensor, "*#batch n"],
     upper: Float[Tensor, "*#batch n"],
-    least: float,
+    caps: Float[Tensor, "2"],
 ) -> Float[Tensor, "*batch n"]:
-    """Scale the task's velocity as a whole so that limits need not cut single joints.
+    """Slow the task down where limits that cut single joints would make the tool faster.
 
     A limit that cuts one of two joints which nearly undo each other's motion lets the other
-    swing the tool off its path. Slowed down as a whole the tool keeps its direction. Only so
-    far: cut at that pace, a task slides along a limit instead of stopping there.
+    swing the tool off its path, faster than was asked for. Slowed down as a whole, less is
+    cut. Where a cut makes the tool slower the task goes on, and slides along the limit.
 
     Args:
         task: Joint velocity of the task [rad/s].
+        J: Geometric Jacobian of the tool.
         lower: Lowest allowed velocity [rad/s].
         upper: Highest allowed velocity [rad/s].
-        least: Least factor, 0 to 1.
+        caps: Highest linear and angular speed [m/s, rad/s], by which both are compared.
 
     Returns:
-        The scaled velocity [rad/s].
+        The velocity, scaled no further than to where nothing is cut [rad/s].
     """
+    cut = torch.minimum(torch.maximum(task, lower), upper)
+    asked, done = (
+        torch.linalg.vector_norm(
+            torch.linalg.vecdot(J, v.unsqueeze(-2)).view(*v.shape[:-1], 2, 3) / caps[:, None],
+            dim=(-2, -1),
+        ).unsqueeze(-1)
+        for v in (task, cut)
+    )
     moving = torch.where(task == 0, torch.finfo(task.dtype).tiny, task)
-    factor = torch.maximum(lower / moving, upper / moving).amin(-1, keepdim=True)
-    return factor.clamp(least, 1) * task
+    fits = torch.maximum(lower / moving, upper / moving).amin(-1, keepdim=True)
+    slowed = torch.maximum(asked / done, fits).clamp(0, 1)
+    return torch.where(done > asked, slowed, 1.0) * task
 
 
 def scale_null_space(

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import sampling
 import torch
@@ -144,31 +145,49 @@ class TestFitNullSpace:
 
 
 class TestScaleTask:
-    lower = torch.tensor([-1.0, -2.0, 0.1], dtype=torch.float64)
-    upper = torch.tensor([1.0, 0.5, 1.0], dtype=torch.float64)
-    """The last joint is past its lower limit: all that it may do is return."""
+    """Two joints that undo each other's motion of the tool, and one along another axis."""
+
+    lower = torch.tensor([-1.0, -1.0, -1.0], dtype=torch.float64)
+    upper = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
+    caps = torch.tensor([0.25, 1.0], dtype=torch.float64)
+    J = torch.zeros(6, 3, dtype=torch.float64)
+    J[0, 0], J[0, 1], J[4, 2] = 1.0, -0.8, 0.5
 
     def scaled(self, *task: float) -> list[float]:
         task = torch.tensor(task, dtype=torch.float64)
-        return scale_task(task, self.lower, self.upper, 0.25).tolist()
+        return scale_task(task, self.J, self.lower, self.upper, self.caps).tolist()
 
     def test_what_fits_is_left_alone(self):
-        assert self.scaled(-1.0, 0.5, 0.1) == [-1.0, 0.5, 0.1]
-        assert self.scaled(1.0, -2.0, 1.0) == [1.0, -2.0, 1.0]
-
-    def test_the_joint_that_would_be_cut_most_slows_all(self):
-        assert self.scaled(1.25, 1.0, 0.5) == [0.625, 0.5, 0.25]
-        assert self.scaled(-2.0, 0.5, 0.5) == [-1.0, 0.25, 0.25]
-
-    def test_it_slows_no_further_than_asked(self):
-        assert self.scaled(0.5, 5.0, 0.5) == [0.125, 1.25, 0.125]
-        assert self.scaled(0.4, 0.4, -0.4) == [0.1, 0.1, -0.1]
-
-    def test_rest_stays_rest(self):
+        assert self.scaled(1.0, -1.0, 0.5) == [1.0, -1.0, 0.5]
         assert self.scaled(0.0, 0.0, 0.0) == [0.0, 0.0, 0.0]
 
+    def test_a_cut_that_makes_the_tool_slower_is_left_to_the_limit(self):
+        assert self.scaled(2.0, 0.0, 0.0) == [2.0, 0.0, 0.0]
+        assert self.scaled(0.0, 0.0, -4.0) == [0.0, 0.0, -4.0]
+
+    def test_a_cut_that_makes_it_faster_slows_all(self):
+        # Asked for 1.25 - 1.2 = 0.05 m/s; cut, the first joint would leave -0.2 m/s.
+        assert self.scaled(1.25, 1.5, 0.0) == pytest.approx([0.8333333, 1.0, 0.0])
+
+    def test_both_speeds_count_by_their_caps(self):
+        # 0.05 m/s and 1 rad/s of (0.25, 1): 1.02. Cut: 0.2 and 0.5: 0.94, which is slower.
+        assert self.scaled(1.25, 1.5, 2.0) == [1.25, 1.5, 2.0]
+        # 0.05 and 0.9: 0.92. Cut, 0.2 and 0.5: 0.94, which is faster.
+        share = np.hypot(0.05 / 0.25, 0.9) / np.hypot(0.2 / 0.25, 0.5)
+        expected = [1.25 * share, 1.5 * share, 1.8 * share]
+        assert self.scaled(1.25, 1.5, 1.8) == pytest.approx(expected)
+
+    def test_unbounded_caps_slow_nothing(self):
+        task = torch.tensor([1.25, 1.5, 0.0], dtype=torch.float64)
+        caps = torch.full((2,), torch.inf, dtype=torch.float64)
+        assert (scale_task(task, self.J, self.lower, self.upper, caps) == task).all()
+
     def test_a_batch_is_a_loop(self):
-        task = 2 * random(50, 3, rng=sampling.generator(7))
-        whole = scale_task(task, self.lower, self.upper, 0.25)
+        rng = sampling.generator(7)
+        task = torch.tensor([1.25, 1.5, 0.0]) + 0.3 * random(50, 3, rng=rng)
+        J = self.J + 0.1 * random(50, 6, 3, rng=rng)
+        whole = scale_task(task, J, self.lower, self.upper, self.caps)
+        assert (whole != task).any()
         for k in range(50):
-            assert (scale_task(task[k], self.lower, self.upper, 0.25) == whole[k]).all()
+            one = scale_task(task[k], J[k], self.lower, self.upper, self.caps)
+            torch.testing.assert_close(one, whole[k])
