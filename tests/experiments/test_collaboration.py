@@ -38,7 +38,7 @@ from hrc_learn.experiments.run_recording import (
     worker_distance,
 )
 from hrc_learn.experiments.snapshots import viewpoint
-from hrc_learn.geometry import Box
+from hrc_learn.geometry import Box, quaternion
 from hrc_learn.sim import NOWHERE, CameraChange, Imperfections, OcclusionInterval
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
@@ -503,6 +503,32 @@ def test_where_no_way_gets_free_the_object_is_put_back(skills):
     assert not job.world.cabinet_contacts.touches
     home = torch.from_numpy(job.cell.state.joint_position)
     assert float((home - WORKPLACE.home_joints()).abs().max()) < 0.02
+
+
+@shapes_unchecked()
+def test_a_turn_near_the_edge_of_the_image_keeps_the_marker_in_view(skills):
+    """80 degrees, for an object whose grasp has the marker 80 px above the lower edge."""
+    servo = VisualServoConfig(timeout=5.0)
+    job = simulate_collaboration(
+        *skills,
+        ("middle",),
+        camera="synthetic",
+        config=replace(BRIEF, grasping=GraspingConfig(servo=servo, attempts=1)),
+        imperfections=Imperfections.nominal(),
+        seed=113,
+    )
+    time, feature = np.array(job.cell.log["time"]), np.array(job.cell.log["feature"])
+    pose = WORKPLACE.robot.chain.forward(
+        torch.from_numpy(np.array(job.cell.log["joint_position"]))
+    )
+    assert "after 5 s" in job.failure
+    seen = np.isfinite(feature[:, 0])
+    first = np.flatnonzero(seen)[0]
+    servoing = slice(first, np.searchsorted(time, time[first] + 4.0))
+    turned = quaternion.angle(pose.orientation[servoing], pose.orientation[first])
+    assert turned.max() > 1.2
+    assert feature[servoing, 1].max() > 900
+    assert seen[servoing].all()
 
 
 @pytest.mark.slow
