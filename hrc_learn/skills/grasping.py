@@ -40,8 +40,16 @@ JOINT_SPEED = 0.6
 DESCENT_SPEED = 0.08
 """Mean speed of the last centimetres down to an object [m/s]."""
 CLOSING_TIME = 0.7
-"""For the fingers to close and for the grip to settle [s]."""
+"""For the fingers to close and for the grip to settle, at least [s]."""
 
+# For the fingers to open before the arm leaves, at least [s].
+_OPENING_TIME = 0.3
+# Longest that fingers are waited for [s]: the Franka Hand's whole stroke at a quarter of its
+# speed, 3.2 s, and half a second to begin.
+_LONGEST_FINGER_MOTION = 4.0
+# Fingers have moved when the opening has changed by so much [m], and are at rest when it has
+# changed by less than a tenth of that for so long [s]: of a gripper that tells it at 50 Hz.
+_FINGERS_MOVED, _FINGERS_REST = 0.002, 0.1
 # The marker plate stands out from the arm's capsules by up to this [m].
 _PLATE_CLEARANCE = 0.06
 # Clearance is checked at one of so many samples: at JOINT_SPEED the arm moves 3 cm in between.
@@ -285,8 +293,7 @@ class Grasping:
         self._feel(item)
         height = self._table + item.half_size[2]
         self._cell.move_straight(self._at_height(height), speed=DESCENT_SPEED)
-        self._cell.gripper.move(CLOSED)
-        self._cell.hold_pose(CLOSING_TIME)
+        move_fingers(self._cell, CLOSED, CLOSING_TIME)
         if not holds(self._cell, item):
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
@@ -367,9 +374,8 @@ class Grasping:
     def start_over(self) -> None:
         """Open the fingers and go home, clear of the table and of the camera's view."""
         self._cell.tracked_markers = ()
-        self._cell.gripper.move(OPEN)
         self._cell.load = None
-        self._cell.hold_pose(0.3)  # time for the fingers to open
+        move_fingers(self._cell, OPEN, _OPENING_TIME)
         if self._cell.pose.position[2] < self._workplace.hover_height:
             self.lift()
         self.go_home()
@@ -390,12 +396,39 @@ def as_load(item: GraspObject) -> GraspedBox:
     return GraspedBox(half_size=(y, x, z))
 
 
+def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
+    """Open or close the fingers, and hold the end effector still until they are at rest.
+
+    Real grippers begin late, and some tell the opening only once they have arrived: as long as
+    it is what it was, they are waited for.
+
+    Args:
+        cell: Arm and gripper.
+        width: Opening to reach, or to squeeze towards [m].
+        at_least: How long to hold still in any case [s].
+    """
+    before, begun = cell.state.gripper_width, cell.time
+    cell.gripper.move(width)
+    cell.hold_pose(at_least - _FINGERS_REST)
+    expected = abs(width - before) > _FINGERS_MOVED
+    while True:
+        last = cell.state.gripper_width
+        cell.hold_pose(_FINGERS_REST)
+        now = cell.state.gripper_width
+        at_rest = abs(now - last) < _FINGERS_MOVED / 10
+        moved = abs(now - before) > _FINGERS_MOVED
+        if (at_rest and moved) or not expected or cell.time - begun > _LONGEST_FINGER_MOTION:
+            return
+
+
 def holds(cell: WorkCell, item: GraspObject) -> bool:
     """Whether the fingers are as far apart as an object between them keeps them.
 
-    Half the object's width is the threshold: far from both a held object and closed fingers.
+    Half the object's width is the lower threshold, the middle between that width and open
+    fingers the upper one: far from a held object, and from closed and open fingers.
     """
-    return cell.state.gripper_width > item.half_size[0]
+    half = item.half_size[0]
+    return half < cell.state.gripper_width < half + OPEN / 2
 
 
 def raised(pose: Pose, height: float) -> Pose:

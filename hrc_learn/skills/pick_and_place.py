@@ -31,6 +31,7 @@ from hrc_learn.skills.grasping import (
     GraspingConfig,
     holds,
     joint_plan,
+    move_fingers,
     raised,
 )
 from hrc_learn.skills.marker_sensor import longest_occlusion
@@ -120,7 +121,7 @@ TRANSFER, RELEASE = Phase.TRANSFER, Phase.RELEASE
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
 _NEGLIGIBLE = 0.3
 RELEASE_TIME = 0.8
-"""For the fingers to open and for the released object to come to rest [s]."""
+"""For the fingers to open and for the released object to come to rest, at least [s]."""
 # Straight way back along the end effector's own axis, until nothing of the object is between
 # the fingers [m]; and its speed: at the usual one the shoulder comes near its limits [m/s].
 _CLEARANCE, _RETREAT_SPEED = 0.08, 0.08
@@ -178,9 +179,8 @@ def _put_down(cell: WorkCell, goal: Pose, lowering: float) -> Pose:
     below.position[2] -= lowering
     cell.move_until_contact(below)
     released = cell.pose
-    cell.gripper.move(OPEN)
     cell.load = None
-    cell.hold_pose(RELEASE_TIME)
+    move_fingers(cell, OPEN, RELEASE_TIME)
     return released
 
 

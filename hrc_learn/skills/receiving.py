@@ -18,7 +18,14 @@ from hrc_learn.dmp import InteractionEstimate, InteractionPrimitive
 from hrc_learn.geometry import Pose
 from hrc_learn.protocols import PersonObservation, PersonTracker
 from hrc_learn.skills.failures import MissedGraspError
-from hrc_learn.skills.grasping import CLOSED, CLOSING_TIME, OPEN, as_load, holds
+from hrc_learn.skills.grasping import (
+    CLOSED,
+    CLOSING_TIME,
+    OPEN,
+    as_load,
+    holds,
+    move_fingers,
+)
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.skills.workplace import GraspObject
 
@@ -181,15 +188,13 @@ class Receiving:
         while self.receipt.attempts < self._config.attempts:
             self._await_hand(beside, deadline)
             self.receipt.attempts += 1
-            self._cell.gripper.move(CLOSED)
-            self._cell.hold_pose(CLOSING_TIME)
+            move_fingers(self._cell, CLOSED, CLOSING_TIME)
             if holds(self._cell, item):
                 self.receipt.taken = self._cell.time
                 self.receipt.place = self._cell.pose.position.numpy().copy()
                 self._cell.load = as_load(item)
                 return self.receipt
-            self._cell.gripper.move(OPEN)
-            self._cell.hold_pose(CLOSING_TIME)
+            move_fingers(self._cell, OPEN, CLOSING_TIME)
         raise MissedGraspError("receive: the fingers closed on nothing in the person's hand.")
 
     def _recognise(self, deadline: float) -> InteractionEstimate:

@@ -1,0 +1,96 @@
+"""Fingers that begin late and take their time, and how long an arm waits for them."""
+
+import math
+from dataclasses import replace
+
+import pytest
+from obedient_arm import ObedientArm
+
+from hrc_learn.kinematics import panda
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills import WorkCell
+from hrc_learn.skills.grasping import CLOSED, CLOSING_TIME, OPEN, holds, move_fingers
+from hrc_learn.teleoperation import ScriptedPerturbation
+
+ITEM = Workplace().scene.objects[0]
+WIDTH = 2 * ITEM.half_size[0]
+
+
+class SlowHand(ObedientArm):
+    """Fingers that begin late, stop at what is between them, and may tell only where they end.
+
+    Such is a driver whose calls return when the fingers have arrived.
+    """
+
+    def __init__(self, width, *, late=0.0, speed=0.1, between=0.0, tells_on_the_way=True):
+        super().__init__(panda.ready.numpy())
+        self.width = self.told = width
+        self.goal, self.begin = width, math.inf
+        self.late, self.speed, self.between = late, speed, between
+        self.tells_on_the_way = tells_on_the_way
+
+    def read(self):
+        return replace(super().read(), gripper_width=self.told)
+
+    def move(self, width):
+        self.goal, self.begin = max(width, self.between), self.time + self.late
+
+    @property
+    def arrived(self):
+        return abs(self.goal - self.width) < 1e-9
+
+    def advance(self, duration):
+        super().advance(duration)
+        if self.time > self.begin:
+            step = self.speed * duration
+            self.width += min(max(self.goal - self.width, -step), step)
+        if self.tells_on_the_way or self.arrived:
+            self.told = self.width
+
+
+def cell_of(hand):
+    person = ScriptedPerturbation(panda, ())
+    return WorkCell(chain=panda, arm=hand, gripper=hand, human=person, advance=hand.advance)
+
+
+@pytest.mark.parametrize("tells_on_the_way", [True, False])
+@pytest.mark.parametrize("late", [0.0, 0.5, 1.5])
+@pytest.mark.parametrize(("start", "goal"), [(OPEN, CLOSED), (WIDTH, OPEN)])
+def test_the_arm_waits_until_the_fingers_have_arrived(start, goal, late, tells_on_the_way):
+    between = WIDTH if goal == CLOSED else 0.0
+    hand = SlowHand(start, late=late, between=between, tells_on_the_way=tells_on_the_way)
+    cell = cell_of(hand)
+    move_fingers(cell, goal, CLOSING_TIME)
+    assert hand.arrived
+    assert holds(cell, ITEM) == (goal == CLOSED)
+    # Two looks, 0.1 s apart each, may pass until it is clear that they rest.
+    arrival = late + abs(hand.width - start) / hand.speed
+    assert cell.time < max(CLOSING_TIME, arrival + 0.2) + 0.02
+
+
+def test_fingers_that_are_quick_cost_no_time():
+    cell = cell_of(SlowHand(OPEN, between=WIDTH))
+    move_fingers(cell, CLOSED, CLOSING_TIME)
+    assert cell.time == pytest.approx(CLOSING_TIME)
+
+
+@pytest.mark.parametrize("width", [OPEN, math.nan])
+def test_nobody_waits_for_fingers_that_are_there_or_that_are_none(width):
+    cell = cell_of(SlowHand(width))
+    move_fingers(cell, OPEN, 0.3)
+    assert cell.time == pytest.approx(0.3)
+
+
+def test_fingers_that_never_move_hold_nothing_and_are_given_up():
+    cell = cell_of(SlowHand(OPEN, late=math.inf))
+    move_fingers(cell, CLOSED, CLOSING_TIME)
+    # The stroke of 0.08 m at a quarter of the Franka Hand's 0.1 m/s, and then some.
+    assert 3.2 < cell.time < 5.0
+    assert not holds(cell, ITEM)
+
+
+@pytest.mark.parametrize(
+    ("width", "held"), [(0.0, False), (WIDTH, True), (0.8 * WIDTH, True), (OPEN, False)]
+)
+def test_only_fingers_about_as_far_apart_as_the_object_is_wide_hold_it(width, held):
+    assert holds(cell_of(SlowHand(width)), ITEM) == held
