@@ -35,6 +35,7 @@ from hrc_learn.controller.resolved_rate import (
     planned_motion,
     resolved_rate,
     restored_drift,
+    saturate_in_null_space,
     scale_null_space,
     scale_task,
 )
@@ -73,6 +74,8 @@ class ControllerConfig:
     is computed for where the arm will be by then."""
     null_damping: float = 3.0
     """c_d: null-space input divided by it is velocity."""
+    null_space_saturation: bool = True
+    """Saturation in the null space: the other joints do what limits take from single ones."""
     task_slows: bool = True
     """Slow the task down as a whole where a limit that cuts single joints would make the tool
     faster than the task asks for."""
@@ -114,6 +117,7 @@ class ControllerConfig:
             linear_speed=math.inf,
             angular_speed=math.inf,
             vision_rate=math.inf,
+            null_space_saturation=False,
             task_slows=False,
             null_space_yields=False,
             drift_compensation_rate=0.0,
@@ -423,14 +427,15 @@ class AdaptiveController(nn.Module):
             else:
                 pose, J = self.chain.forward_and_jacobian(coming)
                 basis = self._basis(goals, pose, J)
-        if basis is None:
-            task, null = resolved_rate(J, twist, null)
-        else:
-            rows = (basis @ twist.unsqueeze(-1)).squeeze(-1)
-            task, null = resolved_rate(basis @ J, rows, null)
+        J_task, rows = J, twist
+        if basis is not None:
+            J_task, rows = basis @ J, (basis @ twist.unsqueeze(-1)).squeeze(-1)
+        task, null = resolved_rate(J_task, rows, null)
         bounds = self.safety.velocity_bounds(q)
         # Constraints let task and null space yield better.
         cut = self.config.safety.constraints is None
+        if cut and self.config.null_space_saturation:
+            task = saturate_in_null_space(task, J_task, rows, *bounds)
         if cut and self.config.task_slows:
             task = scale_task(task, J, *bounds, self.caps[0])
         if goals.posture is not None:

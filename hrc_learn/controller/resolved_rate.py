@@ -104,6 +104,47 @@ def _damped_gram(J: Float[Tensor, "*batch rows n"]) -> Float[Tensor, "*batch row
     return torch.addcmul(gram, eye, damping_square[..., None, None])
 
 
+def saturate_in_null_space(
+    task: Float[Tensor, "*batch n"],
+    J: Float[Tensor, "*batch rows n"],
+    twist: Float[Tensor, "*batch rows"],
+    lower: Float[Tensor, "*#batch n"],
+    upper: Float[Tensor, "*#batch n"],
+) -> Float[Tensor, "*batch n"]:
+    """Let the other joints do what limits take from single ones of the task.
+
+    Joints that a limit cuts move as fast as it lets them, and the others are solved for what is
+    left of the twist: one round of the saturation in the null space (Flacco, De Luca and
+    Khatib, "Control of redundant robots under hard joint constraints", T-RO 2015). Without it
+    an arm with a joint at its limit may stand still short of where it could go: where the least
+    velocity for the twist is of that joint alone.
+
+    Args:
+        task: Joint velocity of the task, by `resolved_rate` [rad/s].
+        J: As there.
+        twist: As there.
+        lower: Lowest allowed velocity [rad/s].
+        upper: Highest allowed velocity [rad/s].
+
+    Returns:
+        The velocity, in which only joints that were not cut may leave their bounds; or the one
+        given, where that, cut, comes nearer to the twist [rad/s].
+    """
+    cut = torch.minimum(torch.maximum(task, lower), upper)
+    free = cut == task
+    left = twist - torch.linalg.vecdot(J, cut.masked_fill(free, 0).unsqueeze(-2))
+    J_free = J * free.unsqueeze(-2)
+    others = matmul(J_free.mT, solve_positive(_damped_gram(J_free), left.unsqueeze(-1)))
+    shared = torch.where(free, others.squeeze(-1), cut)
+
+    def off(velocity: Tensor) -> Tensor:
+        within = torch.minimum(torch.maximum(velocity, lower), upper)
+        missing = twist - torch.linalg.vecdot(J, within.unsqueeze(-2))
+        return torch.linalg.vecdot(missing, missing).unsqueeze(-1)
+
+    return torch.where(off(shared) < off(task), shared, task)
+
+
 def scale_task(
     task: Float[Tensor, "*batch n"],
     J: Float[Tensor, "*batch 6 n"],

@@ -270,8 +270,10 @@ def off_its_way(rng: torch.Generator, **options) -> tuple[Tensor, Tensor]:
 
 
 def test_near_limits_the_tool_slows_down_rather_than_leaving_its_way():
-    cut, cut_turns = off_its_way(sampling.generator(11), task_slows=False)
-    slowed, slowed_turns = off_its_way(sampling.generator(11))
+    # Alone: saturation in the null space leaves little to be slowed down.
+    alone = {"null_space_saturation": False}
+    cut, cut_turns = off_its_way(sampling.generator(11), task_slows=False, **alone)
+    slowed, slowed_turns = off_its_way(sampling.generator(11), **alone)
     cap = ControllerConfig().angular_speed
     assert slowed_turns.quantile(0.9) <= cap
     assert cut_turns.quantile(0.9) > cap  # else the starts would test nothing
