@@ -142,7 +142,9 @@ def saturate_in_null_space(
         missing = twist - torch.linalg.vecdot(J, within.unsqueeze(-2))
         return torch.linalg.vecdot(missing, missing).unsqueeze(-1)
 
-    return torch.where(off(shared) < off(task), shared, task)
+    # Of a task that is not cut both are alike, but for rounding.
+    better = (off(shared) < off(task)) & ~free.all(-1, keepdim=True)
+    return torch.where(better, shared, task)
 
 
 def scale_task(

@@ -281,6 +281,32 @@ def test_near_limits_the_tool_slows_down_rather_than_leaving_its_way():
     assert slowed.amax() < 0.5 * cut.amax()
 
 
+@pytest.mark.parametrize("saturation", [True, False])
+def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(saturation):
+    """Where a servoed arm stood still: on its way it would turn joint 1 alone, at its limit."""
+    q = torch.tensor([2.876, -1.141, -1.587, -1.918, -1.176, 1.713, -0.213], dtype=DOUBLE)
+    start, turn = panda.forward(q), quaternion.exp(torch.tensor([0, 0, 0.5], dtype=DOUBLE))
+    goal = Pose(
+        quaternion.rotate(turn, start.position),
+        quaternion.multiply(turn, start.orientation),
+    )
+    away = goal.position - start.position
+    assert (panda.jacobian(q)[:3, 0] * away).sum() / away.norm() > 0.5
+    target = torch.tensor([500.0, 500.0], dtype=DOUBLE)
+    goals = Goals.at(goal.position, goal.orientation, target, half_size=(0.01, 0.01, 0.01))
+    config = ControllerConfig(null_space_saturation=saturation)
+    estimator = FixedEstimator(network(torch.zeros(2, 6, dtype=DOUBLE)))
+    controller = AdaptiveController(panda, estimator, goals, config=config)
+    state, unseen = controller.initial_state(q), torch.tensor(False)
+    for _ in range(500):
+        command, state = controller.step(state, observe(q, dt=0.01, feature_visible=unseen))
+        q = q + 0.01 * command.joint_velocity
+    end = panda.forward(q)
+    off = (end.position - goal.position).abs().amax()
+    assert (off < 0.01) == saturation
+    assert (quaternion.angle(end.orientation, goal.orientation) < 0.2) == saturation
+
+
 def violations(q: Tensor, v: Tensor, before: Tensor, dt: float) -> Tensor:
     """Whether position, velocity or acceleration limits are broken, or anything is NaN."""
     outside = (q > LIMITS.upper) | (q < LIMITS.lower)

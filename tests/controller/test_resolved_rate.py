@@ -2,14 +2,17 @@ import numpy as np
 import pytest
 import sampling
 import torch
+from scipy.optimize import lsq_linear
 
 from hrc_learn.controller.resolved_rate import (
     excess_speed,
     resolved_rate,
+    saturate_in_null_space,
     scale_null_space,
     scale_task,
 )
 from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
+from hrc_learn.kinematics.redundancy import SINGULAR_BELOW
 
 
 def random(*shape: int, rng: torch.Generator) -> torch.Tensor:
@@ -190,4 +193,89 @@ class TestScaleTask:
         assert (whole != task).any()
         for k in range(50):
             one = scale_task(task[k], J[k], self.lower, self.upper, self.caps)
+            torch.testing.assert_close(one, whole[k])
+
+
+class TestSaturation:
+    """What limits take from joints of the task, the others do."""
+
+    def cut_tasks(self, limit: float, seed: int, count: int = 400):
+        """Jacobians of the Panda, twists, their least velocities, and a bound on all joints."""
+        rng = sampling.generator(seed)
+        J = regular_jacobians(count, rng)
+        twist = random(len(J), 6, rng=rng)
+        task, _ = resolved_rate(J, twist, torch.zeros(len(J), 7, dtype=torch.float64))
+        twist, task = (v / task.abs().amax(-1, keepdim=True) for v in (twist, task))
+        return J, twist, task, torch.full((7,), limit, dtype=torch.float64)
+
+    def missed(self, J, velocity, twist, bound):
+        """Of the twist, by a velocity that is cut."""
+        return (
+            (J @ torch.minimum(torch.maximum(velocity, -bound), bound)[..., None])[..., 0]
+            - twist
+        ).norm(dim=-1)
+
+    def test_what_fits_is_left_alone(self):
+        J, twist, task, bound = self.cut_tasks(1.0 + 1e-9, 11)
+        assert torch.equal(saturate_in_null_space(task, J, twist, -bound, bound), task)
+
+    def test_the_tool_moves_as_asked_where_the_other_joints_can(self):
+        J, twist, task, bound = self.cut_tasks(0.9, 12, 2000)
+        shared = saturate_in_null_space(task, J, twist, -bound, bound)
+        # Near the singularities of the joints that are left the motion is damped.
+        left = J.masked_fill((task.abs() > bound)[..., None, :], 0)
+        regular = torch.linalg.svdvals(left)[:, -1] > 2 * SINGULAR_BELOW
+        fits = regular & (shared.abs() <= bound + 1e-12).all(-1)
+        assert fits.sum() > 20
+        assert (self.missed(J, shared, twist, bound)[fits] < 1e-9).all()
+        assert (self.missed(J, task, twist, bound)[fits] > 0.05).all()
+
+    def test_no_velocity_within_the_bounds_does_much_better(self):
+        J, twist, task, bound = self.cut_tasks(0.8, 13)
+        shared = saturate_in_null_space(task, J, twist, -bound, bound)
+        missed, before = (self.missed(J, v, twist, bound) for v in (shared, task))
+        assert (missed <= before + 1e-12).all()
+        assert (missed < before - 1e-3).double().mean() > 0.5
+        bounds = -bound.numpy(), bound.numpy()
+        least = [
+            np.sqrt(2 * lsq_linear(a.numpy(), b.numpy(), bounds).cost)
+            for a, b in zip(J, twist, strict=True)
+        ]
+        least = torch.tensor(least, dtype=torch.float64)
+        # One round leaves to limits what it drives others into.
+        assert (missed >= least - 1e-6).all()
+        gained = ((before - missed) / (before - least).clamp(min=1e-9)).clamp(0, 1)
+        assert gained.mean() > 0.6
+
+    def test_a_joint_that_is_locked_goes_as_far_as_its_limit(self):
+        J, twist, task, _ = self.cut_tasks(1.0, 14)
+        most = task.abs().argmax(-1, keepdim=True)
+        wide = torch.full_like(task, 50.0)
+        lower, upper = -wide, wide.scatter(-1, most, 0.3)
+        task, twist = (v * task.gather(-1, most).sign() for v in (task, twist))
+        shared = saturate_in_null_space(task, J, twist, lower, upper)
+        changed = (shared != task).any(-1)
+        assert changed.double().mean() > 0.5
+        torch.testing.assert_close(
+            shared.gather(-1, most)[changed], torch.full_like(shared[changed, :1], 0.3)
+        )
+
+    def test_six_joints_slide_along_a_limit(self):
+        rng = sampling.generator(15)
+        J = regular_jacobians(400, rng)[..., :6]
+        J = J[torch.linalg.svdvals(J)[:, -1] > 0.1]
+        twist = random(len(J), 6, rng=rng)
+        task = torch.linalg.solve(J, twist)
+        bound = (0.5 * task.abs().amax(-1, keepdim=True)).expand_as(task)
+        shared = saturate_in_null_space(task, J, twist, -bound, bound)
+        assert shared.isfinite().all()
+        assert (
+            self.missed(J, shared, twist, bound) <= self.missed(J, task, twist, bound)
+        ).all()
+
+    def test_a_batch_is_a_loop(self):
+        J, twist, task, bound = self.cut_tasks(0.7, 16)
+        whole = saturate_in_null_space(task, J, twist, -bound, bound)
+        for k in range(0, len(J), 10):
+            one = saturate_in_null_space(task[k], J[k], twist[k], -bound, bound)
             torch.testing.assert_close(one, whole[k])
