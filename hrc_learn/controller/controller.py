@@ -403,6 +403,8 @@ class AdaptiveController(nn.Module):
         """Joint velocity of the law, with the pose drift compensated while a person acts."""
         d, rate = self._nullspace_input(observation), self.config.drift_compensation_rate
         xi_q = self.joint_region.gradient(q)
+        if goals.rest is not None:
+            xi_q = xi_q + self.config.null_damping * goals.rest.gradient(q)
         null = (-xi_q if d is None else d - xi_q) / self.config.null_damping
 
         # B^T B J is the Jacobian of what the task leads of the tool's motion.

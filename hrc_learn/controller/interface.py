@@ -60,6 +60,8 @@ class Goals:
     posture: PostureRegion | None = None
     """Where to go in joint space before task-space feedback takes over; None: it leads from
     the start."""
+    rest: PostureRegion | None = None
+    """Where the null space goes back to; None: it stays where task and people leave it."""
 
     @property
     def task(self) -> TaskSpace:
@@ -133,6 +135,28 @@ class Goals:
         """
         region = None if posture is None else PostureRegion(goal=posture)
         return replace(self, posture=region)
+
+    def resting_at(
+        self,
+        posture: Float[Tensor, "*#batch n"] | None,
+        *,
+        rate: float = 1.0,
+        speed: float = 0.4,
+    ) -> Goals:
+        """The same goals, with a null space that goes back to a posture [rad].
+
+        Least velocities for a task that goes to and fro add up to a motion of the null space,
+        which in time takes joints to their limits, and the arm into singularities.
+
+        Args:
+            posture: One that suits the box; None: the null space stays where it is.
+            rate: How fast it is near there [1/s].
+            speed: Fastest way back, of all joints together [rad/s].
+        """
+        region = None
+        if posture is not None:
+            region = PostureRegion(goal=posture, stiffness=rate, saturation=speed / rate)
+        return replace(self, rest=region)
 
     def with_vision(self, enabled: bool) -> Goals:
         """The same goals with the camera taking part or not."""

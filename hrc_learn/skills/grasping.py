@@ -214,10 +214,12 @@ class Grasping:
                 "Put it into the camera's view, and the arm out of it."
             )
         pixel, angle = detected
+        posture = self._posture() if self._config.approach else self._workplace.hover_joints()
         return ServoTarget(
             config=self._config.servo,
             above=self._workplace.hover(),
-            posture=self._posture() if self._config.approach else None,
+            posture=posture if self._config.approach else None,
+            rest=posture if self._cell.config.after_push == "return" else None,
             target=partial(self._target, pixel),
             lines=self._lines,
             depth_gradient=self._depth_gradient,

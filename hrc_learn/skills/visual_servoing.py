@@ -22,6 +22,7 @@ from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsConfig
 from hrc_learn.skills.failures import MissedGraspError
 from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
 from hrc_learn.skills.marker_sensor import HeldMarker
+from hrc_learn.skills.null_space_yielding import changed_rate
 from hrc_learn.skills.work_cell import WorkCell
 
 # Parts of a probe's height that are tried until its upper end is well within the image.
@@ -90,6 +91,10 @@ class VisualServoConfig:
     would leave the marker 1 cm off its demonstrated place."""
     rate: float = 4.0
     """How fast the end effector returns into the box and into the cone [1/s]."""
+    rest_rate: float = 1.0
+    """How fast the null space goes back to the posture above the table [1/s]."""
+    rest_speed: float = 0.4
+    """Fastest way back, of all joints together [rad/s], as along paths."""
     drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
     """How what a person draws acts on the goals."""
 
@@ -171,6 +176,8 @@ class ServoTarget:
     """Least and greatest turn of the gripper about the vertical [rad]."""
     orientation: Float[Tensor, "4"] | None = None
     """Of the end effector, turned for the object; None: that of `above`."""
+    rest: Float[Tensor, " joints"] | None = None
+    """Joint positions near which the null space keeps [rad]; None: it stays where it is."""
     raised: float = 0.0
     """Height above the box to servo at for now, further along the line [m]."""
 
@@ -259,6 +266,7 @@ class VisualServo:
         self._at_rest: Measurement | None = None  # mean of what was seen at the last rest
         self._held: HeldMarker | None = None
         self._drawn = DrawnGoals(self._config.drawn, refusal, cell.tell)
+        self._rests = 1.0  # share of its speed with which the null space goes back
         self._led = 0.0  # time for which a person has led the end effector away [s]
         self._above = _NO_TURN  # orientation of the last target that is not turned
         self.state: ControllerState = controller.initial_state(cell.joints)
@@ -413,6 +421,7 @@ class VisualServo:
             self._last_detection, self._detected = observation.time, True
             self._last_pixel = feature.numpy()
         planned = target.goals(self._image_jacobian(), self._cell.pose, detected=self._detected)
+        planned = self._resting(planned, target.rest)
         self._drawn.read(asked, planned, self._cell.time)
         goals = self._drawn.applied(planned, self._cell.pose.position)
         age = torch.tensor(self._cell.time - observation.time, dtype=torch.float64)
@@ -446,6 +455,17 @@ class VisualServo:
             self._led += self._cell.pace.time - clock
             if self._held is not None:  # the marker goes with an end effector that is led
                 self._held = HeldMarker(self._config.half_hidden)
+
+    def _resting(self, goals: Goals, rest: Float[Tensor, " joints"] | None) -> Goals:
+        """The goals with a null space that goes back, but while a person pushes it."""
+        pushed = self._cell.human_input.nullspace_input.any()
+        self._rests = float(changed_rate(self._rests, float(not pushed), self._cell.config.dt))
+        if self._rests == 0:
+            return goals
+        rate, speed = (
+            self._rests * x for x in (self._config.rest_rate, self._config.rest_speed)
+        )
+        return goals.resting_at(rest, rate=rate, speed=speed)
 
     def _out_of_view(self) -> bool:
         """Whether the marker has left the image, rather than being occluded."""

@@ -1,5 +1,6 @@
 """The law in closed loop against a camera it cannot see."""
 
+import itertools
 from collections.abc import Iterator
 
 import pytest
@@ -305,6 +306,33 @@ def test_an_arm_gets_away_from_a_limit_that_all_of_its_way_seems_to_need(saturat
     off = (end.position - goal.position).abs().amax()
     assert (off < 0.01) == saturation
     assert (quaternion.angle(end.orientation, goal.orientation) < 0.2) == saturation
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_the_null_space_goes_back_to_rest_and_the_tool_stays(rests):
+    """From the elbow to the side, by the arm's own inverse for the same pose."""
+    pose, rest = panda.forward(POSTURE), POSTURE
+    q = panda.inverse(pose, float(rest[6]) - 0.6, near=rest)
+    goals = Goals.at(pose.position, pose.orientation, torch.full((2,), 500.0, dtype=DOUBLE))
+    goals = goals.resting_at(rest if rests else None, rate=2.0, speed=0.3)
+    estimator = FixedEstimator(network(torch.zeros(2, 6, dtype=DOUBLE)))
+    controller = AdaptiveController(panda, estimator, goals)
+    state, unseen = controller.initial_state(q), torch.tensor(False)
+    away, fastest = [(q - rest).norm()], torch.zeros((), dtype=DOUBLE)
+    assert away[0] > 0.5
+    for _ in range(500):
+        command, state = controller.step(state, observe(q, dt=0.01, feature_visible=unseen))
+        fastest = torch.maximum(fastest, command.joint_velocity.norm())
+        q = q + 0.01 * command.joint_velocity
+        away.append((q - rest).norm())
+    off = (panda.forward(q).position - pose.position).norm()
+    assert off < 2e-3
+    if rests:
+        assert away[-1] < 0.1 * away[0]
+        assert 0.2 < fastest <= 0.3
+        assert all(after <= before + 1e-6 for before, after in itertools.pairwise(away))
+    else:
+        assert away[-1] > 0.99 * away[0]
 
 
 def violations(q: Tensor, v: Tensor, before: Tensor, dt: float) -> Tensor:

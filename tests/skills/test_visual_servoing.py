@@ -320,3 +320,24 @@ def test_only_a_marker_last_seen_near_the_edge_has_left_the_image(pixel, missing
     servo, _ = servo_in(StillCell(None))
     vars(servo).update(_last_pixel=np.array(pixel), _last_detection=servo._cell.time - missing)
     assert servo._out_of_view() == out
+
+
+def test_the_null_space_goes_back_but_while_a_person_pushes_it():
+    servo, _ = servo_in(StillCell(None))
+    servo._rests, rest = 1.0, panda.ready
+    planned = CONFIG.goals(panda.forward(panda.ready), np.array([700.0, 500.0]))
+    speeds = []
+    for push in [0.0] * 5 + [2.0] * 60 + [0.0] * 60:
+        servo._cell.human_input = SimpleNamespace(nullspace_input=np.array([0.0, push]))
+        goals = servo._resting(planned, rest)
+        far = torch.full((7,), 10.0, dtype=torch.float64)
+        back = (
+            0.0 if goals.rest is None else float(goals.rest.gradient(panda.ready + far).norm())
+        )
+        speeds.append(back)
+    speeds = np.array(speeds)
+    np.testing.assert_allclose(speeds[[0, 4, -1]], CONFIG.rest_speed, rtol=1e-3)
+    assert not speeds[40:65].any()  # pushed for half a second and more
+    # Gone and back without jumps.
+    assert np.abs(np.diff(speeds)).max() < 0.1 * CONFIG.rest_speed
+    assert servo._resting(planned, None).rest is None
