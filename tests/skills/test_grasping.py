@@ -39,7 +39,7 @@ from hrc_learn.skills.grasping import Grasping, GraspingConfig
 from hrc_learn.skills.placing import check_plan
 from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
 
 WORKPLACE = Workplace()
@@ -369,6 +369,35 @@ def test_a_person_is_told_where_the_arm_cannot_be_led(skill, place, said):
     words = task.refusal(pose)
     assert said in words
     assert bool(said) == bool(words)
+
+
+@pytest.mark.parametrize("after_push", ["return", "stay"])
+@pytest.mark.parametrize("approach", [True, False])
+def test_the_null_space_goes_back_to_the_posture_above_the_table(
+    skill, monkeypatch, approach, after_push
+):
+    world = World(WORKPLACE.scene)
+    world.reset(WORKPLACE.home_joints().numpy())
+    cell = WorkCell(
+        chain=panda,
+        arm=world.arm,
+        gripper=world.arm,
+        human=ScriptedDrawing(()),
+        advance=world.advance,
+        config=WorkCellConfig(after_push=after_push),
+    )
+    task = Grasping(cell, WORKPLACE, skill, GraspingConfig(approach=approach))
+    monkeypatch.setattr(task, "_detect", lambda item: (np.array([700.0, 500.0]), 0.0))
+    target = task.locate(WORKPLACE.scene.objects[0])
+    above = panda.forward(WORKPLACE.hover_joints())
+    if after_push == "stay":
+        assert target.rest is None
+    else:
+        torch.testing.assert_close(panda.forward(target.rest).position, above.position)
+    if approach:
+        torch.testing.assert_close(panda.forward(target.posture).position, above.position)
+    else:
+        assert target.posture is None
 
 
 @pytest.mark.slow
