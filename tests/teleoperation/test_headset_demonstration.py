@@ -50,11 +50,16 @@ def test_a_demonstration_by_two_hands_is_recorded_kept_and_replayed(tmp_path):
             person.press("Stop")
             person.button("Save").wait_for()
             wait_until(lambda: session.recorder.status.state == "stopped", "it stopped")
-            person.press("Replay")
-            person.tab.wait_for_function(
-                "[...document.querySelectorAll('button')].some("
-                "b => b.textContent === 'Replay' && b.getAttribute('aria-pressed') === 'true')"
+            # Watched from now on: on a busy machine it may be over before the page is asked.
+            person.tab.evaluate(
+                "() => { window.replayed = false;"
+                " new MutationObserver(() => { window.replayed ||="
+                " [...document.querySelectorAll('button')].some(b => b.textContent === 'Replay'"
+                " && b.getAttribute('aria-pressed') === 'true'); })"
+                ".observe(document, {subtree: true, childList: true, attributes: true}); }"
             )
+            person.press("Replay")
+            person.tab.wait_for_function("window.replayed")
             person.press("Save")
             wait_until(lambda: session.recorder.status.state == "ready" or _doubted(person), "")
             if _doubted(person):  # this machine is busy, and the quality gate says so
