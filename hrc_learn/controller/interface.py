@@ -152,7 +152,12 @@ class Goals:
             posture: One that suits the box; None: the null space stays where it is.
             rate: How fast it is near there [1/s].
             speed: Fastest way back, of all joints together [rad/s].
+
+        Raises:
+            ValueError: Rate or speed is not positive.
         """
+        if not (rate > 0 and speed > 0):
+            raise ValueError(f"rate and speed must be positive, but are {rate} and {speed}.")
         region = None
         if posture is not None:
             region = PostureRegion(goal=posture, stiffness=rate, saturation=speed / rate)

@@ -52,7 +52,7 @@ class YieldingConfig:
     """Decay rate of the pose error on given motions [1/s]."""
     after_push: Literal["return", "stay"] = "return"
     """Whether the joints go back to a planned path, or on beside it, when a person who pushed
-    them aside lets go."""
+    them aside lets go; and whether a servoed arm goes back to its posture."""
     return_speed: float = 0.4
     """Fastest way back, of all joints together [rad/s]."""
     clearance: float = 0.03

@@ -93,8 +93,6 @@ class VisualServoConfig:
     """How fast the end effector returns into the box and into the cone [1/s]."""
     rest_rate: float = 1.0
     """How fast the null space goes back to the posture above the table [1/s]."""
-    rest_speed: float = 0.4
-    """Fastest way back, of all joints together [rad/s], as along paths."""
     drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
     """How what a person draws acts on the goals."""
 
@@ -462,10 +460,8 @@ class VisualServo:
         self._rests = float(changed_rate(self._rests, float(not pushed), self._cell.config.dt))
         if self._rests == 0:
             return goals
-        rate, speed = (
-            self._rests * x for x in (self._config.rest_rate, self._config.rest_speed)
-        )
-        return goals.resting_at(rest, rate=rate, speed=speed)
+        rate, speed = self._config.rest_rate, self._cell.config.return_speed
+        return goals.resting_at(rest, rate=self._rests * rate, speed=self._rests * speed)
 
     def _out_of_view(self) -> bool:
         """Whether the marker has left the image, rather than being occluded."""
