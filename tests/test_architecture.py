@@ -104,6 +104,7 @@ LIBRARIES: dict[str, set[str]] = {
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
+    "dmp": {"threadpoolctl"},
     "cli": {"ray", "huggingface_hub", "httpx"},
     "demos": {"av", "scipy", "huggingface_hub"},
     "vision": {"cv2"},

@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch.autograd import forward_ad
 
 from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper
+from hrc_learn.dmp._system import response
 
 # Files
 
@@ -441,20 +442,39 @@ def test_threads_share_a_primitive():
 
 
 @pytest.mark.parametrize("n_threads", [1, 2])
-@pytest.mark.parametrize("shape", [(1,), (5,), (2, 3)])
-def test_a_batch_without_gradients_is_a_loop(shape, n_threads):
-    """On one thread NumPy multiplies motion by motion."""
+@pytest.mark.parametrize("most", [0, 10**6])
+@pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3)])
+def test_every_way_to_multiply_gives_the_same_motions(monkeypatch, shape, most, n_threads):
+    """In NumPy motion by motion, in PyTorch all at once, and as gradients need it."""
     time, position = arm_motion(n_samples=80)
     positions = position + torch.randn(*shape, 1, 7, dtype=torch.float64)
     dmp = JointDMP.fit(time, positions, 12)
+    derived = dmp.rollout()
+    monkeypatch.setattr(response, "most_in_numpy", lambda: most)
     before = torch.get_num_threads()
     torch.set_num_threads(n_threads)
     try:
         with torch.no_grad():
             motion = dmp.rollout()
-            for i in np.ndindex(shape):
-                one = dmp[i].rollout()
-                torch.testing.assert_close(motion.position[i], one.position)
-                torch.testing.assert_close(motion.velocity[i], one.velocity)
+            for name in ("position", "velocity", "acceleration"):
+                torch.testing.assert_close(
+                    getattr(motion, name), getattr(derived, name).detach()
+                )
+            for i in np.ndindex(shape) if shape else ():
+                torch.testing.assert_close(motion.position[i], dmp[i].rollout().position)
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("libraries", "most"),
+    [
+        ([("openmp", None), ("openblas", "SkylakeX")], 10**6),
+        ([("openblas", "Haswell")], 10**5),
+        ([("openmp", None)], 10**5),
+    ],
+)
+def test_numpy_multiplies_what_its_library_has_kernels_for(monkeypatch, libraries, most):
+    found = [{"internal_api": api, "architecture": name} for api, name in libraries]
+    monkeypatch.setattr("threadpoolctl.threadpool_info", lambda: found)
+    assert response.most_in_numpy.__wrapped__() == most

@@ -411,7 +411,7 @@ def _parts(s: Float[Tensor, "B T"]) -> Iterator[slice]:
     return (slice(i, i + size) for i in range(0, s.shape[0], size))
 
 
-def _empty(like: Tensor, *shape: int) -> Tensor:
+def in_large_pages(like: Tensor, *shape: int) -> Tensor:
     """Memory for a result, of NumPy on a CPU: it asks for large pages, and for hundreds of
     megabytes the system takes as long to find small ones as a motion to fill them.
     """
@@ -427,7 +427,7 @@ class _Motion(torch.autograd.Function):
     def forward(s, coordinates, response, order):
         table = _table(response, order, coordinates)
         B, D, _ = coordinates.shape
-        y = _empty(coordinates, B, s.shape[1], D)
+        y = in_large_pages(coordinates, B, s.shape[1], D)
         bags = None
         for part in _parts(s):
             x = coordinates[part]
