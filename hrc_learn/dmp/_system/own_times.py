@@ -14,10 +14,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from hrc_learn.dmp._system.products import in_large_pages, product, without_subnormals
 
 if TYPE_CHECKING:
     from hrc_learn.dmp._system.response import Response
@@ -320,12 +321,6 @@ def _moments_to_gram(
     return table.flatten(0, 1)
 
 
-def without_subnormals(values: Tensor) -> Tensor:
-    """Zeros for what is lost beside one, but makes every product take several times as long."""
-    limits = torch.finfo(values.dtype)
-    return torch.where(values.abs() < limits.tiny / limits.eps, 0.0, values)
-
-
 def _spring_pieces(response: "Response", order: int) -> Float[Tensor, "pieces P 2"]:
     """Coefficients of `spring_rows` on the pieces of the forcing."""
     forced = response.forced
@@ -359,9 +354,9 @@ def _rows(
     table: OwnTimesTable, coordinates: Float[Tensor, "B D M"], pieces: int | None = None
 ) -> Tensor:
     """Coefficients of each motion, (B, pieces, K, D), of the first pieces or of all."""
-    B, D, M = coordinates.shape
+    B, D, _ = coordinates.shape
     matrix = table.matrix if pieces is None else table.matrix[:, : pieces * table.size]
-    rows = coordinates.reshape(-1, M) @ matrix
+    rows = product(coordinates, matrix)
     return rows.view(B, D, -1, table.size).permute(0, 2, 3, 1)
 
 
@@ -409,15 +404,6 @@ def _parts(s: Float[Tensor, "B T"]) -> Iterator[slice]:
     most = AT_ONCE.get(s.device.type, AT_ONCE["cpu"])
     size = max(1, most // max(s.shape[1], 1))
     return (slice(i, i + size) for i in range(0, s.shape[0], size))
-
-
-def in_large_pages(like: Tensor, *shape: int) -> Tensor:
-    """Memory for a result, of NumPy on a CPU: it asks for large pages, and for hundreds of
-    megabytes the system takes as long to find small ones as a motion to fill them.
-    """
-    if not like.is_cpu:
-        return like.new_empty(shape)
-    return torch.from_numpy(np.empty(shape, str(like.dtype).removeprefix("torch.")))
 
 
 class _Motion(torch.autograd.Function):

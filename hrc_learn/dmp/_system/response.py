@@ -9,7 +9,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,12 +20,8 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import fits_numpy, readable
 from hrc_learn.dmp._system.bases import Basis
 from hrc_learn.dmp._system.closed_forms import SpringDamper, approach_state, minimum_jerk
-from hrc_learn.dmp._system.own_times import (
-    OwnTimesTable,
-    in_large_pages,
-    motion,
-    without_subnormals,
-)
+from hrc_learn.dmp._system.own_times import OwnTimesTable, motion
+from hrc_learn.dmp._system.products import most_in_numpy, product, without_subnormals
 
 GAUSS_POINTS = 12
 """For the forcing over one piece of a table, which no basis function changes much in."""
@@ -486,7 +482,7 @@ class Trajectory(ArrayOutputs):
         given = latest is not None or (s.ndim == 1 and not s.requires_grad and readable(s))
         if order > 2 or not given:
             return self._at_own_times(X, order)
-        y = _transposed_product(X, self._response.matrices(s, X.dtype)[order])
+        y = product(X, self._response.matrices(s, X.dtype)[order]).mT
         is_single = X.ndim == 2 and not self.duration.ndim  # shapes take longer to compare
         if is_single or self.duration.shape == X.shape[:-2]:
             return y
@@ -515,55 +511,6 @@ class Trajectory(ArrayOutputs):
         return broadcast_shapes(
             self._coordinates.shape[:-2], self.s.shape[:-1], self.duration.shape
         )
-
-
-WITH_SMALL_KERNELS = {"SkylakeX", "Cooperlake", "SapphireRapids"}
-"""Processors, as OpenBLAS 0.3.29 calls them, for which it multiplies small matrices without
-packing them first: those with AVX-512, AMD's among them."""
-FEWEST = 4
-"""Rows for which these kernels are faster than a flat product of all motions."""
-
-
-@cache
-def most_in_numpy() -> int:
-    """Multiplications up to which NumPy is faster than PyTorch, on one thread.
-
-    For one motion of 7 x 1000 and 50 functions (371,000) OpenBLAS takes 5 us with kernels for
-    small matrices and 25 us without, PyTorch's MKL 15 us (AMD EPYC of 2025).
-    """
-    from threadpoolctl import threadpool_info
-
-    small = any(
-        library.get("architecture") in WITH_SMALL_KERNELS
-        for library in threadpool_info()
-        if library["internal_api"] == "openblas"
-    )
-    return 10**6 if small else 10**5
-
-
-def _transposed_product(
-    X: Float[Tensor, "*batch D M"], H: Float[Tensor, "M T"]
-) -> Float[Tensor, "*batch T D"]:
-    """(X H)'; where nothing derives it, in the library that is faster and in large pages.
-
-    For batches, motion by motion with OpenBLAS's kernels for small matrices takes less than
-    half the time of a flat product, without them four times as long.
-    """
-    D, alone = X.shape[-2], X.ndim == 2
-    if fits_numpy(X):
-        x = X.detach() if X.requires_grad else X
-        small = D * H.numel() <= most_in_numpy()
-        if alone:
-            return torch.from_numpy(x.numpy().dot(H.numpy()).T) if small else (x @ H).mT
-        if small and D >= FEWEST and torch.get_num_threads() == 1:
-            return torch.from_numpy(np.matmul(x.numpy(), H.numpy())).mT
-        y = in_large_pages(x, *X.shape[:-1], H.shape[-1])
-        torch.mm(x.flatten(0, -2), H, out=y.view(-1, H.shape[-1]))
-        return y.mT
-    if alone:
-        return (X @ H).mT
-    # One flat product: batched ones of PyTorch against a shared matrix are ten times slower.
-    return (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1).mT
 
 
 def broadcast_shapes(*shapes: tuple[int, ...]) -> tuple[int, ...]:
