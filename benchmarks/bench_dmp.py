@@ -27,6 +27,7 @@ from dmp_peers import measure_peers
 from operations import count_operations
 from rich.console import Console
 from rich.table import Table
+from threadpoolctl import threadpool_info
 from timing import Timing, time_calls
 
 from hrc_learn import cli
@@ -273,7 +274,13 @@ def read_figures(path: Path) -> dict[str, float]:
 
 def show(figures: dict[str, float], earlier: dict[str, float]) -> None:
     """Print all figures, with what they should reach and what they were."""
-    table = Table("figure", *(3 * [""]), title="Movement primitives, one thread")
+    kernels = [
+        library["architecture"]
+        for library in threadpool_info()
+        if library["internal_api"] == "openblas"
+    ]
+    title = f"Movement primitives, one thread; OpenBLAS for {', '.join(kernels) or 'none'}"
+    table = Table("figure", *(3 * [""]), title=title)
     for column, name in zip(table.columns[1:], ("measured", "reach", "earlier"), strict=True):
         column.header, column.justify = name, "right"
     for name, value in figures.items():
