@@ -39,7 +39,9 @@ JOINTS, SAMPLES, BASIS = 7, 1000, 50
 TARGETS: dict[str, tuple[float, int]] = {
     "rollout_1_of_gemm": (0.6, +1),
     "rollout_256_of_gemm": (0.95, +1),
-    "rollout_4096_of_gemm": (0.6, +1),
+    "rollout_4096_of_gemm": (0.95, +1),
+    "rollout_256_contiguous_of_gemm": (0.7, +1),
+    "rollout_4096_contiguous_of_gemm": (0.7, +1),
     "rollout_1_per_s": (50_000, +1),
     "rollout_256_per_s": (50_000, +1),
     "rollout_4096_per_s": (50_000, +1),
@@ -123,6 +125,7 @@ def measure_rollouts(batch: int, repeats: int) -> dict[str, float]:
     calls: dict[str, Callable[[], object]] = {
         "gemm": lambda: X @ H,
         "rollout": lambda: dmp.rollout(goal=goal).position,
+        "contiguous": lambda: dmp.rollout(goal=goal).position.contiguous(),
         "everything": everything,
     }
     t = time_calls(calls, repeats_for(batch, repeats))
@@ -130,6 +133,7 @@ def measure_rollouts(batch: int, repeats: int) -> dict[str, float]:
         f"gemm_{batch}_us": 1e6 * t["gemm"].median,
         f"rollout_{batch}_us": 1e6 * t["rollout"].median,
         f"rollout_{batch}_of_gemm": t["gemm"].median / t["rollout"].median,
+        f"rollout_{batch}_contiguous_of_gemm": t["gemm"].median / t["contiguous"].median,
         f"rollout_{batch}_least_us": 1e6 * t["rollout"].least,
         f"rollout_{batch}_of_gemm_least": t["gemm"].least / t["rollout"].least,
         f"rollout_{batch}_operations": count_operations(calls["rollout"]),
