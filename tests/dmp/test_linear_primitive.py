@@ -479,3 +479,10 @@ def test_numpy_multiplies_what_its_library_has_kernels_for(monkeypatch, librarie
     found = [{"internal_api": api, "architecture": name} for api, name in libraries]
     monkeypatch.setattr("threadpoolctl.threadpool_info", lambda: found)
     assert products.most_in_numpy.__wrapped__() == most
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (2, 3, 5), (2, 4, 5)])
+def test_parameters_are_multiplied_where_nothing_derives_them(shape):
+    X, H = torch.nn.Parameter(torch.randn(*shape)), torch.randn(5, 6)
+    with torch.no_grad():
+        torch.testing.assert_close(products.product(X, H), X.detach() @ H)
