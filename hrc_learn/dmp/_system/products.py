@@ -43,14 +43,13 @@ def product(
     """
     D, alone = X.shape[-2], X.ndim == 2
     if fits_numpy(X):
-        x = X.detach() if X.requires_grad else X
         small = D * H.numel() <= most_in_numpy()
         if alone:
-            return torch.from_numpy(x.numpy().dot(H.numpy())) if small else x @ H
+            return torch.from_numpy(X.numpy().dot(H.numpy())) if small else X @ H
         if small and D >= FEWEST and torch.get_num_threads() == 1:
-            return torch.from_numpy(np.matmul(x.numpy(), H.numpy()))
-        y = in_large_pages(x, *X.shape[:-1], H.shape[-1])
-        torch.mm(x.flatten(0, -2), H, out=y.view(-1, H.shape[-1]))
+            return torch.from_numpy(np.matmul(X.numpy(), H.numpy()))
+        y = in_large_pages(X, *X.shape[:-1], H.shape[-1])
+        torch.mm(X.flatten(0, -2), H, out=y.view(-1, H.shape[-1]))
         return y
     if alone:
         return X @ H
