@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -342,6 +343,18 @@ def test_a_hand_that_comes_down_along_the_line_stays_on_it():
     assert target.deviation(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)
 
 
+def unled_cell(world: World, **settings: Any) -> WorkCell:
+    """Of a world whose arm nobody leads."""
+    return WorkCell(
+        chain=panda,
+        arm=world.arm,
+        gripper=world.arm,
+        human=ScriptedDrawing(()),
+        advance=world.advance,
+        config=WorkCellConfig(**settings),
+    )
+
+
 @pytest.mark.parametrize(
     ("place", "said"),
     [
@@ -356,13 +369,7 @@ def test_a_person_is_told_where_the_arm_cannot_be_led(skill, place, said):
     """Away from above the middle of the table [m]; the last is within the cabinet."""
     world = World(WORKPLACE.scene)
     world.reset(WORKPLACE.hover_joints().numpy())
-    cell = WorkCell(
-        chain=panda,
-        arm=world.arm,
-        gripper=world.arm,
-        human=ScriptedDrawing(()),
-        advance=world.advance,
-    )
+    cell = unled_cell(world)
     task = Grasping(cell, WORKPLACE, skill, check=lambda plan: check_plan(plan, world))
     hover = WORKPLACE.hover()
     pose = Pose(hover.position + torch.tensor(place, dtype=torch.float64), hover.orientation)
@@ -378,14 +385,7 @@ def test_the_null_space_goes_back_to_the_posture_above_the_table(
 ):
     world = World(WORKPLACE.scene)
     world.reset(WORKPLACE.home_joints().numpy())
-    cell = WorkCell(
-        chain=panda,
-        arm=world.arm,
-        gripper=world.arm,
-        human=ScriptedDrawing(()),
-        advance=world.advance,
-        config=WorkCellConfig(after_push=after_push),
-    )
+    cell = unled_cell(world, after_push=after_push)
     task = Grasping(cell, WORKPLACE, skill, GraspingConfig(approach=approach))
     monkeypatch.setattr(task, "_detect", lambda item: (np.array([700.0, 500.0]), 0.0))
     target = task.locate(WORKPLACE.scene.objects[0])

@@ -21,7 +21,7 @@ def most_in_numpy() -> int:
     """Multiplications up to which NumPy is faster than PyTorch, on one thread.
 
     For one motion of 7 x 1000 and 50 functions (371,000) OpenBLAS takes 5 us with kernels for
-    small matrices and 25 us without, PyTorch's MKL 15 us (AMD EPYC of 2025).
+    small matrices and 25 us without (Haswell's), PyTorch's MKL 15 us (AMD EPYC with AVX-512).
     """
     from threadpoolctl import threadpool_info
 
