@@ -77,9 +77,10 @@ class Headset:
         return self.tab.get_by_role("button", name=name, exact=True)
 
     def press(self, name: str) -> None:
-        """Press a button of the page: those in the room do the same."""
+        """Press a button of the page, once it can be pressed: those in the room do the same."""
+        enabled = self.tab.get_by_role("button", name=name, exact=True, disabled=False)
         # The page's own view may not answer to a mouse while the headset shows another.
-        self.button(name).evaluate("button => button.click()")
+        enabled.evaluate("button => button.click()")
         self.frames(2)
 
     def frames(self, count: int) -> None:

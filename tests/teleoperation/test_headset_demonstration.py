@@ -48,7 +48,6 @@ def test_a_demonstration_by_two_hands_is_recorded_kept_and_replayed(tmp_path):
             person.pinch("right", closed=False)
             assert np.linalg.norm(session.frame(4) - elbow) > 0
             person.press("Stop")
-            person.button("Save").wait_for()
             wait_until(lambda: session.recorder.status.state == "stopped", "it stopped")
             # Watched from now on: on a busy machine it may be over before the page is asked.
             person.tab.evaluate(
