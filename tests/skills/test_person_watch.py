@@ -1,5 +1,6 @@
 """What the arm takes people's distances for, between two observations of them."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,11 +9,11 @@ import pytest
 import sampling
 import torch
 
-from hrc_learn.controller import SeparationConfig
+from hrc_learn.controller import SafetyConfig, SeparationConfig
 from hrc_learn.experiments.collaboration.worker import somebody_comes
 from hrc_learn.kinematics import GraspedBox, panda, panda_capsules, separation
 from hrc_learn.protocols import PersonObservation
-from hrc_learn.sim import WorkerDistance, World, whole_arm
+from hrc_learn.sim import Imperfections, WorkerDistance, WorkerSensor, World, whole_arm
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
@@ -216,6 +217,46 @@ def test_the_arm_rests_by_the_time_that_somebody_may_arrive(distance, speed):
     # Late by the age and the reaction, and with 0.15 s to come to rest.
     expected = np.clip((arrival - age - SEPARATION.reaction_time) / 0.15, 0.0, 1.0)
     assert found.share == pytest.approx(expected, abs=2e-3)
+
+
+class Hand:
+    """A ball below the gripper that rests, and then reaches through it: minimum jerk [m, s]."""
+
+    radius, begin = 0.05, 0.3
+    worker = SimpleNamespace(radius=np.array([radius]))
+
+    def __init__(self, gap):
+        self._tip, self._gap = panda.forward(WORKPLACE.hover_joints()).position.numpy(), gap
+        # The peak of the acceleration is 5.77 times the way by the square of the time.
+        self._way = gap + 0.08
+        self._duration = math.sqrt(5.77 * self._way / 9.0)
+
+    def gap(self, time):
+        s = min(max((time - self.begin) / self._duration, 0.0), 1.0)
+        return self._gap - self._way * (10 * s**3 - 15 * s**4 + 6 * s**5)
+
+    def ends_at(self, time):
+        down = self.gap(time) + self.radius
+        return np.broadcast_to(self._tip - [0.0, 0.0, down], (1, 2, 3)).copy()
+
+
+@pytest.mark.parametrize("gap", [0.1, 0.15, 0.2, 0.3])
+def test_a_hand_that_sets_off_meets_an_arm_at_rest(gap):
+    """Seen as late as nominal, with 9 m/s^2: commands take effect before it is there."""
+    sizes = replace(Imperfections.nominal(), person_noise=0.0, person_loss=0.0)
+    separation = sizes.plant(SafetyConfig()).separation
+    hand, now, rests = Hand(gap), 0.0, None
+    sensor = WorkerSensor(hand, lambda: now, sizes, np.random.default_rng(0))
+    watch = PersonWatch(sensor, panda_capsules, separation)
+    while hand.gap(now) > 0:
+        found = watch.look(now, WORKPLACE.hover_joints())
+        if now < hand.begin or found.share > 0:
+            rests = None
+        elif rests is None:
+            rests = now
+        now += 0.002
+    assert rests is not None
+    assert rests < now - (sizes.command_delay + sizes.servo_lag)
 
 
 def test_nobody_who_stays_away_slows_the_arm_down():
