@@ -297,6 +297,8 @@ class Grasping:
         self._cell.move_straight(self._at_height(height), speed=DESCENT_SPEED)
         move_fingers(self._cell, CLOSED, CLOSING_TIME)
         if not holds(self._cell, item):
+            # What was felt may not have been the table.
+            self._table, self._table_range = 0.0, _TABLE_RANGE
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
             )

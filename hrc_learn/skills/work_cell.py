@@ -508,6 +508,9 @@ class WorkCell:
     ) -> Pose | None:
         """Move on a straight line, and stop where something is met; where that was.
 
+        It waits while a person pushes the null space: friction turns with the joints, which feels
+        like a contact.
+
         Args:
             goal: Where to, if nothing is met.
             speed: Mean speed [m/s]: what is met gives way by as much as it takes to stop.
@@ -522,10 +525,15 @@ class WorkCell:
         along = (along / along.norm().clamp(min=1e-9)).numpy()
         felt: deque[float] = deque(maxlen=_FELT)
         before: deque[Pose] = deque(maxlen=_FELT)
+        still = torch.zeros(6, dtype=torch.float64)
         free, moving = None, 0
         line, begun = StraightLine(self.pose, goal, speed), self.pace.time
         while (passed := self.pace.time - begun) < line.duration:
             self._contact_expected = self.time + _LEAVING
+            if self.yielding.pushed:
+                self.track_pose(line.at(passed)[0], still)
+                begun, moving = self.pace.time - passed, 0
+                continue
             self._track_line(line, passed)
             felt.append(-float(self._contact_force() @ along))
             before.append(self.pose)

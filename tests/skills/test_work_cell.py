@@ -168,6 +168,37 @@ def test_where_nothing_is_met_it_ends_at_the_goal():
     torch.testing.assert_close(cell.pose.position, lowered(0.04).position, rtol=0, atol=1e-3)
 
 
+class RoughWall(Wall):
+    """Its joints have dry friction, which an estimate of external torques tells as well."""
+
+    def read(self):
+        state = super().read()
+        friction = 1.5 * np.tanh(self.velocity / 0.01)
+        return replace(state, external_torque=state.external_torque - friction)
+
+
+def test_who_pushes_the_null_space_is_not_taken_for_a_surface():
+    """Two pushes, one on the way and one as the surface is near, to both sides."""
+    top = float(panda.forward(HOVER).position[2]) - 0.03
+    cell = cell_with(RoughWall(top, noise=0.2))
+    pull = 8.0 * self_motion(panda.ready)
+
+    class Pushes(Human):
+        def read(self, state):
+            first, second = 0.6 < state.time < 1.1, 1.7 < state.time < 2.2
+            return HumanInput(nullspace_input=pull * (int(first) - int(second)))
+
+    cell.human = Pushes()
+    met = cell.move_until_contact(lowered(0.06))
+    pushed = (cell.log["nullspace_input"] != 0).any(axis=1)
+    assert pushed.sum() > 90
+    # It waited meanwhile.
+    descent = np.diff(cell.log["goal_position"][:, 2])
+    np.testing.assert_allclose(descent[pushed[:-1] & pushed[1:]], 0.0, atol=1e-9)
+    assert met is not None
+    assert float(met.position[2]) == pytest.approx(top, abs=2e-3)
+
+
 def test_a_jump_of_the_null_space_input_comes_smoothly(cell):
     pull = np.array([0.6, 0.0, -0.6, 0.0, 0.5, 0.0, 0.0])
 

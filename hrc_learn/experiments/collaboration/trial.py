@@ -51,7 +51,7 @@ from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
-from hrc_learn.skills.person_watch import PersonWatch
+from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
 from hrc_learn.skills.pick_and_place import (
     HOME,
     INTERACT,
@@ -102,6 +102,10 @@ THREE_OBJECTS = (
 _APART = 0.118
 """Distance at which the open fingers about one object clear the next, however both lie [m]:
 0.06 m to the outside of a finger, 0.046 m to the corner of the largest object."""
+
+# At which a hand that brings something to the robot may get faster than it was seen to be
+# [m/s^2]: who hands over watches the arm, and it has to come near enough to be given anything.
+_BRINGS = 3.0
 
 NULL_SPACE_FORCES = (
     ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
@@ -314,7 +318,8 @@ def simulate_collaboration(
     somebody = giving or visit
     if somebody is not None:
         tracker = WorkerSensor(somebody, lambda: world.time, sizes, chance)
-        watch = PersonWatch(tracker, whole_arm(scene.arm), safety.separation)
+        expected = PersonWatchConfig(acceleration=_BRINGS) if handover else None
+        watch = PersonWatch(tracker, whole_arm(scene.arm), safety.separation, expected)
     if visit is not None:
         move_worker(world, visit)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
