@@ -508,8 +508,8 @@ class WorkCell:
     ) -> Pose | None:
         """Move on a straight line, and stop where something is met; where that was.
 
-        It waits while a person pushes the null space: friction turns with the joints, which feels
-        like a contact.
+        It waits while a person pushes the null space: friction turns with the joints, and that
+        feels like a contact.
 
         Args:
             goal: Where to, if nothing is met.
