@@ -169,19 +169,24 @@ def test_where_nothing_is_met_it_ends_at_the_goal():
 
 
 class RoughWall(Wall):
-    """Its joints have dry friction, which an estimate of external torques tells as well."""
+    """An estimate of external torques has its joints' dry friction in it, and an error of its
+    model of gravity that changes with the posture: as if something pushed the hand up or down.
+    """
 
     def read(self):
         state = super().read()
         friction = 1.5 * np.tanh(self.velocity / 0.01)
-        return replace(state, external_torque=state.external_torque - friction)
+        aside = float(self_motion(HOVER) @ (self.q - HOVER.numpy()))
+        gravity = 80.0 * aside * panda.jacobian(torch.from_numpy(self.q))[2].numpy()
+        torque = state.external_torque - friction + gravity
+        return replace(state, external_torque=torque)
 
 
 def test_who_pushes_the_null_space_is_not_taken_for_a_surface():
     """Two pushes, one on the way and one as the surface is near, to both sides."""
     top = float(panda.forward(HOVER).position[2]) - 0.03
     cell = cell_with(RoughWall(top, noise=0.2))
-    pull = 8.0 * self_motion(panda.ready)
+    pull = 8.0 * self_motion(HOVER)
 
     class Pushes(Human):
         def read(self, state):
