@@ -35,6 +35,7 @@ from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills import MissedGraspError, grasping
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig
 from hrc_learn.skills.placing import check_plan
@@ -398,6 +399,33 @@ def test_the_null_space_goes_back_to_the_posture_above_the_table(
         torch.testing.assert_close(panda.forward(target.posture).position, above.position)
     else:
         assert target.posture is None
+
+
+def test_what_was_felt_by_fingers_that_missed_is_not_believed(skill, monkeypatch):
+    """Something 3 cm above the table is met first; then the table is felt where it may be."""
+    world = World(WORKPLACE.scene)
+    world.reset(WORKPLACE.hover_joints().numpy())
+    cell = unled_cell(world)
+    task, item = Grasping(cell, WORKPLACE, skill), WORKPLACE.scene.objects[0]
+    lowest = []
+
+    def meet(goal):
+        lowest.append(float(goal.position[2]))
+        high = goal.position.new_tensor([0.0, 0.0, 0.03 + WORKPLACE.fingertip])
+        return Pose(high, goal.orientation) if len(lowest) in (1, 3) else None
+
+    monkeypatch.setattr(cell, "move_until_contact", meet)
+    monkeypatch.setattr(cell, "move_straight", lambda goal, speed: None)
+    monkeypatch.setattr(grasping, "move_fingers", lambda cell, width, least: None)
+    for _ in range(2):
+        with pytest.raises(MissedGraspError, match="closed on nothing"):
+            task.close_on(item)
+    assert lowest[1] == pytest.approx(lowest[0])
+    # What is felt by fingers that hold the object is where the table is for the next one.
+    monkeypatch.setattr(grasping, "holds", lambda cell, item: True)
+    for _ in range(2):
+        task.close_on(item)
+    assert lowest[3] > lowest[2] + 0.05
 
 
 @pytest.mark.slow
