@@ -42,7 +42,7 @@ from hrc_learn.skills.arm_motion import (
     null_space_slowdown,
     task_rate,
 )
-from hrc_learn.skills.failures import StoppedByPersonError
+from hrc_learn.skills.failures import StoppedByPersonError, TaskFailedError
 from hrc_learn.skills.marker_sensor import (
     DelayedDetection,
     LatencyConfig,
@@ -520,19 +520,28 @@ class WorkCell:
         Returns:
             Pose of the end effector when it met something; None if it met nothing, also for an
             arm that does not tell external torques.
+
+        Raises:
+            TaskFailedError: Somebody has pushed the null space for too long (`longest_wait`).
         """
         along = goal.position - self.pose.position
         along = (along / along.norm().clamp(min=1e-9)).numpy()
         felt: deque[float] = deque(maxlen=_FELT)
         before: deque[Pose] = deque(maxlen=_FELT)
         still = torch.zeros(6, dtype=torch.float64)
-        free, moving = None, 0
+        free, moving, waited = None, 0, 0.0
         line, begun = StraightLine(self.pose, goal, speed), self.pace.time
         while (passed := self.pace.time - begun) < line.duration:
             self._contact_expected = self.time + _LEAVING
             if self.yielding.pushed:
                 self.track_pose(line.at(passed)[0], still)
                 begun, moving = self.pace.time - passed, 0
+                waited += self.config.dt
+                if waited > self.config.longest_wait:
+                    raise TaskFailedError(
+                        f"the null space was pushed for {waited:.0f} s while the hand felt for "
+                        "a contact: let it go, or let the arm wait longer (longest_wait)."
+                    )
                 continue
             self._track_line(line, passed)
             felt.append(-float(self._contact_force() @ along))

@@ -14,6 +14,7 @@ from hrc_learn.protocols import HINDRANCES, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import (
     BlockedPathError,
+    TaskFailedError,
     WorkCell,
     WorkCellConfig,
     joint_line,
@@ -202,6 +203,19 @@ def test_who_pushes_the_null_space_is_not_taken_for_a_surface():
     np.testing.assert_allclose(descent[pushed[:-1] & pushed[1:]], 0.0, atol=1e-9)
     assert met is not None
     assert float(met.position[2]) == pytest.approx(top, abs=2e-3)
+
+
+def test_who_pushes_for_ever_is_not_waited_for_so_long():
+    class Push(Human):
+        def read(self, state):
+            return HumanInput(nullspace_input=2.0 * self_motion(HOVER))
+
+    arm = Wall(-1.0)
+    cell = cell_with(arm, config=WorkCellConfig(longest_wait=0.3))
+    cell.human = Push()
+    with pytest.raises(TaskFailedError, match="null space was pushed"):
+        cell.move_until_contact(lowered(0.04))
+    assert cell.time < 0.5
 
 
 def test_a_jump_of_the_null_space_input_comes_smoothly(cell):
