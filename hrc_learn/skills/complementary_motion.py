@@ -18,12 +18,15 @@ from hrc_learn.skills.arm_motion import joints_near, kept_clear, resolved_rate
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
     FAR_ASIDE,
+    LEADS_BACK,
     LONGEST_RETURN,
     NARROW,
     NullSpaceYielding,
     YieldingConfig,
     changed_rate,
+    share_of_push,
     smallest_singular_value,
+    straightness,
 )
 from hrc_learn.skills.person_feedback import PersonFeedback, share_kept
 
@@ -46,11 +49,6 @@ _REACHED, _METRES_PER_RADIAN = 5e-4, 0.1
 # By which the arm may be nearer to what is around it than the policy's own posture [m]:
 # rounding must not stop it.
 _NO_NEARER = 1e-3
-# Cosines between the null space and the way back in joint space, of which the one may lead
-# elsewhere than the other: below the first the motion waits, below the second people have less
-# and less of a say. An elbow that has gone a quarter of its circle has 0.7, one of half of it
-# none. Nearer than so much the null space does lead back [rad].
-_STRAIGHT, _NEARBY = (0.65, 0.8), 0.3
 # Share of the room that is missing which has to be regained in the time looked ahead, or the
 # motion waits: predictions err as much.
 _REGAINED = 0.3
@@ -231,14 +229,13 @@ class ComplementaryMotion:
         away = null_projection(J, error)
         faster = _FASTEST / float(away.norm().clamp(min=1e-9))
         retreat = min(self._config.pose_gain, faster) * away
-        wanted, straight = self._config.pose_gain * error, _straightness(away, error)
+        wanted, straight = self._config.pose_gain * error, float(straightness(away, error))
         hindrances = self._feedback.hindrances
         if back is None:
             hindrances.note("narrow_path", 0.0)
         else:
             # Far aside the null space may lead elsewhere than back: nobody gets that far.
-            least, enough = _STRAIGHT
-            share = min(max((straight - least) / (enough - least), 0.0), 1.0)
+            share = share_of_push(straight)
             # While they push nothing pulls the joints back.
             yielding = self._yielding
             push = yielding.null_velocity if yielding.pushed else back
@@ -257,19 +254,19 @@ class ComplementaryMotion:
             null = clear.null if share_kept(led, clear.null) < share_kept(led, null) else null
             waits |= bool(clear.waits)
         distance = float(self._clear(joints))
-        if waits or straight < _STRAIGHT[0]:
+        if waits or straight < LEADS_BACK:
             # Against the person, as the end effector would have to stop otherwise.
             null, waits = self._retreat(joints, going, feasible(retreat), led, margin)
         if self._yielding.pushed:
             # Of what is asked, not of what the arm has picked up of it by now.
             asked = null_projection(J, moved / dt + wanted)
             possible = self._within_limits(joints, posture, task, asked, told=True)
-            if share_kept(led, null) < 1 and straight >= _STRAIGHT[0]:
+            if share_kept(led, null) < 1 and straight >= LEADS_BACK:
                 stretched = float(self._from_singularity(joints)) < distance
                 cause = "singularity" if stretched else "obstacle"
                 hindrances.note(cause, share_kept(possible, null), distance=100 * distance)
         # At a pose that stays the null space leads back as it led aside, further on maybe not.
-        waits = waits or straight < _STRAIGHT[0] or float(error.norm()) > FAR_ASIDE
+        waits = waits or straight < LEADS_BACK or float(error.norm()) > FAR_ASIDE
         self._null = null
         reached = joints_near(self._chain, goal, joints + dt * (task + null))
         off = self._chain.forward(reached).twist_to(goal)
@@ -399,9 +396,3 @@ class ComplementaryMotion:
         if float((following - posture).norm()) < _SAME:
             self._yielding.aside, self._waited = False, 0.0
         return following
-
-
-def _straightness(away: Float[Tensor, " joints"], error: Float[Tensor, " joints"]) -> float:
-    """Cosine between the null-space part of a way back and all of it; 1 of a short one."""
-    size = float(error.norm())
-    return float(away.norm()) / size if size > _NEARBY else 1.0

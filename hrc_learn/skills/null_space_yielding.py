@@ -34,6 +34,12 @@ NARROW = 0.07
 # How far the joints may be from a path that goes on [rad]: with 1.4 rad, an elbow aside by some
 # 0.2 m, all found back, with 2 rad not all.
 FAR_ASIDE = 1.8
+# Cosines between the null space and the way back in joint space, of which the one may lead
+# elsewhere than the other: below the first a path waits, below the second people have less and
+# less of a say. An elbow that has gone a quarter of its circle has 0.7, one of half of it none.
+# Nearer than so much the null space does lead back [rad].
+LEADS_BACK = 0.65
+_PUSHED_FREELY, _NEARBY = 0.8, 0.3
 # Motion of the end effector, metres and radians as they are, below which nothing waits [1/s].
 _AT_REST = 1e-3
 # In which a path stops, and goes on [s].
@@ -295,6 +301,28 @@ def smallest_singular_value(
         joint_position: [rad]
     """
     return torch.linalg.svdvals(chain.jacobian(joint_position))[..., -1]
+
+
+def straightness(
+    away: Float[Tensor, "*batch joints"], error: Float[Tensor, "*batch joints"]
+) -> Float[Tensor, "*batch"]:
+    """Cosine between the null-space part of a way back and all of it; 1 of a short one.
+
+    Args:
+        away: The null-space part [rad].
+        error: From the joints to their path [rad].
+    """
+    size = error.norm(dim=-1)
+    return torch.where(size > _NEARBY, away.norm(dim=-1) / size.clamp(min=_NEARBY), 1.0)
+
+
+def share_of_push(straight: float) -> float:
+    """What is left of a push by somebody who has led the joints aside, 0 to 1.
+
+    Args:
+        straight: `straightness` of their way back.
+    """
+    return min(max((straight - LEADS_BACK) / (_PUSHED_FREELY - LEADS_BACK), 0.0), 1.0)
 
 
 def share_of_motion(

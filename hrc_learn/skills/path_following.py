@@ -8,15 +8,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
     FAR_ASIDE,
+    LEADS_BACK,
     LONGEST_RETURN,
     NARROW,
     changed_rate,
+    share_of_push,
     smallest_singular_value,
+    straightness,
 )
 from hrc_learn.skills.work_cell import WorkCell
 
@@ -152,6 +156,11 @@ class PathFollower:
                 cell.hindrances.note("narrow_path", 0.0)
             cell.step(velocity + self._config.pose_gain * error, pose, path_joints=goal)
             return 0.0
+        if self._config.after_push == "return":
+            # Far aside the null space may lead elsewhere than back: nobody gets that far.
+            share = share_of_push(self._straightness(error))
+            cell.hindrances.note("too_far", share)
+            back = back - (1.0 - share) * self._yielding.null_velocity
         ahead = goal + self._config.command_delay * velocity
         twist = cell.chain.jacobian(ahead) @ velocity
         if cell.track_pose(pose, twist, velocity + back, path_joints=goal):
@@ -167,12 +176,18 @@ class PathFollower:
         Args:
             goal: Where on the path [rad].
         """
-        joints, returns = self._cell.joints, self._config.after_push == "return"
-        if returns and float((goal - joints).norm()) > FAR_ASIDE:
-            return True
+        joints = self._cell.joints
+        if self._config.after_push == "return":
+            error = goal - joints
+            if float(error.norm()) > FAR_ASIDE or self._straightness(error) < LEADS_BACK:
+                return True
         ahead = joints + CHANGE_OF_RATE * self._cell.commanded_velocity
         near = smallest_singular_value(self._cell.chain, torch.stack([joints, ahead]))
         return bool((near < NARROW).any())
+
+    def _straightness(self, error: Float[Tensor, " joints"]) -> float:
+        """How much of the way back to the path lies in the null space, 0 to 1."""
+        return float(straightness(null_projection(self._cell.jacobian, error), error))
 
     def go_straight_back(self, progress: float) -> float:
         """To a path that waits, where no motion of the null space leads.

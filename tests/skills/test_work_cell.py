@@ -9,6 +9,7 @@ from obedient_arm import ObedientArm
 from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import HINDRANCES, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
@@ -430,7 +431,8 @@ def is_astray(cell, goal):
 
 
 def test_joints_are_astray_far_from_their_path_and_near_a_singularity(cell):
-    near = torch.full((7,), 0.9 * FAR_ASIDE / 7**0.5, dtype=torch.float64)
+    *_, null = np.linalg.svd(panda.jacobian(cell.joints).numpy())[2]
+    near = torch.from_numpy(0.9 * FAR_ASIDE * null)
     assert not is_astray(cell, cell.joints + near)
     assert is_astray(cell, cell.joints + near * 1.2)
     straight = torch.tensor([0.0, 0.0, 0.0, -0.1, 0.0, 0.1, 0.0], dtype=torch.float64)
@@ -441,6 +443,48 @@ def test_joints_are_astray_far_from_their_path_and_near_a_singularity(cell):
     arm = ObedientArm(panda.ready.numpy())
     stays = cell_with(arm, config=WorkCellConfig(after_push="stay"))
     assert not is_astray(stays, stays.joints + near * 1.2)
+
+
+def aside(joints, size, straight):
+    """From joints to a path: as far, and with that cosine to where the null space leads."""
+    first, *_, null = np.linalg.svd(panda.jacobian(joints).numpy())[2]
+    return torch.from_numpy(size * (straight * null + np.sqrt(1 - straight**2) * first))
+
+
+def test_joints_are_astray_where_the_null_space_leads_elsewhere_than_back(cell):
+    def astray(size, straight, cell=cell):
+        return is_astray(cell, cell.joints + aside(cell.joints, size, straight))
+
+    assert astray(1.0, 0.6)
+    assert not astray(1.0, 0.7)
+    assert not astray(0.25, 0.6)  # so near it does lead back
+    arm = ObedientArm(panda.ready.numpy())
+    assert not astray(1.0, 0.6, cell_with(arm, config=WorkCellConfig(after_push="stay")))
+
+
+@pytest.mark.parametrize(
+    ("straight", "after_push", "share"),
+    [(0.6, "return", 0.0), (0.725, "return", 0.5), (0.9, "return", 1.0), (0.6, "stay", 1.0)],
+)
+def test_nobody_pushes_joints_so_far_that_they_do_not_find_back(straight, after_push, share):
+    class Person(Human):
+        def read(self, state):
+            return HumanInput(nullspace_input=0.1 * PUSH)
+
+    arm = ObedientArm(panda.ready.numpy())
+    # So slow on its way back that all the motion is of the push.
+    config = WorkCellConfig(after_push=after_push, pose_gain=1e-3)
+    cell = cell_with(arm, config=config)
+    cell.human = Person()
+    cell.hold_pose(0.5)
+    push = cell.yielding.null_velocity
+    assert push.norm() > 0.05
+    path = (cell.joints + aside(cell.joints, 1.0, straight)).numpy()[None]
+    jacobian = cell.jacobian
+    follow_path(cell, path, until=lambda: len(cell.log) > 50)
+    led = null_projection(jacobian, torch.from_numpy(cell.log["command_velocity"][50]))
+    assert float(led @ push / (push @ push)) == pytest.approx(share, abs=0.06)
+    assert hindered(cell, "too_far")[50] == (share < 1)
 
 
 def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
