@@ -17,13 +17,13 @@ from hrc_learn.protocols import ArmState, Human
 from hrc_learn.skills.arm_motion import joints_near, kept_clear, resolved_rate
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
-    FAR_ASIDE,
     LEADS_BACK,
     LONGEST_RETURN,
     NARROW,
     NullSpaceYielding,
     YieldingConfig,
     changed_rate,
+    may_not_find_back,
     share_of_push,
     smallest_singular_value,
     straightness,
@@ -229,13 +229,13 @@ class ComplementaryMotion:
         away = null_projection(J, error)
         faster = _FASTEST / float(away.norm().clamp(min=1e-9))
         retreat = min(self._config.pose_gain, faster) * away
-        wanted, straight = self._config.pose_gain * error, float(straightness(away, error))
+        wanted, straight = self._config.pose_gain * error, straightness(away, error)
         hindrances = self._feedback.hindrances
         if back is None:
             hindrances.note("narrow_path", 0.0)
         else:
             # Far aside the null space may lead elsewhere than back: nobody gets that far.
-            share = share_of_push(straight)
+            share = float(share_of_push(straight))
             # While they push nothing pulls the joints back.
             yielding = self._yielding
             push = yielding.null_velocity if yielding.pushed else back
@@ -254,19 +254,19 @@ class ComplementaryMotion:
             null = clear.null if share_kept(led, clear.null) < share_kept(led, null) else null
             waits |= bool(clear.waits)
         distance = float(self._clear(joints))
-        if waits or straight < LEADS_BACK:
+        if waits or float(straight) < LEADS_BACK:
             # Against the person, as the end effector would have to stop otherwise.
             null, waits = self._retreat(joints, going, feasible(retreat), led, margin)
         if self._yielding.pushed:
             # Of what is asked, not of what the arm has picked up of it by now.
             asked = null_projection(J, moved / dt + wanted)
             possible = self._within_limits(joints, posture, task, asked, told=True)
-            if share_kept(led, null) < 1 and straight >= LEADS_BACK:
+            if share_kept(led, null) < 1 and float(straight) >= LEADS_BACK:
                 stretched = float(self._from_singularity(joints)) < distance
                 cause = "singularity" if stretched else "obstacle"
                 hindrances.note(cause, share_kept(possible, null), distance=100 * distance)
         # At a pose that stays the null space leads back as it led aside, further on maybe not.
-        waits = waits or straight < LEADS_BACK or float(error.norm()) > FAR_ASIDE
+        waits = waits or bool(may_not_find_back(error, straight))
         self._null = null
         reached = joints_near(self._chain, goal, joints + dt * (task + null))
         off = self._chain.forward(reached).twist_to(goal)

@@ -316,13 +316,44 @@ def straightness(
     return torch.where(size > _NEARBY, away.norm(dim=-1) / size.clamp(min=_NEARBY), 1.0)
 
 
-def share_of_push(straight: float) -> float:
+def share_of_push(straight: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """What is left of a push by somebody who has led the joints aside, 0 to 1.
 
     Args:
         straight: `straightness` of their way back.
     """
-    return min(max((straight - LEADS_BACK) / (_PUSHED_FREELY - LEADS_BACK), 0.0), 1.0)
+    return ((straight - LEADS_BACK) / (_PUSHED_FREELY - LEADS_BACK)).clamp(0.0, 1.0)
+
+
+def may_not_find_back(
+    error: Float[Tensor, "*batch joints"], straight: Float[Tensor, "*batch"]
+) -> Bool[Tensor, "*batch"]:
+    """Whether the null space might lead joints elsewhere than back to a path that goes on.
+
+    It leads to another posture for the same pose, if that is nearer by then.
+
+    Args:
+        error: From the joints to their path [rad].
+        straight: `straightness` of their way back.
+    """
+    return (error.norm(dim=-1) > FAR_ASIDE) | (straight < LEADS_BACK)
+
+
+def nears_singularity(
+    chain: SerialChain,
+    joints: Float[Tensor, "*batch joints"],
+    velocity: Float[Tensor, "*batch joints"],
+) -> Bool[Tensor, "*batch"]:
+    """Whether an arm beside its path is near a singularity, or will be when the path has
+    stopped: no task is kept there that the path itself does not pass.
+
+    Args:
+        chain: Kinematics of the arm.
+        joints: Where they are [rad].
+        velocity: Their own [rad/s].
+    """
+    ahead = joints + CHANGE_OF_RATE * velocity
+    return (smallest_singular_value(chain, torch.stack([joints, ahead])) < NARROW).any(0)
 
 
 def share_of_motion(

@@ -13,11 +13,11 @@ from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
-    FAR_ASIDE,
-    LEADS_BACK,
     LONGEST_RETURN,
     NARROW,
     changed_rate,
+    may_not_find_back,
+    nears_singularity,
     share_of_push,
     smallest_singular_value,
     straightness,
@@ -158,7 +158,7 @@ class PathFollower:
             return 0.0
         if self._config.after_push == "return":
             # Far aside the null space may lead elsewhere than back: nobody gets that far.
-            share = share_of_push(self._straightness(error))
+            share = float(share_of_push(self._straightness(error)))
             cell.hindrances.note("too_far", share)
             back = back - (1.0 - share) * self._yielding.null_velocity
         ahead = goal + self._config.command_delay * velocity
@@ -170,24 +170,19 @@ class PathFollower:
     def is_astray(self, goal: Float[Tensor, " joints"]) -> bool:
         """Whether joints aside might not find back to a path that goes on.
 
-        The null space leads to another posture for the same pose, if that is nearer by then,
-        and no task is kept near a singularity that the path itself does not pass.
-
         Args:
             goal: Where on the path [rad].
         """
-        joints = self._cell.joints
-        if self._config.after_push == "return":
-            error = goal - joints
-            if float(error.norm()) > FAR_ASIDE or self._straightness(error) < LEADS_BACK:
-                return True
-        ahead = joints + CHANGE_OF_RATE * self._cell.commanded_velocity
-        near = smallest_singular_value(self._cell.chain, torch.stack([joints, ahead]))
-        return bool((near < NARROW).any())
+        cell = self._cell
+        error = goal - cell.joints
+        lost = self._config.after_push == "return" and bool(
+            may_not_find_back(error, self._straightness(error))
+        )
+        return lost or bool(nears_singularity(cell.chain, cell.joints, cell.commanded_velocity))
 
-    def _straightness(self, error: Float[Tensor, " joints"]) -> float:
-        """How much of the way back to the path lies in the null space, 0 to 1."""
-        return float(straightness(null_projection(self._cell.jacobian, error), error))
+    def _straightness(self, error: Float[Tensor, " joints"]) -> Float[Tensor, ""]:
+        """How much of the way back to the path [rad] lies in the null space, 0 to 1."""
+        return straightness(null_projection(self._cell.jacobian, error), error)
 
     def go_straight_back(self, progress: float) -> float:
         """To a path that waits, where no motion of the null space leads.

@@ -31,6 +31,7 @@ from hrc_learn.kinematics import GraspedBox, panda, separation
 from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit, whole_arm
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line, nearest_configuration
+from hrc_learn.skills.null_space_yielding import CHANGE_OF_RATE
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.viz import StepLog
 
@@ -141,6 +142,41 @@ def test_who_stops_and_waits_rests_while_anybody_is_within_the_distance():
     assert float(v[stopped].abs().max()) < 1e-6
     assert float(v[~inside].abs().max()) > 0.1
     assert float(found.waited) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("size", "straight", "astray", "share"),
+    [
+        (1.0, 0.6, True, 0.0),
+        (1.0, 0.725, False, 0.5),
+        (1.0, 0.95, False, 1.0),
+        (0.25, 0.6, False, 1.0),
+        (2.0, 0.95, True, 1.0),
+    ],
+)
+def test_pushed_far_aside_the_paths_wait_as_those_of_the_work_cell(
+    size, straight, astray, share
+):
+    """Where `tests/skills/test_work_cell.py` has a single arm wait, and as much of a push."""
+    drawn = replace(job([0], IDEAL), workers=WorkerTables.nobody(1, DT))
+    batch = worker_runs._Batch(drawn, making_way("expert"), CELL)
+    joints = torch.from_numpy(CYCLE.path[:1])
+    first, *_, null = np.linalg.svd(panda.jacobian(joints[0]).numpy())[2]
+    error = size * (straight * null + np.sqrt(1 - straight**2) * first)
+    batch._paths.position[0, 0] += torch.from_numpy(error)
+    batch._null[0] = torch.from_numpy(0.05 * null)
+    # So slow on its way back that all the motion is of the push.
+    batch._config = replace(CELL, pose_gain=1e-6)
+    with torch.inference_mode():
+        command = batch._command(joints, torch.zeros(1, dtype=torch.long))
+        assert bool(command.astray) == astray
+        assert float(command.joint_velocity[0].numpy() @ null) / 0.05 == pytest.approx(
+            share, abs=1e-3
+        )
+        # As if the end effector were on its path.
+        command = command._replace(goal=joints, wanted=torch.zeros_like(joints))
+        batch._go_on(0, torch.zeros(1, dtype=torch.long), command)
+    assert float(batch._rate) == pytest.approx(1.0 - astray * DT / CHANGE_OF_RATE)
 
 
 def test_the_margin_is_that_of_a_logged_run():

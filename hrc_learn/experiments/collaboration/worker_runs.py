@@ -53,9 +53,13 @@ from hrc_learn.skills.null_space_yielding import (
     changed_rate,
     eased_null_velocity,
     eased_way_back,
+    may_not_find_back,
+    nears_singularity,
     share_of_motion,
+    share_of_push,
     smallest_singular_value,
     stays_aside,
+    straightness,
 )
 from hrc_learn.skills.pace import people_bind
 from hrc_learn.skills.path_following import STUCK, behind_path
@@ -240,6 +244,8 @@ class _Command(NamedTuple):
     """Along the path [rad/s]."""
     waits: Tensor
     """Whether the arm, pushed aside, would meet something if the path went on."""
+    astray: Tensor
+    """Whether it might not find back to a path that goes on."""
 
 
 class _Batch:
@@ -492,7 +498,7 @@ class _Batch:
         wanted = rate.unsqueeze(-1) * paths.between(paths.velocity, cycle, later)
         error = goal - measured
         command = wanted + config.pose_gain * error
-        waits = torch.zeros(len(live), dtype=torch.bool)
+        waits, astray = torch.zeros(2, len(live), dtype=torch.bool)
         pushed, aside = (self._null[live] != 0).any(-1), self._aside[live]
         gone = (~paths.narrow[cycle, here] | aside) & stays_aside(pushed, aside, error)
         self._aside[live] = gone
@@ -501,13 +507,18 @@ class _Batch:
         if len(some):
             away = null_projection(panda.jacobian(measured[some]), error[some])
             goes = (rate[some] <= 0) | ~pushed[some]
+            # Whoever pushes far has no more say: the null space would lead elsewhere than back.
+            straight = straightness(away, error[some])
+            near = nears_singularity(panda, measured[some], self._guard.velocity[live[some]])
+            astray[some] = may_not_find_back(error[some], straight) | near
+            less = (1.0 - share_of_push(straight)).unsqueeze(-1) * self._null[live[some]]
             away = away * goes.unsqueeze(-1)
             back[some] = eased_way_back(self._back[live[some]], away, config.dt, config)
             command[some], waits[some] = self._beside(
-                some, measured[some], goal[some], wanted[some], wanted[some] + back[some]
+                some, measured[some], goal[some], wanted[some], wanted[some] + back[some] - less
             )
         self._back[live] = back
-        return _Command(command, goal, wanted, waits)
+        return _Command(command, goal, wanted, waits, astray)
 
     def _beside(
         self, some: Tensor, q: Tensor, goal: Tensor, wanted: Tensor, drift: Tensor
@@ -562,9 +573,8 @@ class _Batch:
         waiting = torch.where(aside, torch.where(counts, waited, waiting), 0.0)
         self._waiting[live] = waiting
         backs = (waiting > STUCK) & (self._progress[live] > 0)
-        behind = torch.where(
-            ~backs & aside & paths.narrow_ahead[cycle, here], torch.inf, behind
-        )
+        stops = ~backs & aside & (paths.narrow_ahead[cycle, here] | command.astray)
+        behind = torch.where(stops, torch.inf, behind)
         direction = torch.where(backs, -1, 1).numpy()
         rate = torch.from_numpy(
             changed_rate(rate.numpy(), (2.0 - behind).numpy(), config.dt, direction)
