@@ -38,7 +38,7 @@ _TEXTS: Mapping[Hindrance, str] = {
     "task": "that way the end effector would have to move",
     "narrow_path": "the path leads through a singularity: nobody can push the arm off it here",
     "too_far": "the arm is too far aside to find back",
-    "task_waits": "the task waits until the arm comes back",
+    "task_waits": "the task waits until you let go and the arm is back",
     "person": "{somebody}",
     "stopped": "the safety filter brakes the arm",
 }

@@ -534,6 +534,7 @@ class WorkCell:
         while (passed := self.pace.time - begun) < line.duration:
             self._contact_expected = self.time + _LEAVING
             if self.yielding.pushed:
+                self.hindrances.mention("task_waits")
                 self.track_pose(line.at(passed)[0], still)
                 begun, moving = self.pace.time - passed, 0
                 waited += self.config.dt

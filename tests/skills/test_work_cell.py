@@ -202,6 +202,7 @@ def test_who_pushes_the_null_space_is_not_taken_for_a_surface():
     # It waited meanwhile.
     descent = np.diff(cell.log["goal_position"][:, 2])
     np.testing.assert_allclose(descent[pushed[:-1] & pushed[1:]], 0.0, atol=1e-9)
+    assert hindered(cell, "task_waits").sum() > 90  # and said so
     assert met is not None
     assert float(met.position[2]) == pytest.approx(top, abs=2e-3)
 
