@@ -31,9 +31,9 @@ LONGEST_RETURN = 5.0
 # Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
 # as damping begins at 0.05.
 NARROW = 0.07
-# How far the joints may be from a path that goes on [rad]: with 1.4 rad, an elbow aside by some
-# 0.2 m, all found back, with 2 rad not all.
-FAR_ASIDE = 1.8
+# How far the joints may be from a path that goes on, and from one that waited for them [rad]:
+# with 1.4 rad, an elbow aside by some 0.2 m, all found back, with 2 rad not all.
+FAR_ASIDE, _NEAR_AGAIN = 1.8, 1.4
 # Cosines between the null space and the way back in joint space, of which the one may lead
 # elsewhere than the other: below the first a path waits, below the second people have less and
 # less of a say. An elbow that has gone a quarter of its circle has 0.7, one of half of it none.
@@ -326,7 +326,9 @@ def share_of_push(straight: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def may_not_find_back(
-    error: Float[Tensor, "*batch joints"], straight: Float[Tensor, "*batch"]
+    error: Float[Tensor, "*batch joints"],
+    straight: Float[Tensor, "*batch"],
+    before: Bool[Tensor, "*batch"] | bool = False,
 ) -> Bool[Tensor, "*batch"]:
     """Whether the null space might lead joints elsewhere than back to a path that goes on.
 
@@ -335,8 +337,13 @@ def may_not_find_back(
     Args:
         error: From the joints to their path [rad].
         straight: `straightness` of their way back.
+        before: Whether they might not have found back a step before: a path that waits for
+            them does so until they are well on their way, or it would lead them astray again.
     """
-    return (error.norm(dim=-1) > FAR_ASIDE) | (straight < LEADS_BACK)
+    before = torch.as_tensor(before)
+    far = torch.where(before, _NEAR_AGAIN, FAR_ASIDE)
+    aslant = torch.where(before, _PUSHED_FREELY, LEADS_BACK)
+    return (error.norm(dim=-1) > far) | (straight < aslant)
 
 
 def nears_singularity(

@@ -85,7 +85,7 @@ class PathFollower:
         dt = self._config.dt
         self._velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
         singular = smallest_singular_value(cell.chain, torch.from_numpy(path.copy()))
-        self._narrow = singular < NARROW
+        self._narrow, self._astray = singular < NARROW, False
         self._yielding.begin(torch.from_numpy(path[0]) - cell.joints)
 
     def follow(self, until: Callable[[], bool]) -> int:
@@ -175,10 +175,12 @@ class PathFollower:
         """
         cell = self._cell
         error = goal - cell.joints
-        lost = self._config.after_push == "return" and bool(
-            may_not_find_back(error, self._straightness(error))
+        self._astray = self._config.after_push == "return" and bool(
+            may_not_find_back(error, self._straightness(error), self._astray)
         )
-        return lost or bool(nears_singularity(cell.chain, cell.joints, cell.commanded_velocity))
+        return self._astray or bool(
+            nears_singularity(cell.chain, cell.joints, cell.commanded_velocity)
+        )
 
     def _straightness(self, error: Float[Tensor, " joints"]) -> Float[Tensor, ""]:
         """How much of the way back to the path [rad] lies in the null space, 0 to 1."""

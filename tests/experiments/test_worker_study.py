@@ -162,8 +162,12 @@ def test_pushed_far_aside_the_paths_wait_as_those_of_the_work_cell(
     batch = worker_runs._Batch(drawn, making_way("expert"), CELL)
     joints = torch.from_numpy(CYCLE.path[:1])
     first, *_, null = np.linalg.svd(panda.jacobian(joints[0]).numpy())[2]
-    error = size * (straight * null + np.sqrt(1 - straight**2) * first)
-    batch._paths.position[0, 0] += torch.from_numpy(error)
+
+    def aside(size: float, straight: float) -> Tensor:
+        error = size * (straight * null + np.sqrt(1 - straight**2) * first)
+        return joints[0] + torch.from_numpy(error)
+
+    batch._paths.position[0, 0] = aside(size, straight)
     batch._null[0] = torch.from_numpy(0.05 * null)
     # So slow on its way back that all the motion is of the push.
     batch._config = replace(CELL, pose_gain=1e-6)
@@ -176,7 +180,13 @@ def test_pushed_far_aside_the_paths_wait_as_those_of_the_work_cell(
         # As if the end effector were on its path.
         command = command._replace(goal=joints, wanted=torch.zeros_like(joints))
         batch._go_on(0, torch.zeros(1, dtype=torch.long), command)
-    assert float(batch._rate) == pytest.approx(1.0 - astray * DT / CHANGE_OF_RATE)
+        assert float(batch._rate) == pytest.approx(1.0 - astray * DT / CHANGE_OF_RATE)
+        # Who was astray is until they are well on their way back.
+        batch._progress[0] = 0.0
+        for size, straight in ((1.6, 0.95), (1.0, 0.75)):
+            batch._paths.position[0, 0] = aside(size, straight)
+            command = batch._command(joints, torch.zeros(1, dtype=torch.long))
+            assert bool(command.astray) == astray
 
 
 def test_the_margin_is_that_of_a_logged_run():

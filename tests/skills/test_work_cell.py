@@ -463,6 +463,20 @@ def test_joints_are_astray_where_the_null_space_leads_elsewhere_than_back(cell):
     assert not astray(1.0, 0.6, cell_with(arm, config=WorkCellConfig(after_push="stay")))
 
 
+def test_joints_that_were_astray_are_not_until_they_are_well_on_their_way(cell):
+    def goal(size, straight):
+        return cell.joints + aside(cell.joints, size, straight)
+
+    for far in (goal(FAR_ASIDE + 0.1, 1.0), goal(1.0, 0.6)):
+        follower = PathFollower(cell, cell.joints[None].numpy())
+        assert not follower.is_astray(goal(FAR_ASIDE - 0.1, 0.9))
+        assert follower.is_astray(far)
+        assert follower.is_astray(goal(FAR_ASIDE - 0.1, 0.9))
+        assert follower.is_astray(goal(1.0, 0.75))
+        assert not follower.is_astray(goal(1.3, 0.85))
+        assert not follower.is_astray(goal(FAR_ASIDE - 0.1, 0.9))
+
+
 @pytest.mark.parametrize(
     ("straight", "after_push", "share"),
     [(0.6, "return", 0.0), (0.725, "return", 0.5), (0.9, "return", 1.0), (0.6, "stay", 1.0)],

@@ -280,7 +280,7 @@ class _Batch:
         zeros = torch.zeros(runs, dtype=torch.float64)
         self._progress, self._waiting = zeros.clone(), zeros.clone()
         self._rate, self._pace, self._share = zeros + 1, zeros + 1, zeros + 1
-        self._aside = torch.zeros(runs, dtype=torch.bool)
+        self._aside, self._lost = torch.zeros(2, runs, dtype=torch.bool)
         self._null, self._back = torch.zeros_like(self._q), torch.zeros_like(self._q)
         far, count = zeros + _RANGE, torch.zeros(runs, dtype=torch.int64)
         self._found = WorkerRuns(
@@ -509,9 +509,11 @@ class _Batch:
             goes = (rate[some] <= 0) | ~pushed[some]
             # Whoever pushes far has no more say: the null space would lead elsewhere than back.
             straight = straightness(away, error[some])
-            near = nears_singularity(panda, measured[some], self._guard.velocity[live[some]])
-            astray[some] = may_not_find_back(error[some], straight) | near
-            less = (1.0 - share_of_push(straight)).unsqueeze(-1) * self._null[live[some]]
+            these = live[some]
+            lost = may_not_find_back(error[some], straight, self._lost[these])
+            near = nears_singularity(panda, measured[some], self._guard.velocity[these])
+            self._lost[these], astray[some] = lost, lost | near
+            less = (1.0 - share_of_push(straight)).unsqueeze(-1) * self._null[these]
             away = away * goes.unsqueeze(-1)
             back[some] = eased_way_back(self._back[live[some]], away, config.dt, config)
             command[some], waits[some] = self._beside(
