@@ -189,6 +189,18 @@ def test_pushed_far_aside_the_paths_wait_as_those_of_the_work_cell(
             assert bool(command.astray) == astray
 
 
+def test_pushed_near_a_singularity_the_paths_wait():
+    drawn = replace(job([0], IDEAL), workers=WorkerTables.nobody(1, DT))
+    batch = worker_runs._Batch(drawn, making_way("expert"), CELL)
+    stretched = torch.tensor([[0.0, 0.0, 0.0, -0.1, 0.0, 0.1, 0.0]], dtype=torch.float64)
+    batch._null[0] = 0.05
+    with torch.inference_mode():
+        for joints, astray in ((torch.from_numpy(CYCLE.path[:1]), False), (stretched, True)):
+            batch._paths.position[0, 0] = joints[0]
+            command = batch._command(joints, torch.zeros(1, dtype=torch.long))
+            assert bool(command.astray) == astray
+
+
 def test_the_margin_is_that_of_a_logged_run():
     early = reaching(3)
     q, v, found = recorded(job([3], IDEAL, early), making_way("none"), 300)

@@ -8,10 +8,11 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.skills import ComplementaryMotion, YieldingConfig, joint_line
-from hrc_learn.skills.null_space_yielding import FAR_ASIDE
+from hrc_learn.skills.null_space_yielding import FAR_ASIDE, LEADS_BACK
 
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
@@ -257,3 +258,15 @@ def test_joints_far_aside_hold_the_policy_until_they_are_nearer():
     moves = postures.diff(dim=0).abs().amax(dim=-1) > 0
     assert not moves[4:][far.unfold(0, 6, 1).all(dim=-1)].any()
     np.testing.assert_allclose(joints[-1], wishes[-1], atol=1e-3)
+
+
+def test_where_the_null_space_may_lead_elsewhere_people_have_less_of_a_say_and_are_told():
+    posture = np.array([0.59, -0.25, -0.05, -2.05, 0.0, 1.61, 1.13])
+    human = Pusher(2 * SIDEWAYS, 0.2, 1e9)
+    postures, joints, _ = followed(np.repeat(posture[None], 200, axis=0), human)
+    error = postures[-1] - joints[-1]
+    away = null_projection(panda.jacobian(joints[-1]), error)
+    straight = float(away.norm() / error.norm())  # the cosine, by its definition
+    assert LEADS_BACK < straight < 0.8  # from which on less and less is left
+    kept = {reason.hindrance: reason.kept for reason in human.told[-1].reasons}
+    assert kept["too_far"] == pytest.approx((straight - LEADS_BACK) / 0.15, abs=0.02)

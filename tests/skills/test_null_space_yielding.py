@@ -10,6 +10,7 @@ from hrc_learn.skills.null_space_yielding import (
     NullSpaceYielding,
     YieldingConfig,
     eased_null_velocity,
+    nears_singularity,
 )
 
 Q = torch.tensor([0.4, 0.2, -0.3, -2.2, 0.1, 2.4, 0.6], dtype=torch.float64)
@@ -78,3 +79,22 @@ def test_arms_of_a_batch_yield_as_each_alone():
         )
         for one, every in zip(alone, together, strict=True):
             torch.testing.assert_close(every[k], one, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("smallest", "towards", "nears"),
+    [(0.09, 1.0, True), (0.09, -1.0, False), (0.09, 0.0, False), (0.06, -1.0, True)],
+)
+def test_an_arm_nears_a_singularity_by_the_time_that_its_path_has_stopped(
+    smallest, towards, nears
+):
+    """The second joint takes the shoulder to where its axes are in a plane."""
+    postures = torch.tensor([-0.3, 0.0, 1.5, -1.9, -0.1, 2.0, -0.3], dtype=torch.float64)
+    postures = postures.repeat(700, 1)
+    postures[:, 1] = torch.linspace(0.1, 0.8, 700, dtype=torch.float64)
+    values = np.linalg.svd(panda.jacobian(postures).numpy())[1][:, -1]
+    assert (np.diff(values) > 0).all()
+    q = postures[np.abs(values - smallest).argmin()]
+    velocity = torch.zeros(7, dtype=torch.float64)
+    velocity[1] = -towards
+    assert bool(nears_singularity(panda, q, velocity)) == nears
