@@ -235,10 +235,10 @@ class ComplementaryMotion:
             hindrances.note("narrow_path", 0.0)
         else:
             # Far aside the null space may lead elsewhere than back: nobody gets that far.
-            share = float(share_of_push(straight))
             # While they push nothing pulls the joints back.
             yielding = self._yielding
             push = yielding.null_velocity if yielding.pushed else back
+            share = float(share_of_push(push, away, straight))
             wanted = torch.lerp(retreat, push, share)
             hindrances.note_across(push, null_projection(J, push))
             hindrances.note("too_far", share)

@@ -31,19 +31,26 @@ LONGEST_RETURN = 5.0
 # Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
 # as damping begins at 0.05.
 NARROW = 0.07
-# How far the joints may be from a path that goes on, and from one that waited for them [rad]:
-# with 1.4 rad, an elbow aside by some 0.2 m, all found back, with 2 rad not all.
-FAR_ASIDE, _NEAR_AGAIN = 1.8, 1.4
-# Cosines between the null space and the way back in joint space, of which the one may lead
-# elsewhere than the other: below the first a path waits, below the second people have less and
-# less of a say. An elbow that has gone a quarter of its circle has 0.7, one of half of it none.
-# Nearer than so much the null space does lead back [rad].
+# How far the joints may be from a path that goes on [rad]: with 1.4 rad, an elbow aside by some
+# 0.2 m, all found back, with 2 rad not all. A path that waited for them goes on with 1.4 rad.
+FAR_ASIDE = 1.8
+_NEAR_AGAIN = 1.4
+# Cosine between the null space and the way back in joint space below which the one may lead
+# elsewhere than the other: an elbow that has gone a quarter of its circle has 0.7, one that has
+# gone half of it none. Paths that waited go on with the second, with which people are free.
 LEADS_BACK = 0.65
-_PUSHED_FREELY, _NEARBY = 0.8, 0.3
+_LEADS_WELL_BACK = 0.8
+# Joints nearer to their path than the first do find back, those farther than the second by that
+# cosine [rad].
+_NEARBY = 0.3, 0.5
 # Motion of the end effector, metres and radians as they are, below which nothing waits [1/s].
 _AT_REST = 1e-3
 # In which a path stops, and goes on [s].
 CHANGE_OF_RATE = 0.2
+STUCK = 2.0
+"""Time after which a path that waits for joints which come no nearer is gone back [s]."""
+# By how much they have to come nearer not to be stuck [rad]: 1 s of the slowest ways back.
+_NEARER = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +79,8 @@ class NullSpaceYielding:
     Attributes:
         nullspace_input: What the person asks for, without jumps [N m].
         aside: Whether the joints are off their path.
+        lost: Whether the null space might lead them elsewhere than back: the path waits.
+        push_share: What is left of a push that leads them farther aside, 0 to 1.
         hindrances: What keeps the arm from following; whoever tells the person empties it.
     """
 
@@ -94,6 +103,7 @@ class NullSpaceYielding:
         self.hindrances = hindrances or Hindrances()
         self._back = torch.zeros(len(chain.joint_names), dtype=torch.float64)
         self.nullspace_input, self.aside = self._back.numpy(), False
+        self.lost, self.push_share = False, 1.0
 
     @property
     def pushed(self) -> bool:
@@ -169,9 +179,15 @@ class NullSpaceYielding:
             The velocity, in the null space [rad/s]; None of joints on their path.
         """
         away = self._away(joints, error, jacobian) if yields or self.aside else None
+        self.push_share = 1.0
         if away is None:
-            self._back = torch.zeros_like(error)
+            self._back, self.lost = torch.zeros_like(error), False
             return None
+        if self._config.after_push == "return":
+            straight = straightness(away, error)
+            waited = self.lost and not self.pushed
+            self.lost = bool(may_not_find_back(error, straight, waited))
+            self.push_share = float(share_of_push(self.null_velocity, away, straight))
         # Not against the person while they push.
         goes = returns or (self._config.after_push == "return" and not self.pushed)
         away = away if goes else torch.zeros_like(away)
@@ -306,29 +322,21 @@ def smallest_singular_value(
 def straightness(
     away: Float[Tensor, "*batch joints"], error: Float[Tensor, "*batch joints"]
 ) -> Float[Tensor, "*batch"]:
-    """Cosine between the null-space part of a way back and all of it; 1 of a short one.
+    """How much of a way back the null space leads: the cosine of the two, 1 of a short way.
 
     Args:
-        away: The null-space part [rad].
-        error: From the joints to their path [rad].
+        away: The part of the way in the null space [rad].
+        error: All of it, from the joints to their path [rad].
     """
-    size = error.norm(dim=-1)
-    return torch.where(size > _NEARBY, away.norm(dim=-1) / size.clamp(min=_NEARBY), 1.0)
-
-
-def share_of_push(straight: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """What is left of a push by somebody who has led the joints aside, 0 to 1.
-
-    Args:
-        straight: `straightness` of their way back.
-    """
-    return ((straight - LEADS_BACK) / (_PUSHED_FREELY - LEADS_BACK)).clamp(0.0, 1.0)
+    size, (near, far) = error.norm(dim=-1), _NEARBY
+    cosine = away.norm(dim=-1) / size.clamp(min=near)
+    return torch.lerp(torch.ones_like(size), cosine, ((size - near) / (far - near)).clamp(0, 1))
 
 
 def may_not_find_back(
     error: Float[Tensor, "*batch joints"],
     straight: Float[Tensor, "*batch"],
-    before: Bool[Tensor, "*batch"] | bool = False,
+    waited: Bool[Tensor, "*batch"] | bool = False,
 ) -> Bool[Tensor, "*batch"]:
     """Whether the null space might lead joints elsewhere than back to a path that goes on.
 
@@ -337,13 +345,59 @@ def may_not_find_back(
     Args:
         error: From the joints to their path [rad].
         straight: `straightness` of their way back.
-        before: Whether they might not have found back a step before: a path that waits for
-            them does so until they are well on their way, or it would lead them astray again.
+        waited: Whether the path has waited for them, and nobody pushes them any more: it goes
+            on once they are well on their way, as it would lead them astray again.
     """
-    before = torch.as_tensor(before)
-    far = torch.where(before, _NEAR_AGAIN, FAR_ASIDE)
-    aslant = torch.where(before, _PUSHED_FREELY, LEADS_BACK)
-    return (error.norm(dim=-1) > far) | (straight < aslant)
+    waited = torch.as_tensor(waited)
+    farthest = torch.where(waited, _NEAR_AGAIN, FAR_ASIDE)
+    least = torch.where(waited, _LEADS_WELL_BACK, LEADS_BACK)
+    return (error.norm(dim=-1) > farthest) | (straight < least)
+
+
+def share_of_push(
+    push: Float[Tensor, "*batch joints"],
+    away: Float[Tensor, "*batch joints"],
+    straight: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch"]:
+    """What is left of a push, 0 to 1: nobody leads joints to where they would not find back.
+
+    Args:
+        push: Velocity that is asked for [rad/s]. All is left of one that leads back.
+        away: Null-space part of the way back [rad].
+        straight: Its `straightness`.
+    """
+    share = ((straight - LEADS_BACK) / (_LEADS_WELL_BACK - LEADS_BACK)).clamp(0.0, 1.0)
+    return torch.where(torch.linalg.vecdot(push, away) > 0, 1.0, share)
+
+
+def waited_for(
+    waited: Float[Tensor, "*batch"],
+    nearest: Float[Tensor, "*batch"],
+    off: Float[Tensor, "*batch"],
+    rate: Float[Tensor, "*batch"],
+    counts: Bool[Tensor, "*batch"],
+    dt: float,
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """For how long a path has waited for joints that come no nearer, a step later.
+
+    The time in which it goes on counts against that, as it is at rest half of the time before
+    somebody who pushes again and again.
+
+    Args:
+        waited: A step before [s].
+        nearest: How far the joints were from the path when they last had come nearer [rad].
+        off: How far they are now [rad].
+        rate: Of the path, -1 to 1.
+        counts: Whether the step does: nobody pushes, or slows the path down.
+        dt: Control step [s].
+
+    Returns:
+        The first two, a step later.
+    """
+    nearer = counts & (off < nearest - _NEARER) & (waited <= STUCK)
+    longer = (waited + (1.0 - 2.0 * rate.clamp(min=0)) * dt).clamp(min=0)
+    waited = torch.where(nearer, 0.0, torch.where(counts, longer, waited))
+    return waited, torch.where(nearer | ~counts, off, nearest)
 
 
 def nears_singularity(
@@ -351,8 +405,8 @@ def nears_singularity(
     joints: Float[Tensor, "*batch joints"],
     velocity: Float[Tensor, "*batch joints"],
 ) -> Bool[Tensor, "*batch"]:
-    """Whether an arm beside its path is near a singularity, or will be when the path has
-    stopped: no task is kept there that the path itself does not pass.
+    """Whether an arm beside its path is near a singularity, or will be by the time that the
+    path has stopped: there it could not keep the end effector on it.
 
     Args:
         chain: Kinematics of the arm.

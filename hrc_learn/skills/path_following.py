@@ -10,22 +10,20 @@ from torch import Tensor
 
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.failures import BlockedPathError
+from hrc_learn.skills.failures import BlockedPathError, TaskFailedError
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
     LONGEST_RETURN,
     NARROW,
+    STUCK,
     changed_rate,
-    may_not_find_back,
     nears_singularity,
-    share_of_push,
     smallest_singular_value,
-    straightness,
+    waited_for,
 )
+from hrc_learn.skills.person_feedback import share_kept
 from hrc_learn.skills.work_cell import WorkCell
 
-STUCK = 2.0
-"""Time after which a path that waits for the joints is gone back [s]."""
 # After which they go back straight [s]; and to how many samples of the path that is tried.
 _LONGEST_WAIT, _OTHERS = 20.0, 20
 # Distance of the end effector from its path for the path to wait, and time by which servos lag
@@ -60,6 +58,8 @@ def follow_path(
 
     Raises:
         BlockedPathError: If the arm, pushed aside, does not find back to a path that waits.
+        TaskFailedError: If somebody holds the arm aside for too long (`longest_wait`) while the
+            path waits.
     """
     if not len(path):
         return 0
@@ -85,13 +85,15 @@ class PathFollower:
         dt = self._config.dt
         self._velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
         singular = smallest_singular_value(cell.chain, torch.from_numpy(path.copy()))
-        self._narrow, self._astray = singular < NARROW, False
+        self._narrow = singular < NARROW
         self._yielding.begin(torch.from_numpy(path[0]) - cell.joints)
 
     def follow(self, until: Callable[[], bool]) -> int:
         """Along all of it; the number of samples that were tracked."""
         cell, path, yielding, dt = self._cell, self._path, self._yielding, self._config.dt
-        progress, rate, waited = 0.0, 1.0, 0.0
+        progress, rate, held = 0.0, 1.0, 0.0
+        waited = torch.zeros((), dtype=torch.float64)
+        nearest = torch.full_like(waited, torch.inf)
         while progress <= len(path) - 1:
             if until():
                 return int(progress)
@@ -102,23 +104,34 @@ class PathFollower:
             behind = self._track(
                 goal, wanted, yields=not bool(self._narrow[here]), returns=rate <= 0
             )
-            if not yielding.aside:
-                waited = 0.0
             # Who pushes again and again must not hold it up for good.
-            elif not yielding.pushed and cell.pace.undisturbed:
-                waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
+            counts = torch.tensor(not yielding.pushed and cell.pace.undisturbed)
+            off, speed = (goal - cell.joints).norm(), torch.tensor(rate, dtype=torch.float64)
+            waited, nearest = waited_for(waited, nearest, off, speed, counts, dt)
+            if not yielding.aside:
+                waited = torch.zeros_like(waited)
             # The null space that led aside further back leads back there as well.
-            backs = waited > STUCK and progress > 0
+            backs = float(waited) > STUCK and progress > 0
             if not backs and yielding.aside:
-                stops = bool(self._narrow[here : ahead + 1].any()) or self.is_astray(goal)
+                stops = (
+                    yielding.lost
+                    or bool(self._narrow[here : ahead + 1].any())
+                    or bool(nears_singularity(cell.chain, cell.joints, cell.commanded_velocity))
+                )
                 behind = math.inf if stops else behind
             rate = float(changed_rate(rate, 2.0 - behind, dt, -1 if backs else 1))
             if rate <= 0:
                 cell.hindrances.mention("task_waits")
+            held = held + dt if rate <= 0 and yielding.pushed else 0.0
+            if held > self._config.longest_wait:
+                raise TaskFailedError(
+                    f"the arm was held aside for {held:.0f} s while its path waited: let it "
+                    "go, or let it wait longer (longest_wait)."
+                )
             progress = max(progress + rate * cell.pace.share, 0.0)
-            if waited > _LONGEST_WAIT:
+            if float(waited) > _LONGEST_WAIT:
                 progress = self.go_straight_back(progress)
-                waited = 0.0
+                waited = torch.zeros_like(waited)
         if self._config.after_push == "return":
             end = torch.from_numpy(path[-1])
             deadline = cell.time + LONGEST_RETURN
@@ -156,35 +169,21 @@ class PathFollower:
                 cell.hindrances.note("narrow_path", 0.0)
             cell.step(velocity + self._config.pose_gain * error, pose, path_joints=goal)
             return 0.0
-        if self._config.after_push == "return":
-            # Far aside the null space may lead elsewhere than back: nobody gets that far.
-            share = float(share_of_push(self._straightness(error)))
-            cell.hindrances.note("too_far", share)
-            back = back - (1.0 - share) * self._yielding.null_velocity
+        self._tell(back)
         ahead = goal + self._config.command_delay * velocity
         twist = cell.chain.jacobian(ahead) @ velocity
-        if cell.track_pose(pose, twist, velocity + back, path_joints=goal):
+        share, drift = self._yielding.push_share, velocity + back
+        if cell.track_pose(pose, twist, drift, push_share=share, path_joints=goal):
             return math.inf
         return float(behind_path(cell.pose.twist_to(pose), twist))
 
-    def is_astray(self, goal: Float[Tensor, " joints"]) -> bool:
-        """Whether joints aside might not find back to a path that goes on.
-
-        Args:
-            goal: Where on the path [rad].
-        """
-        cell = self._cell
-        error = goal - cell.joints
-        self._astray = self._config.after_push == "return" and bool(
-            may_not_find_back(error, self._straightness(error), self._astray)
-        )
-        return self._astray or bool(
-            nears_singularity(cell.chain, cell.joints, cell.commanded_velocity)
-        )
-
-    def _straightness(self, error: Float[Tensor, " joints"]) -> Float[Tensor, ""]:
-        """How much of the way back to the path [rad] lies in the null space, 0 to 1."""
-        return straightness(null_projection(self._cell.jacobian, error), error)
+    def _tell(self, back: Float[Tensor, " joints"]) -> None:
+        """Tell who pushes what they cannot lead on, or is led back meanwhile [rad/s]."""
+        cell, yielding = self._cell, self._yielding
+        if yielding.pushed:
+            push = null_projection(cell.jacobian, yielding.null_velocity)
+            kept = share_kept(push, yielding.push_share * push + back)
+            cell.hindrances.note("too_far" if yielding.lost else "task_waits", kept)
 
     def go_straight_back(self, progress: float) -> float:
         """To a path that waits, where no motion of the null space leads.

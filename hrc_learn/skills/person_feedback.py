@@ -37,8 +37,8 @@ _TEXTS: Mapping[Hindrance, str] = {
     "speed": "the arm may not be led faster",
     "task": "that way the end effector would have to move",
     "narrow_path": "the path leads through a singularity: nobody can push the arm off it here",
-    "too_far": "the arm is too far aside to find back",
-    "task_waits": "the task waits until you let go and the arm is back",
+    "too_far": "the arm is led so far aside that it might not find back",
+    "task_waits": "the task waits until you let go",
     "person": "{somebody}",
     "stopped": "the safety filter brakes the arm",
 }

@@ -424,6 +424,7 @@ class WorkCell:
         twist: Float[Tensor, "6"],
         drift: Float[Tensor, " joints"] | None = None,
         *,
+        push_share: float = 1.0,
         path_joints: Float[Tensor, " joints"] | None = None,
     ) -> bool:
         """One step of tracking a moving pose; the null space yields to the person.
@@ -432,6 +433,7 @@ class WorkCell:
             goal: Where the end effector should be.
             twist: Its velocity (linear [m/s], angular [rad/s]).
             drift: Joint velocity whose null-space part is wanted besides [rad/s].
+            push_share: What is left of the person's own, 0 to 1.
             path_joints: Where the joints should be on a path of theirs [rad], for the log.
 
         Returns:
@@ -441,7 +443,7 @@ class WorkCell:
         # Where the arm will be when it follows: the null space is that of then.
         J = self.chain.jacobian(joints + self.config.command_delay * self._guard.velocity)
         correction = self.config.pose_gain * self.pose.twist_to(goal)
-        null_velocity = self.yielding.null_velocity
+        null_velocity = push_share * self.yielding.null_velocity
         if drift is not None:
             null_velocity = null_velocity + drift
         task = task_rate(J, twist + correction)

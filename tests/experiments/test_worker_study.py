@@ -168,25 +168,25 @@ def test_pushed_far_aside_the_paths_wait_as_those_of_the_work_cell(
         return joints[0] + torch.from_numpy(error)
 
     batch._paths.position[0, 0] = aside(size, straight)
-    batch._null[0] = torch.from_numpy(0.05 * null)
+    batch._null[0] = torch.from_numpy(-0.05 * null)
     # So slow on its way back that all the motion is of the push.
     batch._config = replace(CELL, pose_gain=1e-6)
     with torch.inference_mode():
         command = batch._command(joints, torch.zeros(1, dtype=torch.long))
-        assert bool(command.astray) == astray
-        assert float(command.joint_velocity[0].numpy() @ null) / 0.05 == pytest.approx(
+        assert bool(command.stops) == astray
+        assert float(command.joint_velocity[0].numpy() @ null) / -0.05 == pytest.approx(
             share, abs=1e-3
         )
         # As if the end effector were on its path.
         command = command._replace(goal=joints, wanted=torch.zeros_like(joints))
         batch._go_on(0, torch.zeros(1, dtype=torch.long), command)
         assert float(batch._rate) == pytest.approx(1.0 - astray * DT / CHANGE_OF_RATE)
-        # Who was astray is until they are well on their way back.
-        batch._progress[0] = 0.0
-        for size, straight in ((1.6, 0.95), (1.0, 0.75)):
+        # Who was astray is, once let go, until they are well on their way back.
+        batch._progress[0], batch._null[0] = 0.0, 0.0
+        for size, straight, still in ((1.6, 0.95, True), (1.0, 0.75, True), (1.3, 0.85, False)):
             batch._paths.position[0, 0] = aside(size, straight)
             command = batch._command(joints, torch.zeros(1, dtype=torch.long))
-            assert bool(command.astray) == astray
+            assert bool(command.stops) == (astray and still)
 
 
 def test_pushed_near_a_singularity_the_paths_wait():
@@ -198,7 +198,7 @@ def test_pushed_near_a_singularity_the_paths_wait():
         for joints, astray in ((torch.from_numpy(CYCLE.path[:1]), False), (stretched, True)):
             batch._paths.position[0, 0] = joints[0]
             command = batch._command(joints, torch.zeros(1, dtype=torch.long))
-            assert bool(command.astray) == astray
+            assert bool(command.stops) == astray
 
 
 def test_the_margin_is_that_of_a_logged_run():

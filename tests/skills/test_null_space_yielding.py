@@ -11,6 +11,7 @@ from hrc_learn.skills.null_space_yielding import (
     YieldingConfig,
     eased_null_velocity,
     nears_singularity,
+    waited_for,
 )
 
 Q = torch.tensor([0.4, 0.2, -0.3, -2.2, 0.1, 2.4, 0.6], dtype=torch.float64)
@@ -98,3 +99,80 @@ def test_an_arm_nears_a_singularity_by_the_time_that_its_path_has_stopped(
     velocity = torch.zeros(7, dtype=torch.float64)
     velocity[1] = -towards
     assert bool(nears_singularity(panda, q, velocity)) == nears
+
+
+def aside(size, straight):
+    """From `Q` to a path: as far, and with that cosine to where the null space leads."""
+    first = np.linalg.svd(panda.jacobian(Q).numpy())[2][0]
+    return torch.from_numpy(size * (straight * unit() + np.sqrt(1 - straight**2) * first))
+
+
+def yielding_at(*ways, after_push="return", pushed=False):
+    """After steps with joints aside by each of the ways."""
+    yielding = NullSpaceYielding(panda, 0.01, YieldingConfig(after_push=after_push))
+    yielding.begin(ways[0])
+    if pushed:
+        yielding.nullspace_input = -unit()
+    for way in ways:
+        yielding.way_back(Q, way)
+    return yielding
+
+
+@pytest.mark.parametrize(
+    ("size", "straight", "lost"),
+    [
+        (1.7, 0.9, False),
+        (1.9, 0.9, True),
+        (1.0, 0.7, False),
+        (1.0, 0.6, True),
+        # So near they do find back; in between there is no jump.
+        (0.29, 0.1, False),
+        (0.36, 0.6, False),
+        (0.45, 0.5, True),
+    ],
+)
+def test_joints_are_lost_far_aside_and_where_the_null_space_leads_elsewhere(
+    size, straight, lost
+):
+    assert yielding_at(aside(size, straight)).lost == lost
+    assert yielding_at(aside(size, straight), pushed=True).lost == lost
+    # Whoever stays beside the path need not find back.
+    stays = yielding_at(aside(size, straight), after_push="stay")
+    assert not stays.lost
+    assert stays.push_share == 1.0
+
+
+@pytest.mark.parametrize("lost", [aside(1.9, 0.9), aside(1.0, 0.6)])
+def test_joints_that_were_lost_are_until_they_are_well_on_their_way(lost):
+    assert yielding_at(lost, aside(1.45, 0.9)).lost
+    assert yielding_at(lost, aside(1.0, 0.77)).lost
+    assert not yielding_at(lost, aside(1.35, 0.82)).lost
+    assert not yielding_at(lost, aside(1.35, 0.82), aside(1.7, 0.7)).lost
+    # Back on the path, or beside it while they are held there, they are not.
+    assert not yielding_at(lost, aside(0.01, 1.0), aside(1.7, 0.7)).lost
+    assert not yielding_at(lost, aside(1.7, 0.7), pushed=True).lost
+
+
+def test_a_path_waits_for_joints_as_long_as_they_come_nearer():
+    """2 s without 0.05 rad of way; half as long again after time in which it went on."""
+    one, dt = torch.ones((), dtype=torch.float64), 0.01
+
+    def steps(offs, waited=0.0, nearest=torch.inf, rate=0.0, counts=True):
+        waited, nearest = waited * one, nearest * one
+        for off in offs:
+            waited, nearest = waited_for(
+                waited, nearest, off * one, rate * one, torch.tensor(counts), dt
+            )
+        return float(waited)
+
+    slowly, stuck = np.linspace(2.0, 1.0, 600), np.full(100, 1.5)
+    assert steps(slowly) < 0.5
+    assert steps(stuck) == pytest.approx(0.99)
+    assert steps(np.linspace(1.5, 1.46, 100)) == pytest.approx(0.99)
+    assert steps(stuck, rate=1.0, waited=1.5, nearest=1.5) == pytest.approx(0.5)
+    assert steps(stuck[:50], waited=1.0, nearest=1.5, rate=-1.0) == pytest.approx(1.5)
+    # Not while somebody pushes, who may push it farther: that is where it comes back from.
+    assert steps(stuck, waited=1.0, counts=False) == pytest.approx(1.0)
+    assert steps([2.5], nearest=0.5, counts=False) == 0.0
+    # A path that is gone back is gone back to where the joints are on it again.
+    assert steps(slowly, waited=2.5, nearest=2.0) > 8.0

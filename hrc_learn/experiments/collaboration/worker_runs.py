@@ -50,6 +50,7 @@ from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
     LEAST_INPUT,
     NARROW,
+    STUCK,
     changed_rate,
     eased_null_velocity,
     eased_way_back,
@@ -60,9 +61,10 @@ from hrc_learn.skills.null_space_yielding import (
     smallest_singular_value,
     stays_aside,
     straightness,
+    waited_for,
 )
 from hrc_learn.skills.pace import people_bind
-from hrc_learn.skills.path_following import STUCK, behind_path
+from hrc_learn.skills.path_following import behind_path
 from hrc_learn.skills.person_watch import (
     BESIDE_PEOPLE,
     PersonWatchConfig,
@@ -244,8 +246,10 @@ class _Command(NamedTuple):
     """Along the path [rad/s]."""
     waits: Tensor
     """Whether the arm, pushed aside, would meet something if the path went on."""
-    astray: Tensor
-    """Whether it might not find back to a path that goes on."""
+    stops: Tensor
+    """Whether it might not find back to a path that goes on, or nears a singularity."""
+    off: Tensor
+    """How far its joints are from the path [rad]."""
 
 
 class _Batch:
@@ -279,6 +283,7 @@ class _Batch:
         self._guard = self._safety.initial_state(self._q.clone())
         zeros = torch.zeros(runs, dtype=torch.float64)
         self._progress, self._waiting = zeros.clone(), zeros.clone()
+        self._nearest = zeros + torch.inf
         self._rate, self._pace, self._share = zeros + 1, zeros + 1, zeros + 1
         self._aside, self._lost = torch.zeros(2, runs, dtype=torch.bool)
         self._null, self._back = torch.zeros_like(self._q), torch.zeros_like(self._q)
@@ -498,32 +503,33 @@ class _Batch:
         wanted = rate.unsqueeze(-1) * paths.between(paths.velocity, cycle, later)
         error = goal - measured
         command = wanted + config.pose_gain * error
-        waits, astray = torch.zeros(2, len(live), dtype=torch.bool)
+        waits, stops = torch.zeros(2, len(live), dtype=torch.bool)
         pushed, aside = (self._null[live] != 0).any(-1), self._aside[live]
         gone = (~paths.narrow[cycle, here] | aside) & stays_aside(pushed, aside, error)
         self._aside[live] = gone
+        self._lost[live] &= gone
         some = torch.nonzero(gone).squeeze(-1)
         back = torch.zeros_like(measured)
         if len(some):
             away = null_projection(panda.jacobian(measured[some]), error[some])
             goes = (rate[some] <= 0) | ~pushed[some]
-            # Whoever pushes far has no more say: the null space would lead elsewhere than back.
-            straight = straightness(away, error[some])
-            these = live[some]
-            lost = may_not_find_back(error[some], straight, self._lost[these])
+            these, straight = live[some], straightness(away, error[some])
+            waited = self._lost[these] & ~pushed[some]
+            lost = may_not_find_back(error[some], straight, waited)
             near = nears_singularity(panda, measured[some], self._guard.velocity[these])
-            self._lost[these], astray[some] = lost, lost | near
-            less = (1.0 - share_of_push(straight)).unsqueeze(-1) * self._null[these]
+            self._lost[these], stops[some] = lost, lost | near
+            push = self._null[these]
+            push = share_of_push(push, away, straight).unsqueeze(-1) * push
             away = away * goes.unsqueeze(-1)
-            back[some] = eased_way_back(self._back[live[some]], away, config.dt, config)
+            back[some] = eased_way_back(self._back[these], away, config.dt, config)
             command[some], waits[some] = self._beside(
-                some, measured[some], goal[some], wanted[some], wanted[some] + back[some] - less
+                some, measured[some], goal[some], wanted[some], wanted[some] + back[some] + push
             )
         self._back[live] = back
-        return _Command(command, goal, wanted, waits, astray)
+        return _Command(command, goal, wanted, waits, stops, error.norm(dim=-1))
 
     def _beside(
-        self, some: Tensor, q: Tensor, goal: Tensor, wanted: Tensor, drift: Tensor
+        self, some: Tensor, q: Tensor, goal: Tensor, wanted: Tensor, null: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Joint velocities of arms aside: the end effector keeps to its path."""
         config, live = self._config, self.live[some]
@@ -532,7 +538,7 @@ class _Batch:
         twist = panda.jacobian(goal + self._delay * wanted) @ wanted.unsqueeze(-1)
         correction = config.pose_gain * panda.forward(q).twist_to(there)
         task = resolved_rate(J, twist.squeeze(-1) + correction, torch.zeros_like(q))
-        null = null_projection(J, self._null[live] + drift)
+        null = null_projection(J, null)
         null = null * null_space_slowdown(panda, q, null).unsqueeze(-1)
         null, waits = self._kept_clear(q, task, null)
         room = self._room.velocity_bounds(q)
@@ -570,12 +576,14 @@ class _Batch:
             behind[some] = behind_path(off, (J @ wanted.unsqueeze(-1)).squeeze(-1))
         behind = torch.where(command.waits, torch.inf, behind)
         pushed = (self._null[live] != 0).any(-1)
-        counts = aside & ~pushed & (self._pace[live] == 1)
-        waited = (waiting + (1 - 2 * rate.clamp(min=0)) * config.dt).clamp(min=0)
-        waiting = torch.where(aside, torch.where(counts, waited, waiting), 0.0)
-        self._waiting[live] = waiting
+        counts = ~pushed & (self._pace[live] == 1)
+        waiting, nearest = waited_for(
+            waiting, self._nearest[live], command.off, rate, counts, config.dt
+        )
+        waiting = torch.where(aside, waiting, 0.0)
+        self._waiting[live], self._nearest[live] = waiting, nearest
         backs = (waiting > STUCK) & (self._progress[live] > 0)
-        stops = ~backs & aside & (paths.narrow_ahead[cycle, here] | command.astray)
+        stops = ~backs & aside & (paths.narrow_ahead[cycle, here] | command.stops)
         behind = torch.where(stops, torch.inf, behind)
         direction = torch.where(backs, -1, 1).numpy()
         rate = torch.from_numpy(
