@@ -16,13 +16,14 @@ from hrc_learn.skills.null_space_yielding import (
     LONGEST_RETURN,
     NARROW,
     STUCK,
+    NullSpaceYielding,
     changed_rate,
     nears_singularity,
     smallest_singular_value,
     waited_for,
 )
 from hrc_learn.skills.person_feedback import share_kept
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 
 # After which they go back straight [s]; and to how many samples of the path that is tried.
 _LONGEST_WAIT, _OTHERS = 20.0, 20
@@ -91,47 +92,26 @@ class PathFollower:
     def follow(self, until: Callable[[], bool]) -> int:
         """Along all of it; the number of samples that were tracked."""
         cell, path, yielding, dt = self._cell, self._path, self._yielding, self._config.dt
-        progress, rate, held = 0.0, 1.0, 0.0
-        waited = torch.zeros((), dtype=torch.float64)
-        nearest = torch.full_like(waited, torch.inf)
+        progress, rate, patience = 0.0, 1.0, _Patience(self._config)
         while progress <= len(path) - 1:
             if until():
                 return int(progress)
             now = rate * cell.pace.led
             later = progress + now * self._config.command_delay / dt
             goal, wanted = _between(path, progress), now * _between(self._velocity, later)
-            here, ahead = int(progress), int(progress + CHANGE_OF_RATE / dt)
-            behind = self._track(
-                goal, wanted, yields=not bool(self._narrow[here]), returns=rate <= 0
-            )
-            # Who pushes again and again must not hold it up for good.
-            counts = torch.tensor(not yielding.pushed and cell.pace.undisturbed)
-            off, speed = (goal - cell.joints).norm(), torch.tensor(rate, dtype=torch.float64)
-            waited, nearest = waited_for(waited, nearest, off, speed, counts, dt)
-            if not yielding.aside:
-                waited = torch.zeros_like(waited)
+            narrow = bool(self._narrow[int(progress)])
+            behind = self._track(goal, wanted, yields=not narrow, returns=rate <= 0)
+            patience.step(yielding, goal - cell.joints, rate, cell.pace.undisturbed)
             # The null space that led aside further back leads back there as well.
-            backs = float(waited) > STUCK and progress > 0
-            if not backs and yielding.aside:
-                stops = (
-                    yielding.lost
-                    or bool(self._narrow[here : ahead + 1].any())
-                    or bool(nears_singularity(cell.chain, cell.joints, cell.commanded_velocity))
-                )
-                behind = math.inf if stops else behind
+            backs = patience.is_stuck and progress > 0
+            if not backs and yielding.aside and self._stops(progress):
+                behind = math.inf
             rate = float(changed_rate(rate, 2.0 - behind, dt, -1 if backs else 1))
             if rate <= 0:
                 cell.hindrances.mention("task_waits")
-            held = held + dt if rate <= 0 and yielding.pushed else 0.0
-            if held > self._config.longest_wait:
-                raise TaskFailedError(
-                    f"the arm was held aside for {held:.0f} s while its path waited: let it "
-                    "go, or let it wait longer (longest_wait)."
-                )
             progress = max(progress + rate * cell.pace.share, 0.0)
-            if float(waited) > _LONGEST_WAIT:
-                progress = self.go_straight_back(progress)
-                waited = torch.zeros_like(waited)
+            if patience.is_over:
+                progress, patience = self.go_straight_back(progress), _Patience(self._config)
         if self._config.after_push == "return":
             end = torch.from_numpy(path[-1])
             deadline = cell.time + LONGEST_RETURN
@@ -176,6 +156,15 @@ class PathFollower:
         if cell.track_pose(pose, twist, drift, push_share=share, path_joints=goal):
             return math.inf
         return float(behind_path(cell.pose.twist_to(pose), twist))
+
+    def _stops(self, progress: float) -> bool:
+        """Whether joints aside could not follow the path from a sample on, or not find back."""
+        cell, ahead = self._cell, int(progress + CHANGE_OF_RATE / self._config.dt)
+        return (
+            self._yielding.lost
+            or bool(self._narrow[int(progress) : ahead + 1].any())
+            or bool(nears_singularity(cell.chain, cell.joints, cell.commanded_velocity))
+        )
 
     def _tell(self, back: Float[Tensor, " joints"]) -> None:
         """Tell who pushes what they cannot lead on, or is led back meanwhile [rad/s]."""
@@ -228,6 +217,60 @@ class PathFollower:
         distance = self._cell.clearance(way[:: max(1, len(way) // _CHECKED)])
         ends = distance[[0, -1]].min()
         return not bool((distance < ends.clamp(max=self._config.clearance)).any())
+
+
+class _Patience:
+    """For how long a path has waited for joints that somebody pushed aside."""
+
+    def __init__(self, config: WorkCellConfig):
+        """Begin with none."""
+        self._config = config
+        self._waited = torch.zeros((), dtype=torch.float64)
+        self._nearest = torch.full_like(self._waited, torch.inf)
+        self._held = 0.0
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether it has waited so long that it is gone back."""
+        return float(self._waited) > STUCK
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has waited so long that the joints go straight back."""
+        return float(self._waited) > _LONGEST_WAIT
+
+    def step(
+        self,
+        yielding: NullSpaceYielding,
+        error: Float[Tensor, " joints"],
+        rate: float,
+        undisturbed: bool,
+    ) -> None:
+        """Count one step.
+
+        Args:
+            yielding: Of the null space.
+            error: From the joints to the path [rad].
+            rate: Of the path, -1 to 1.
+            undisturbed: Whether nobody slows it down or pauses it.
+
+        Raises:
+            TaskFailedError: Somebody holds the arm aside for too long.
+        """
+        # Who pushes again and again must not hold it up for good.
+        counts = torch.tensor(undisturbed and not yielding.pushed)
+        speed, dt = error.new_tensor(rate), self._config.dt
+        self._waited, self._nearest = waited_for(
+            self._waited, self._nearest, error.norm(), speed, counts, dt
+        )
+        if not yielding.aside:
+            self._waited = torch.zeros_like(self._waited)
+        self._held = self._held + dt if rate <= 0 and yielding.pushed else 0.0
+        if self._held > self._config.longest_wait:
+            raise TaskFailedError(
+                f"the arm was held aside for {self._held:.0f} s while its path waited: let it "
+                "go, or let it wait longer (longest_wait)."
+            )
 
 
 def _between(samples: Float[np.ndarray, "steps joints"], at: float) -> Float[Tensor, " joints"]:

@@ -173,6 +173,7 @@ def test_a_path_waits_for_joints_as_long_as_they_come_nearer():
     assert steps(stuck[:50], waited=1.0, nearest=1.5, rate=-1.0) == pytest.approx(1.5)
     # Not while somebody pushes, who may push it farther: that is where it comes back from.
     assert steps(stuck, waited=1.0, counts=False) == pytest.approx(1.0)
-    assert steps([2.5], nearest=0.5, counts=False) == 0.0
+    _, nearest = waited_for(one, 0.5 * one, 2.5 * one, one, torch.tensor(False), dt)
+    assert steps(np.linspace(2.5, 1.0, 600), nearest=float(nearest)) < 0.5
     # A path that is gone back is gone back to where the joints are on it again.
     assert steps(slowly, waited=2.5, nearest=2.0) > 8.0
