@@ -31,7 +31,7 @@ from hrc_learn.kinematics import GraspedBox, panda, separation
 from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit, whole_arm
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line, nearest_configuration
-from hrc_learn.skills.null_space_yielding import CHANGE_OF_RATE
+from hrc_learn.skills.null_space_yielding import CHANGE_OF_RATE, FAR_ASIDE
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.viz import StepLog
 
@@ -182,11 +182,18 @@ def test_pushed_far_aside_the_paths_wait_as_those_of_the_work_cell(
         batch._go_on(0, torch.zeros(1, dtype=torch.long), command)
         assert float(batch._rate) == pytest.approx(1.0 - astray * DT / CHANGE_OF_RATE)
         # Who was astray is, once let go, until they are well on their way back.
-        batch._progress[0], batch._null[0] = 0.0, 0.0
-        for size, straight, still in ((1.6, 0.95, True), (1.0, 0.75, True), (1.3, 0.85, False)):
+        batch._progress[0] = 0.0
+        for push, size, straight, still in (
+            (0.0, 1.6, 0.95, True),
+            (0.0, 1.0, 0.75, True),
+            (0.05, 1.6, 0.95, False),
+            (0.0, 2.0, 0.95, True),
+            (0.0, 1.3, 0.85, False),
+        ):
+            batch._null[0] = torch.from_numpy(push * null)
             batch._paths.position[0, 0] = aside(size, straight)
             command = batch._command(joints, torch.zeros(1, dtype=torch.long))
-            assert bool(command.stops) == (astray and still)
+            assert bool(command.stops) == (still and (astray or size > FAR_ASIDE))
 
 
 def test_pushed_near_a_singularity_the_paths_wait():

@@ -21,7 +21,7 @@ from hrc_learn.skills import (
     joint_line,
 )
 from hrc_learn.skills.null_space_yielding import FAR_ASIDE, STUCK
-from hrc_learn.skills.path_following import PathFollower, follow_path
+from hrc_learn.skills.path_following import PathFollower, _Patience, follow_path
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 
@@ -459,6 +459,42 @@ def test_nobody_pushes_joints_so_far_that_they_do_not_find_back(
     lost = farther and after_push == "return" and straight < 0.65
     assert hindered(cell, "too_far")[50] == lost
     assert cell.log["followed"][50] == pytest.approx(share, abs=0.1)
+
+
+def test_who_pushes_is_told_that_a_path_which_waits_leads_the_joints_back():
+    null = np.linalg.svd(panda.jacobian(panda.ready).numpy())[2][-1]
+
+    class Person(Human):
+        def read(self, state):
+            return HumanInput(nullspace_input=-0.5 * null)
+
+    cell = cell_with(ObedientArm(panda.ready.numpy()))
+    cell.human = Person()
+    cell.hold_pose(0.5)
+    path = np.repeat(cell.joints.numpy()[None] + (FAR_ASIDE + 0.1) * null, 100, axis=0)
+    follow_path(cell, path, until=lambda: len(cell.log) > 120)
+    followed, velocity = cell.log["followed"], cell.log["joint_velocity"] @ null
+    assert followed[49] == pytest.approx(1.0, abs=0.01)
+    assert velocity[49] < -0.1
+    # From 0.5 s on, as the path has stopped and the joints turn round.
+    assert followed[-1] == 0.0
+    assert velocity[-1] > 0.1
+    assert hindered(cell, "too_far")[-1]
+
+
+def test_a_path_gone_back_to_where_the_joints_are_on_it_goes_on():
+    cell = cell_with(ObedientArm(panda.ready.numpy()))
+    patience, off = _Patience(cell.config), torch.full((7,), 0.5, dtype=torch.float64)
+    cell.yielding.begin(off)
+    for _ in range(205):
+        patience.step(cell.yielding, off, 0.0, True)
+    assert patience.is_stuck
+    for _ in range(100):
+        patience.step(cell.yielding, off * 0.5, -1.0, True)
+    assert patience.is_stuck
+    cell.yielding.begin(torch.zeros_like(off))
+    patience.step(cell.yielding, off * 0, -1.0, True)
+    assert not patience.is_stuck
 
 
 def test_a_path_that_waits_is_not_gone_back_while_the_joints_come_nearer():

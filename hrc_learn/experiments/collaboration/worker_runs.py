@@ -507,7 +507,6 @@ class _Batch:
         pushed, aside = (self._null[live] != 0).any(-1), self._aside[live]
         gone = (~paths.narrow[cycle, here] | aside) & stays_aside(pushed, aside, error)
         self._aside[live] = gone
-        self._lost[live] &= gone
         some = torch.nonzero(gone).squeeze(-1)
         back = torch.zeros_like(measured)
         if len(some):
