@@ -1,8 +1,11 @@
-"""An arm that does as it is told: it integrates velocities exactly."""
+"""An arm that does as it is told, integrating velocities exactly; and its work cell."""
 
 import numpy as np
 
-from hrc_learn.protocols import ArmState
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import HINDRANCES, ArmState
+from hrc_learn.skills import WorkCell
+from hrc_learn.teleoperation import ScriptedPerturbation
 
 
 class ObedientArm:
@@ -27,3 +30,20 @@ class ObedientArm:
 
     def advance(self, duration):
         self.q, self.time = self.q + duration * self.velocity, self.time + duration
+
+
+def cell_with(arm, human=None, **options):
+    """A work cell of a Panda, by default with nobody beside it."""
+    return WorkCell(
+        chain=panda,
+        arm=arm,
+        gripper=arm,
+        human=human or ScriptedPerturbation(panda, ()),
+        advance=arm.advance,
+        **options,
+    )
+
+
+def hindered(cell, hindrance):
+    """In which steps the person was told of a hindrance."""
+    return cell.log["hindered"][:, HINDRANCES.index(hindrance)].astype(bool)
