@@ -157,7 +157,7 @@ def test_who_stops_and_waits_rests_while_anybody_is_within_the_distance():
 def test_pushed_far_aside_the_paths_wait_as_those_of_the_work_cell(
     size, straight, astray, share
 ):
-    """Where `tests/skills/test_path_following.py` has a single arm wait, and as much of a push."""
+    """Where `test_path_following.py` has a single arm wait, and as much of a push."""
     drawn = replace(job([0], IDEAL), workers=WorkerTables.nobody(1, DT))
     batch = worker_runs._Batch(drawn, making_way("expert"), CELL)
     joints = torch.from_numpy(CYCLE.path[:1])
