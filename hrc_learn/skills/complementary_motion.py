@@ -234,8 +234,8 @@ class ComplementaryMotion:
         if back is None:
             hindrances.note("narrow_path", 0.0)
         else:
-            # Far aside the null space may lead elsewhere than back: nobody gets that far.
-            # While they push nothing pulls the joints back.
+            # While they push nothing pulls the joints back; but far aside, where the null space
+            # may lead elsewhere than back, less and less is left of a push.
             yielding = self._yielding
             push = yielding.null_velocity if yielding.pushed else back
             share = float(share_of_push(push, away, straight))

@@ -37,11 +37,11 @@ FAR_ASIDE = 1.8
 _NEAR_AGAIN = 1.4
 # Cosine between the null space and the way back in joint space below which the one may lead
 # elsewhere than the other: an elbow that has gone a quarter of its circle has 0.7, one that has
-# gone half of it none. Paths that waited go on with the second, with which people are free.
+# gone half of it none. From the second on paths that waited go on, and a push counts in full.
 LEADS_BACK = 0.65
 _LEADS_WELL_BACK = 0.8
-# Joints nearer to their path than the first do find back, those farther than the second by that
-# cosine [rad].
+# Distances from the path [rad]: below the first joints find back whatever the cosine, which
+# counts in full from the second on.
 _NEARBY = 0.3, 0.5
 # Motion of the end effector, metres and radians as they are, below which nothing waits [1/s].
 _AT_REST = 1e-3
@@ -380,8 +380,8 @@ def waited_for(
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """For how long a path has waited for joints that come no nearer, a step later.
 
-    The time in which it goes on counts against that, as it is at rest half of the time before
-    somebody who pushes again and again.
+    Time in which the path goes on is taken off again: one that stops and starts before somebody
+    who pushes again and again is stuck only if it rests for more than half of the time.
 
     Args:
         waited: A step before [s].

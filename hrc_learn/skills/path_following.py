@@ -172,7 +172,8 @@ class PathFollower:
         if yielding.pushed:
             push = null_projection(cell.jacobian, yielding.null_velocity)
             kept = share_kept(push, yielding.push_share * push + back)
-            cell.hindrances.note("too_far" if yielding.lost else "task_waits", kept)
+            far = yielding.lost or yielding.push_share < 1
+            cell.hindrances.note("too_far" if far else "task_waits", kept)
 
     def go_straight_back(self, progress: float) -> float:
         """To a path that waits, where no motion of the null space leads.
