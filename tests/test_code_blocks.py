@@ -18,14 +18,14 @@ from hrc_learn.kinematics import panda, to_urdf
 from hrc_learn.viz import run_dashboard
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(
     r"^(?:<!-- not run: (?P<reason>[^>]+) -->\n)?```(?P<language>\w*)\n(?P<body>.*?)^```",
     re.MULTILINE | re.DOTALL,
 )
 NAME = re.compile(r"`(hrc_learn(?:\.\w+)+)`")
 SHORT_NAME = re.compile(r"`((?!hrc_learn)[a-z_]+\.\w+)`")
-"""How docs/paper.md, which is one long table of them, writes `hrc_learn.regions.Region`."""
+"""Names in docs/concepts/paper.md, a table of them: `regions.Region` without the package."""
 MOST_NOT_RUN = 3
 """Blocks that only say what cannot be tried here; a new one has to be worth it."""
 

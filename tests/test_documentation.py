@@ -18,11 +18,17 @@ builder = pytest.mark.skipif(
 )
 
 CHECKOUT = {
-    "README.md": "# Robots\n\n[A guide](docs/guide.md), [its end](docs/guide.md#end).\n",
     "CHANGELOG.md": "# Changes\n",
     "CONTRIBUTING.md": "# Contributing\n\nSee [the code](hrc_learn/arm/_moving.py).\n",
-    "docs/guide.md": "# Guide\n\n[Back](../README.md), [move][hrc_learn.arm.move]\n\n## End\n",
-    "docs/notation.md": "# Notation\n",
+    "docs/index.md": "# Robots\n\n[A guide](howto/guide.md), [its end](howto/guide.md#end).\n",
+    "docs/tutorial.md": "# Tutorial\n",
+    "docs/howto/guide.md": (
+        "# Guide\n\n[Home](../index.md), [move][hrc_learn.arm.move]\n\n## End\n"
+    ),
+    "docs/howto/index.md": "# How-to\n\n[More](more.md), [guide](guide.md)\n",
+    "docs/howto/more.md": "# More\n",
+    "docs/concepts/index.md": "# Concepts\n",
+    "docs/benchmarks/index.md": "# Benchmarks\n",
     "hrc_learn/__init__.py": '"""Robots."""\n\nfrom .arm import move as move\n',
     "hrc_learn/arm/__init__.py": '"""Arms."""\n\nfrom ._moving import move as move\n',
     "hrc_learn/arm/_moving.py": (
@@ -65,6 +71,11 @@ def test_every_name_of_our_faces_is_described_or_linked():
             assert export.path in pages or f".{export.name}" in pages[face.name], export.path
 
 
+def test_a_section_follows_the_order_of_its_index(tmp_path):
+    pages = build_docs.section(checkout(tmp_path), "howto")
+    assert pages == ["howto/index.md", "howto/more.md", "howto/guide.md"]
+
+
 @builder
 def test_the_site_opens_without_a_network(tmp_path):
     out = tmp_path / "site"
@@ -72,8 +83,8 @@ def test_the_site_opens_without_a_network(tmp_path):
     page = (out / "api" / "hrc_learn.arm.html").read_text()
     assert "Of the hand [m/s]." in page
     assert 'id="hrc_learn.arm.move"' in page
-    guide = (out / "guide.html").read_text()
-    assert 'href="api/hrc_learn.arm.html#hrc_learn.arm.move"' in guide
+    guide = (out / "howto" / "guide.html").read_text()
+    assert 'href="../api/hrc_learn.arm.html#hrc_learn.arm.move"' in guide
     for html in out.rglob("*.html"):
         assert not build_docs.REMOTE.search(html.read_text()), html
     assert not list(out.rglob("_*"))
@@ -83,9 +94,9 @@ def test_the_site_opens_without_a_network(tmp_path):
 @pytest.mark.parametrize(
     ("name", "old", "new", "complaint"),
     [
-        ("README.md", "docs/guide.md)", "docs/gide.md)", "gide.md"),
-        ("README.md", "#end", "#ends", "ends"),
-        ("docs/guide.md", "arm.move", "arm.moved", "hrc_learn.arm.moved"),
+        ("docs/index.md", "howto/guide.md)", "howto/gide.md)", "gide.md"),
+        ("docs/index.md", "#end", "#ends", "ends"),
+        ("docs/howto/guide.md", "arm.move", "arm.moved", "hrc_learn.arm.moved"),
         ("hrc_learn/arm/_moving.py", "speed: Of", "sped: Of", "'sped'"),
     ],
     ids=["page", "anchor", "reference", "argument"],

@@ -1,4 +1,4 @@
-"""Build the documentation site: README, docs/ and a reference made from the docstrings.
+"""Build the documentation site: docs/ and a reference made from the docstrings.
 
 Everything is read from this checkout and nothing from the network; `hrc_learn` is parsed, not
 imported. Whatever the builder warns of (a broken link or anchor, a docstring that describes
@@ -9,6 +9,7 @@ import argparse
 import ast
 import importlib.util
 import json
+import posixpath
 import re
 import shutil
 import subprocess
@@ -22,7 +23,10 @@ SITE = ROOT / "docs" / "site.yml"
 PACKAGE = "hrc_learn"
 # Modules of their own beside the packages that users implement or call.
 PUBLIC_MODULES = ("protocols",)
-SOURCE_LINK = re.compile(r"\[([^\]]+)\]\((?!\w+:)([^)\s#]+)((?:#[^)\s]*)?)\)")
+SOURCE_LINK = re.compile(
+    r"""(\[[^\]]+\]\(|<img [^>]*src=")(?!\w+:)([^)\s#"]+)((?:#[^)\s]*)?(?:\)|"))"""
+)
+LINK_TEXT = re.compile(r"\[([^\]]+)\]\(.*")
 DOCSTRING_WARNING = re.compile(r"(griffe|mkdocstrings\w*|mkdocs_autorefs):")
 REMOTE_SHIM = re.compile(r'src="https://[^"]*/iframe-worker/[^"]*"')
 REMOTE = re.compile(r"""<(?:script|img|iframe)\b[^>]*?\bsrc=["']?(https?:[^"'>\s]+)""")
@@ -141,30 +145,47 @@ def reference(root: Path) -> dict[str, str]:
     return pages
 
 
-def guides(root: Path) -> list[str]:
-    """Pages of docs/ in the order in which the README names them, then the others."""
-    readme = (root / "README.md").read_text("utf-8")
-    pages = sorted((root / "docs").glob("*.md"))
-    named = {page.name: readme.find(f"docs/{page.name}") for page in pages}
-    return sorted(named, key=lambda name: (named[name] < 0, named[name]))
+def pages_of(root: Path) -> dict[Path, str]:
+    """All pages that are written by hand: file of the checkout -> page of the site."""
+    docs = root / "docs"
+    pages = {page: page.relative_to(docs).as_posix() for page in sorted(docs.rglob("*.md"))}
+    return pages | {
+        root / "CHANGELOG.md": "changelog.md",
+        root / "CONTRIBUTING.md": "contributing.md",
+    }
+
+
+def section(root: Path, folder: str) -> list[str]:
+    """Pages of a folder of docs/: its index, pages in the order of the index, the others."""
+    docs = root / "docs"
+    index = docs / folder / "index.md"
+    text = index.read_text("utf-8") if index.exists() else ""
+
+    def rank(page: Path) -> tuple[bool, int, str]:
+        found = text.find(f"]({page.relative_to(docs / folder).as_posix()}")
+        return page != index, found if found >= 0 else len(text), page.name
+
+    pages = sorted((docs / folder).rglob("*.md"), key=rank)
+    return [page.relative_to(docs).as_posix() for page in pages]
 
 
 def for_site(text: str, page: Path, pages: dict[Path, str], root: Path) -> str:
-    """A page's text with links to files of the checkout turned into links of the site.
+    """A page's text with its links to files turned into links between pages of the site.
 
-    The site has no sources: what links to one keeps its words and loses its link. A link that
-    leads nowhere stays as it is, for the builder to complain of.
+    The site has no source files: a link to one becomes plain text. A broken link stays as it
+    is, so that the builder reports it.
     """
+    here = posixpath.dirname(pages[page])
 
     def relink(match: re.Match[str]) -> str:
-        words, target, anchor = match.groups()
+        before, target, after = match.groups()
         file = (page.parent / target).resolve()
         if file in pages:
-            return f"[{words}]({pages[file]}{anchor})"
+            return f"{before}{posixpath.relpath(pages[file], here)}{after}"
         if (root / "docs" / "images") in file.parents:
-            return f"[{words}](images/{file.name})"
+            return f"{before}{posixpath.relpath(f'images/{file.name}', here)}{after}"
         if file.exists() and root in file.parents:
-            return words
+            return LINK_TEXT.sub(r"\1", match[0])
         return match[0]
 
     pieces, start = [], 0
@@ -180,31 +201,26 @@ def stage(root: Path, folder: Path) -> list:
     Returns:
         The site's navigation, as the builder takes it.
     """
-    (folder / "api").mkdir(parents=True)
-    guide_names = guides(root)
-    pages = {root / "docs" / name: name for name in guide_names}
-    pages |= {
-        root / "README.md": "index.md",
-        root / "CHANGELOG.md": "changelog.md",
-        root / "CONTRIBUTING.md": "contributing.md",
+    pages = pages_of(root)
+    texts = {
+        name: for_site(page.read_text("utf-8"), page, pages, root)
+        for page, name in pages.items()
     }
-    for page, name in pages.items():
-        text = for_site(page.read_text("utf-8"), page, pages, root)
+    api = reference(root)
+    texts |= {f"api/{name}.md": text for name, text in api.items()}
+    for name, text in texts.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, "utf-8")
     if (root / "docs" / "images").exists():
         shutil.copytree(root / "docs" / "images", folder / "images")
-    api = reference(root)
-    for name, text in api.items():
-        (folder / "api" / f"{name}.md").write_text(text, "utf-8")
+    packages = [{name.removeprefix(f"{PACKAGE}."): f"api/{name}.md"} for name in sorted(api)]
     return [
-        {"Get started": "index.md"},
-        {"Guides": [name for name in guide_names if name != "notation.md"]},
-        {
-            "API reference": [
-                {name.removeprefix(f"{PACKAGE}."): f"api/{name}.md"} for name in sorted(api)
-            ]
-        },
-        {"Notation": "notation.md"},
+        {"Home": "index.md"},
+        {"Tutorial": "tutorial.md"},
+        {"How-to": section(root, "howto")},
+        {"Concepts": section(root, "concepts")},
+        {"Reference": packages},
+        {"Benchmarks": section(root, "benchmarks")},
         {"Changelog": "changelog.md"},
         {"Contributing": "contributing.md"},
     ]

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs" / "dmp_gallery.md").read_text()
+PAGE = (ROOT / "docs" / "concepts" / "dmp_gallery.md").read_text()
 SHOWN = re.findall(r"images/dmp_(\w+)\.png", PAGE)
 
 
 @pytest.fixture(scope="module")
 def gallery():
-    folder = ROOT / "docs"
+    folder = ROOT / "tools" / "docs"
     sys.path.insert(0, str(folder))
     try:
         spec = importlib.util.spec_from_file_location("dmp_gallery", folder / "dmp_gallery.py")
@@ -51,7 +51,7 @@ def test_unknown_pictures_are_refused(gallery, tmp_path):
 
 
 def test_it_says_what_it_does(run_here):
-    status, shown, _ = run_here("docs/dmp_gallery.py", "--help")
+    status, shown, _ = run_here("tools/docs/dmp_gallery.py", "--help")
     assert status == 0
     assert "Draw the pictures" in shown
     assert "--only" in shown

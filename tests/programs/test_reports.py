@@ -94,13 +94,13 @@ kept
 
 @pytest.fixture
 def experiments():
-    return load(ROOT / "docs" / "experiments.py")
+    return load(ROOT / "tools" / "docs" / "experiments.py")
 
 
 def test_pictures_and_tables_of_the_page_are_refreshed(runs, tmp_path, experiments):
     page = tmp_path / "page.md"
     page.write_text(PAGE)
-    experiments.main(experiments.Args(placing=runs[1], page=page))
+    experiments.main(experiments.Args(placing=runs[1], page=page, images=tmp_path / "images"))
     text = page.read_text()
     assert text.startswith(PAGE[: PAGE.index("old")])
     assert text.endswith(PAGE[PAGE.index("<!-- end") :])
@@ -132,7 +132,9 @@ def test_a_film_becomes_a_picture_that_moves(runs, tmp_path, experiments):
     write_report(tmp_path / "run", replace(read_report(runs[0]), film=film))
     page = tmp_path / "page.md"
     page.write_text("kept")
-    experiments.main(experiments.Args(film=tmp_path / "run", page=page))
+    experiments.main(
+        experiments.Args(film=tmp_path / "run", page=page, images=tmp_path / "images")
+    )
     shown = Image.open(tmp_path / "images" / "film.webp")
     assert (shown.size, shown.n_frames) == ((640, 60), 4)
     for number, level in enumerate(levels):
@@ -166,7 +168,7 @@ def test_a_page_needs_a_run(experiments):
 
 
 def test_the_pictures_of_the_page_are_there_and_small():
-    text = (ROOT / "docs" / "experiments.md").read_text()
-    shown = {part.split(")")[0] for part in text.split("(images/")[1:]}
+    text = (ROOT / "docs" / "concepts" / "experiments.md").read_text()
+    shown = {part.split(")")[0] for part in text.split("(../images/")[1:]}
     for name in shown:
         assert 5_000 < (IMAGES / name).stat().st_size < 200_000, name

@@ -25,7 +25,7 @@ from hrc_learn.teleoperation.devices import GamepadConfig
 from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
 from hrc_learn.teleoperation.page import PageConfig
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[2] / "docs" / "concepts"
 
 
 def default_of(function, name):

@@ -1,10 +1,10 @@
-"""Refresh the pictures of docs/teleoperation.md: the page and the view of a headset.
+"""Refresh the pictures of docs/concepts/teleoperation.md: the page and the view of a headset.
 
 A mouse in a headless Chromium leads the simulated arm and is photographed meanwhile; then two
 hands of an emulated headset do, from picture to picture of a film, as drawing without a GPU
 takes longer than the film shows.
 
-python docs/teleoperation.py
+python tools/docs/teleoperation.py
 """
 
 import sys
@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 # The browser is that of the tests.
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
 from headset_in_browser import (  # pyright: ignore[reportMissingImports]
     Headset,
     headset,
@@ -52,7 +52,7 @@ FRAME = 150
 class Args:
     """Where to."""
 
-    out: Path = Path(__file__).parent / "images"
+    out: Path = Path(__file__).parents[2] / "docs" / "images"
     """Folder of the pictures."""
 
 

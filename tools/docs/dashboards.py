@@ -1,11 +1,11 @@
-"""Refresh the pictures of docs/dashboards.md: what a browser shows of each recording.
+"""Refresh the pictures of docs/concepts/dashboards.md: what a browser shows of each recording.
 
 Every recording is served as `hrc show --web` does, opened in a headless Chromium and
 photographed; of a run, each of its tabs.
 
 hrc run collaboration --pulls random --worker --out outputs/beside
 hrc show outputs/placing_demos --out outputs/demonstrations.rrd
-python docs/dashboards.py --run outputs/beside/run.rrd \
+python tools/docs/dashboards.py --run outputs/beside/run.rrd \
     --demonstrations outputs/demonstrations.rrd
 """
 
@@ -26,7 +26,7 @@ from urllib.parse import quote
 from PIL import Image
 
 # The browser is that of the tests.
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
+sys.path.append(str(Path(__file__).parents[2] / "tests"))
 from page_in_browser import chromium  # pyright: ignore[reportMissingImports]
 
 from hrc_learn import cli
@@ -58,7 +58,7 @@ class Args:
     """Of `hrc sweep --recording`."""
     load: float = 90.0
     """Until the viewer has drawn all of a recording [s]."""
-    out: Path = Path(__file__).parent / "images"
+    out: Path = Path(__file__).parents[2] / "docs" / "images"
     """Folder of the pictures."""
 
 

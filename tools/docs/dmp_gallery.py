@@ -1,7 +1,7 @@
-"""Draw the pictures of docs/dmp_gallery.md: one of every kind of movement primitive.
+"""Draw the pictures of docs/concepts/dmp_gallery.md: one of every kind of movement primitive.
 
-python docs/dmp_gallery.py --out docs/images
-python docs/dmp_gallery.py --out /tmp/pictures --only joint pose
+python tools/docs/dmp_gallery.py --out docs/images
+python tools/docs/dmp_gallery.py --out /tmp/pictures --only joint pose
 """
 
 import io
@@ -43,7 +43,7 @@ PICTURES: dict[str, tuple[Picture, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Draw the pictures of docs/dmp_gallery.md."""
+    """Draw the pictures of docs/concepts/dmp_gallery.md."""
 
     out: Path
     """Folder that receives dmp_NAME.png for each."""

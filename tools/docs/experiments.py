@@ -1,15 +1,15 @@
-"""Refresh the pictures and tables of docs/experiments.md from the folders of runs.
+"""Refresh the pictures and tables of docs/concepts/experiments.md from the folders of runs.
 
 The page decides what is shown: each `images/KIND_NAME.png` in it is made from the picture NAME
 in the report of that kind of run, and the lines between `<!-- KIND measured -->` and
 `<!-- end -->` become the table of what that run measured.
 
-python docs/experiments.py --placing outputs/placing --grasping outputs/grasping
+python tools/docs/experiments.py --placing outputs/placing --grasping outputs/grasping
 
 The film of a run becomes images/film.webp, which README and page show.
 
 hrc run collaboration --pulls random --worker --out outputs/beside
-python docs/experiments.py --film outputs/beside
+python tools/docs/experiments.py --film outputs/beside
 """
 
 import re
@@ -23,7 +23,8 @@ from PIL import Image
 from hrc_learn import cli
 from hrc_learn.viz.report import Measurement, Report, read_report
 
-PAGE = Path(__file__).with_name("experiments.md")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = DOCS / "concepts" / "experiments.md"
 WIDTH = 1000
 """Of the pictures, at most [px]."""
 COLOURS = 256
@@ -47,7 +48,9 @@ class Args:
     film: Path | None = None
     """Folder of a run with a film, likewise."""
     page: Path = PAGE
-    """The page; its pictures are in images/ beside it."""
+    """The page."""
+    images: Path = DOCS / "images"
+    """Folder of the pictures."""
 
 
 def main(args: Args) -> None:
@@ -73,7 +76,7 @@ def main(args: Args) -> None:
         pictures |= shown_pictures(kind, report, text)
         text = with_table(kind, report, text)
     for name, content in pictures.items():
-        path = args.page.parent / "images" / name
+        path = args.images / name
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(content)
         print(f"{path}: {len(content) / 1e3:.0f} kB")
