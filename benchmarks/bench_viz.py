@@ -22,8 +22,8 @@ import rerun as rr
 from timing import time_calls
 
 from hrc_learn import cli
+from hrc_learn.log import CameraRecording, RunRecording, StepLog
 from hrc_learn.vision import CameraModel, Marker, MarkerDetector, SyntheticCamera
-from hrc_learn.viz import CameraRecording, RunRecording, StepLog
 from hrc_learn.viz.run_dashboard import LiveSender, LogStream, record_run
 
 STEPS = 200  # timed together, since one takes less than the clock resolves

@@ -5,8 +5,9 @@ from dataclasses import fields
 import numpy as np
 
 from hrc_learn.geometry import Body, Box, Capsule
+from hrc_learn.log import CameraRecording, Event, JointRanges, RunRecording
 from hrc_learn.vision import CameraModel
-from hrc_learn.viz import CameraRecording, Event, FitRecording, JointLimits, RunRecording
+from hrc_learn.viz import FitRecording
 
 STEPS = 200
 OPTIONAL = (
@@ -30,7 +31,7 @@ OPTIONAL = (
 )
 """Fields of a run that may be None."""
 NAMES = tuple(f"joint{i}" for i in range(1, 8))
-LIMITS = JointLimits(lower=np.full(7, -2.9), upper=np.full(7, 2.9), velocity=np.full(7, 2.0))
+LIMITS = JointRanges(lower=np.full(7, -2.9), upper=np.full(7, 2.9), velocity=np.full(7, 2.0))
 
 
 def camera_recording(time: np.ndarray, images: int = 3) -> CameraRecording:

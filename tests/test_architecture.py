@@ -27,6 +27,8 @@ CORE: dict[str, set[str]] = {
     "protocols": set(),
     "watchdog": set(),
     "geometry": set(),
+    "vision": set(),
+    "log": {"store", "geometry", "vision"},
     "kinematics": {"store", "geometry"},
     "dmp": {"store", "model_files", "distributed", "geometry"},
     "regions": {"pytree", "geometry"},
@@ -46,9 +48,8 @@ CORE: dict[str, set[str]] = {
 
 EDGES: dict[str, set[str]] = {
     "demos": {*CORE},
-    "vision": {*CORE},
-    "viz": {*CORE, "vision"},
-    "sim": {*CORE, "vision", "viz"},
+    "viz": {*CORE},
+    "sim": {*CORE},
 }
 """Edges likewise: where the package meets files, screens and simulators."""
 
@@ -76,6 +77,7 @@ LIBRARIES: dict[str, set[str]] = {
     # Of its modules for commands, each imported when its command runs.
     "cli": {"torch", "jaxtyping", "numpy", "tyro", "rich"},
     "store": set(),
+    "log": {"jaxtyping", "numpy"},
     "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
     "vision": {"jaxtyping", "numpy"},
     "viz": {

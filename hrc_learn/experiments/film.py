@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Box
+from hrc_learn.log import RunRecording
 from hrc_learn.sim import Arrow, OffscreenRenderer, RecordedWorld, RenderingUnavailableError
 from hrc_learn.skills.pick_and_place import HOME, INTERACT, RELEASE, TRANSFER
 from hrc_learn.vision import CameraModel
-from hrc_learn.viz import RunRecording, palette
+from hrc_learn.viz import palette
 from hrc_learn.viz.film import CameraInset, Line, Picture, annotated, draw_run, film_mp4
 from hrc_learn.viz.report import Film
 

@@ -23,10 +23,10 @@ from hrc_learn.experiments.run_recording import (
     live_view,
     no_live_view,
 )
+from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import Imperfections, PhysicsError
 from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.store import new_folder, write_json
-from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import (
     FILM,
     PAGE,

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from hrc_learn.experiments.run_recording import body_poses, true_tool
 from hrc_learn.geometry import quaternion
+from hrc_learn.log import LoggedSteps
 from hrc_learn.sim import MotionLog, World
-from hrc_learn.viz import LoggedSteps
 
 # How an object is to be held: its x axis along the fingers' line of closing, which is the
 # hand's y axis, its top towards the palm.

@@ -19,12 +19,12 @@ from hrc_learn.experiments.path_distance import path_distance
 from hrc_learn.geometry import Box, Pose, quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.log import CameraRecording, JointRanges, LoggedSteps, RunRecording
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.work_cell import HINDRANCE_COLUMNS, SAFETY_COLUMNS, WorkCell
 from hrc_learn.vision import CameraModel
-from hrc_learn.viz import CameraRecording, JointLimits, LoggedSteps, RunRecording
 
 ELBOW, TOOL = 3, -1
 """Frames of the elbow and of the tool among the links."""
@@ -196,10 +196,10 @@ def unwanted_contacts(
     }
 
 
-def drawn_limits(chain: SerialChain) -> JointLimits:
+def drawn_limits(chain: SerialChain) -> JointRanges:
     """Limits of an arm, to be drawn beside its joint positions."""
     limits = chain.limits
-    return JointLimits(
+    return JointRanges(
         lower=limits.lower.numpy(),
         upper=limits.upper.numpy(),
         velocity=limits.velocity.numpy(),

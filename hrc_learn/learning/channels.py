@@ -16,12 +16,9 @@ from hrc_learn.demos import Demonstration, DemonstrationSet, PaddedDemonstration
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import arm_angle, fr3, panda
-from hrc_learn.viz import (
-    DemonstrationsRecording,
-    DemonstrationTrace,
-    JointLimits,
-)
-from hrc_learn.viz.arm_bodies import panda_bodies
+from hrc_learn.kinematics.arm_shapes import panda_bodies
+from hrc_learn.log import JointRanges
+from hrc_learn.viz import DemonstrationsRecording, DemonstrationTrace
 
 type Channel = Literal["joint", "position", "orientation", "pose"]
 type Primitive = JointDMP | OrientationDMP | PoseDMP
@@ -372,7 +369,7 @@ def demonstrations_recording(
         demonstrations=tuple(
             _shown(demo, known, images.get(demo.episode, {})) for demo in demos
         ),
-        joint_limits=JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy())
+        joint_limits=JointRanges(lower=limits.lower.numpy(), upper=limits.upper.numpy())
         if known
         else None,
         notes=tuple(str(note) for note in demos.notes),

@@ -42,7 +42,8 @@ from hrc_learn.learning.channels import (
     require_motion,
     select_channels,
 )
-from hrc_learn.viz import FitRecording, JointLimits
+from hrc_learn.log import JointRanges
+from hrc_learn.viz import FitRecording
 from hrc_learn.viz.recordings import Seen
 
 EACH = "each"
@@ -347,7 +348,7 @@ def fit_recording(
     if channel != "joint":
         paths, reproduced = cut(shown), cut(made)
     elif motions.joint_names == panda.joint_names:
-        limits = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
+        limits = JointRanges(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
         paths = cut(panda.forward(shown.double()).position)
         reproduced = cut(panda.forward(made.double()).position)
     residual = {}

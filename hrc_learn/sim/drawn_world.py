@@ -12,10 +12,10 @@ import numpy as np
 
 from hrc_learn.geometry import Body, MeshFile, read_mesh
 from hrc_learn.geometry.shapes import Box, Colour
+from hrc_learn.kinematics.arm_shapes import arm_meshes
+from hrc_learn.log import RunRecording
 from hrc_learn.sim.scene import add_surroundings
 from hrc_learn.sim.world import World
-from hrc_learn.viz import RunRecording
-from hrc_learn.viz.arm_bodies import arm_meshes
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hrc_learn.geometry import Body, Box, Capsule
+from hrc_learn.kinematics.arm_shapes import arm_meshes
 from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM
 from hrc_learn.sim.worker_distance import NearestPair, WorkerDistance
 from hrc_learn.sim.world import World, body_geoms
-from hrc_learn.viz.arm_bodies import arm_meshes
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.

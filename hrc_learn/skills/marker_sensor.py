@@ -11,9 +11,9 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.log import StepLog
 from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, angle, centre
-from hrc_learn.viz import StepLog
 
 
 class MarkerSensor:

@@ -25,6 +25,7 @@ from hrc_learn.controller import (
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import GraspedBox, SerialChain
+from hrc_learn.log import Event, StepLog
 from hrc_learn.protocols import (
     HINDRANCES,
     Arm,
@@ -63,7 +64,6 @@ from hrc_learn.skills.person_feedback import (
     share_kept,
 )
 from hrc_learn.skills.person_watch import BESIDE_PEOPLE, PersonWatch
-from hrc_learn.viz import Event, StepLog
 
 HINDRANCE_COLUMNS = HINDRANCES
 """Names of the components of the log's column "hindered"."""

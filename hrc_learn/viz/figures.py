@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import (
     STYLE,
@@ -25,13 +26,7 @@ from hrc_learn.viz.figure_parts import (
     scaled,
     shade,
 )
-from hrc_learn.viz.recordings import (
-    FitRecording,
-    JointLimits,
-    RunRecording,
-    Seen,
-    SweepRecording,
-)
+from hrc_learn.viz.recordings import FitRecording, Seen, SweepRecording
 
 
 def joints_figure(run: RunRecording) -> Figure:
@@ -182,7 +177,7 @@ def _joints(
     names: tuple[str, ...],
     done: list[tuple[np.ndarray, np.ndarray]],
     demos: list[tuple[np.ndarray, np.ndarray]],
-    limits: JointLimits | None,
+    limits: JointRanges | None,
     *,
     label: str,
     unit: str = "rad",

@@ -18,9 +18,9 @@ from PIL import Image, ImageDraw, ImageFont
 
 from hrc_learn.geometry import Body, Box, quaternion
 from hrc_learn.geometry.shapes import Colour
+from hrc_learn.log import CameraRecording, RunRecording
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
-from hrc_learn.viz.recordings import CameraRecording, RunRecording
 
 Picture = UInt8[np.ndarray, "height width 3"]
 

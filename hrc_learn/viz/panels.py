@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Shaped
 
+from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
-from hrc_learn.viz.recordings import JointLimits, RunRecording
 
 Colour = tuple[int, int, int, int]
 
@@ -232,7 +232,7 @@ def joint_plot(
     i: int,
     position: np.ndarray,
     demo: np.ndarray | None,
-    limits: JointLimits | None,
+    limits: JointRanges | None,
     unit: str = "rad",
 ) -> Plot:
     """Position of joint i over its demonstration and between its limits."""
@@ -247,7 +247,7 @@ def joint_plot(
     return Plot(title=f"{name} [{unit}]", curves=tuple(curves))
 
 
-def limit_curves(path: str, limits: JointLimits, i: int, steps: int) -> Curves:
+def limit_curves(path: str, limits: JointRanges, i: int, steps: int) -> Curves:
     """Both limits of joint i."""
     bounds = np.broadcast_to([limits.lower[i], limits.upper[i]], (steps, 2))
     names, red = ("lower limit", "upper limit"), palette.rgba(palette.LIMIT)

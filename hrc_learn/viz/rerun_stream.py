@@ -15,10 +15,10 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile, MeshPart, read_mesh
+from hrc_learn.log import CameraRecording
 from hrc_learn.store import new_file
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Curves, Plot, Tab
-from hrc_learn.viz.recordings import CameraRecording
 
 TIMELINE = "time"
 """All that is recorded lies on this timeline [s]: the viewer shows one at a time."""

@@ -20,9 +20,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from jaxtyping import Float, Int, Shaped
 
+from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Plot, run_tabs, several, without_empty_plots
-from hrc_learn.viz.recordings import RunRecording
 from hrc_learn.viz.rerun_stream import (
     CameraStream,
     StaticShapes,
@@ -41,7 +41,6 @@ from hrc_learn.viz.rerun_stream import (
     tab_view,
     thin,
 )
-from hrc_learn.viz.step_log import LoggedSteps
 
 
 def run_outline(run: RunRecording) -> tuple:

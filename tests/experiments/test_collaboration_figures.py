@@ -16,7 +16,7 @@ from hrc_learn.experiments.collaboration.report import (
 )
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import gripper_down
-from hrc_learn.viz import Event
+from hrc_learn.log import Event
 
 OBJECTS = {"box": (0.0, 2.0), "tin": (2.0, 4.0)}
 PHASES = ("detect", "servo", "transfer", "release")

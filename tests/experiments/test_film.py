@@ -9,8 +9,8 @@ from sample_runs import sample_run
 
 from hrc_learn.experiments import film
 from hrc_learn.experiments.film import caption, frames
+from hrc_learn.log import Event
 from hrc_learn.viz import palette
-from hrc_learn.viz.step_log import Event
 
 
 def labels(run, step):

@@ -23,8 +23,8 @@ from hrc_learn.experiments.frame import (
 )
 from hrc_learn.experiments.metric_table import Metric, evaluate, p95
 from hrc_learn.experiments.monte_carlo import Trial
+from hrc_learn.log import LoggedSteps, RunRecording, StepLog
 from hrc_learn.sim import Imperfections, PhysicsError
-from hrc_learn.viz import LoggedSteps, RunRecording, StepLog
 from hrc_learn.viz.report import Picture, Section, read_report
 
 

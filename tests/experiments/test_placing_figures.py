@@ -8,11 +8,11 @@ from PIL import Image
 
 from hrc_learn.experiments.placing import figures as draw
 from hrc_learn.geometry import Box
-from hrc_learn.viz import JointLimits
+from hrc_learn.log import JointRanges
 
 SHELVES = ("lower", "middle", "upper")
 BOX = Box(name="board", centre=(0.4, -0.6, 0.2), half_size=(0.3, 0.15, 0.01))
-LIMITS = JointLimits(lower=np.full(7, -2.0), upper=np.full(7, 2.0))
+LIMITS = JointRanges(lower=np.full(7, -2.0), upper=np.full(7, 2.0))
 
 
 def motion(height=0.4, duration=10.0, tremor=0.0, samples=400):

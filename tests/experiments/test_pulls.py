@@ -9,9 +9,9 @@ from hrc_learn.experiments.path_distance import path_distance
 from hrc_learn.experiments.run_recording import Deviation
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import UnreachableError, panda
+from hrc_learn.log import StepLog
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation import ScriptedForce, random_pulls
-from hrc_learn.viz import StepLog
 
 TIME = 0.01 * np.arange(300)
 

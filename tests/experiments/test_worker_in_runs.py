@@ -14,11 +14,11 @@ from hrc_learn.experiments.collaboration.worker import (
     worker_contacts,
 )
 from hrc_learn.kinematics import panda, separation
+from hrc_learn.log import StepLog
 from hrc_learn.sim import MotionLog, WorkerDistance, World, whole_arm
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
-from hrc_learn.viz import StepLog
 
 WORKPLACE = Workplace()
 VISIT = somebody_comes(WORKPLACE, np.random.default_rng(5))

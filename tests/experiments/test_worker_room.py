@@ -19,9 +19,9 @@ from hrc_learn.experiments.collaboration.worker_room import (
 )
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, panda, panda_capsules
+from hrc_learn.log import StepLog
 from hrc_learn.sim import whole_arm
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.viz import StepLog
 
 # pyright: reportAttributeAccessIssue=false
 

@@ -28,12 +28,12 @@ from hrc_learn.experiments.collaboration.worker_study import (
 from hrc_learn.experiments.collaboration.worker_tables import WorkerTables
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import GraspedBox, panda, separation
+from hrc_learn.log import StepLog
 from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit, whole_arm
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line, nearest_configuration
 from hrc_learn.skills.null_space_yielding import CHANGE_OF_RATE, FAR_ASIDE
 from hrc_learn.skills.work_cell import WorkCellConfig
-from hrc_learn.viz import StepLog
 
 WORKPLACE, DT = Workplace(), 0.01
 CELL = WorkCellConfig(dt=DT)

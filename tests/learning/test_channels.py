@@ -4,8 +4,8 @@ import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda, panda_capsules
+from hrc_learn.kinematics.arm_shapes import panda_bodies
 from hrc_learn.learning.channels import Motions, demonstrations_recording
-from hrc_learn.viz.arm_bodies import panda_bodies
 
 
 @pytest.fixture

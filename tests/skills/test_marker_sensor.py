@@ -4,6 +4,7 @@ import torch
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
+from hrc_learn.log import StepLog
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
@@ -12,7 +13,6 @@ from hrc_learn.skills.marker_sensor import (
     MarkerObservation,
     longest_occlusion,
 )
-from hrc_learn.viz import StepLog
 
 PERIOD = 0.04
 WORKPLACE = Workplace()

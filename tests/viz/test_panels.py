@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from sample_runs import OPTIONAL, STEPS, sample_run
 
-from hrc_learn.viz import JointLimits
+from hrc_learn.log import JointRanges
 from hrc_learn.viz.panels import Curves, Tab, run_tabs
 
 FIELDS = {"camera": "Servoing", "potentials": "Lyapunov"}
@@ -113,7 +113,7 @@ def test_names_with_blanks_and_slashes_make_plain_paths():
 
 
 def test_joints_at_their_limits_are_at_the_edges_of_the_bands():
-    limits = JointLimits(
+    limits = JointRanges(
         lower=np.array([-1.0, 0.0]), upper=np.array([1.0, 4.0]), velocity=np.array([2.0, 0.5])
     )
     position = np.tile([-1.0, 3.0], (STEPS, 1))

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -18,8 +19,8 @@ from PIL import Image
 from rrd_reading import Rrd
 from sample_runs import OPTIONAL, sample_run, until
 
-from hrc_learn.geometry import Capsule
-from hrc_learn.viz import Event, RunRecording, StepLog
+from hrc_learn.geometry import Box, Capsule, MeshFile
+from hrc_learn.log import Event, RunRecording, StepLog
 from hrc_learn.viz.panels import run_tabs
 from hrc_learn.viz.rerun_stream import capsules, samples, thin
 from hrc_learn.viz.run_dashboard import (
@@ -414,3 +415,39 @@ def test_a_port_that_is_taken_is_said():
         port = taken.getsockname()[1]
         with pytest.raises(ValueError, match=f"port {port} is taken"), serve_stream(port):
             pass
+
+
+CUBE = """solid cube
+facet normal 0 0 1
+outer loop
+vertex 0 0 0
+vertex 1 0 0
+vertex 0 1 0
+endloop
+endfacet
+endsolid cube
+"""
+
+
+def test_a_mesh_is_drawn_in_place_of_what_it_shows(tmp_path):
+    (tmp_path / "cube.stl").write_text(CUBE)
+    run = sample_run()
+    (body,) = run.bodies
+    plate = Box(centre=(0.0, 0.0, 0.1), half_size=(0.03, 0.03, 0.001), name="marker_plate")
+    half_turn = (0.0, 0.0, 0.0, 1.0)
+    mesh = MeshFile(
+        path=tmp_path / "cube.stl", orientation=half_turn, colour=(1.0, 0.0, 0.0, 1.0)
+    )
+    body = replace(body, boxes=(*body.boxes, plate), meshes=(mesh,))
+    record_run(tmp_path / "run.rrd", replace(run, bodies=(body,)))
+    rrd = Rrd(tmp_path / "run.rrd")
+    entity = "world/bodies/hand/mesh0_0"
+    (corners,) = rrd.column(entity, "Mesh3D:vertex_positions", static=True)
+    (normals,) = rrd.column(entity, "Mesh3D:vertex_normals", static=True)
+    ((colour,),) = rrd.column(entity, "Mesh3D:albedo_factor", static=True)
+    assert sorted(np.round(corners, 6).tolist()) == [[-1, 0, 0], [0, -1, 0], [0, 0, 0]]
+    np.testing.assert_allclose(normals, [[0, 0, 1]] * 3, atol=1e-6)
+    assert colour == 0xFF0000FF
+    assert "world/bodies/hand/capsules" not in rrd.entities
+    (labels,) = rrd.column("world/bodies/hand/boxes", "Boxes3D:labels", static=True)
+    assert labels == ["marker_plate"]

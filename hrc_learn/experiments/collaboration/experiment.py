@@ -30,6 +30,7 @@ from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_recording import record, worker_distance
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import ArmChoice
+from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import CameraKind, Imperfections, RenderingUnavailableError
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
@@ -39,7 +40,6 @@ from hrc_learn.store import read_made_by
 from hrc_learn.teleoperation import DrawnInterval, ForceMapping, ScriptedForce
 from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
 from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
 
 # Time for the elbow to come to rest after the last drag [s], as after the two without a worker.

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from hrc_learn.experiments.path_distance import path_distance
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain, panda
+from hrc_learn.log import LoggedSteps
 from hrc_learn.teleoperation import ScriptedForce
-from hrc_learn.viz import LoggedSteps
 
 type Clearance = Callable[[Float[torch.Tensor, "*batch joints"]], Float[torch.Tensor, "*batch"]]
 """Distance of an arm at given joint positions [rad] from what is around it [m]."""

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
 from hrc_learn.experiments.snapshots import Image, snapshots_figure
-from hrc_learn.viz import Event, RunRecording, palette
+from hrc_learn.log import Event, RunRecording
+from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import (
     STYLE,
     WIDTH,

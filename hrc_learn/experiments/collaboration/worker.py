@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hrc_learn.controller import SeparationConfig
 from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, panda, separation
+from hrc_learn.log import LoggedSteps
 from hrc_learn.sim import (
     MotionLog,
     Touch,
@@ -22,7 +23,6 @@ from hrc_learn.sim import (
 )
 from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.viz import LoggedSteps
 
 # When he comes beside the elbow [s] and how often he reaches: a robot waits above the first
 # object 11 s after it began, and he is to reach under it then.

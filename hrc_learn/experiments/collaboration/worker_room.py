@@ -15,10 +15,10 @@ from torch import Tensor
 
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, separation
+from hrc_learn.log import LoggedSteps
 from hrc_learn.sim import WorkerVisit
 from hrc_learn.sim.worker import Posture
 from hrc_learn.sim.worker_visit import HAND_OVER_BENCH
-from hrc_learn.viz import LoggedSteps
 
 CLEAR = 0.05
 """Distance from the arm that a posture has to leave [m]: intrusion beyond the capsules of body

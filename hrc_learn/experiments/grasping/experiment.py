@@ -22,13 +22,13 @@ from hrc_learn.experiments.grasping.trial import (
 )
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.kinematics import ArmChoice
+from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.teleoperation import DrawnInterval
 from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
 
 _COMPARED_TIMEOUT = 20.0

@@ -46,12 +46,12 @@ from hrc_learn.experiments.placing.trial import (
 )
 from hrc_learn.experiments.run_recording import no_live_view
 from hrc_learn.kinematics import ArmChoice, FrankaWorkArm, UnreachableError
+from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import Imperfections, RenderingUnavailableError, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.placing import PlacingSkill, PlanningSpace, check_plan
 from hrc_learn.store import read_made_by
-from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
 
 ABLATION = "ablation"

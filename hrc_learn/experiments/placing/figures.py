@@ -18,9 +18,10 @@ from hrc_learn.experiments.placing.arm_angle_ablation import SimulatedDemonstrat
 from hrc_learn.experiments.placing.trial import PlacingRun
 from hrc_learn.experiments.snapshots import Image, viewpoint
 from hrc_learn.geometry import Box
+from hrc_learn.log import JointRanges
 from hrc_learn.sim import OffscreenRenderer, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.viz import JointLimits, palette
+from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import (
     STYLE,
     WIDTH,
@@ -96,7 +97,7 @@ def shelf_joints_figure(
     names: Sequence[str],
     demonstration: Motion,
     motions: Mapping[str, Motion],
-    limits: JointLimits,
+    limits: JointRanges,
 ) -> Figure:
     """Every joint over time: the demonstration, and the motion to each shelf.
 

@@ -33,8 +33,8 @@ from hrc_learn.experiments.placing.trial import (
 from hrc_learn.experiments.run_recording import demonstrated_joints, drawn_limits, true_tool
 from hrc_learn.experiments.snapshots import snapshots_figure
 from hrc_learn.geometry import Box
+from hrc_learn.log import RunRecording
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS
-from hrc_learn.viz import RunRecording
 from hrc_learn.viz.report import Picture, Section
 
 SUMMARY = (

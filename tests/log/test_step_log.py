@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hrc_learn.viz import Event, StepLog
+from hrc_learn.log import Event, StepLog
 
 
 def filled(steps: int, block: int = 8192) -> StepLog:
