@@ -23,10 +23,10 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 import torch
+from grasp_trials import TrialConfig, run_trials
 from rich.console import Console
 
 from hrc_learn import cli
-from hrc_learn.experiments.controller.grasp_trials import TrialConfig, run_trials
 from hrc_learn.jacobian import KalmanEstimator
 from hrc_learn.kinematics import (
     Arm,

@@ -81,11 +81,6 @@ CASES = {
         "{inputs}/placing {inputs}/placing_demos --out out --json j.json"
     ),
     "evaluate image-jacobian": Case("{inputs}/aiming {inputs}/aiming_demos --json j.json"),
-    "tune": Case(
-        "--out out --generations 2 --population 3 --starts.count 4 --starts.duration 0.3 "
-        "--json j.json",
-        resumed=("out.search.json",),
-    ),
     "smooth": Case(
         "--checkpoint checkpoint --dataset {inputs}/placing_demos --json j.json",
         copies=("checkpoint",),
@@ -97,9 +92,6 @@ CASES = {
         resumed=("out.*.jsonl",),
     ),
     "report": Case("{inputs}/run --out page.html --json j.json"),
-    "sweep": Case(
-        "--only near --trials 5 --out out --json j.json --figure f.png --recording r.rrd"
-    ),
     "serve": Case("--step eager --rate 100 --duration 1 --json j.json"),
     "run collaboration": Case(
         "--placing {inputs}/placing --aiming {inputs}/aiming --out out --camera synthetic "

@@ -119,7 +119,6 @@ COMMANDS: dict[str, Command] = {
         "learn.EvaluateImageJacobian",
         ("model", "dataset"),
     ),
-    "tune": Command("gains, searched over simulated grasps", "tune.tune", "learn.Tune"),
     "smooth": Command(
         "limits on what any LeRobot policy asks for", "smooth.smooth", "learn.Smooth"
     ),
@@ -139,7 +138,6 @@ COMMANDS: dict[str, Command] = {
         "run.RunCollaboration",
     ),
     "report": Command("one page from the folders of several runs", "show.report", "run.Report"),
-    "sweep": Command("thousands of simulated grasps as batches", "sweep.sweep", "run.Sweep"),
     "sweep worker": Command(
         "a thousand jobs beside a worker, who is waited for or made way for",
         "sweep_worker.sweep_worker",

@@ -9,5 +9,3 @@ from hrc_learn.viz.recordings import DemonstrationTrace as DemonstrationTrace
 from hrc_learn.viz.recordings import ErrorMap as ErrorMap
 from hrc_learn.viz.recordings import FitRecording as FitRecording
 from hrc_learn.viz.recordings import LearningRecording as LearningRecording
-from hrc_learn.viz.recordings import SweepRecording as SweepRecording
-from hrc_learn.viz.recordings import SweptTrials as SweptTrials

@@ -26,7 +26,7 @@ from hrc_learn.viz.figure_parts import (
     scaled,
     shade,
 )
-from hrc_learn.viz.recordings import FitRecording, Seen, SweepRecording
+from hrc_learn.viz.recordings import FitRecording, Seen
 
 
 def joints_figure(run: RunRecording) -> Figure:
@@ -291,46 +291,6 @@ def measures_figure(
             if len(episodes) <= 20:
                 axes.set_xticks(places, [str(episode) for episode in episodes])
         figure.supxlabel("episode (line: median)", fontsize=9)
-    return figure
-
-
-_PANELS = 4
-"""Of the figure of a sweep, in a row."""
-
-
-def arrival_figure(sweep: SweepRecording) -> Figure:
-    """Share of the trials that are on target over time: a panel an experiment, a curve a class.
-
-    The dots at the end are the shares that succeed by all counts.
-    """
-    arrivals = np.concatenate([trials.arrival for trials in sweep.experiments.values()])
-    end = 1.05 * arrivals[np.isfinite(arrivals)].max(initial=0.0) or 1.0
-    rows = -(-len(sweep.experiments) // _PANELS)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 0.9 + 1.5 * rows))
-        grid = figure.subplots(rows, _PANELS, sharex=True, sharey=True, squeeze=False)
-        panels = grid.ravel()
-        for axes, (name, trials) in zip(panels, sweep.experiments.items(), strict=False):
-            for k, group in enumerate(sweep.groups):
-                members, colour = trials.of(k), palette.SERIES[k % len(palette.SERIES)]
-                if not len(members.arrival):
-                    continue
-                times = np.sort(members.arrival[np.isfinite(members.arrival)])
-                times = np.concatenate([[0.0], times, [end]])
-                share = 100 * members.share(times)
-                axes.step(times, share, where="post", color=colour, label=group)
-                success = 100 * members.success.mean()
-                axes.plot(end, success, "o", color=colour, ms=4, clip_on=False, zorder=5 - k)
-            axes.set_title(name.replace("_", " "))
-        for axes in panels[len(sweep.experiments) :]:
-            axes.set_axis_off()
-        for axes in panels[max(len(sweep.experiments) - _PANELS, 0) : len(sweep.experiments)]:
-            axes.tick_params(labelbottom=True)
-        panels[0].set(xlim=(0, end), ylim=(0, 103), yticks=(0, 50, 100))
-        handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper left", ncols=len(labels))
-        figure.supylabel("on target [%]", fontsize=9)
-        figure.supxlabel("time [s]", fontsize=9)
     return figure
 
 

@@ -22,7 +22,6 @@ from hrc_learn.cli._options import short_help
 from hrc_learn.cli.arguments.dataset import Repair
 from hrc_learn.demos.repair import RepairOptions
 from hrc_learn.dmp.forcing_scale import SCALINGS
-from hrc_learn.experiments.controller.sweep import EXPERIMENTS
 from hrc_learn.experiments.grasping.experiment import VARIANTS
 from hrc_learn.kinematics import MissingModelError
 from hrc_learn.learning.channels import CHANNELS
@@ -141,7 +140,6 @@ def test_the_short_help_says_what_is_required_and_the_defaults():
         (choices.Channel, CHANNELS),
         (choices.Scaling, SCALINGS),
         (choices.Variant, [*VARIANTS, "none"]),
-        (choices.Experiment, EXPERIMENTS),
     ],
     ids=["shelf", "camera", "kind", "scaling", "variant", "experiment"],
 )
@@ -175,7 +173,6 @@ def test_options_of_a_repair_are_those_of_the_package():
         (("evaluate", "none", "none"), "none"),
         (("evaluate", "--dataset", "none"), "no dataset at none"),
         (("evaluate", "image-jacobian", "none", "none"), "none"),
-        (("tune", "--out", "new", "--resume"), "new.search.json"),
         (("recover", "none"), "none"),
         (("smooth", "--checkpoint", "none"), "no folder none"),
         (

@@ -14,7 +14,6 @@ from rrd_reading import Rrd
 from hrc_learn.cli.commands import evaluate
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.learning.channels import ReproductionError
-from hrc_learn.learning.tuning import TuningState
 from hrc_learn.viz.report import read_report
 
 
@@ -226,36 +225,6 @@ def test_a_missing_dataset_and_unknown_joints_are_bad_input(tmp_path):
     assert "elbow" in outcome.error
     assert "joint1" in outcome.error
     assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (None, "holds no search to go on with (KeyError: 'search')"),
-        ({"names": ("a", "b", "c")}, "searches a, b, c, not vision_rate"),
-        ({"middle": (1.0,)}, "holds no search to go on with"),
-        ({"spread": ("wide",) * 3}, "holds no search to go on with"),
-    ],
-)
-def test_a_search_is_not_taken_up_from_another_file(tmp_path, change, message):
-    search = TuningState.around({"vision_rate": 1.0, "linear_speed": 0.1, "angular_speed": 1.0})
-    state = {"search": search.to_json() | (change or {}), "costs": []}
-    place = tmp_path / "gains.search.json"
-    place.write_text("{}" if change is None else json.dumps(state))
-    error = done("tune", "--out", tmp_path / "gains", "--resume", status=2).error
-    assert f"error: {place}" in error
-    assert message in error
-
-
-@pytest.mark.slow
-def test_a_search_for_gains_is_taken_up_again(tmp_path):
-    few = ("--population", 3, "--starts.count", 4, "--starts.duration", 0.3)
-    out, place = tmp_path / "gains", tmp_path / "gains.search.json"
-    done("tune", "--out", out, "--generations", 2, *few)
-    gains = json.loads((out / "gains.json").read_text())
-    assert set(gains) == {"vision_rate", "linear_speed", "angular_speed"}
-    assert not place.exists()
-    done("tune", "--out", out, "--resume", *few, status=2)
 
 
 def test_an_evaluation_without_a_model_holds_demonstrations_out(poses, tmp_path):

@@ -5,6 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hostile_streams import (
+    STREAMS,
+    StreamConfig,
+    hostile_streams,
+)
 from sampling import generator
 from step_equality import controller_and_observation
 from unchecked import shapes_unchecked
@@ -18,11 +23,6 @@ from hrc_learn.controller import (
 )
 from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.deploy import EagerRunner, PackageRunner, StepRunner, open_step
-from hrc_learn.experiments.controller.hostile_streams import (
-    STREAMS,
-    StreamConfig,
-    hostile_streams,
-)
 from hrc_learn.kinematics import FR3_VINTAGES, fr3, panda
 
 CONFIGS = {

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import sampling
 import torch
+from grasp_trials import CORNERS, TrialConfig, run_trials
 from torch.utils import _pytree
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import VisionBlending
-from hrc_learn.experiments.controller.grasp_trials import CORNERS, TrialConfig, run_trials
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     BroydenEstimator,

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import sampling
 import torch
+from grasp_trials import PEDESTAL, TABLE
 
-from hrc_learn.experiments.controller.grasp_trials import PEDESTAL, TABLE
 from hrc_learn.kinematics import LINK_CAPSULES, CapsuleArm, panda, panda_capsules
 from hrc_learn.kinematics.collision import segment_box_distance
 from hrc_learn.sim import FINGER_STROKE, SceneConfig, build_scene, whole_arm

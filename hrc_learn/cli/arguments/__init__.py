@@ -79,7 +79,7 @@ Experiment = Literal[
     "stress_plant",
     "stress_plant_worse",
 ]
-"""Keys of `hrc_learn.experiments.controller.sweep.EXPERIMENTS`."""
+"""Keys of `controller_experiments.EXPERIMENTS`."""
 
 
 def beside(dataset: Path, what: str) -> Path:

@@ -158,9 +158,7 @@ class EvaluateImageJacobian(Measured):
     """Of the end effector, in the second of two grids [rad]; the first has it pointing down."""
     closed_loop: bool = True
     """Whether to run the closed loops, which take a minute or more."""
-    starts: Configuration = Detail(
-        "hrc_learn.experiments.controller.initialization_study", "StartsConfig"
-    )
+    starts: Configuration = Detail("hrc_learn.experiments.jacobian_evaluation", "StartsConfig")
     """How starts are drawn."""
 
 
@@ -183,7 +181,7 @@ class Tune(OfRobot, Written):
     population: int = 8
     """Gains tried in each."""
     starts: Configuration = Detail(
-        "hrc_learn.experiments.controller.initialization_study", "StartsConfig", {"count": 48}
+        "hrc_learn.experiments.jacobian_evaluation", "StartsConfig", {"count": 48}
     )
     """How closed loops are drawn; their seed is that of the search."""
     held_out_seed: int = 1000

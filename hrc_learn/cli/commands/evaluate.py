@@ -212,7 +212,7 @@ LEAST_SPEED_UP = 1.5
 def evaluate_image_jacobian(args: EvaluateImageJacobian) -> int:
     """An image Jacobian against the simulator's true one."""
     # MuJoCo, which the evaluation of primitives does without.
-    from hrc_learn.experiments.controller.initialization_study import (
+    from hrc_learn.experiments.jacobian_evaluation import (
         ClosedLoops,
         compare_starts,
         compare_with_truth,

@@ -9,11 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
+from disturbance_trials import uniform
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter
-from hrc_learn.experiments.controller.disturbance_trials import uniform
 from hrc_learn.kinematics import JointLimits, franka_chain
 
 STREAMS = ("random", "bang-bang", "resonant", "outward", "chasing", "poisoned")

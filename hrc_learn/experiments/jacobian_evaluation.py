@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
+from hrc_learn.controller import AdaptiveController, Goals
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
@@ -140,17 +140,14 @@ class ClosedLoops:
             robot=robot,
         )
 
-    def times(
-        self, estimator: ImageJacobianEstimator, control: ControllerConfig | None = None
-    ) -> Float[Tensor, " starts"]:
+    def times(self, estimator: ImageJacobianEstimator) -> Float[Tensor, " starts"]:
         """Time until the marker stays at its target [s]; infinite where it does not."""
         config, target = self.config, self.goals.vision.target
-        chain = self.robot.chain
-        controller = AdaptiveController(chain, estimator, self.goals, config=control)
+        controller = AdaptiveController(self.robot.chain, estimator, self.goals)
         reached = torch.full((len(self.start),), math.inf, dtype=torch.float64)
 
         def watch(step: int, q: Tensor, *_: object) -> None:
-            error = self.camera.project(chain.forward(q))[0] - target
+            error = self.camera.project(self.robot.chain.forward(q))[0] - target
             near = torch.linalg.vector_norm(error, dim=-1) < config.reached
             # The first step of the last interval inside.
             reached.copy_(torch.where(near, reached.clamp(max=step * config.dt), math.inf))
@@ -186,7 +183,6 @@ class _Turned(KalmanEstimator):
 def compare_starts(
     network: RBFImageJacobian,
     loops: ClosedLoops,
-    control: ControllerConfig | None = None,
     on_run: Callable[[str], None] = lambda name: None,
 ) -> dict[str, float]:
     """Convergence times [s] from the learned Jacobian and from a guess.
@@ -194,7 +190,6 @@ def compare_starts(
     Args:
         network: Learned from demonstrations of the camera.
         loops: What is run.
-        control: Gains, the same for all.
         on_run: Told the name of each run as it begins.
 
     Returns:
@@ -213,7 +208,7 @@ def compare_starts(
     times, figures = {}, {}
     for name, estimator in estimators.items():
         on_run(name)
-        times[name] = loops.times(estimator, control)
+        times[name] = loops.times(estimator)
         figures |= {f"{name}_{k}": v for k, v in summary(times[name]).items()}
     for name in ("guessed", "fixed"):
         # Where neither converges, neither is faster.

@@ -9,11 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
-
-from hrc_learn.controller import GRIPPER_DOWN
-from hrc_learn.experiments.controller.grasp_trials import (
+from grasp_trials import (
     MARKER,
     Judge,
     TrialConfig,
@@ -22,6 +18,10 @@ from hrc_learn.experiments.controller.grasp_trials import (
     draw_scene,
     grasp_controller,
 )
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.controller import GRIPPER_DOWN
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian
 from hrc_learn.sim import SceneConfig, World, open_camera

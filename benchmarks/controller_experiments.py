@@ -7,21 +7,21 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from torch import Tensor
-
-from hrc_learn.experiments.controller.disturbance_trials import (
+from disturbance_trials import (
     EffortConfig,
     StressConfig,
     run_effort_trials,
     run_stress_trials,
 )
-from hrc_learn.experiments.controller.grasp_trials import TrialConfig, TrialResult, run_trials
-from hrc_learn.experiments.controller.hostile_trials import (
+from grasp_trials import TrialConfig, TrialResult, run_trials
+from hostile_trials import (
     PlantConfig,
     PoisonConfig,
     run_plant_trials,
     run_poison_trials,
 )
+from torch import Tensor
+
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.jacobian import (
     BroydenEstimator,
@@ -75,7 +75,7 @@ def _grasp(
 ) -> BatchedTrials:
     def run(config: TrialConfig) -> TrialResult:
         if mujoco:  # whose import takes a second
-            from hrc_learn.experiments.controller.mujoco_trials import run_mujoco_trials
+            from mujoco_trials import run_mujoco_trials
 
             return run_mujoco_trials(estimator, config)
         return run_trials(estimator, config)

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from unchecked import shapes_unchecked
-
-from hrc_learn.controller import SafetyFilter
-from hrc_learn.experiments.controller.hostile_streams import (
+from hostile_streams import (
     HostileStreams,
     StreamConfig,
     hostile_streams,
 )
+from unchecked import shapes_unchecked
+
+from hrc_learn.controller import SafetyFilter
 from hrc_learn.kinematics import FR3_VINTAGES, JointLimits, panda
 
 ROOT = Path(__file__).parents[2]

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from grasp_trials import MARKER
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import AdaptiveController, Goals, Observation
 from hrc_learn.controller.monitors import LimitMonitor
-from hrc_learn.experiments.controller.grasp_trials import MARKER
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,

@@ -13,6 +13,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from disturbance_trials import (
+    all_finite,
+    random_controller,
+    ticks_beyond,
+    uniform,
+)
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils import _pytree
@@ -24,12 +30,6 @@ from hrc_learn.controller import (
     SafetyFilter,
 )
 from hrc_learn.controller.monitors import LimitMonitor
-from hrc_learn.experiments.controller.disturbance_trials import (
-    all_finite,
-    random_controller,
-    ticks_beyond,
-    uniform,
-)
 from hrc_learn.jacobian import (
     CompositeEstimator,
     FixedEstimator,
