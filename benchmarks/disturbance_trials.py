@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils import _pytree
 
-from hrc_learn.controller import AdaptiveController, Goals, Observation
-from hrc_learn.controller.monitors import LimitMonitor
+from hrc_learn.controller import AdaptiveController, Goals, LimitMonitor, Observation
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,

@@ -21,12 +21,12 @@ from hrc_learn.controller import (
     ControllerConfig,
     ControllerState,
     Goals,
+    LimitMonitor,
     Observation,
     paper_goals,
     paper_joint_region,
 )
 from hrc_learn.controller.interface import HALF_SIZE
-from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import (

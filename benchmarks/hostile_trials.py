@@ -25,11 +25,11 @@ from torch.utils import _pytree
 
 from hrc_learn.controller import (
     Goals,
+    LimitMonitor,
     Observation,
     SafetyConfig,
     SafetyFilter,
 )
-from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.jacobian import (
     CompositeEstimator,
     FixedEstimator,

@@ -4,17 +4,18 @@ from hrc_learn.controller.action_chunk_filter import LIMIT_KINDS as LIMIT_KINDS
 from hrc_learn.controller.action_chunk_filter import ActionChunkFilter as ActionChunkFilter
 from hrc_learn.controller.action_chunk_filter import ActionChunkReport as ActionChunkReport
 from hrc_learn.controller.action_chunk_filter import ActionChunkState as ActionChunkState
+from hrc_learn.controller.adaptive_controller import AdaptiveController as AdaptiveController
+from hrc_learn.controller.adaptive_controller import ControllerConfig as ControllerConfig
+from hrc_learn.controller.adaptive_controller import ControllerState as ControllerState
 from hrc_learn.controller.constraint_layer import (
     ConstrainedVelocity as ConstrainedVelocity,
 )
 from hrc_learn.controller.constraint_layer import ConstraintConfig as ConstraintConfig
 from hrc_learn.controller.constraint_layer import Distances as Distances
+from hrc_learn.controller.constraint_layer import SeparationConfig as SeparationConfig
 from hrc_learn.controller.constraint_layer import (
     constrained_velocity as constrained_velocity,
 )
-from hrc_learn.controller.controller import AdaptiveController as AdaptiveController
-from hrc_learn.controller.controller import ControllerConfig as ControllerConfig
-from hrc_learn.controller.controller import ControllerState as ControllerState
 from hrc_learn.controller.feedback import BlendingConfig as BlendingConfig
 from hrc_learn.controller.feedback import BlendingState as BlendingState
 from hrc_learn.controller.feedback import VisionBlending as VisionBlending
@@ -29,10 +30,7 @@ from hrc_learn.controller.interface import Goals as Goals
 from hrc_learn.controller.interface import Observation as Observation
 from hrc_learn.controller.interface import paper_goals as paper_goals
 from hrc_learn.controller.interface import paper_joint_region as paper_joint_region
-from hrc_learn.controller.monitors import LimitMonitor as LimitMonitor
-from hrc_learn.controller.monitors import lyapunov_function as lyapunov_function
-from hrc_learn.controller.monitors import lyapunov_rate as lyapunov_rate
-from hrc_learn.controller.motion_barriers import SeparationConfig as SeparationConfig
+from hrc_learn.controller.limit_barrier import LimitMonitor as LimitMonitor
 from hrc_learn.controller.resolved_rate import scale_null_space as scale_null_space
 from hrc_learn.controller.safety_filter import INTERVENTIONS as INTERVENTIONS
 from hrc_learn.controller.safety_filter import ConstraintReport as ConstraintReport

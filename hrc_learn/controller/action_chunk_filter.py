@@ -1,5 +1,7 @@
-"""A jerk-limited filter of action chunks: what a policy asks for, followed as nearly as the
-limits of position, velocity, acceleration and jerk allow.
+"""Jerk-limited filter of the action chunks of a policy.
+
+Its output follows the requested positions as closely as the limits of position, velocity,
+acceleration and jerk allow.
 """
 
 from __future__ import annotations
@@ -11,74 +13,74 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hrc_learn.controller.motion_barriers import LimitBarrier
+from hrc_learn.controller.limit_barrier import LimitBarrier
 from hrc_learn.kinematics import MotionLimits
 from hrc_learn.pytree import pytree
 
 LIMIT_KINDS = ("position", "velocity", "acceleration", "jerk")
-"""Limits that a chunk may break, in the order of the last axis of a report's flags."""
+"""Kinds of limits that a chunk may exceed, in the order of the last axis of `broken`."""
 
-# Fraction of the limits that a correction counts on; the motion followed needs the rest.
+# Fraction of the limits used by corrections; the motion that is followed needs the rest.
 _USABLE = 0.8
 # Fastest decay of errors, as fractions of the sampling rate: of those tried, the fastest with
 # which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a second.
 _POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
-# Differences of rounded numbers, float32 too, may exceed a limit in the last digits.
+# Differences of rounded numbers may exceed a limit by this ratio, also in float32.
 _ROUNDING = 1 + 1e-6
-# Larger numbers are taken for invalid: squares of much larger ones overflow.
+# Larger numbers count as invalid: their squares could overflow.
 _LARGEST_VALID = 1e50
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class ActionChunkState:
-    """Where the motion is, carried from one chunk to the next."""
+    """State of the motion between two chunks."""
 
     position: Float[Tensor, "*batch D"]
-    """Of the last sample of the output."""
+    """Last output position."""
     velocity: Float[Tensor, "*batch D"]
-    """Difference quotient that led to it [1/s]."""
+    """Difference quotient of the last two output positions [1/s]."""
     acceleration: Float[Tensor, "*batch D"]
-    """Difference quotient that led to the velocity [1/s^2]."""
+    """Difference quotient of the last two velocities [1/s^2]."""
     reference: Float[Tensor, "*batch D"]
-    """Last position asked for."""
+    """Last requested position."""
     reference_velocity: Float[Tensor, "*batch D"]
-    """With which it moved, as far as it was a motion [1/s]."""
+    """Velocity of the requested positions, within the limits [1/s]."""
     reference_acceleration: Float[Tensor, "*batch D"]
-    """Likewise [1/s^2]."""
+    """Acceleration of the requested positions, within the limits [1/s^2]."""
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class ActionChunkReport:
-    """What was wrong with a chunk, and what was changed."""
+    """Limits exceeded by a chunk, and the corrections."""
 
     broken: Bool[Tensor, "*batch T 4"]
-    """Whether each of `LIMIT_KINDS` would be broken by going there exactly, from the state."""
+    """True for each of `LIMIT_KINDS` that the requested positions would exceed."""
     change: Float[Tensor, "*batch T D"]
-    """Position handed out less the one asked for."""
+    """Output position less the requested one."""
 
 
 @final
 class ActionChunkFilter(nn.Module):
     """Follows chunks of positions within limits of position, velocity, acceleration and jerk.
 
-    A chunk that keeps the limits and goes on where the last one ended comes out as it went in.
-    Otherwise the motion leaves it and comes back: with e the distance to the chunk, e' its
-    rate and a_r the chunk's acceleration,
+    A chunk that keeps the limits and continues the last one passes unchanged. Otherwise the
+    motion leaves it and returns: with e the distance to the chunk, e' its rate and a_r the
+    acceleration of the chunk,
 
         a = a_r - h'(e; A, lambda) e' - h(e' + h(e; A, lambda); j, mu)
         h(x; b, k) = sign(x) (sqrt((b/k)^2 + 2 b |x|) - b/k)
 
     so that e' follows -h(e), along which e brakes with A while it is large and decays at the
-    rate lambda once it is small. The step from one chunk to the next counts as error, not as
-    motion, so position, velocity and acceleration go on without a jump.
+    rate lambda once it is small. The gap between two chunks counts as error, not as motion, so
+    position, velocity and acceleration continue without a jump.
 
-    The limits hold for *any* chunks, by `LimitBarrier`, as they are for differences of what is
-    handed out: v_k = (p_k - p_{k-1})/dt, a_k = (v_k - v_{k-1})/dt, j_k = (a_k - a_{k-1})/dt.
-    It takes a start within the barrier's set: at rest, A^3/(8 j^2) + A^2 dt/(2 j) away from the
-    limits of position. A is lowered where that would be more than a tenth of their range.
-    Each coordinate is followed by itself, in the unit of its limits.
+    The limits hold for *any* chunks, by `LimitBarrier`. They are limits of differences of the
+    output: v_k = (p_k - p_{k-1})/dt, a_k = (v_k - v_{k-1})/dt, j_k = (a_k - a_{k-1})/dt.
+    The start must be within the barrier's set: at rest, A^3/(8 j^2) + A^2 dt/(2 j) away from
+    the position limits. A is lowered where that would exceed a tenth of their range. Each
+    coordinate is filtered separately, in the unit of its limits.
     """
 
     braking_acceleration: Tensor
@@ -92,7 +94,7 @@ class ActionChunkFilter(nn.Module):
         """Prepare for chunks of one sampling rate.
 
         Args:
-            limits: Of every coordinate; those of position may be infinite.
+            limits: Limits of each coordinate; those of position may be infinite.
             dt: Time from one sample of a chunk to the next [s].
 
         Raises:
@@ -115,7 +117,7 @@ class ActionChunkFilter(nn.Module):
         position: Float[Tensor, "*batch D"],
         velocity: Float[Tensor, "*batch D"] | None = None,
     ) -> ActionChunkState:
-        """State of a motion at rest, or in steady motion, in the limits' precision."""
+        """State at rest, or in steady motion, in the dtype of the limits."""
         position = position.to(self.braking_acceleration)
         still = torch.zeros_like(position)
         velocity = still if velocity is None else still + velocity
@@ -134,13 +136,13 @@ class ActionChunkFilter(nn.Module):
         """Follow one chunk, of one sample or many.
 
         Args:
-            chunk: Positions asked for, dt apart, the first dt after the state's. What is no
-                number, or beyond all bounds, is taken for the value before it.
-            state: After the chunk before.
+            chunk: Requested positions, dt apart, the first dt after the state's. Invalid
+                values (NaN, infinite, above 1e50) are replaced by the value before them.
+            state: State after the last chunk.
 
         Returns:
-            Positions (*batch, T, D) to go to instead, in the chunk's precision; the state
-            after the last; what was changed.
+            Positions (*batch, T, D) to go to instead, in the dtype of the chunk; the state
+            after the last of them; the report.
         """
         asked = _replace_invalid(chunk.to(self.braking_acceleration), state.reference)
         broken = self._broken_limits(asked, state)
@@ -153,7 +155,7 @@ class ActionChunkFilter(nn.Module):
         return smooth.to(chunk), state, report
 
     def _step(self, state: ActionChunkState, asked: Tensor) -> ActionChunkState:
-        """Go towards one sample."""
+        """One step towards one requested position."""
         dt = self.dt
         velocity, acceleration = self._reference_motion(state, asked)
         error = state.position - (asked - velocity * dt)
@@ -180,11 +182,11 @@ class ActionChunkFilter(nn.Module):
     def _reference_motion(
         self, state: ActionChunkState, asked: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Velocity and acceleration of the samples, as far as they are a motion.
+        """Velocity and acceleration of the requested positions, within the limits.
 
-        Both are those of the samples where these keep the limits. Where they do not, the
-        velocity goes after theirs with the limit of acceleration, which passes steps by and
-        still learns a new slope, and there is no acceleration to be followed.
+        Where the requested positions exceed the limits, the velocity follows theirs with the
+        highest acceleration, which ignores steps and still adapts to a new slope, and the
+        acceleration is zero.
         """
         barrier, dt = self.barrier, self.dt
         change = ((asked - state.reference) / dt - state.reference_velocity) / dt
@@ -194,7 +196,7 @@ class ActionChunkFilter(nn.Module):
         return state.reference_velocity + limited * dt, limited.masked_fill(~motion, 0)
 
     def _broken_limits(self, asked: Tensor, state: ActionChunkState) -> Tensor:
-        """Flags of a report."""
+        """Flags of `LIMIT_KINDS` that the requested positions would exceed."""
         barrier, dt = self.barrier, self.dt
         upper_wall, lower_wall = barrier.walls[1], -barrier.walls[0]
         outside = (asked > upper_wall) | (asked < lower_wall)
@@ -210,7 +212,7 @@ class ActionChunkFilter(nn.Module):
 
 
 def _braking_rate(x: Tensor, strength: Tensor, rate: Tensor | float) -> tuple[Tensor, Tensor]:
-    """The function h and its slope: how fast x may change if it is to come to rest at zero.
+    """The function h(x) and its slope: the rate of x with which it comes to rest at zero.
 
     Square root far from zero (constant deceleration), a line of slope `rate` close to it.
     """
@@ -220,7 +222,7 @@ def _braking_rate(x: Tensor, strength: Tensor, rate: Tensor | float) -> tuple[Te
 
 
 def _replace_invalid(chunk: Tensor, before: Tensor) -> Tensor:
-    """The chunk with what is no number, or absurdly large, replaced by the value before it."""
+    """The chunk with each invalid value replaced by the value before it."""
     if (chunk.abs() < _LARGEST_VALID).all():
         return chunk
     rows = []
@@ -231,13 +233,13 @@ def _replace_invalid(chunk: Tensor, before: Tensor) -> Tensor:
 
 
 def _reduced_acceleration(limits: MotionLimits, dt: float) -> Tensor:
-    """Acceleration that can be ended within a twentieth of the range before a limit.
+    """Acceleration limit with which a stop needs at most a tenth of the position range.
 
-    The larger of both terms of the way that `LimitBarrier` needs at rest stays below the room,
-    so that together they take at most a tenth of the range.
+    Each of the two terms of the distance that `LimitBarrier` needs at rest stays below a
+    twentieth of the range.
     """
-    room, j = 0.05 * (limits.upper - limits.lower), limits.jerk
-    ramped = torch.minimum((8 * j**2 * room) ** (1 / 3), (2 * j * room / dt).sqrt())
+    distance, j = 0.05 * (limits.upper - limits.lower), limits.jerk
+    ramped = torch.minimum((8 * j**2 * distance) ** (1 / 3), (2 * j * distance / dt).sqrt())
     return torch.minimum(limits.acceleration, ramped)
 
 

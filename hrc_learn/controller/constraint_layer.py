@@ -1,7 +1,8 @@
-"""One layer for all that limits a motion: the joints, the tool, the distances around the arm.
+"""Joint velocities that keep joint limits and distances at once, by a quadratic program.
 
-The joint velocity nearest to a wanted one that keeps them, with the task first: a quadratic
-program of one unknown more than the arm has joints, and one for conflicts (`small_qp`).
+The program finds the joint velocity nearest to a wanted one, with priority for the task. It has
+one unknown more than the arm has joints, and one for conflicts (`small_qp`). The distances are
+those of the arm from itself, from objects and from people (`SeparationConfig`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller.motion_barriers import SeparationConfig
 from hrc_learn.controller.small_qp import least_change, none_binds
 from hrc_learn.geometry.numerics import is_number, matmul, orthonormal_basis
 from hrc_learn.pytree import pytree
@@ -21,32 +21,32 @@ from hrc_learn.pytree import pytree
 
 @dataclass(frozen=True, kw_only=True)
 class ConstraintConfig:
-    """What is kept, and what yields to keep it."""
+    """Distances to keep, and the priorities among what yields to keep them."""
 
     clearance: float = 0.03
-    """Distance that is kept from things [m]: three times the errors of base and table. Of
-    people the protective distance is kept (`SeparationConfig`)."""
+    """Distance kept from objects and from the arm itself [m]: three times the calibration error
+    of base and table. From people the protective distance is kept (`SeparationConfig`)."""
     rate: float = 5.0
-    """Fastest decay of what a distance is above that [1/s], as of joints towards their limits;
-    at most 1/dt."""
+    """Fastest decay of a distance towards the clearance [1/s], as for joints towards their
+    limits; at most 1/dt."""
     task_weight: float = 100.0
-    """Of slowing down the task by all of it, beside 1 rad/s of the null space: to keep a
-    hundredth of its speed the null space changes by up to 1 rad/s, and not by more."""
+    """Cost of stopping the task, relative to 1 rad/s of null-space motion: the null space
+    changes by up to 1 rad/s to save a hundredth of the task's speed."""
     path_weight: float = 1e3
-    """Of leaving the path of the task, beside slowing it down; per rad/s."""
+    """Cost of leaving the path of the task by 1 rad/s, relative to stopping it."""
     distance_weight: float = 1e2
-    """Of approaching faster than allowed, beside leaving the path; per m/s. With 1e2, what is
-    approached too fast where distances exclude each other is least to a part in 1e4."""
+    """Cost of approaching 1 m/s faster than allowed, relative to leaving the path. With 1e2 the
+    violation of conflicting distances is minimal to a part in 1e4."""
     steps: int = 16
-    """Of the solver; where they are not enough the arm brakes. Arms that a person walked up to
-    never needed more than 12; limits drawn at random take more than 16 in 4 % of the states,
-    and more than 24 in 0.1 %. Each takes some 3 % of a compiled control step."""
+    """Steps of the solver; the arm brakes where they are not enough. Arms approached by a
+    person never needed more than 12; random limits need more than 16 in 4 % of the states, and
+    more than 24 in 0.1 %. Each takes about 3 % of a compiled control step."""
     early_exit: bool = False
-    """Whether the solver stops as soon as it is done: 3 times as fast where steps run one by
-    one, not compiled. Such a step neither compiles nor maps over batches."""
+    """True: the solver stops as soon as it is done, which is 3 times as fast in eager mode.
+    Such a step neither compiles nor maps over batches."""
 
     def __post_init__(self):
-        if self.clearance < 0:
+        if not self.clearance >= 0:
             raise ValueError(f"clearance must not be negative, but is {self.clearance}")
         for name in ("rate", "task_weight", "path_weight", "distance_weight"):
             if not getattr(self, name) > 0:
@@ -54,31 +54,108 @@ class ConstraintConfig:
         if self.steps < 1:
             raise ValueError(f"steps must be at least 1, but is {self.steps}")
 
+    @property
+    def path_cost(self) -> float:
+        """Cost of leaving the path by 1 rad/s, relative to 1 rad/s of the null space."""
+        return self.task_weight * self.path_weight
+
+    @property
+    def slack_cost(self) -> float:
+        """Cost of approaching 1 m/s too fast, relative to 1 rad/s of the null space."""
+        return self.path_cost * self.distance_weight
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeparationConfig:
+    """Speed and separation monitoring: the speed allowed near a person.
+
+    The fields are the terms of the protective separation distance (ISO/TS 15066:2016,
+    5.5.4.2.3).
+    """
+
+    human_speed: float = 1.6
+    """v_h, speed of the person towards the arm where it is not measured [m/s]: walking speed
+    of ISO 13855."""
+    reaction_time: float = 0.1
+    """T_r, time from the person's motion to the arm's response [s]: sensing, transport, and
+    about 20 ms for a control step and the ramp of the acceleration."""
+    deceleration: float = 2.0
+    """Deceleration a of the tool while the arm stops [m/s^2]: T_s = v/a, S_s = v^2/(2 a)."""
+    clearance: float = 0.2
+    """C + Z_d + Z_r, intrusion and the uncertainty of both positions [m]: the distance left
+    when both have come to rest."""
+
+    def __post_init__(self):
+        for name in ("human_speed", "reaction_time", "clearance"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, but is {getattr(self, name)}")
+        if not self.deceleration > 0:
+            raise ValueError(f"deceleration must be positive, but is {self.deceleration}")
+
+    def protective_distance(
+        self,
+        speed: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """S_p = v_h (T_r + v/a) + v T_r + v^2/(2 a) + C + Z_d + Z_r [m].
+
+        Args:
+            speed: v, closing speed of the arm [m/s]; negative counts as zero.
+            human_speed: v_h, see `highest_speed`.
+        """
+        v = speed.clamp(min=0)
+        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
+        stopping = v / self.deceleration
+        arm = v * (self.reaction_time + stopping / 2)
+        return v_h * (self.reaction_time + stopping) + arm + self.clearance
+
+    def highest_speed(
+        self,
+        distance: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """Speed towards a person that keeps the protective separation distance [m/s].
+
+        The root v of  d = S_p(v),  see `protective_distance`; zero where the person is too
+        close for any motion. An unknown distance (NaN) counts as zero.
+
+        Args:
+            distance: Distance between person and arm [m]; infinite: no person is near.
+            human_speed: v_h, measured speed of the person towards the arm, plus the speed they
+                may gain meanwhile [m/s]; negative counts as zero. None: the configured one.
+        """
+        a = self.deceleration
+        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
+        spare = distance - v_h * self.reaction_time - self.clearance
+        spare = torch.where(spare > 0, spare, 0.0)  # NaN compares false: too close
+        delay = self.reaction_time + v_h / a
+        return a * (torch.sqrt(delay**2 + (2 / a) * spare) - delay)
+
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Distances:
-    """Distances that must not become too small: of the arm from itself, the scene, a worker."""
+    """Distances between pairs of bodies to keep: the arm itself, the scene, a person."""
 
     distance: Float[Tensor, "*batch pairs"]
-    """[m]"""
+    """Distance of each pair [m]."""
     gradient: Float[Tensor, "*batch pairs n"]
-    """By the joint positions [m/rad]; zero of a pair that the arm does not move."""
+    """Gradient over the joint positions [m/rad]; zero for a pair that the arm does not move."""
     approach_speed: Float[Tensor, "*batch pairs"]
-    """At which the distance shrinks while the arm rests [m/s]: the speed of the other towards
-    the arm, along the line between both."""
+    """Rate at which the distance shrinks while the arm rests [m/s]: the speed of the other body
+    towards the arm, along the line between both."""
     person: Bool[Tensor, "*batch pairs"] | None = None
-    """Of a person: the arm comes nearer as slowly as the protective distance asks, and rests
-    before it; people who come nearer themselves need not be fled from. Else of a thing; None:
-    all are."""
+    """True for pairs with a person: the arm approaches only as fast as the protective distance
+    allows, and does not retreat from a person who approaches. False for objects; None: all
+    pairs are objects."""
 
     def known(self) -> Bool[Tensor, "*batch"]:
-        """Whether all are numbers."""
+        """True where all values are finite."""
         known = is_number(self.distance) & is_number(self.approach_speed)
         return (known & is_number(self.gradient).all(-1)).all(-1)
 
     def double(self) -> Distances:
-        """The same in float64."""
+        """The distances in float64."""
         return Distances(
             distance=self.distance.double(),
             gradient=self.gradient.double(),
@@ -87,7 +164,7 @@ class Distances:
         )
 
     def where(self, known: Bool[Tensor, "*batch"]) -> Distances:
-        """The same where known, elsewhere zeros."""
+        """The distances where `known`, zeros elsewhere."""
         unknown = ~known.unsqueeze(-1)
         return Distances(
             distance=self.distance.masked_fill(unknown, 0),
@@ -99,26 +176,29 @@ class Distances:
     def closing_speed(
         self, config: ConstraintConfig, separation: SeparationConfig
     ) -> Float[Tensor, "*batch pairs"]:
-        """At which the arm may shrink each distance [m/s]; negative: it has to increase it."""
-        thing = config.rate * (self.distance - config.clearance) - self.approach_speed
+        """Speed allowed to the arm towards each other body [m/s]; negative: it has to
+        retreat.
+        """
+        towards_object = config.rate * (self.distance - config.clearance) - self.approach_speed
         if self.person is None:
-            return thing
-        person = separation.highest_speed(self.distance, self.approach_speed)
-        return torch.where(self.person, person, thing)
+            return towards_object
+        towards_person = separation.highest_speed(self.distance, self.approach_speed)
+        return torch.where(self.person, towards_person, towards_object)
 
 
 class ConstrainedVelocity(NamedTuple):
-    """A joint velocity within all limits, and what it took."""
+    """A joint velocity within all limits, and the effect of the limits."""
 
     joint_velocity: Float[Tensor, "*batch n"]
-    """[rad/s]"""
+    """Joint velocities [rad/s]."""
     slowed: Float[Tensor, "*batch"]
-    """Part of the task that was given up: 0 none, 1 all."""
+    """Fraction of the task velocity given up, 0 to 1."""
     violation: Float[Tensor, "*batch"]
-    """By how much distances shrink faster than they may [m/s]: above zero where the limits of
-    the joints, or other distances, leave nothing better."""
+    """Excess of the fastest closing speed over the allowed one [m/s]; above zero where joint
+    limits or other distances leave no better solution."""
     solved: Bool[Tensor, "*batch"]
-    """False: the arm brakes, as an input was not a number or the solver's steps not enough."""
+    """False: the arm brakes, because an input was not finite or the solver needed more
+    steps."""
 
 
 def constrained_velocity(
@@ -129,10 +209,10 @@ def constrained_velocity(
     upper: Float[Tensor, "*batch n"],
     distances: Distances | None = None,
     config: ConstraintConfig | None = None,
-    share: Float[Tensor, "*batch"] | None = None,
+    task_fraction: Float[Tensor, "*batch"] | None = None,
     separation: SeparationConfig | None = None,
 ) -> ConstrainedVelocity:
-    """The velocity nearest to a wanted one that the limits allow, the task first.
+    """The joint velocity nearest to a wanted one that keeps all limits, the task first.
 
     With the task's velocity t, an orthonormal basis N of the null space of J, and P of the
     range of J^T, every joint velocity is
@@ -142,101 +222,138 @@ def constrained_velocity(
     and the one returned solves
 
         min  |z|^2 + W_t^2 sigma^2 + W_p^2 |e|^2 + W_d^2 delta^2
-        s.t. lower <= u <= upper,   -share <= sigma <= 0,
+        s.t. lower <= u <= upper,   -task_fraction <= sigma <= 0,
              -dd/dq u <= c + delta,
 
-    with c = rate (d - clearance) - approach_speed for things, and for people the speed that
+    with c = rate (d - clearance) - approach_speed for objects, and for people the speed that
     keeps the protective distance (`Distances.closing_speed`).
 
-    The weights are far apart. So the limits of the joints hold exactly; distances hold, or
-    shrink too fast by as little as the joints let them, `delta` alike for all pairs; the path
-    of the task is kept while anything on it is allowed, J u being J wanted + sigma J t; of the
-    task as much as possible remains; and the null space yields first. Where nothing binds it
-    is the wanted velocity itself.
+    The weights are far apart, which makes them priorities. Joint limits hold exactly. Distances
+    hold, or are violated by the least possible excess `delta`, equal for all pairs. The tool
+    stays on the path of the task, J u = J wanted + sigma J t, if any motion on it is allowed.
+    The task keeps as much of its speed as possible. The null space yields first. Where no limit
+    binds, the result is the wanted velocity.
 
-    On the path the tool moves by J u = J wanted + sigma J t, whatever the null space does, and
-    never faster than wanted: a cap on its speed is one on the wanted velocity.
+    On the path the tool never moves faster than wanted, whatever the null space does: a cap on
+    its speed is a cap on the wanted velocity.
 
     Args:
         wanted: Joint velocity of task and null space together [rad/s].
-        task: That of the task, along which it may slow down [rad/s]. What of it leaves the tool
-            at rest counts as the null space's.
-        jacobian: Of the tool, with at most as many rows as joints; singular ones too.
-        lower: Lowest joint velocity allowed, now and with a view to position, acceleration and
-            jerk [rad/s]. Not above `upper`.
+        task: Joint velocity of the task, along which it may slow down [rad/s]. A component that
+            does not move the tool counts as null-space motion.
+        jacobian: Jacobian of the tool, with at most as many rows as joints; may be singular.
+        lower: Lowest joint velocity allowed by the limits of position, velocity, acceleration
+            and jerk [rad/s]. Not above `upper`.
         upper: Highest joint velocity allowed [rad/s].
-        distances: To be kept; None: none.
-        config: Default: the recommended settings.
-        share: Of the task in the wanted velocity, 0 to 1, as while the arm gets under way;
-            None: all of it.
-        separation: Of the protective distance from people. Default: the recommended settings.
+        distances: Distances to keep; None: none.
+        config: Weights and clearance; default: the recommended settings.
+        task_fraction: Fraction of the task contained in the wanted velocity, 0 to 1, below 1
+            while the arm accelerates; None: 1.
+        separation: Protective distance from people; default: the recommended settings.
     """
     config = config or ConstraintConfig()
-    dtype = wanted.dtype
-    # Weights are 1e7 apart, and float32 has seven digits.
-    wanted, task, jacobian, lower, upper = (
-        x.double() for x in (wanted, task, jacobian, lower, upper)
+    dtype, m = wanted.dtype, jacobian.shape[-2]
+    if task_fraction is None:
+        task_fraction = torch.ones_like(wanted[..., 0])
+    given, known = _finite(
+        _Program(wanted, task, jacobian, lower, upper, task_fraction, distances)
     )
-    if distances is not None:
-        distances = distances.double()
-    share = torch.ones_like(wanted[..., 0]) if share is None else share.double()
-    numbers = (wanted, task, lower, upper, jacobian.flatten(-2), share.unsqueeze(-1))
-    known = is_number(torch.cat(numbers, dim=-1)).all(-1)
-    if distances is not None:
-        known = known & distances.known()
-        distances = distances.where(known)
-    unknown = ~known.unsqueeze(-1)
-    wanted, task = wanted.masked_fill(unknown, 0), task.masked_fill(unknown, 0)
-    jacobian = jacobian.masked_fill(unknown.unsqueeze(-1), 0)
-    share = share.masked_fill(~known, 0)
-    bounded = is_number(torch.cat([lower, upper], dim=-1)).all(-1, keepdim=True)
-    lower, upper = lower.masked_fill(~bounded, 0), upper.masked_fill(~bounded, 0)
-
-    # What the limits leave, of joints, task and distances, counted from the wanted velocity.
-    zero = torch.zeros_like(share)
-    least = [lower - wanted, -share.unsqueeze(-1)]
-    most = [upper - wanted, zero.unsqueeze(-1)]
+    wanted, distances = given.wanted, given.distances
+    # Limits of joints, task and distances, relative to the wanted velocity.
+    zero = torch.zeros_like(given.task_fraction)
+    least = [given.lower - wanted, -given.task_fraction.unsqueeze(-1)]
+    most = [given.upper - wanted, zero.unsqueeze(-1)]
     if distances is not None:
         allowed = distances.closing_speed(config, separation or SeparationConfig())
         least.append(torch.full_like(allowed, -torch.inf))
         most.append(allowed + torch.linalg.vecdot(distances.gradient, wanted.unsqueeze(-2)))
     least, most = torch.cat(least, dim=-1), torch.cat(most, dim=-1)
     if config.early_exit and bool(none_binds(least, most).all()):
-        u = wanted.clamp(lower, upper).to(dtype)
         return ConstrainedVelocity(
-            joint_velocity=u,
-            slowed=torch.where(known, zero, share).to(dtype),
+            joint_velocity=wanted.clamp(given.lower, given.upper).to(dtype),
+            slowed=torch.where(known, zero, given.task_fraction).to(dtype),
             violation=zero.to(dtype),
             solved=known,
         )
 
-    m, along = jacobian.shape[-2], config.task_weight
-    off_path = along * config.path_weight
-    slack = off_path * config.distance_weight
-    # Joint velocities of one unit of cost each: off the path, along it, in the null space.
+    basis = _unit_cost_directions(given.jacobian, given.task, config)
+    rows = _limit_rows(basis, None if distances is None else distances.gradient, m, config)
+    change = least_change(rows, least, most, config.steps, early_exit=config.early_exit)
+    y, solved = change.point, known & change.solved
+    u = wanted + matmul(y[..., None, :-1], basis).squeeze(-2)
+    # An arm that brakes goes to zero; the clamp removes the rounding of the solver.
+    u = torch.where(solved.unsqueeze(-1), u, 0.0).clamp(given.lower, given.upper)
+    slowed = torch.where(solved, -y[..., m] / config.task_weight, given.task_fraction)
+    violation = torch.where(solved, y[..., -1] / config.slack_cost, 0.0)
+    return ConstrainedVelocity(u.to(dtype), slowed.to(dtype), violation.to(dtype), solved)
+
+
+class _Program(NamedTuple):
+    """Arguments of `constrained_velocity`."""
+
+    wanted: Tensor
+    task: Tensor
+    jacobian: Tensor
+    lower: Tensor
+    upper: Tensor
+    task_fraction: Tensor
+    distances: Distances | None
+
+
+def _finite(given: _Program) -> tuple[_Program, Bool[Tensor, "*batch"]]:
+    """The arguments in float64 with zeros in place of invalid ones, and True where valid."""
+    # Weights are 1e7 apart, and float32 has seven digits.
+    wanted, task, J, lower, upper, fraction = (x.double() for x in given[:-1])
+    distances = None if given.distances is None else given.distances.double()
+    numbers = (wanted, task, lower, upper, J.flatten(-2), fraction.unsqueeze(-1))
+    known = is_number(torch.cat(numbers, dim=-1)).all(-1)
+    if distances is not None:
+        known = known & distances.known()
+        distances = distances.where(known)
+    unknown = ~known.unsqueeze(-1)
+    unbounded = ~is_number(torch.cat([lower, upper], dim=-1)).all(-1, keepdim=True)
+    finite = _Program(
+        wanted=wanted.masked_fill(unknown, 0),
+        task=task.masked_fill(unknown, 0),
+        jacobian=J.masked_fill(unknown.unsqueeze(-1), 0),
+        lower=lower.masked_fill(unbounded, 0),
+        upper=upper.masked_fill(unbounded, 0),
+        task_fraction=fraction.masked_fill(~known, 0),
+        distances=distances,
+    )
+    return finite, known
+
+
+def _unit_cost_directions(
+    jacobian: Float[Tensor, "*batch m n"],
+    task: Float[Tensor, "*batch n"],
+    config: ConstraintConfig,
+) -> Float[Tensor, "*batch n+1 n"]:
+    """Joint velocities of one unit of cost each: m off the path, one along it, null space."""
+    m = jacobian.shape[-2]
     basis = orthonormal_basis(jacobian).mT
     null, path = basis[..., m:, :], task.unsqueeze(-2)
     path = path - matmul(matmul(path, null.mT), null)
-    basis = torch.cat([basis[..., :m, :] / off_path, path / along, null], dim=-2)
-    # Rows of the limits.
-    joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
-    slower = torch.zeros_like(joints[..., :1])
-    slower[..., m, :] = 1 / along
-    rows = [joints, slower]
-    if distances is not None:
-        each = torch.full_like(distances.distance, 1 / slack).unsqueeze(-2)
-        rows.append(-torch.cat([matmul(basis, distances.gradient.mT), each], dim=-2))
-    change = least_change(
-        torch.cat(rows, dim=-1), least, most, config.steps, early_exit=config.early_exit
+    return torch.cat(
+        [basis[..., :m, :] / config.path_cost, path / config.task_weight, null], dim=-2
     )
 
-    y, solved = change.point, known & change.solved
-    u = wanted + matmul(y[..., None, :-1], basis).squeeze(-2)
-    # An arm that brakes goes to zero; the limits cut what the solver leaves by rounding.
-    u = torch.where(solved.unsqueeze(-1), u, 0.0).clamp(lower, upper)
-    return ConstrainedVelocity(
-        joint_velocity=u.to(dtype),
-        slowed=torch.where(solved, -y[..., m] / along, share).to(dtype),
-        violation=torch.where(solved, y[..., -1] / slack, 0.0).to(dtype),
-        solved=solved,
-    )
+
+def _limit_rows(
+    basis: Float[Tensor, "*batch n+1 n"],
+    gradient: Float[Tensor, "*batch pairs n"] | None,
+    m: int,
+    config: ConstraintConfig,
+) -> Float[Tensor, "*batch n+2 limits"]:
+    """Columns of `least_change`: limits of the joints, of the task, of the distances.
+
+    The last unknown is the common excess of the distances.
+    """
+    joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
+    slower = torch.zeros_like(joints[..., :1])
+    slower[..., m, :] = 1 / config.task_weight
+    rows = [joints, slower]
+    if gradient is not None:
+        excess = torch.full_like(gradient[..., 0], 1 / config.slack_cost).unsqueeze(-2)
+        rows.append(-torch.cat([matmul(basis, gradient.mT), excess], dim=-2))
+    return torch.cat(rows, dim=-1)

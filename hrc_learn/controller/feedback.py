@@ -1,10 +1,9 @@
-"""Feedback of the regions and what leads the arm: joint-space approach, Cartesian feedback or
-vision feedback, blended smoothly.
+"""Regional feedback, and the smooth blending of joint-space, Cartesian and vision feedback.
 
-Two levels between 0 and 1 decide that. The *vision level* fades vision feedback in on top of
-Cartesian feedback while the camera sees the feature. The *task level* takes the lead from a
-joint-space approach to a posture, and gives it to both of them. Measurements that cannot be
-trusted are replaced before any feedback is computed.
+Two levels between 0 and 1 set the blend. The *vision level* fades vision feedback in, on top of
+Cartesian feedback, while the camera sees the feature. The *task level* fades from a joint-space
+approach towards a posture to task-space feedback. Invalid measurements are replaced before any
+feedback is computed.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ from hrc_learn.geometry.numerics import is_number
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import PostureRegion
 
-# Region function of the posture beyond which a joint-space approach begins anew: at the default
-# tolerance of 0.5 rad, a distance of 1.5 rad, more than a person pulls the elbow away.
+# Region function of the posture beyond which a joint-space approach starts again: at the
+# default tolerance of 0.5 rad a distance of 1.5 rad, more than a person pulls the elbow away.
 _FAR_FROM_POSTURE = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class BlendingConfig:
-    """When the camera takes part, and how fast."""
+    """Conditions for vision feedback, and its fading time."""
 
     image_size: tuple[int, int] = (1440, 1080)
-    """Width and height of the image [px]."""
+    """Width and height of the image [px]; default: the paper's camera."""
     hysteresis: float = 40.0
-    """How far inside the image a feature must be found before it is used [px]; once used, it
-    is used up to the edge. Without this the blending chatters at the border."""
+    """Distance from the image border at which a new feature is first used [px]; from then on it
+    is used up to the border. Without hysteresis the blending chatters there."""
     blend_time: float = 0.3
     """Time in which vision feedback fades in and out [s]; 0: at once."""
     max_feature_age: float = 0.25
-    """Older measurements of the feature are not used, and stop an arm that needs them [s]."""
+    """Age above which a feature is not used, and stops an arm that needs it [s]."""
 
 
 @pytree
@@ -50,16 +49,16 @@ class BlendingState:
     """State of the blending between Cartesian and vision feedback."""
 
     active: Bool[Tensor, "*batch"]
-    """Whether the feature is being followed."""
+    """True while the feature is followed."""
     level: Float[Tensor, "*batch"]
     """Fraction of vision feedback in the command, 0 to 1."""
     feature: Float[Tensor, "*batch rows"]
-    """Where the feature was last seen [px]: what fades out when it is lost."""
+    """Last measured feature [px]; its feedback fades out when the feature is lost."""
 
 
 @final
 class VisionBlending(nn.Module):
-    """Decides from the measured feature how much vision feedback takes part."""
+    """Level of vision feedback, from the measured feature."""
 
     centre: Tensor
     """Middle of the image [px]; pixels count from 0, so it is also the half size."""
@@ -71,7 +70,12 @@ class VisionBlending(nn.Module):
         self.register_buffer("centre", (size - 1) / 2)
 
     def initial_state(self, like: Float[Tensor, "*batch n"], points: int = 1) -> BlendingState:
-        """Nothing seen yet, for the batch of `like` and a feature of so many points."""
+        """State before the first image.
+
+        Args:
+            like: Joint positions, of which batch shape, dtype and device are taken.
+            points: Number of points of the feature.
+        """
         level = torch.zeros_like(like[..., 0])
         return BlendingState(
             active=torch.zeros_like(level, dtype=torch.bool),
@@ -80,7 +84,7 @@ class VisionBlending(nn.Module):
         )
 
     def restored(self, state: BlendingState) -> BlendingState:
-        """The state, with nothing followed where it is not of numbers."""
+        """The state, reset where it is not finite."""
         known = is_number(state.level) & is_number(state.feature).all(-1)
         fresh = self.initial_state(state.level.unsqueeze(-1), state.feature.shape[-1] // 2)
         return BlendingState(
@@ -101,19 +105,19 @@ class VisionBlending(nn.Module):
         """One step of the blending.
 
         Args:
-            state: Of the step before.
-            feature: Measured position [px]; anything, also NaN, where it is not usable.
-            usable: Whether the camera takes part and found the feature.
+            state: State after the last step.
+            feature: Measured position [px]; any value, also NaN, where it is not usable.
+            usable: True where vision is enabled and the feature was found.
             dt: Step [s].
-            age: Of the measurement [s]; None: none.
+            age: Age of the measurement [s]; None: zero.
 
         Returns:
-            The next state; whether the feature was seen within the image; and whether the arm
-            must stop because the camera it follows has fallen silent (None without an age).
+            The next state; True where the feature was seen within the image; and True where
+            the arm must stop because its feature is too old (None without an age).
         """
         stop = None
         if age is not None:
-            # An age of NaN is not known; one far below zero says that the clocks differ.
+            # NaN is an unknown age; an age far below zero means that the clocks differ.
             late = ~(age.abs() <= self.config.max_feature_age)
             stop = usable & late & state.active
             usable = usable & ~late
@@ -125,7 +129,7 @@ class VisionBlending(nn.Module):
         active = seen & (state.active | (inside >= self.config.hysteresis))
         level = fade(state.level, active, dt, self.config.blend_time)
         if stop is not None:
-            # Wait for the camera: neither fade out nor forget that it was in charge.
+            # Wait for the camera: neither fade out nor stop following.
             active = active | stop
             level = torch.where(stop, state.level, level)
         feature = torch.where(seen.unsqueeze(-1), feature, state.feature)
@@ -138,7 +142,7 @@ def fade(
     dt: float | Float[Tensor, ""],
     time: float,
 ) -> Float[Tensor, "*batch"]:
-    """Move a level towards 1 or 0, all the way in `time` seconds."""
+    """Move a level towards 1 where `rising`, else towards 0, within `time` seconds."""
     wanted = rising.to(level.dtype)
     if time == 0:
         return wanted
@@ -152,11 +156,11 @@ def approach_velocity(
     jacobian: Float[Tensor, "*batch 6 n"],
     caps: Float[Tensor, "2"],
 ) -> Float[Tensor, "*batch n"]:
-    """Joint velocity towards a posture, as slow as the caps of the tool ask [rad/s].
+    """Joint velocity towards a posture, within the caps on the tool speed [rad/s].
 
     Args:
-        posture: Where to go.
-        joint_position: Now [rad].
+        posture: Region of the goal posture.
+        joint_position: Measured joint positions [rad].
         jacobian: Geometric Jacobian of the tool.
         caps: Highest linear and angular speed of the tool [m/s, rad/s].
     """
@@ -173,29 +177,28 @@ def next_task_level(
     dt: float | Float[Tensor, ""],
     blend_time: float,
 ) -> Float[Tensor, "*batch"]:
-    """Fraction to which task-space feedback has taken over from the approach, 0 to 1.
+    """Level of task-space feedback after a joint-space approach, 0 to 1.
 
-    It does so inside the posture region: earlier it would lead an arm from whatever posture it
-    is in, and many of those end at a joint limit. Once it has, it keeps the lead, also where a
-    person or the task moves the joints out of the region, unless the posture lies far away, as
-    when a new phase begins.
+    It rises inside the posture region: task-space feedback from an arbitrary posture often ends
+    at a joint limit. Then it stays up, also where a person or the task moves the joints out of
+    the region, unless the posture is far away, as at the start of a new phase.
 
     Args:
-        task_level: The fraction after the step before.
-        posture: Of the approach; None: there is none.
-        joint_position: Now [rad].
-        vision_active: Whether the camera leads the arm, which then is not called back.
+        task_level: Level after the last step.
+        posture: Region of the approach; None: no approach.
+        joint_position: Measured joint positions [rad].
+        vision_active: True while the feature is followed: then the approach does not restart.
         dt: Step [s].
-        blend_time: Time in which to take over [s].
+        blend_time: Time of the transition [s].
     """
     if posture is None:
         return torch.zeros_like(task_level)
     f = posture.value(joint_position)
-    leads = (task_level > 0) & ((f <= _FAR_FROM_POSTURE) | vision_active)
-    return fade(task_level, leads | (f <= 0), dt, blend_time)
+    stays = (task_level > 0) & ((f <= _FAR_FROM_POSTURE) | vision_active)
+    return fade(task_level, stays | (f <= 0), dt, blend_time)
 
 
-# Pixel rate that is always allowed [px/s]: keeps the cap above zero at the target itself.
+# Pixel rate that is always allowed [px/s]: keeps the cap above zero at the target.
 _LEAST_PIXEL_RATE = 1.0
 
 
@@ -203,9 +206,9 @@ class Feedback(NamedTuple):
     """Feedback vectors of the regions and their combination."""
 
     xi_x: Float[Tensor, "*batch rows"]
-    """Of the vision region, faded by the blending."""
+    """Feedback of the vision region, scaled by the vision level."""
     xi_r: Float[Tensor, "*batch 6"]
-    """Of the Cartesian regions, position then orientation."""
+    """Feedback of the Cartesian regions, position then orientation."""
     s: Float[Tensor, "*batch 6"]
     """J_s_hat^T xi_x + xi_r."""
     potential: Float[Tensor, "*batch"]
@@ -223,10 +226,10 @@ def regional_feedback(
 
     Args:
         goals: The regions.
-        pose: Of the tool.
-        blending: How much of vision feedback takes part, and where the feature is.
+        pose: Pose of the tool.
+        blending: Vision level and feature.
         image_jacobian: J_s_hat at the pose [px/m, px/rad].
-        vision_rate: Fastest decay of the pixel error to ask for [1/s].
+        vision_rate: Fastest decay of the pixel error to request [1/s].
     """
     P_t, xi_position = goals.position.feedback(pose.position)
     if goals.orientation is None:
@@ -247,8 +250,8 @@ def regional_feedback(
 def _excess_rate(
     J_s: Tensor, xi_x: Tensor, error: Tensor, vision_rate: float
 ) -> Float[Tensor, "*batch 1"]:
-    """What to divide vision feedback by to keep the rate of the pixel error; at least 1."""
-    # The feature moves with J_s J_s^T xi_x, as far as the estimate is right.
+    """Divisor of vision feedback that caps the rate of the pixel error; at least 1."""
+    # The feature moves with J_s J_s^T xi_x, if the estimate is right.
     descent = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2)
     speed = torch.linalg.vecdot(J_s, descent.unsqueeze(-2))
     speed = torch.linalg.vector_norm(speed, dim=-1, keepdim=True)
@@ -260,29 +263,43 @@ def _excess_rate(
 def analytic_descent(
     s: Float[Tensor, "*batch 6"], orientation: Float[Tensor, "*batch 4"]
 ) -> Float[Tensor, "*batch 6"]:
-    """Twist B B^T s, to which -J_A^+ (J_sA^T xi_x + xi_rA) amounts (but for the sign).
+    """Twist B B^T s, for which J^+ (B B^T s) = J_A^+ (J_sA^T xi_x + xi_rA).
 
     With r_dot = B^-1 twist, B = diag(I, J_l(phi)) for the rotation vector phi of the tool, the
     analytic Jacobian is J_A = B^-1 J, so J_A^+ = J^+ B, and a gradient over r is B^T times one
-    over small motions of the tool. So s of the geometric form serves both laws; they differ in
-    the metric by which a gradient becomes a motion.
+    over small motions of the tool. Both laws use the s of the geometric form; they differ in
+    the metric that maps a gradient to a motion.
 
     Args:
         s: J_s_hat^T xi_x + xi_r of the geometric form.
-        orientation: Of the tool.
+        orientation: Orientation of the tool.
     """
     phi = quaternion.log(orientation)
     turn = quaternion.left_jacobian(phi, quaternion.left_jacobian_transposed(phi, s[..., 3:]))
     return torch.cat([s[..., :3], turn], dim=-1)
 
 
+def potential_rate(
+    s: Float[Tensor, "*batch 6"],
+    jacobian: Float[Tensor, "*batch 6 n"],
+    joint_velocity: Float[Tensor, "*batch n"],
+) -> Float[Tensor, "*batch"]:
+    """Rate of the potential P_v + P_c predicted by the estimated image Jacobian [1/s].
+
+    A measured potential that falls more slowly shows an error of the image Jacobian. A positive
+    rate shows a motion that a limit or a person has turned against the task.
+    """
+    twist = torch.linalg.vecdot(jacobian, joint_velocity.unsqueeze(-2))
+    return torch.linalg.vecdot(s, twist)
+
+
 def validated_position(
     observation: Observation, expected: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
-    """Joint position [rad]: measured, or the expected one where that is NaN or stale.
+    """Joint positions [rad]: measured, or the expected ones where those are NaN or stale.
 
     Returns:
-        The position, and where it is the expected one.
+        The positions, and True where they are the expected ones.
     """
     q = observation.joint_position
     stale = ~is_number(q).all(-1)
@@ -291,12 +308,12 @@ def validated_position(
     return torch.where(stale.unsqueeze(-1), expected, q), stale
 
 
-def known_step(
+def validated_step(
     dt: float | Float[Tensor, ""], longest: float
 ) -> tuple[float | Tensor, Bool[Tensor, ""] | bool]:
-    """Time that passes until the next step [s], none where it is not known, and whether it is.
+    """Time until the next step [s], zero where invalid, and True where it is valid.
 
-    A number is known: the safety filter raises where it is outside (0, longest].
+    A number is always valid here: the safety filter raises if it is outside (0, longest].
     """
     if not isinstance(dt, Tensor):
         return dt, True
@@ -307,7 +324,7 @@ def known_step(
 def effective_goals(
     observation: Observation, default: Goals
 ) -> tuple[Goals, Bool[Tensor, "*batch"] | bool]:
-    """Goals of this step, and whether the target is known: one that is NaN is not."""
+    """Goals of this step, and True where the target is known (not NaN)."""
     goals = default if observation.goals is None else observation.goals
     target = observation.target
     if target is None:

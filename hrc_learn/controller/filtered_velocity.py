@@ -1,7 +1,7 @@
-"""The step of an arm that is told joint velocities: whatever is asked for, through the safety
-filter, with the speed of the tool capped.
+"""Control step that passes a wanted joint velocity through the safety filter.
 
-It steps as `AdaptiveController` does, so it is exported and run likewise (`hrc_learn.deploy`).
+Its interface is that of `AdaptiveController`, so it is exported and run in the same way
+(`hrc_learn.deploy`).
 """
 
 from __future__ import annotations
@@ -25,50 +25,51 @@ from hrc_learn.pytree import pytree
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class WantedVelocity:
-    """What a step is given."""
+    """Observation of a velocity step."""
 
     joint_position: Float[Tensor, "*batch n"]
-    """Measured [rad]."""
+    """Measured joint positions [rad]."""
     joint_velocity: Float[Tensor, "*batch n"]
-    """Wanted [rad/s]."""
+    """Wanted joint velocities [rad/s]."""
     stop: Bool[Tensor, "*batch"]
-    """Whether to brake to rest whatever is wanted."""
+    """True to brake to rest, whatever is wanted."""
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class FilteredVelocity:
-    """What a step gives."""
+    """Command of a velocity step."""
 
     joint_velocity: Float[Tensor, "*batch n"]
-    """To send [rad/s]."""
+    """Joint velocities to send [rad/s]."""
     safety: SafetyReport
-    """What the filter did."""
+    """Interventions of the safety filter."""
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class VelocityStepState:
-    """What a step remembers."""
+    """State of a velocity step."""
 
     safety: SafetyState
+    """State of the safety filter."""
 
 
 @final
 class VelocityStep(nn.Module):
-    """A joint velocity that keeps the limits of an arm and of its tool's speed.
+    """Joint velocities within the limits of an arm and a cap on its tool speed.
 
     Attributes:
-        chain: The arm, which has the limits.
+        chain: Kinematics and limits of the arm.
     """
 
     def __init__(self, chain: SerialChain, *, dt: float, config: SafetyConfig | None = None):
-        """Take the limits of an arm.
+        """Prepare the filter.
 
         Args:
-            chain: The arm.
+            chain: Kinematics and limits of the arm.
             dt: Time between two steps [s].
-            config: Of the filter.
+            config: Settings of the filter.
 
         Raises:
             ValueError: The filter cannot guarantee the limits at this step.

@@ -1,4 +1,4 @@
-"""What goes into a control step and what comes out of it: goals, observation, command.
+"""Inputs and outputs of a control step: goals, observation, command.
 
 All are pytrees of tensors, so a step compiles, exports and maps over batches.
 """
@@ -27,45 +27,48 @@ from hrc_learn.regions import (
 )
 
 type ToolRegion = OrientationRegion | AxisRegion | None
-"""What is led of the tool's orientation: all, its z axis, or nothing."""
+"""Controlled part of the tool's orientation: all of it, its z axis, or nothing."""
 
-_OF_TASK: dict[TaskSpace, Callable[[Tensor], ToolRegion]] = {
+_TOOL_REGIONS: dict[TaskSpace, Callable[[Tensor], ToolRegion]] = {
     "pose": lambda goal: OrientationRegion(goal=goal),
     "position+axis": lambda goal: AxisRegion(goal=goal),
     "position": lambda goal: None,
 }
 
 HALF_SIZE = (0.12, 0.12, 0.08)
-"""Half edges of the box that proved large enough to find the marker in view [m]."""
-IMAGE_SIZE = (1440, 1080)
-"""Width and height of the paper's camera [px]."""
+"""Half edges of a box that is large enough for the camera to find the marker [m]."""
+# Width and height of the images of the paper's camera [px].
+_PAPER_IMAGE = (1440, 1080)
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Goals:
-    """The attracting regions and whether the camera takes part.
+    """The attracting regions.
 
-    Tensors all through, so a task changes them between two steps without rebuilding or
+    All fields are tensors, so a task changes them between two steps without rebuilding or
     recompiling the controller.
     """
 
     position: PositionRegion
+    """Box for the tool centre point."""
     orientation: ToolRegion
-    """Of the tool; an `AxisRegion` leaves turns about its axis free, None all of them. An arm
-    of fewer joints than a pose has dimensions is led by less than one."""
+    """Cone for the tool orientation. An `AxisRegion` leaves rotation about its axis free, None
+    all rotation: for tasks, and arms, with fewer than six degrees of freedom."""
     vision: VisionRegion
+    """Region of the feature in the image."""
     vision_enabled: Bool[Tensor, "*#batch"]
-    """False: steer by the Cartesian regions alone, whatever the camera sees."""
+    """False: use the Cartesian regions alone, whatever the camera sees."""
     posture: PostureRegion | None = None
-    """Where to go in joint space before task-space feedback takes over; None: it leads from
-    the start."""
+    """Posture approached in joint space before task-space feedback takes over; None: task-space
+    feedback acts from the start."""
     rest: PostureRegion | None = None
-    """Where the null space goes back to; None: it stays where task and people leave it."""
+    """Posture to which the null space returns; None: it stays where task and people leave
+    it."""
 
     @property
     def task(self) -> TaskSpace:
-        """What of the tool's pose is led."""
+        """Controlled part of the tool pose."""
         if self.orientation is None:
             return "position"
         return "position+axis" if isinstance(self.orientation, AxisRegion) else "pose"
@@ -78,20 +81,20 @@ class Goals:
         target: Float[Tensor, "*#batch rows"] | None = None,
         *,
         half_size: Sequence[float] = HALF_SIZE,
-        image_size: tuple[int, int] = IMAGE_SIZE,
+        image_size: tuple[int, int] = _PAPER_IMAGE,
         task: TaskSpace = "pose",
     ) -> Goals:
         """Goals with the recommended gains.
 
         Args:
-            centre: Of the box for the tool centre point [m].
-            orientation: Of the tool, a unit quaternion.
-            target: Of the feature in the image [px], u and v of each of its points; None
+            centre: Centre of the box for the tool centre point [m].
+            orientation: Orientation of the tool, a unit quaternion (w, x, y, z).
+            target: Target of the feature in the image [px], u and v of each of its points; None
                 switches the camera off.
-            half_size: Of the box [m].
+            half_size: Half edges of the box [m].
             image_size: Width and height of the image [px].
-            task: What of the tool's pose is led: all, its position and its z axis, or its
-                position. What is not led is null space.
+            task: Controlled part of the tool pose: all of it, position and z axis, or position.
+                The rest becomes null space.
 
         Raises:
             ValueError: The target lies outside the image.
@@ -101,7 +104,7 @@ class Goals:
             target = centre.new_tensor(image_size) / 2
         return cls(
             position=PositionRegion(centre=centre, half_size=centre.new_tensor(half_size)),
-            orientation=_OF_TASK[task](orientation),
+            orientation=_TOOL_REGIONS[task](orientation),
             vision=VisionRegion.inside_image(target, image_size),
             vision_enabled=torch.tensor(enabled, device=centre.device),
         )
@@ -111,7 +114,7 @@ class Goals:
         centre: Float[Tensor, "*#batch 3"],
         half_size: Float[Tensor, "*#batch 3"] | None = None,
     ) -> Goals:
-        """The same goals with the box elsewhere and, if told, of another size [m]."""
+        """The goals with another centre and, if given, another half size of the box [m]."""
         if half_size is None:
             half_size = self.position.half_size
         return replace(
@@ -119,19 +122,19 @@ class Goals:
         )
 
     def turned_to(self, orientation: Float[Tensor, "*#batch 4"]) -> Goals:
-        """The same goals with another tool orientation, where one is led."""
+        """The goals with another tool orientation, where orientation is controlled."""
         if self.orientation is None:
             return self
         return replace(self, orientation=replace(self.orientation, goal=orientation))
 
     def aimed_at(self, target: Float[Tensor, "*#batch rows"]) -> Goals:
-        """The same goals with another target in the image [px]."""
+        """The goals with another target in the image [px]."""
         return replace(self, vision=replace(self.vision, target=target))
 
     def approached_by(self, posture: Float[Tensor, "*#batch n"] | None) -> Goals:
-        """The same goals, first approached in joint space towards a posture [rad].
+        """The goals, first approached in joint space towards a posture [rad].
 
-        Take an inverse-kinematics solution of the box centre that is near the arm.
+        Use an inverse-kinematics solution of the box centre that is near the arm.
         """
         region = None if posture is None else PostureRegion(goal=posture)
         return replace(self, posture=region)
@@ -143,15 +146,15 @@ class Goals:
         rate: float = 1.0,
         speed: float = 0.4,
     ) -> Goals:
-        """The same goals, with a null space that goes back to a posture [rad].
+        """The goals, with a null space that returns to a posture [rad].
 
-        Least velocities for a task that goes to and fro add up to a motion of the null space,
-        which in time takes joints to their limits, and the arm into singularities.
+        Minimum-norm velocities of a repeated task add up to a drift of the null space, which
+        in time takes joints to their limits and the arm into singularities.
 
         Args:
-            posture: One that suits the box; None: the null space stays where it is.
-            rate: How fast it is near there [1/s].
-            speed: Fastest way back, of all joints together [rad/s].
+            posture: Posture that suits the box; None: the null space stays where it is.
+            rate: Convergence rate near the posture [1/s].
+            speed: Highest speed, norm over all joints [rad/s].
 
         Raises:
             ValueError: Rate or speed is not positive.
@@ -164,100 +167,99 @@ class Goals:
         return replace(self, rest=region)
 
     def with_vision(self, enabled: bool) -> Goals:
-        """The same goals with the camera taking part or not."""
+        """The goals with vision feedback switched on or off."""
         return replace(self, vision_enabled=torch.full_like(self.vision_enabled, enabled))
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """What the controller is told at one step."""
+    """Measurements and requests of one control step."""
 
     joint_position: Float[Tensor, "*batch n"]
-    """Measured [rad]."""
+    """Measured joint positions [rad]."""
     feature: Float[Tensor, "*batch rows"]
-    """Measured feature (u, v) [px], or u and v of several points in turn, as the corners of a
-    marker; anything, also NaN, where it is not visible."""
+    """Measured feature (u, v) [px], or u and v of several points in turn, such as the corners
+    of a marker; any value, also NaN, where it is not visible."""
     feature_visible: Bool[Tensor, "*batch"]
-    """Whether the feature was found in the image."""
+    """True if the feature was found in the image."""
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
     target: Float[Tensor, "*#batch rows"] | None = None
-    """Target in the image [px]; None: that of the goals. NaN: not known, so the camera does
-    not take part."""
+    """Target in the image [px]; None: that of the goals. NaN (unknown) switches vision feedback
+    off."""
     nullspace_input: Float[Tensor, "*batch n"] | None = None
-    """The operator's input d: effort of a person on each joint, which moves the arm in its
-    null space [N m]; None: nobody acts."""
+    """Null-space input d of the paper: joint torques exerted by a person [N m]; None: none."""
     goals: Goals | None = None
-    """Regions to go to; None: those the controller was built with."""
+    """Regions to go to; None: those of the controller."""
     feature_new: Bool[Tensor, "*batch"] | None = None
-    """Whether `feature` stems from an image that no earlier step has used; None: it does."""
+    """True if `feature` is from an image that no earlier step has used; None: it is."""
     feature_age: Float[Tensor, "*batch"] | None = None
-    """Time since the image was taken [s]; None: none."""
+    """Time since the image was taken [s]; None: zero."""
     image_joint_position: Float[Tensor, "*batch n"] | None = None
-    """Joint position when the image was taken [rad]; None: the present one. Pairing an image
+    """Joint positions when the image was taken [rad]; None: the present ones. Pairing an image
     with a later pose teaches the estimator a wrong Jacobian."""
     joint_state_stale: Bool[Tensor, "*batch"] | None = None
-    """Whether the joint position is too old to be used; None: it is not."""
+    """True if the joint position is too old to be used; None: it is not."""
     human_distance: Float[Tensor, "*batch"] | None = None
-    """Distance of the nearest person from the arm [m], by which the tool slows down and stops;
-    NaN: not known, stop. None: nobody is watched for."""
+    """Distance of the nearest person from the tool [m], which slows and stops the tool; NaN
+    (unknown): stop. None: no person is monitored."""
     distances: Distances | None = None
-    """Of the arm from itself, the scene and a worker, which `SafetyConfig.constraints` keep;
-    None: none is."""
+    """Distances of the arm from itself, the scene and people, kept by
+    `SafetyConfig.constraints`; None: none."""
     stop: Bool[Tensor, "*batch"] | None = None
-    """Whether to brake to rest and stay there, as a watchdog or a person asks; None: no."""
+    """True to brake to rest and stay there, for a watchdog or a person; None: no."""
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """The joint velocity to send, and how it came about."""
+    """The joint velocity to send, and the terms of the law that led to it."""
 
     joint_velocity: Float[Tensor, "*batch n"]
-    """To send [rad/s]; it has passed the safety filter."""
+    """Joint velocity to send [rad/s], after the safety filter."""
     twist: Float[Tensor, "*batch 6"]
     """Wanted motion of the tool (linear [m/s], angular [rad/s])."""
     null_velocity: Float[Tensor, "*batch n"]
     """Joint velocity in the null space [rad/s]."""
     xi_x: Float[Tensor, "*batch rows"]
-    """Vision feedback, faded by the blending."""
+    """Vision feedback, scaled by the blending."""
     xi_r: Float[Tensor, "*batch 6"]
     """Cartesian feedback, position then orientation."""
     xi_q: Float[Tensor, "*batch n"]
     """Joint-space feedback."""
     s: Float[Tensor, "*batch 6"]
-    """J_s_hat^T xi_x + xi_r, which goes to zero where the law is stable."""
+    """Task-space feedback J_s_hat^T xi_x + xi_r, which converges to zero."""
     image_jacobian: Float[Tensor, "*batch rows 6"]
-    """Estimate J_s_hat [px/m, px/rad]."""
+    """Estimated image Jacobian J_s_hat [px/m, px/rad]."""
     weight_norm: Float[Tensor, "*batch"]
     """Frobenius norm of the estimator's weights."""
     vision_level: Float[Tensor, "*batch"]
     """Fraction of vision feedback, 0 to 1."""
     potential: Float[Tensor, "*batch"]
     """Sum of the task-space potentials P_v + P_t + P_o: the part of the Lyapunov function
-    that needs no true weights."""
+    that does not depend on the true weights."""
     potential_rate: Float[Tensor, "*batch"]
-    """Its rate as the estimated image Jacobian has it [1/s]; not positive where the law acts
-    alone (`hrc_learn.controller.monitors`)."""
+    """Rate of the potential, predicted with the estimated image Jacobian [1/s]; not positive
+    while no limit or person changes the motion (`feedback.potential_rate`)."""
     safety: SafetyReport
-    """What the safety filter did."""
+    """Interventions of the safety filter."""
 
 
 # Parameters of the paper's grasping experiment (Table I), as printed.
 
 GRIPPER_DOWN = (-0.28, 0.63, 0.66, 0.28)
-"""p_g as printed; its norm is 0.995, and scalar first it points the gripper down."""
+"""Goal orientation p_g as printed (w, x, y, z), gripper down; its norm is 0.995."""
 
 INITIAL_IMAGE_JACOBIAN = (
     (-1500.0, 0.0, 0.0, 0.0, -200.0, 60.0),
     (0.0, 2400.0, 170.0, -200.0, 0.0, 180.0),
 )
-"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above whose image right is -x."""
+"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above the table, image right along -x."""
 
 
 def paper_joint_region(limits: JointLimits) -> JointRegion:
-    """The paper's joint-space region in its printed, symmetric form; default gains."""
+    """The paper's joint-space region in its printed, symmetric form, with default gains."""
     return JointRegion.from_limits(limits.lower, limits.upper, formulation="paper")
 
 
@@ -270,9 +272,9 @@ def paper_goals(
     """The paper's regions with their printed gains and gradients.
 
     Args:
-        centre: Of the box, which the paper leaves to the expert [m].
-        half_size: Of the box, which the paper leaves to the expert [m].
-        target: In the image [px].
+        centre: Centre of the box, chosen by the expert in the paper [m].
+        half_size: Half edges of the box, chosen by the expert in the paper [m].
+        target: Target in the image [px].
         stiffness: k_c of the box; default: as printed.
     """
     goal = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
@@ -281,7 +283,7 @@ def paper_goals(
         orientation=OrientationRegion(goal=goal, stiffness=1.0, formulation="paper"),
         vision=VisionRegion(
             target=target,
-            half_size=target.new_tensor((1440.0, 1080.0)),
+            half_size=target.new_tensor(_PAPER_IMAGE),
             formulation="paper",
         ),
         vision_enabled=torch.tensor(True, device=centre.device),

@@ -1,9 +1,9 @@
 """Small quadratic programs, batched, in a fixed number of steps and without branches.
 
-The dual active-set method of Goldfarb and Idnani (1983). It begins at the optimum without
-limits and takes in one limit at a time, so a program of which few limits bind is solved in as
-few steps, and exactly. Each step takes a limit in or lets one go, for each element of a batch
-by itself: the same operations whatever the data, which compile and export.
+This is the dual active-set method of Goldfarb and Idnani (1983). It starts at the optimum
+without limits and adds one limit at a time to the active set, so a program with few active
+limits is solved exactly in as few steps. Each step adds or drops one limit, separately for each
+element of a batch: the operations do not depend on the data, so they compile and export.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-# Violations of a limit that count as rounding.
+# Violations of a limit up to this are rounding.
 _TOLERANCE = 1e-10
-# Length of what the rows that bind leave of another row, relative to it, below which it depends
-# on them: projecting leaves 1e-16 by rounding, and weights of 1e7 make 1e-7 of a row count.
+# A row depends linearly on the active ones if its projection on their null space is relatively
+# shorter than this: rounding leaves 1e-16, and weights of 1e7 make 1e-7 of a row significant.
 _DEPENDENT = 1e-12
 
 
@@ -28,29 +28,30 @@ class LeastChange(NamedTuple):
 
     point: Float[Tensor, "*batch p"]
     multipliers: Float[Tensor, "*batch rows"]
-    """Of the limits: positive where the upper one binds, negative where the lower one does."""
+    """Lagrange multipliers: positive at active upper limits, negative at active lower ones."""
     solved: Bool[Tensor, "*batch"]
-    """Whether it was found within the steps that were allowed."""
+    """True where the solution was found within the allowed steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Step:
-    """Where the method is: the nearest point within those limits that are taken in."""
+    """Iterate of the method: the nearest point within the active limits."""
 
     y: Tensor
+    """The point (p)."""
     dual: Tensor
-    """Multipliers, not negative."""
+    """Multipliers, not negative (rows)."""
     side: Tensor
-    """Of the limits taken in: 1 the upper, -1 the lower; 0 of the others."""
+    """1 for an active upper limit, -1 for an active lower one, 0 otherwise (rows)."""
     operators: Tensor
-    """Side by side, the projector on the directions that keep them (p, p), and the
-    pseudo-inverse of their rows, each times its side (p, rows), zero of the others."""
+    """Projector on the null space of the active rows (p, p) and, to its right, their
+    pseudo-inverse, each column times its side, zero for inactive limits (p, rows)."""
     pending: Tensor
-    """Whether a limit is being taken in (1): it had to wait for another one to go."""
+    """True while a limit is only partly added: another one had to be dropped first (1)."""
     index: Tensor
     """Number of that limit (1)."""
-    share: Tensor
-    """Its multiplier so far (1)."""
+    multiplier: Tensor
+    """Multiplier of that limit so far (1)."""
 
 
 def least_change(
@@ -67,14 +68,14 @@ def least_change(
     y = L^T (x - x_0), counted from the optimum x_0 without limits.
 
     Args:
-        rows: C^T, a column for each limit: sums then run over the first axis, and what is
-            compiled is vectors of limits.
-        lower: Not above `upper`; minus infinity where there is none.
-        upper: Infinity where there is none.
-        steps: To be made. It takes one for each limit that binds, and two for each that is
-            taken in on the way and let go again.
-        early_exit: Make no more steps than it takes, by a branch on the data, which neither
-            compiles nor maps over batches.
+        rows: C^T, a column for each limit: sums then run over the first axis, and compiled
+            code works on vectors of limits.
+        lower: Lower limits, not above `upper`; minus infinity: none.
+        upper: Upper limits; infinity: none.
+        steps: Number of steps. Each active limit takes one, and each limit added and dropped
+            on the way takes two.
+        early_exit: True: stop at the solution, by a branch on the data, which neither compiles
+            nor maps over batches.
     """
     *batch, p, _ = rows.shape
     nothing = torch.zeros_like(lower)
@@ -86,10 +87,10 @@ def least_change(
         operators=torch.cat([eye, torch.zeros_like(rows)], dim=-1),
         pending=torch.zeros_like(lower[..., :1], dtype=torch.bool),
         index=torch.zeros_like(lower[..., :1], dtype=torch.int64),
-        share=nothing[..., :1],
+        multiplier=nothing[..., :1],
     )
     if early_exit:
-        now = _as_far_as_needed(now, rows, lower, upper, steps)
+        now = _solve_unfinished(now, rows, lower, upper, steps)
     else:
         for _ in range(steps):
             now = _next(now, rows, lower, upper)
@@ -99,25 +100,25 @@ def least_change(
 def none_binds(
     lower: Float[Tensor, "*batch rows"], upper: Float[Tensor, "*batch rows"]
 ) -> Bool[Tensor, "*batch"]:
-    """Whether the origin is within the limits of `least_change`, whatever their rows are."""
+    """True where the origin is within the limits of `least_change`, for any rows."""
     return torch.maximum(lower, -upper).amax(-1) <= _TOLERANCE
 
 
-def _as_far_as_needed(
+def _solve_unfinished(
     now: _Step, rows: Tensor, lower: Tensor, upper: Tensor, steps: int
 ) -> _Step:
-    """Steps of those elements of a batch that are not solved yet."""
+    """Take steps with those elements of a batch that are not solved yet."""
     if steps == 0:
         return now
     waiting = ~_solved(now, rows, lower, upper)
     if not bool(waiting.any()):
         return now
     if bool(waiting.all()):
-        return _as_far_as_needed(_next(now, rows, lower, upper), rows, lower, upper, steps - 1)
-    # A mask of the whole batch, so that of few elements that wait only those are computed.
+        return _solve_unfinished(_next(now, rows, lower, upper), rows, lower, upper, steps - 1)
+    # Only the unsolved elements are computed.
     part = _Step(**{name: value[waiting] for name, value in vars(now).items()})
     limits = rows.expand(*now.operators.shape[:-1], -1)[waiting], lower[waiting], upper[waiting]
-    part = _as_far_as_needed(part, *limits, steps)
+    part = _solve_unfinished(part, *limits, steps)
     merged = {}
     for name, value in vars(now).items():
         merged[name] = value.clone()
@@ -127,7 +128,7 @@ def _as_far_as_needed(
 
 def _solved(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tensor, "*batch"]:
     below, above = _violations(now, rows, lower, upper)
-    # A limit that is still being taken in is one that is violated.
+    # A pending limit is not active yet, so it counts as violated.
     violation = torch.where(now.side == 0, torch.maximum(below, above), 0.0).amax(-1)
     return violation <= _TOLERANCE
 
@@ -135,11 +136,13 @@ def _solved(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tens
 def _violations(
     now: _Step, rows: Tensor, lower: Tensor, upper: Tensor
 ) -> tuple[Tensor, Tensor]:
+    """Violations of the lower and the upper limits, positive where violated."""
     value = _combine(now.y, rows)
     return lower - value, value - upper
 
 
 def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
+    """One step: add the most violated limit, or drop one that stands in its way."""
     below, above = _violations(now, rows, lower, upper)
     violation = torch.where(now.side == 0, torch.maximum(below, above), -1.0)
     index = torch.where(now.pending, now.index, violation.argmax(-1, keepdim=True))
@@ -148,12 +151,12 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     excess = torch.maximum(a, b)
     wanted = now.pending | (excess > _TOLERANCE)
 
-    # Direction in which the limit is reached while the others are kept, and what their
-    # multipliers lose on the way.
+    # Direction towards the limit that keeps the active ones, and the rates at which their
+    # multipliers fall on the way.
     p = rows.shape[-2]
     c = side * _column(rows, index)
     passed = _combine(c, now.operators)
-    # Projected twice, or too little of a short rest is right.
+    # Projected twice: one projection leaves too few correct digits of a short vector.
     z, lost = _combine(passed[..., :p], now.operators[..., :p]), passed[..., p:]
     zz = (z * z).sum(-1, keepdim=True)
     independent = zz > _DEPENDENT**2 * (c * c).sum(-1, keepdim=True)
@@ -173,30 +176,33 @@ def _next(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> _Step:
     direction = torch.where(adds, z, v)
     square = torch.where(adds, zz, (v * v).sum(-1, keepdim=True))
     scale = torch.where(acts, 1 / torch.where(acts, square, 1.0), 0.0)
-    # The projector loses the direction of a limit that enters, and gains that of one that
-    # leaves; both make the pseudo-inverse orthogonal to it.
+    # A rank-one update: the projector loses the direction of an added limit and gains that of
+    # a dropped one; both make the pseudo-inverse orthogonal to it.
     entering = torch.cat([z, lost - enters.to(c.dtype)], dim=-1)
     exiting = torch.cat([-v, _combine(v, now.operators[..., p:])], dim=-1)
     turn = scale * torch.where(adds, entering, exiting)
-    share = now.share + length
+    multiplier = now.multiplier + length
     return _Step(
         y=now.y - torch.where(independent, length, 0.0) * z,
         dual=torch.where(
-            enters, share, torch.where(leaves, 0.0, (now.dual - length * lost).clamp(min=0))
+            enters,
+            multiplier,
+            torch.where(leaves, 0.0, (now.dual - length * lost).clamp(min=0)),
         ),
         side=torch.where(enters, side, torch.where(leaves, 0.0, now.side)),
         operators=now.operators - direction.unsqueeze(-1) * turn.unsqueeze(-2),
         pending=drops,
         index=index,
-        share=torch.where(drops, share, 0.0),
+        multiplier=torch.where(drops, multiplier, 0.0),
     )
 
 
 def _combine(weights: Tensor, rows: Tensor) -> Tensor:
-    """Sum of the rows of a matrix, weighted."""
+    """Weighted sum of the rows of a matrix."""
     return (weights.unsqueeze(-1) * rows).sum(-2)
 
 
 def _column(matrix: Tensor, index: Tensor) -> Tensor:
+    """Column of a matrix at an index (1), for each element of a batch."""
     shape = (*matrix.shape[:-1], 1)
     return matrix.gather(-1, index.unsqueeze(-2).expand(shape)).squeeze(-1)

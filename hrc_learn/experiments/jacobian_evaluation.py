@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, Goals
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     FixedEstimator,
@@ -26,6 +25,7 @@ from hrc_learn.kinematics import PANDA, WorkArm, gripper_down
 from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from hrc_learn.skills.visual_skill import guessed_network
 from hrc_learn.vision import CameraModel
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
@@ -38,6 +37,7 @@ from hrc_learn.skills.visual_skill import (
     VisualServoSkill,
     VisualTarget,
 )
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 from hrc_learn.viz import (
     ErrorMap,
     LearningRecording,

@@ -22,7 +22,6 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.demos import load_demos
 from hrc_learn.demos.format.dataset_folder import read_info
 from hrc_learn.geometry import Pose, quaternion
@@ -39,6 +38,7 @@ from hrc_learn.lerobot.arm_robot import MARKER, PIXELS
 from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.smoothing import PREPROCESSOR, read_pipeline
 from hrc_learn.lerobot.smoothing.limits import write_json
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CAMERA_WATCH = "hrc_learn_camera_watch"
 POSE_NAMES = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")

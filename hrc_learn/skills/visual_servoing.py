@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Observation
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import Measurement
 from hrc_learn.regions import OrientationRegion
@@ -24,6 +23,7 @@ from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
 from hrc_learn.skills.marker_sensor import HeldMarker
 from hrc_learn.skills.null_space_yielding import changed_rate
 from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 # Parts of a probe's height that are tried until its upper end is well within the image.
 _PROBE_SHARES = np.array([1.0, 0.75, 0.5])

@@ -25,7 +25,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import INITIAL_IMAGE_JACOBIAN
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CellErrors,
@@ -39,6 +38,7 @@ from hrc_learn.jacobian import (
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.marker_angle import MarkerAngle
 from hrc_learn.store import write_text
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 OBJECT_FEATURE = "observation.object_feature"
 """Column of a dataset with the object's marker in the image."""

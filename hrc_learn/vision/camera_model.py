@@ -14,6 +14,9 @@ from jaxtyping import Bool, Float
 Coefficients = tuple[float, float, float, float, float]
 """(k1, k2, p1, p2, k3): radial k, tangential p."""
 
+IMAGE_SIZE = (1440, 1080)
+"""Width and height of the images of the paper's camera [px]."""
+
 NONE: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 

@@ -10,9 +10,7 @@ from hrc_learn.controller import (
     ControllerConfig,
     Goals,
     Observation,
-    lyapunov_function,
 )
-from hrc_learn.controller.monitors import lyapunov_rate
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import FixedEstimator, PaperEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda, pseudo_inverse
@@ -20,6 +18,16 @@ from hrc_learn.kinematics import panda, pseudo_inverse
 DOUBLE = torch.float64
 GAIN = 3e6
 J0 = torch.tensor([[-1500.0, 0, 0, 0, -200, 60], [0, 2400, 170, -200, 0, 180]], dtype=DOUBLE)
+
+
+def lyapunov_function(potential: Tensor, weight_error: Tensor) -> Tensor:
+    """V = P + 1/2 tr(W~ L^-1 W~^T) of (vt), with L = GAIN I and the 1/2 missing in print."""
+    return potential + weight_error.square().sum((-2, -1)) / (2 * GAIN)
+
+
+def lyapunov_rate(s: Tensor) -> Tensor:
+    """V_dot = -|s|^2 where the assumptions hold."""
+    return -torch.linalg.vecdot(s, s)
 
 
 def run(estimator_of, *, steps: int = 150, dt: float = 2e-3) -> dict[str, Tensor]:
@@ -55,7 +63,7 @@ def run(estimator_of, *, steps: int = 150, dt: float = 2e-3) -> dict[str, Tensor
                 dt=dt,
             )
             command, state = controller.step(state, observation)
-            history["V"].append(lyapunov_function(command.potential, error, GAIN))
+            history["V"].append(lyapunov_function(command.potential, error))
             history["s"].append(command.s)
             history["P"].append(command.potential)
             history["rate"].append(command.potential_rate)

@@ -1,6 +1,6 @@
 import torch
 
-from hrc_learn.controller.monitors import LimitMonitor
+from hrc_learn.controller import LimitMonitor
 from hrc_learn.kinematics import panda
 
 LIMITS, DT = panda.limits, 0.001

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hrc_learn.controller.motion_barriers import LimitBarrier
+from hrc_learn.controller.limit_barrier import LimitBarrier
 from hrc_learn.kinematics import panda
 
 LIMITS = panda.limits

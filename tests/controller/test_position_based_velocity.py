@@ -17,11 +17,11 @@ from unchecked import shapes_unchecked
 from hrc_learn.controller import (
     AdaptiveController,
     ConstraintConfig,
+    LimitMonitor,
     Observation,
     SafetyConfig,
     SafetyFilter,
 )
-from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.deploy import EagerRunner, PackageRunner, StepRunner, open_step
 from hrc_learn.kinematics import FR3_VINTAGES, fr3, panda
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import Measurement
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MarkerObservation, ServoTarget, VisualServo, VisualServoConfig
 from hrc_learn.skills.drawn_goals import DrawnGoals
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CONFIG = VisualServoConfig()
 

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian.fitting import ImageJacobianFitReport
 from hrc_learn.kinematics import gripper_down
@@ -15,6 +14,7 @@ from hrc_learn.skills.visual_skill import (
     VisualTarget,
     guessed_network,
 )
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 OFFSET = np.array([0.12, -0.01, 0.18])
 

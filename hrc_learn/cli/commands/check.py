@@ -9,7 +9,6 @@ from rich.progress import track
 
 from hrc_learn.cli._run import configuration, write_values
 from hrc_learn.cli.arguments.dataset import Check, Recover, Repair
-from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.demos import check_dataset, load_demos, recover_all
 from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
@@ -19,6 +18,7 @@ from hrc_learn.demos.repair import RepairOptions, repair_dataset
 from hrc_learn.jacobian import camera_placements
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 from hrc_learn.store import new_folder, write_json, write_text
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 
 def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str]]:

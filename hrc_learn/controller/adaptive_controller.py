@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
@@ -20,13 +20,13 @@ from hrc_learn.controller.feedback import (
     analytic_descent,
     approach_velocity,
     effective_goals,
-    known_step,
     next_task_level,
+    potential_rate,
     regional_feedback,
     validated_position,
+    validated_step,
 )
 from hrc_learn.controller.interface import Command, Goals, Observation
-from hrc_learn.controller.monitors import potential_rate
 from hrc_learn.controller.resolved_rate import (
     PoseDrift,
     excess_speed,
@@ -39,7 +39,13 @@ from hrc_learn.controller.resolved_rate import (
     scale_null_space,
     scale_task,
 )
-from hrc_learn.controller.safety_filter import SafetyConfig, SafetyFilter, SafetyState
+from hrc_learn.controller.safety_filter import (
+    JointVector,
+    SafetyConfig,
+    SafetyFilter,
+    SafetyReport,
+    SafetyState,
+)
 from hrc_learn.controller.way_making import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import is_number
@@ -52,42 +58,46 @@ from hrc_learn.regions import JointRegion
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerConfig:
-    """Settings of the law; the defaults are those that were measured to work best."""
+    """Settings of the control law; the defaults performed best in our studies."""
 
     linear_speed: float = 0.25
     """Cap on the linear part of the twist [m/s]; the direction of the twist is kept."""
     angular_speed: float = 1.0
-    """Cap on its angular part [rad/s]."""
+    """Cap on the angular part of the twist [rad/s]."""
     vision_rate: float = 4.0
-    """Fastest decay of the pixel error that the estimate may ask for [1/s]. The gain of the
-    law grows with the square of the Jacobian over that of the region: uncapped it can exceed
-    what images at 15 to 30 Hz, late by a frame or more, allow."""
+    """Fastest decay of the pixel error [1/s], as predicted by the estimate. The gain of the law
+    grows with the square of the image Jacobian: without a cap it can exceed the gain that is
+    stable with images at 15 to 30 Hz and a delay of one frame or more."""
     approach_linear_speed: float = 0.5
     """Cap on the linear speed of the tool during a joint-space approach [m/s]."""
     approach_angular_speed: float = 2.0
-    """Cap on its angular speed then [rad/s]."""
+    """Cap on the angular speed of the tool during a joint-space approach [rad/s]."""
     jacobian: Literal["geometric", "analytic"] = "geometric"
-    """By which gradients become motions of the tool: the analytic one counts rotation by the
-    rotation vector, whose rates differ from angular velocity the more the tool is turned."""
+    """Metric that maps gradients to tool motion. The analytic Jacobian uses rates of the
+    rotation vector, which differ from angular velocity the more, the further the tool turns."""
     command_delay: float = 0.0
-    """From a command until the arm follows it, its servos' lag included [s]: the joint velocity
-    is computed for where the arm will be by then."""
+    """Time from a command until the arm follows it, servo lag included [s]. The joint velocity
+    is computed at the joint positions predicted for that time."""
     null_damping: float = 3.0
-    """c_d: null-space input divided by it is velocity."""
+    """c_d: null-space velocity is null-space input divided by c_d."""
     null_space_saturation: bool = True
-    """Saturation in the null space: the other joints do what limits take from single ones."""
+    """Saturation in the null space: free joints take over the motion that limits deny to
+    others."""
     task_slows: bool = True
-    """Slow the task down as a whole where a limit that cuts single joints would make the tool
-    faster than the task asks for."""
+    """Slow the whole task down where a limit on single joints would make the tool faster than
+    requested."""
     null_space_yields: bool = True
-    """Scale null-space motion as a whole where a limit would cut single joints."""
+    """Scale the whole null-space motion where a limit would cut single joints."""
     drift_compensation_rate: float = 2.0
-    """Rate at which the tool returns to its place while a person acts [1/s]; 0: it does not."""
+    """Decay rate of the tool's pose drift while a person moves the null space [1/s]; 0:
+    none."""
     blending: BlendingConfig = field(default_factory=BlendingConfig)
+    """Blending of vision feedback."""
     way_making: WayMakingConfig | None = None
-    """Whether the null space makes way by itself where distances are told; None: it does not,
-    and follows the person."""
+    """Null-space motion away from people and objects at the `distances` of an observation;
+    None: none, the null space follows the person."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
+    """Safety filter."""
 
     def __post_init__(self):
         for name in (
@@ -104,7 +114,7 @@ class ControllerConfig:
             raise ValueError(
                 f"jacobian must be 'geometric' or 'analytic', but is {self.jacobian!r}"
             )
-        if self.drift_compensation_rate < 0:
+        if not self.drift_compensation_rate >= 0:
             raise ValueError(
                 "drift_compensation_rate must not be negative, but is "
                 f"{self.drift_compensation_rate}"
@@ -112,7 +122,7 @@ class ControllerConfig:
 
     @classmethod
     def paper(cls) -> ControllerConfig:
-        """The law as printed: nothing between it and the safety filter."""
+        """The law as printed: no extension between it and the safety filter."""
         return cls(
             linear_speed=math.inf,
             angular_speed=math.inf,
@@ -128,35 +138,37 @@ class ControllerConfig:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class ControllerState:
-    """All that the controller remembers from one step to the next."""
+    """State of the controller between two steps."""
 
     blending: BlendingState
-    """Between Cartesian and vision feedback."""
+    """State of the vision blending."""
     task_level: Float[Tensor, "*batch"]
-    """Fraction to which both have taken over from a joint-space approach, 0 to 1."""
+    """Level of task-space feedback after a joint-space approach, 0 to 1."""
     pose_drift: PoseDrift
-    """Of the tool while a person acts."""
+    """Drift of the tool while a person moves the null space."""
     safety: SafetyState
-    """Of the safety filter, with its counts of interventions."""
+    """State of the safety filter, with its counts of interventions."""
     estimator: Any
-    """Of the image Jacobian: whatever the estimator keeps."""
+    """State of the image-Jacobian estimator."""
 
 
 class _Motion(NamedTuple):
-    """Joint velocity of the law before the safety filter, and how it came about."""
+    """Joint velocity of the law before the safety filter, with its terms."""
 
     joint_velocity: Tensor
     null_velocity: Tensor
     twist: Tensor
-    """Of the tool: the task's, and the correction of the pose drift."""
+    """Twist of the tool: task and drift compensation."""
     task_twist: Tensor
+    """Twist of the task alone."""
     xi_q: Tensor
+    """Joint-space feedback."""
     bounds: tuple[Tensor, Tensor]
-    """Velocities that limits of position and velocity allow."""
+    """Lowest and highest velocities allowed by position and velocity limits."""
     pose_drift: PoseDrift | None
-    """None: not compensated in this step."""
+    """Measured drift; None: not compensated."""
     jacobian: Tensor
-    """Of that part of the tool's motion which the task leads."""
+    """Jacobian of the controlled part of the tool's motion."""
 
 
 @final
@@ -165,45 +177,46 @@ class AdaptiveController(nn.Module):
 
     u = -J^+ (J_s_hat^T xi_x + xi_r) + N c_d^-1 (d - xi_q)               (globalControl)
 
-    with what it takes to run it on an arm: the twist is capped with its direction kept, J^+
-    is damped where J is singular, vision feedback fades in and out, null-space motion yields
-    to the task where a limit is near, and a safety filter has the last word.
+    with extensions for real arms: the twist is capped with its direction kept, J^+ is damped
+    near singularities, vision feedback fades in and out, null-space motion yields to the task
+    near limits, and a safety filter has the last word.
 
-    Goals that lead less than a pose of the tool (`Goals.task`) leave more null space: with rows
+    Goals for less than the whole tool pose (`Goals.task`) leave more null space: with the rows
     J_t = B J of the Jacobian, u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q), along which the
-    potential falls as it does with six.
+    potential falls as with six rows.
 
-    A step is a pure function `(state, observation) -> (command, state)`; nothing is stored
-    in the module. Run real-time loops under `torch.inference_mode()`.
+    A step is a pure function `(state, observation) -> (command, state)`; the module stores no
+    state. Run real-time loops under `torch.inference_mode()`.
     """
 
     def __init__(
         self,
-        chain: SerialChain,
+        arm: SerialChain,
         estimator: ImageJacobianEstimator,
         goals: Goals,
         *,
         config: ControllerConfig | None = None,
         joint_region: JointRegion | None = None,
     ):
-        """Put the parts together.
+        """Prepare the controller.
 
         Args:
-            chain: The arm.
-            estimator: Of the image Jacobian.
-            goals: Regions to go to, unless an observation brings its own.
-            config: Default: the recommended settings.
-            joint_region: Default: that of the chain's limits.
+            arm: The arm, or its kinematic chain.
+            estimator: Estimator of the image Jacobian.
+            goals: Regions to go to, unless an observation has its own.
+            config: Settings; default: the recommended ones.
+            joint_region: Region of the joint limits; default: that of the arm.
 
         Raises:
-            ValueError: The arm has too few joints for what the goals lead.
+            ValueError: The arm has too few joints for the goals.
         """
         super().__init__()
+        chain: SerialChain = getattr(arm, "chain", arm)
         self.chain = chain
         self.estimator = estimator
         self.goals = goals
         self.config = config = config or ControllerConfig()
-        # Here once: which they are is no question of a step.
+        # Ranks depend on the arm alone; computing them once keeps branches out of a step.
         self._ranks = {task: task_rank(chain, task) for task in TASK_ROWS}
         self._check_task(goals)
         limits = chain.limits
@@ -217,20 +230,20 @@ class AdaptiveController(nn.Module):
         self.register_buffer("caps", torch.tensor(caps, dtype=torch.float64))
 
     caps: Tensor
-    """Linear and angular speed: of the task, of a joint-space approach [m/s, rad/s]."""
+    """Linear and angular speed caps of the task and of a joint-space approach [m/s, rad/s]."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True):
-        # Regions are no modules, but move with the module like its buffers.
+        # Regions are not modules, but have to move with this one like its buffers.
         super()._apply(fn, recurse)
         self.goals = _pytree.tree_map(fn, self.goals)
         self.joint_region = _pytree.tree_map(fn, self.joint_region)
         return self
 
     def null_space_dimension(self, task: TaskSpace | None = None) -> int:
-        """How many dimensions of joint motion a task leaves to people and limits.
+        """Dimension of the joint motion that a task leaves free.
 
         Args:
-            task: What of the tool's pose is led; None: what the goals lead.
+            task: Controlled part of the tool pose; None: that of the goals.
         """
         return len(self.chain.joint_names) - self._ranks[task or self.goals.task]
 
@@ -239,22 +252,29 @@ class AdaptiveController(nn.Module):
         if task == "pose" and n < 6:
             left = self.null_space_dimension("position+axis")
             raise ValueError(
-                f"the goals lead the whole pose of the tool, which takes six joints, but the "
-                f"arm has {n}: lead its position and axis, Goals.at(..., "
-                f"task='position+axis'), which leaves {left} of null space, or its position"
+                f"the goals control the whole tool pose, which needs six joints, but the "
+                f"arm has {n}: control its position and axis, Goals.at(..., "
+                f"task='position+axis'), which leaves a null space of {left}, or its position"
             )
         if task != "pose" and self.config.jacobian == "analytic":
             raise ValueError(
-                f"the analytic Jacobian counts whole rotations: goals of {task!r} take "
+                f"the analytic Jacobian needs goals of the whole orientation: for {task!r} use "
                 "ControllerConfig(jacobian='geometric')"
             )
 
     def initial_state(
-        self,
-        joint_position: Float[Tensor, "*batch n"],
-        joint_velocity: Float[Tensor, "*batch n"] | None = None,
+        self, joint_position: JointVector, joint_velocity: JointVector | None = None
     ) -> ControllerState:
-        """State of an arm that starts at a joint position [rad], at rest unless told."""
+        """State at the start.
+
+        Args:
+            joint_position: Measured joint positions (*batch, n) [rad].
+            joint_velocity: Steady joint velocities (*batch, n) [rad/s]; None: at rest.
+
+        Raises:
+            ValueError: A vector does not have one value for each joint.
+        """
+        joint_position = self.safety.joint_vector(joint_position, "joint_position")
         J = self.chain.jacobian(joint_position)
         still = torch.zeros_like(J[..., 0])
         return ControllerState(
@@ -278,81 +298,45 @@ class AdaptiveController(nn.Module):
     ) -> tuple[Command, ControllerState]:
         """One step of the law.
 
-        What is not a number, and a tensor `dt` beyond `SafetyConfig.longest_step`, brakes the
-        arm, flagged `invalid`, or is done without, as a feature not seen. It is neither
-        learned from nor remembered: the next step is healthy.
+        Invalid values (NaN, infinity, a tensor `dt` beyond `SafetyConfig.longest_step`) brake
+        the arm, flagged `invalid`; an invalid feature counts as not visible. They are neither
+        learned from nor stored: the next step is healthy.
 
         Args:
-            state: Of the step before.
-            observation: Of this step.
+            state: State after the last step.
+            observation: Measurements and requests of this step.
 
         Returns:
-            What to send and why, and the next state.
+            The command and the next state.
 
         Raises:
-            ValueError: A number dt is not in (0, longest_step] of the safety settings, or the
-                observation's goals lead more than the arm has joints for.
+            ValueError: The joint positions do not fit the arm; a number dt is not in
+                (0, longest_step] of the safety settings; or the observation's goals control
+                more than the arm has joints for.
         """
         state = self._restored(state)
-        goals, known = effective_goals(observation, self.goals)
-        self._check_task(goals)
-        dt, timed = known_step(observation.dt, self.config.safety.longest_step)
+        goals, known = self._checked_goals(observation)
+        dt, timed = validated_step(observation.dt, self.config.safety.longest_step)
         q, stale = validated_position(observation, state.safety.position)
         pose, J = self.chain.forward_and_jacobian(q)
+        blend_time = self.config.blending.blend_time
         task_level = next_task_level(
-            state.task_level,
-            goals.posture,
-            q,
-            state.blending.active,
-            dt,
-            self.config.blending.blend_time,
+            state.task_level, goals.posture, q, state.blending.active, dt, blend_time
         )
         usable = observation.feature_visible & goals.vision_enabled & known
-        # During a joint-space approach the camera does not take part.
+        if goals.posture is not None:
+            usable = usable & (task_level > 0)  # no vision during a joint-space approach
         blending, seen, stop = self.blending.step(
-            state.blending,
-            observation.feature,
-            usable if goals.posture is None else usable & (task_level > 0),
-            dt,
-            age=observation.feature_age,
+            state.blending, observation.feature, usable, dt, age=observation.feature_age
         )
         J_s = self.estimator.jacobian(state.estimator, pose)
         feedback = regional_feedback(goals, pose, blending, J_s, self.config.vision_rate)
-        descent = feedback.s
-        if self.config.jacobian == "analytic":
-            descent = analytic_descent(descent, pose.orientation)
-        motion = self._motion(state, observation, goals, q, pose, J, task_level, descent)
-        asked = torch.cat([motion.joint_velocity, feedback.xi_x, feedback.xi_r], dim=-1)
-        sound = timed & is_number(asked).all(-1)
-        if observation.stop is not None:
-            stop = observation.stop if stop is None else stop | observation.stop
-        constrained = self.config.safety.constraints is not None
-        v, safety, report = self.safety.step(
-            state.safety,
-            q,
-            motion.joint_velocity,
-            observation.dt,
-            jacobian=J,
-            human_distance=observation.human_distance,
-            stop=stop,
-            stale=stale | ~sound,
-            bounds=motion.bounds,
-            # Those by which the arm makes way need not be kept.
-            distances=observation.distances
-            if constrained or self.config.way_making is None
-            else None,
+        motion = self._motion(state, observation, goals, q, pose, J, task_level, feedback.s)
+        sound = timed & _all_finite(motion.joint_velocity, feedback.xi_x, feedback.xi_r)
+        v, safety, report = self._filtered(
+            state.safety, observation, q, motion, J, stop, stale | ~sound
         )
-        # What the filter left of the task's motion is what the tool ought to do until the next
-        # step: whatever else it does is drift.
-        if motion.pose_drift is None:
-            pose_drift = replace(state.pose_drift, active=torch.zeros_like(stale))
-        else:
-            led = motion.jacobian
-            planned = planned_motion(motion.task_twist, motion.twist, led, v, dt)
-            # An arm that only brakes does not drift.
-            braking = safety.dt.unsqueeze(-1) * torch.linalg.vecdot(led, v.unsqueeze(-2))
-            planned = torch.where(sound.unsqueeze(-1), planned, braking)
-            pose_drift = replace(motion.pose_drift, planned=planned)
+        pose_drift = self._next_drift(state.pose_drift, motion, v, dt, sound, safety)
         command = Command(
             joint_velocity=v,
             twist=motion.twist,
@@ -368,9 +352,8 @@ class AdaptiveController(nn.Module):
             potential_rate=potential_rate(feedback.s, J, v),
             safety=report,
         )
-        estimator = self._adapted(
-            state, observation, pose, dt, seen & ~stale & sound, blending, feedback, sound
-        )
+        seen = seen & ~stale & sound
+        estimator = self._adapted(state, observation, pose, dt, seen, blending, feedback, sound)
         return command, ControllerState(
             blending=blending,
             task_level=task_level,
@@ -379,8 +362,44 @@ class AdaptiveController(nn.Module):
             estimator=estimator,
         )
 
+    def _checked_goals(self, observation: Observation) -> tuple[Goals, Tensor | bool]:
+        """Goals of this step, and True where the target is known; checks both inputs."""
+        self.safety.joint_vector(observation.joint_position, "joint_position")
+        goals, known = effective_goals(observation, self.goals)
+        self._check_task(goals)
+        return goals, known
+
+    def _filtered(
+        self,
+        state: SafetyState,
+        observation: Observation,
+        q: Tensor,
+        motion: _Motion,
+        J: Tensor,
+        stop: Tensor | None,
+        stale: Tensor,
+    ) -> tuple[Tensor, SafetyState, SafetyReport]:
+        """Step of the safety filter."""
+        if observation.stop is not None:
+            stop = observation.stop if stop is None else stop | observation.stop
+        distances = observation.distances
+        if self.config.safety.constraints is None and self.config.way_making is not None:
+            distances = None  # used for way-making alone, not kept
+        return self.safety.step(
+            state,
+            q,
+            motion.joint_velocity,
+            observation.dt,
+            jacobian=J,
+            human_distance=observation.human_distance,
+            stop=stop,
+            stale=stale,
+            bounds=motion.bounds,
+            distances=distances,
+        )
+
     def _restored(self, state: ControllerState) -> ControllerState:
-        """The state, as at the start where it is not of numbers."""
+        """The state with invalid values replaced by those of the start."""
         return ControllerState(
             blending=self.blending.restored(state.blending),
             task_level=state.task_level.masked_fill(~is_number(state.task_level), 0),
@@ -398,64 +417,107 @@ class AdaptiveController(nn.Module):
         pose: Pose,
         J: Tensor,
         task_level: Tensor,
-        descent: Tensor,
+        s: Tensor,
     ) -> _Motion:
-        """Joint velocity of the law, with the pose drift compensated while a person acts."""
+        """Joint velocity of the law, with drift compensation while a person acts."""
+        descent = s
+        if self.config.jacobian == "analytic":
+            descent = analytic_descent(s, pose.orientation)
         d, rate = self._nullspace_input(observation), self.config.drift_compensation_rate
         xi_q = self.joint_region.gradient(q)
         if goals.rest is not None:
             xi_q = xi_q + self.config.null_damping * goals.rest.gradient(q)
         null = (-xi_q if d is None else d - xi_q) / self.config.null_damping
 
-        # B^T B J is the Jacobian of what the task leads of the tool's motion.
-        basis, led = self._basis(goals, pose, J), J
+        # B^T B J is the Jacobian of the controlled part of the tool's motion.
+        basis, controlled = self._basis(goals, pose, J), J
         if basis is not None:
-            led = basis.mT @ (basis @ J)
+            controlled = basis.mT @ (basis @ J)
             descent = led_descent(J, basis, descent)
         twist = task_twist = -descent / excess_speed(descent, self.caps[0])
         pose_drift = None
         if d is not None and rate > 0:
-            # A joint-space approach plans no path of the tool from which it could drift.
+            # A joint-space approach plans no tool path, so there is no drift.
             active = (d != 0).any(-1) & ((task_level == 1) | (goals.posture is None))
-            pose_drift = measure_drift(state.pose_drift, q, led, active)
+            pose_drift = measure_drift(state.pose_drift, q, controlled, active)
             twist = torch.add(task_twist, pose_drift.drift, alpha=rate)
 
-        ahead = self.config.command_delay
-        if ahead > 0:
-            # Where the arm will be when it follows: the null space is that of then.
-            coming = q + ahead * state.safety.velocity
-            if basis is None:
-                J = self.chain.jacobian(coming)
-            else:
-                pose, J = self.chain.forward_and_jacobian(coming)
-                basis = self._basis(goals, pose, J)
+        delay = self.config.command_delay
+        if delay > 0:
+            # Null space at the predicted joints.
+            pose, J = self.chain.forward_and_jacobian(q + delay * state.safety.velocity)
+            basis = self._basis(goals, pose, J)
+        bounds = self.safety.velocity_bounds(q)
+        task, null = self._resolved(goals, q, J, basis, twist, null, task_level, bounds)
+        return _Motion(
+            task + null, null, twist, task_twist, xi_q, bounds, pose_drift, controlled
+        )
+
+    def _resolved(
+        self,
+        goals: Goals,
+        q: Tensor,
+        J: Tensor,
+        basis: Tensor | None,
+        twist: Tensor,
+        null: Tensor,
+        task_level: Tensor,
+        bounds: tuple[Tensor, Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        """Joint velocities of the task and of the null space, which yields near limits."""
+        config = self.config
         J_task, rows = J, twist
         if basis is not None:
             J_task, rows = basis @ J, (basis @ twist.unsqueeze(-1)).squeeze(-1)
         task, null = resolved_rate(J_task, rows, null)
-        bounds = self.safety.velocity_bounds(q)
-        # Constraints let task and null space yield better.
-        cut = self.config.safety.constraints is None
-        if cut and self.config.null_space_saturation:
+        # Constraints resolve the conflict of task and null space themselves.
+        scaled = config.safety.constraints is None
+        if scaled and config.null_space_saturation:
             task = saturate_in_null_space(task, J_task, rows, *bounds)
-        if cut and self.config.task_slows:
+        if scaled and config.task_slows:
             task = scale_task(task, J, *bounds, self.caps[0])
         if goals.posture is not None:
             approach = approach_velocity(goals.posture, q, J, self.caps[1])
             task = torch.lerp(approach, task, task_level.unsqueeze(-1))
-        if cut and self.config.null_space_yields:
+        if scaled and config.null_space_yields:
             null = scale_null_space(task, null, *bounds)
-        return _Motion(task + null, null, twist, task_twist, xi_q, bounds, pose_drift, led)
+        return task, null
+
+    def _next_drift(
+        self,
+        before: PoseDrift,
+        motion: _Motion,
+        joint_velocity: Tensor,
+        dt: float | Tensor,
+        sound: Tensor,
+        safety: SafetyState,
+    ) -> PoseDrift:
+        """Drift state for the next step.
+
+        The part of the task's motion that passed the filter is the planned motion of the tool
+        until the next step: any other motion is drift.
+        """
+        if motion.pose_drift is None:
+            return replace(
+                before, active=torch.zeros_like(motion.twist[..., 0], dtype=torch.bool)
+            )
+        J = motion.jacobian
+        planned = planned_motion(motion.task_twist, motion.twist, J, joint_velocity, dt)
+        # An arm that only brakes does not drift.
+        braking = torch.linalg.vecdot(J, joint_velocity.unsqueeze(-2))
+        braking = safety.dt.unsqueeze(-1) * braking
+        planned = torch.where(sound.unsqueeze(-1), planned, braking)
+        return replace(motion.pose_drift, planned=planned)
 
     def _basis(self, goals: Goals, pose: Pose, J: Tensor) -> Tensor | None:
-        """What the goals lead of the tool's motion; None: all of it."""
+        """Basis of the controlled tool motion; None: all of it."""
         task = goals.task
         return (
             None if task == "pose" else task_basis(J, pose.orientation, task, self._ranks[task])
         )
 
     def _nullspace_input(self, observation: Observation) -> Tensor | None:
-        """The person's, and the effort that would make the arm make way by itself."""
+        """Null-space input of the person, plus the input equivalent to way-making."""
         d, way = observation.nullspace_input, self.config.way_making
         if way is None:
             return d
@@ -477,7 +539,7 @@ class AdaptiveController(nn.Module):
         feedback: Feedback,
         sound: Tensor,
     ) -> Any:
-        """State of the estimator after what the camera saw."""
+        """State of the estimator after the measurement of the camera."""
         q = observation.image_joint_position
         if q is not None:
             # Estimators compute with the pose even where they must not learn from it.
@@ -497,3 +559,8 @@ class AdaptiveController(nn.Module):
             xi_r=feedback.xi_r.masked_fill(~sound.unsqueeze(-1), 0),
         )
         return self.estimator.update(state.estimator, measurement)
+
+
+def _all_finite(*vectors: Tensor) -> Bool[Tensor, "*batch"]:
+    """True where all components of all vectors are finite."""
+    return is_number(torch.cat(vectors, dim=-1)).all(-1)

@@ -1,0 +1,281 @@
+"""Control barrier for joint limits, and an independent monitor of the same limits."""
+
+from __future__ import annotations
+
+from typing import final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from hrc_learn.kinematics import JointLimits, MotionLimits
+
+# Fraction of v_max left unused: sums of rounded numbers must not exceed it in the last digit.
+_ROUNDING = 1e-12
+# Relative excess tolerated by the monitor: differences of rounded numbers exceed limits by it.
+_MONITOR_TOLERANCE = 1 + 1e-9
+# Margin that libfranka subtracts from position-dependent velocity limits, for the same reason
+# (kJointVelocityLimitsTolerance, 0.21) [rad/s].
+_TOLERANCE = 1e-3
+
+
+@final
+class LimitBarrier(nn.Module):
+    """The invariant set of joint states from which all limits can be kept, and its bounds.
+
+    Let delta be the distance to a limit less its margin, v the speed towards it, A and j the
+    limits of acceleration and jerk, and v_hat = v + (a + A)^2/(2 j). The set is
+
+        v_hat <= min(h(delta), v_max + A^2/(2 j)),   h(delta) = sqrt(c^2 + 2 A delta) - c,
+        c = A / rate     <=>     Q(v_hat) = v_hat^2/(2 A) + v_hat/rate <= delta
+
+    v_hat is the speed from which braking with A *at once* ends at the same place as ramping
+    the acceleration down to -A, so one curve h serves. Without a jerk limit v_hat = v.
+
+    The set is invariant in discrete time. Let v_hat_k hold at step k, the joint move by
+    v_k dt, and the next acceleration be max(a_k - j dt, -A). Then v_hat_{k+1} <= v_hat_k -
+    A dt, and for every dt <= 1/rate
+
+        Q(v_hat - A dt) = Q(v_hat) - v_hat dt - A dt (1/rate - dt/2) <= delta - v_k dt,
+
+    and below A dt the joint moves by at most v_hat dt <= rate dt delta <= delta. So a step that
+    keeps all limits always exists. dt is the time between two steps; if it is measured, steps
+    of any length keep the limits. The proof assumes joints that move by v dt, and a start
+    inside the set. At rest v_hat = A^2/(2 j), so the start must satisfy
+
+        delta >= A^3/(8 j^2) + A^2/(2 j rate),
+
+    which is 3 mrad for a Panda at 5 1/s, covered by the margin. The first term, the distance
+    on which the acceleration ramps down, matters where A/j is long, as for slow axes.
+
+    *Starts outside.* From rest nearer to a limit, or past it, a joint moves inwards only. With
+    `rests_outside=False` it must; with True it may also rest. Then the set is
+    v_hat <= max(h(delta), A^2/(2 j)), and a joint that comes to rest within its margin does so
+    at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. That set is
+    invariant as well: braking lowers v_hat.
+
+    *Delay and jitter.* Joints that follow a command after a delay T continue at a speed of at
+    most v + A T while they brake. A wall that recedes by T v_hat, which braking lowers by T A
+    dt in a step, compensates it: Q(v_hat) + T v_hat <= delta, so 1/rate + T replaces 1/rate. If
+    a step lasts (1 + jitter) dt, the deceleration is A/(1 + jitter), which replaces A in Q.
+
+    *Position-dependent velocity limits.* With o and d of `MotionLimits.velocity_bounds` and
+    the margin m they are a curve of the same kind:
+
+        sqrt(2 d (delta + m)) - o >= sqrt(o^2 + 2 d delta) - o   if m >= o^2/(2 d).
+
+    The right-hand side falls as o grows, to h with the knee c >= o, and h grows with A. So the
+    limits hold at every position, and joints brake in time, if Q has min(A, d) in place of A
+    and at least o/d in place of 1/rate, and the margin is wide enough. The offset o includes
+    the margin that libfranka subtracts, and the required m includes the A^2/(2 j) with which
+    joints may come to rest in it. All of these are constants: a step costs nothing more.
+    """
+
+    velocity: Tensor
+    """v_max [rad/s]."""
+    acceleration: Tensor
+    """A [rad/s^2]."""
+    jerk: Tensor
+    """j [rad/s^3]."""
+    walls: Tensor
+    """Lower and upper limits less the margin, times the signs of `sides` (2, n) [rad]."""
+    sides: Tensor
+    """Signs of the lower and the upper limit, (2, 1)."""
+    knee: Tensor
+    """c [rad/s]."""
+    knee_square: Tensor
+    """c^2."""
+    twice_acceleration: Tensor
+    """2 A of Q [rad/s^2]."""
+    reserve: Tensor
+    """Speed gained while the braking builds up, A^2/(2 j) [rad/s]; zero without a jerk
+    limit."""
+
+    def __init__(
+        self,
+        limits: MotionLimits,
+        *,
+        margin: float,
+        rate: float,
+        jerk_limited: bool,
+        rests_outside: bool = False,
+        delay: float = 0.0,
+        jitter: float = 0.0,
+    ):
+        """Prepare the constants.
+
+        Args:
+            limits: Limits of the joints.
+            margin: Distance kept from every position limit [rad]; wider where
+                position-dependent velocity limits require it.
+            rate: Fastest decay of the remaining distance [1/s].
+            jerk_limited: True if the acceleration changes by at most j dt in a step.
+            rests_outside: True if a joint outside its limits may rest there.
+            delay: Time until the joints follow a command [s].
+            jitter: Largest relative excess of a step over its dt.
+        """
+        super().__init__()
+        self.rests_outside = rests_outside
+        self.jerk_limited = jerk_limited
+        A, j = limits.acceleration, limits.jerk
+        reserve = A**2 / (2 * j) if jerk_limited else torch.zeros_like(A)
+        slowest, decay_time = A / (1 + jitter), torch.full_like(A, 1 / rate)
+        margins = torch.full_like(A, margin)
+        if limits.velocity_offset is not None and limits.deceleration is not None:
+            o, d = limits.velocity_offset + _TOLERANCE, limits.deceleration
+            slowest, decay_time = slowest.minimum(d), decay_time.maximum(o / d)
+            margins = margins.maximum((o + reserve) ** 2 / (2 * d))
+        knee = slowest * (decay_time + delay)
+        walls = torch.stack([-limits.lower - margins, limits.upper - margins])
+        constants = {
+            "velocity": limits.velocity * (1 - _ROUNDING),
+            "acceleration": A.clone(),
+            "jerk": j.clone(),
+            "walls": walls,
+            "sides": torch.tensor([[1.0], [-1.0]]).to(walls),
+            "knee": knee,
+            "knee_square": knee**2,
+            "twice_acceleration": 2 * slowest,
+            "reserve": reserve,
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value)
+
+    def velocity_bounds(
+        self, joint_position: Float[Tensor, "*batch n"]
+    ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
+        """Lowest and highest velocity [rad/s] of a steady motion (a = 0) inside the set."""
+        delta = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
+        # h(|delta|) with the sign of delta: past its wall the joint is driven back as fast as
+        # it may approach from the same distance inside, and the root stays real.
+        square = torch.addcmul(self.knee_square, self.twice_acceleration, delta.abs())
+        speed = torch.copysign(square.sqrt() - self.knee, delta)
+        if self.jerk_limited:
+            speed = speed - self.reserve  # v_hat = v + A^2/(2 j) at a = 0
+        if self.rests_outside:
+            speed = speed.clamp(min=0)
+        bounds = speed.clamp(-self.velocity, self.velocity) * -self.sides
+        lower, upper = bounds.unbind(-2)
+        return lower, upper
+
+    def acceleration_bounds(
+        self,
+        velocity: Float[Tensor, "*batch n"],
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Float[Tensor, "*#batch 1"],
+    ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
+        """Lowest and highest acceleration [rad/s^2] that stay inside the set.
+
+        The roots a of v + a dt + (a + A)^2/(2 j) = bound + A^2/(2 j), for both limits.
+
+        Args:
+            velocity: Velocity of the last step [rad/s].
+            bounds: `velocity_bounds` now.
+            dt: Step [s], one for all arms or one for each.
+        """
+        lower, upper = bounds
+        slack = torch.stack([velocity - lower, upper - velocity], dim=-2)
+        offset = (self.acceleration + self.jerk * dt).unsqueeze(-2)
+        # Negative far outside the set, where no acceleration is enough: the clamp brakes hard.
+        square = torch.addcmul(offset * offset, self.jerk, slack, value=2)
+        down, up = (square.clamp(min=0).sqrt() - offset).unbind(-2)
+        return -down, up
+
+    def nearest_acceleration(
+        self,
+        wanted: Float[Tensor, "*batch n"],
+        last: Float[Tensor, "*batch n"],
+        velocity: Float[Tensor, "*batch n"],
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Float[Tensor, "*#batch 1"],
+    ) -> Float[Tensor, "*batch n"]:
+        """The nearest acceleration that keeps the limits now and later [rad/s^2].
+
+        Args:
+            wanted: Acceleration wanted [rad/s^2].
+            last: Acceleration of the last step [rad/s^2].
+            velocity: Velocity of the last step [rad/s].
+            bounds: `velocity_bounds` now.
+            dt: Step [s], one for all arms or one for each.
+        """
+        # The reachable range comes last: outside its set the barrier may ask for more.
+        inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
+        return inside.clamp(*self._reachable_acceleration(last, dt))
+
+    def _reachable_acceleration(
+        self, last: Tensor, dt: float | Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Lowest and highest acceleration of the next step within the jerk limit [rad/s^2]."""
+        reach = self.jerk * dt
+        return (
+            torch.maximum(last - reach, -self.acceleration),
+            torch.minimum(last + reach, self.acceleration),
+        )
+
+    def reachable_velocity(
+        self,
+        velocity: Float[Tensor, "*batch n"],
+        acceleration: Float[Tensor, "*batch n"],
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Float[Tensor, "*#batch 1"],
+    ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
+        """Lowest and highest velocity of the next step that keep all limits [rad/s].
+
+        Where the limits of position and velocity ask for more than those of acceleration and
+        jerk allow, the nearest velocity that those allow.
+
+        Args:
+            velocity: Velocity of the last step [rad/s].
+            acceleration: Acceleration of the last step [rad/s^2].
+            bounds: `velocity_bounds` now.
+            dt: Step [s], one for all arms or one for each.
+        """
+        A = self.acceleration
+        if self.jerk_limited:
+            allowed = self.acceleration_bounds(velocity, bounds, dt)
+            reachable = self._reachable_acceleration(acceleration, dt)
+            lowest, highest = (a.clamp(*allowed).clamp(*reachable) for a in (-A, A))
+            return velocity + dt * lowest, velocity + dt * highest
+        lower, upper = velocity - A * dt, velocity + A * dt
+        return bounds[0].clamp(lower, upper), bounds[1].clamp(lower, upper)
+
+
+@final
+class LimitMonitor:
+    """Monitor of the motion limits of commanded joint velocities, from step to step.
+
+    It shares no code with the safety filter that has to keep them.
+    """
+
+    def __init__(self, limits: JointLimits, velocity: Float[Tensor, "*batch n"], dt: float):
+        """Start monitoring.
+
+        Args:
+            limits: Limits of the joints.
+            velocity: Steady velocity at the start [rad/s].
+            dt: Step [s].
+        """
+        self._limits, self._velocity, self._dt = limits, velocity, dt
+        self._acceleration = torch.zeros_like(velocity)
+
+    def violations(
+        self, q: Float[Tensor, "*batch n"], velocity: Float[Tensor, "*batch n"]
+    ) -> Bool[Tensor, "*batch 4"]:
+        """Flags of exceeded limits in one step: position, velocity, acceleration, jerk.
+
+        Args:
+            q: Joint positions, on which velocity limits may depend [rad].
+            velocity: Velocity commanded for the step [rad/s].
+        """
+        limits = self._limits
+        slowest, fastest = limits.velocity_bounds(q)
+        acceleration = (velocity - self._velocity) / self._dt
+        jerk = (acceleration - self._acceleration) / self._dt
+        self._velocity, self._acceleration = velocity, acceleration
+        broken = [
+            (q > limits.upper) | (q < limits.lower),
+            (velocity > fastest) | (velocity < slowest),
+            acceleration.abs() > limits.acceleration * _MONITOR_TOLERANCE,
+            jerk.abs() > limits.jerk * _MONITOR_TOLERANCE,
+        ]
+        return torch.stack([flags.any(-1) for flags in broken], dim=-1)
