@@ -328,7 +328,7 @@ def _unit_cost_directions(
     jacobian: Float[Tensor, "*batch m n"],
     task: Float[Tensor, "*batch n"],
     config: ConstraintConfig,
-) -> Float[Tensor, "*batch n+1 n"]:
+) -> Float[Tensor, "*batch directions n"]:
     """Joint velocities of one unit of cost each: m off the path, one along it, null space."""
     m = jacobian.shape[-2]
     basis = orthonormal_basis(jacobian).mT
@@ -340,11 +340,11 @@ def _unit_cost_directions(
 
 
 def _limit_rows(
-    basis: Float[Tensor, "*batch n+1 n"],
+    basis: Float[Tensor, "*batch directions n"],
     gradient: Float[Tensor, "*batch pairs n"] | None,
     m: int,
     config: ConstraintConfig,
-) -> Float[Tensor, "*batch n+2 limits"]:
+) -> Float[Tensor, "*batch unknowns limits"]:
     """Columns of `least_change`: limits of the joints, of the task, of the distances.
 
     The last unknown is the common excess of the distances.

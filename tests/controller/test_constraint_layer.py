@@ -210,7 +210,7 @@ def test_a_task_that_is_under_way_is_given_up_by_no_more_than_its_share():
     task = torch.linalg.pinv(J)[:, 0] * 0.2
     stop = torch.zeros(7, dtype=DOUBLE)
     share = torch.tensor(0.25, dtype=DOUBLE)
-    found = constrained_velocity(0.25 * task, task, J, stop, stop, share=share)
+    found = constrained_velocity(0.25 * task, task, J, stop, stop, task_fraction=share)
     assert found.slowed == pytest.approx(0.25, abs=1e-6)
     assert not found.joint_velocity.any()
     # Nor does it run backwards before a person who comes towards it.
@@ -220,7 +220,7 @@ def test_a_task_that_is_under_way_is_given_up_by_no_more_than_its_share():
         approach_speed=torch.tensor([0.1], dtype=DOUBLE),
     )
     wide = torch.full((7,), 9.0, dtype=DOUBLE)
-    found = constrained_velocity(0.25 * task, task, J, -wide, wide, ahead, share=share)
+    found = constrained_velocity(0.25 * task, task, J, -wide, wide, ahead, task_fraction=share)
     assert found.slowed == pytest.approx(0.25, abs=1e-9)
     assert found.violation < 1e-3
     assert (ahead.gradient @ found.joint_velocity).item() == pytest.approx(0.1, abs=1e-3)
