@@ -1,6 +1,4 @@
-"""Demonstrations as plain arrays: one, several of one robot, and several padded to one
-length.
-"""
+"""Demonstrations as plain arrays: one, a set from one robot, and a padded batch."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -11,9 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from hrc_learn.demos.issue import DatasetError
-
-# One demonstration as plain arrays.
+from hrc_learn.demos.issues import DatasetError
 
 JOINT_FIELDS = (
     "joint_position",
@@ -23,47 +19,49 @@ JOINT_FIELDS = (
     "command_position",
     "command_velocity",
 )
-"""Fields with one column a joint, in the order of `joint_names`."""
+"""Fields with one column per joint, in the order of `joint_names`."""
 
 _WIDTHS = {"position": 3, "orientation": 4, "feature": 2}
+_ARRAYS = ("time", *JOINT_FIELDS, *_WIDTHS, "gripper")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Demonstration:
-    """What was recorded while a person showed the task once.
+    """Recording of one demonstration of a task.
 
-    Every array has one row a frame; whatever was not recorded is None. SI units and
-    radians; poses are of the tool centre point in the robot's base frame.
+    Every array has one row per frame; quantities that were not recorded are None. SI units and
+    radians; poses are those of the tool centre point in the robot's base frame. Lists and
+    tensors are converted to arrays.
     """
 
     time: Float64[np.ndarray, " _frames"]
     """Time since the first frame [s], increasing."""
     joint_position: Float64[np.ndarray, "_frames _joints"] | None = None
-    """[rad]"""
+    """Joint positions [rad]."""
     joint_velocity: Float64[np.ndarray, "_frames _joints"] | None = None
-    """[rad/s]"""
+    """Joint velocities [rad/s]."""
     joint_effort: Float64[np.ndarray, "_frames _joints"] | None = None
-    """Measured joint torque [N m]."""
+    """Measured joint torques [N m]."""
     position: Float64[np.ndarray, "_frames _xyz"] | None = None
-    """[m]"""
+    """Position of the tool centre point [m]."""
     orientation: Float64[np.ndarray, "_frames _wxyz"] | None = None
     """Unit quaternion (w, x, y, z), its sign continuous along the demonstration."""
     gripper: Float64[np.ndarray, " _frames"] | None = None
-    """Opening [m], or 0 to 1 where the robot knows no width."""
+    """Opening of the gripper [m], or 0 to 1 if the robot reports no width."""
     feature: Float64[np.ndarray, "_frames _uv"] | None = None
-    """Image feature (u right, v down) [px]; meaningless where `feature_visible` is false."""
+    """Image feature (u right, v down) [px]; undefined where `feature_visible` is False."""
     feature_visible: Bool[np.ndarray, " _frames"] | None = None
-    """Whether the camera saw the feature."""
+    """True where the camera saw the feature."""
     human_effort: Float64[np.ndarray, "_frames _joints"] | None = None
-    """The person's effort d in joint space [N m]."""
+    """Effort d of the person in joint space [N m]."""
     command_position: Float64[np.ndarray, "_frames _joints"] | None = None
-    """Commanded joint position [rad]."""
+    """Commanded joint positions [rad]."""
     command_velocity: Float64[np.ndarray, "_frames _joints"] | None = None
-    """Commanded joint velocity [rad/s]."""
+    """Commanded joint velocities [rad/s]."""
     task: str = ""
-    """What the person was asked to show."""
+    """Task shown, in words."""
     joint_names: tuple[str, ...] = ()
-    """Names of the joints, in the order of the columns; empty where poses alone are known."""
+    """Joint names in the order of the columns; empty if only poses are known."""
     fps: float | int
     """Nominal frame rate [1/s]."""
     start_time: float = 0.0
@@ -71,9 +69,12 @@ class Demonstration:
     episode: int = 0
     """Index of the episode in its dataset."""
     extra: dict[str, Float64[np.ndarray, "_frames _components"]] = field(default_factory=dict)
-    """Every other numeric column, by the key it has in the dataset, unconverted."""
+    """All other numeric columns by their key in the dataset, unconverted."""
 
     def __post_init__(self) -> None:
+        for name in _ARRAYS:
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, float_array(getattr(self, name)))
         frames, joints = len(self.time), len(self.joint_names)
         if frames == 0:
             raise ValueError("a demonstration needs at least one frame, but time is empty")
@@ -133,11 +134,18 @@ class Demonstration:
         return replace(self, joint_names=tuple(names), **chosen)
 
 
+def float_array(values: object) -> Float64[np.ndarray, "..."]:
+    """Array, list or tensor (on any device, with or without gradient) as a float64 array."""
+    if isinstance(values, Tensor):
+        values = values.detach().cpu().numpy()
+    return np.asarray(values, dtype=np.float64)
+
+
 def joint_columns(available: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """Columns of the wanted joints.
 
     Raises:
-        DatasetError: A wanted joint does not exist; the message lists those that do.
+        DatasetError: A wanted joint does not exist; the message lists the existing ones.
     """
     missing = [name for name in wanted if name not in available]
     if missing:
@@ -149,21 +157,18 @@ def joint_columns(available: Sequence[str], wanted: Sequence[str]) -> list[int]:
     return [list(available).index(name) for name in wanted]
 
 
-# Demonstrations of different lengths as tensors of one length.
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PaddedDemonstrations:
-    """Demonstrations stacked along a leading axis; a field is None unless all recorded it.
+    """Batch of demonstrations; a field is None unless all of them recorded it.
 
-    Behind the end of a demonstration its last row is held and time goes on in steps of the
-    last interval, so that time increases everywhere; `mask` is false there.
+    After the end of a demonstration its last row is repeated, and time continues in steps of
+    the last interval, so that it increases everywhere; `mask` is False there.
     """
 
     mask: Bool[Tensor, "demos frames"]
-    """True where a frame was recorded."""
+    """True for recorded frames."""
     length: Int[Tensor, " demos"]
-    """Recorded frames of each demonstration."""
+    """Number of recorded frames of each demonstration."""
     time: Float[Tensor, "demos frames"]
     joint_position: Float[Tensor, "demos frames joints"] | None = None
     joint_velocity: Float[Tensor, "demos frames joints"] | None = None
@@ -180,7 +185,7 @@ class PaddedDemonstrations:
     def to(
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> "PaddedDemonstrations":
-        """Move every field; a dtype changes those that hold real numbers."""
+        """Move every field to a device; a dtype changes the fields of real numbers."""
         moved = {
             f.name: tensor.to(device, dtype if tensor.is_floating_point() else None)
             for f in fields(self)
@@ -190,41 +195,37 @@ class PaddedDemonstrations:
 
 
 def pad(demonstrations: Sequence[Demonstration]) -> PaddedDemonstrations:
-    """Stack demonstrations, holding the last row of the shorter ones (float64)."""
+    """Batch of demonstrations, the last rows of shorter ones repeated (float64)."""
     lengths = np.array([len(demo) for demo in demonstrations])
     longest = int(lengths.max())
-    shared = set.intersection(*(set(demo.recorded) for demo in demonstrations)) - {"time"}
+
+    def repeat_last(array: np.ndarray) -> np.ndarray:
+        return np.concatenate([array, np.repeat(array[-1:], longest - len(array), axis=0)])
+
+    def continue_time(demo: Demonstration) -> np.ndarray:
+        time = demo.time
+        step = time[-1] - time[-2] if len(time) > 1 else 1 / demo.fps
+        return np.concatenate([time, time[-1] + step * np.arange(1, longest - len(time) + 1)])
+
+    common = set.intersection(*(set(demo.recorded) for demo in demonstrations)) - {"time"}
     stacked = {
-        name: np.stack([_hold(getattr(demo, name), longest) for demo in demonstrations])
-        for name in shared
+        name: np.stack([repeat_last(getattr(demo, name)) for demo in demonstrations])
+        for name in common
     }
-    time = np.stack([_go_on(demo.time, longest, demo.fps) for demo in demonstrations])
+    stacked["time"] = np.stack([continue_time(demo) for demo in demonstrations])
     return PaddedDemonstrations(
         mask=torch.from_numpy(np.arange(longest) < lengths[:, None]),
         length=torch.from_numpy(lengths),
-        time=torch.from_numpy(time),
         **{name: torch.from_numpy(array) for name, array in stacked.items()},
     )
-
-
-def _hold(array: np.ndarray, length: int) -> np.ndarray:
-    return np.concatenate([array, np.repeat(array[-1:], length - len(array), axis=0)])
-
-
-def _go_on(time: np.ndarray, length: int, fps: float | int) -> np.ndarray:
-    step = time[-1] - time[-2] if len(time) > 1 else 1 / fps
-    return np.concatenate([time, time[-1] + step * np.arange(1, length - len(time) + 1)])
-
-
-# Several demonstrations of one robot.
 
 
 class DemonstrationSet(Sequence[Demonstration]):
     """Demonstrations of one robot, in the order they were read.
 
     Attributes:
-        notes: What the reader guessed or converted, one sentence each; show it to the user.
-        source: The dataset's folder, "" for demonstrations made in memory.
+        notes: Guesses and conversions of the reader, one sentence each, for the user.
+        source: Folder of the dataset, "" for demonstrations made in memory.
     """
 
     def __init__(
@@ -234,13 +235,22 @@ class DemonstrationSet(Sequence[Demonstration]):
         notes: Sequence[str] = (),
         source: str = "",
     ):
+        """
+        Args:
+            demonstrations: Demonstrations with the same joints.
+            notes: Notes for the user.
+            source: Folder of the dataset.
+
+        Raises:
+            ValueError: The demonstrations differ in their joints.
+        """
         self._demonstrations = tuple(demonstrations)
         self.notes = tuple(notes)
         self.source = source
         names = {demo.joint_names for demo in self._demonstrations}
         if len(names) > 1:
             raise ValueError(
-                f"demonstrations of one set share their joints, but these differ: {names}. "
+                f"demonstrations of one set need the same joints, but these differ: {names}. "
                 f"select_joints(names) brings them to one order."
             )
 
@@ -250,9 +260,7 @@ class DemonstrationSet(Sequence[Demonstration]):
     def __getitem__(self, index: slice) -> "DemonstrationSet": ...
     def __getitem__(self, index):
         if isinstance(index, slice):
-            return DemonstrationSet(
-                self._demonstrations[index], notes=self.notes, source=self.source
-            )
+            return self._like(self._demonstrations[index])
         return self._demonstrations[index]
 
     def __len__(self) -> int:
@@ -267,13 +275,17 @@ class DemonstrationSet(Sequence[Demonstration]):
             f"joints: {', '.join(self.joint_names) or 'none'})"
         )
 
+    def _like(self, demonstrations: Sequence[Demonstration]) -> "DemonstrationSet":
+        return DemonstrationSet(demonstrations, notes=self.notes, source=self.source)
+
     @property
     def joint_names(self) -> tuple[str, ...]:
+        """Joint names of all demonstrations."""
         return self._demonstrations[0].joint_names if self._demonstrations else ()
 
     @property
     def frames(self) -> int:
-        """Frames of all demonstrations together."""
+        """Number of frames of all demonstrations together."""
         return sum(map(len, self._demonstrations))
 
     def select_joints(self, names: Sequence[str]) -> "DemonstrationSet":
@@ -282,22 +294,18 @@ class DemonstrationSet(Sequence[Demonstration]):
         Raises:
             DatasetError: A name is not among `joint_names`.
         """
-        return DemonstrationSet(
-            [demo.select_joints(names) for demo in self], notes=self.notes, source=self.source
-        )
+        return self._like([demo.select_joints(names) for demo in self])
 
     def filter(self, wanted: Callable[[Demonstration], bool]) -> "DemonstrationSet":
-        """Only the demonstrations for which `wanted` is true."""
-        chosen = [demo for demo in self if wanted(demo)]
-        return DemonstrationSet(chosen, notes=self.notes, source=self.source)
+        """Demonstrations for which `wanted` is true."""
+        return self._like([demo for demo in self if wanted(demo)])
 
     def map(self, change: Callable[[Demonstration], Demonstration]) -> "DemonstrationSet":
-        """What `change` makes of each demonstration, such as a step of `preprocessing`."""
-        changed = [change(demo) for demo in self]
-        return DemonstrationSet(changed, notes=self.notes, source=self.source)
+        """Demonstrations changed one by one, such as by a step of `preprocessing`."""
+        return self._like([change(demo) for demo in self])
 
     def padded(self) -> PaddedDemonstrations:
-        """All demonstrations as tensors of one length, with a mask.
+        """All demonstrations as one batch of tensors, with a mask.
 
         Raises:
             ValueError: The set is empty.

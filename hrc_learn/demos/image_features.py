@@ -1,5 +1,9 @@
-"""Image features found in a dataset's videos, kept in files beside it, and put into
-demonstrations.
+"""Image features found in a dataset's videos, kept next to the dataset.
+
+    NAME.features/CAMERA.FEATURE/episode_000000.parquet    u, v, visible: one row per frame
+
+The dataset itself is never changed. Each file is complete or absent, and records which video it
+was made from, so that an interrupted extraction continues and notices new recordings.
 """
 
 import json
@@ -13,12 +17,8 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, UInt8
 
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
-from hrc_learn.demos.format.dataset_folder import (
-    EpisodeEntry,
-    open_folder,
-    open_parquet,
-    read_table,
-)
+from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.format.files import open_parquet, read_table
 from hrc_learn.demos.format.videos import (
     VideoSegment,
     decode,
@@ -26,55 +26,45 @@ from hrc_learn.demos.format.videos import (
     read_segments,
     video_keys,
 )
-from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.frames import to_numpy
 from hrc_learn.store import new_file
 
-# Image features of a dataset in a folder beside it: one file an episode.
-#
-#     NAME.features/CAMERA.FEATURE/episode_000000.parquet    u, v, visible: one row a frame
-#
-# The dataset itself is never touched. Each file is whole or not there, and says of which
-# video it was made, so that an extraction goes on where it was broken off and notices new
-# recordings.
-
 _SOURCE = b"hrc_learn.video"
+
+Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
+"""Pixel (u right, v down) of the feature in an RGB image, or None if it is not visible."""
+
+Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureTrack:
-    """An image feature along one episode."""
+    """Path of an image feature along one episode."""
 
     pixels: Float64[np.ndarray, "_frames 2"]
-    """(u right, v down) [px], 0 where it was not seen."""
+    """Pixel (u right, v down) [px], 0 where the feature is not visible."""
     visible: Bool[np.ndarray, " _frames"]
 
 
-def features_folder(root: Path) -> Path:
-    """Where the features found in the videos of the dataset `root` are kept."""
-    if root.name in ("", ".."):
-        root = root.resolve()
-    return root.with_name(root.name + ".features")
-
-
-def feature_names(root: Path) -> list[str]:
-    """Features that were extracted, whole or in part."""
-    # Hidden ones hold what is not finished.
-    return sorted(path.name for path in features_folder(root).glob("[!.]*") if path.is_dir())
-
-
 class FeatureCache:
-    """The files of one feature of one dataset."""
+    """Files of one feature of one dataset."""
 
     def __init__(self, root: Path, name: str):
+        """
+        Args:
+            root: Folder of the dataset.
+            name: Name of the feature, such as "front.marker_3".
+        """
         self.name = name
-        self._folder = features_folder(root) / name
+        self._folder = _features_folder(root) / name
 
     def path(self, episode: int) -> Path:
+        """File of an episode."""
         return self._folder / f"episode_{episode:06d}.parquet"
 
     def is_current(self, episode: int, segment: VideoSegment) -> bool:
-        """Whether the episode's file is there and was made of this very video."""
+        """True if the file of an episode was made from this very video."""
         path = self.path(episode)
         if not path.is_file():
             return False
@@ -82,45 +72,50 @@ class FeatureCache:
         return metadata.get(_SOURCE) == _fingerprint(segment)
 
     def write(self, episode: int, segment: VideoSegment, track: FeatureTrack) -> None:
-        """Keep what was found in an episode; its file is whole or not there."""
+        """Keep the track of an episode."""
         path = self.path(episode)
         path.parent.mkdir(parents=True, exist_ok=True)
-        table = pa.table(
-            {
-                "u": pa.array(track.pixels[:, 0]),
-                "v": pa.array(track.pixels[:, 1]),
-                "visible": pa.array(track.visible),
-            }
-        )
+        columns = {"u": track.pixels[:, 0], "v": track.pixels[:, 1], "visible": track.visible}
+        table = pa.table({name: pa.array(values) for name, values in columns.items()})
         with new_file(path) as part:
             pq.write_table(
                 table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), part
             )
 
     def read(self, episode: int, frames: int) -> FeatureTrack:
-        """What was found in an episode.
+        """Track of an episode.
 
         Raises:
-            DatasetError: It was not extracted, or is of another recording.
+            DatasetError: The feature was not extracted, or belongs to another recording.
         """
-        file = str(self.path(episode))
-        if not self.path(episode).is_file():
+        path = self.path(episode)
+        if not path.is_file():
             raise DatasetError(
-                f"{self.name} was not extracted from this episode: hrc extract goes on where "
-                f"it was broken off",
-                file=file,
+                f"{self.name} was not extracted from this episode: hrc extract continues an "
+                f"interrupted extraction",
+                file=path,
                 episode=episode,
             )
-        name = self.path(episode).name
-        table = read_table(open_parquet(self._folder, name, episode), file)
+        table = read_table(open_parquet(self._folder, path.name, episode), str(path))
         u, v, visible = (to_numpy(table.column(c))[:, 0] for c in ("u", "v", "visible"))
         if len(u) != frames:
             raise DatasetError(
                 f"{self.name} has {len(u)} frames, the episode {frames}: run hrc extract again",
-                file=file,
+                file=path,
                 episode=episode,
             )
         return FeatureTrack(pixels=np.stack([u, v], axis=1), visible=visible.astype(bool))
+
+
+def _features_folder(root: Path) -> Path:
+    if root.name in ("", ".."):
+        root = root.resolve()
+    return root.with_name(root.name + ".features")
+
+
+def _feature_names(root: Path) -> list[str]:
+    """Features that were extracted, in whole or in part; hidden folders are unfinished."""
+    return sorted(path.name for path in _features_folder(root).glob("[!.]*") if path.is_dir())
 
 
 def _fingerprint(segment: VideoSegment) -> bytes:
@@ -129,32 +124,24 @@ def _fingerprint(segment: VideoSegment) -> bytes:
     return json.dumps(content).encode()
 
 
-# Looking for a feature in all videos of a camera.
-
-Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
-"""Pixel (u right, v down) of the feature in an RGB image, or None where it is not seen."""
-
-Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
-
-
 @dataclass(kw_only=True)
 class Extraction:
-    """What was done."""
+    """Result of `extract_features`."""
 
     name: str
-    """Name of the feature beside the dataset."""
+    """Name of the feature next to the dataset."""
     episodes: int = 0
-    """Episodes looked at now."""
+    """Episodes searched now."""
     known: int = 0
-    """Episodes that had been looked at before."""
+    """Episodes searched earlier."""
     frames: int = 0
-    """Frames looked at now."""
+    """Frames searched now."""
     seen: int = 0
-    """Those of them in which the feature was seen."""
+    """Frames among them that show the feature."""
     without_image: int = 0
     """Frames for which the video holds no image."""
     left_out: dict[int, str] = field(default_factory=dict)
-    """Episodes whose video is missing or damaged, and what is wrong with it."""
+    """Episode index -> fault of its video."""
 
 
 def extract_features(
@@ -165,20 +152,19 @@ def extract_features(
     camera: str | None = None,
     progress: Progress | None = None,
 ) -> Extraction:
-    """Find a feature in every image of a camera and keep it beside the dataset.
+    """Find a feature in every image of a camera and keep it next to the dataset.
 
-    Episodes that were looked at before, in the same videos, are skipped: run it again after
-    it was broken off, or after more was recorded. Those whose video is missing or damaged are
-    left out, and listed in the result.
+    Episodes already searched, in the same videos, are skipped: call it again after an
+    interruption, or after recording more. Episodes without a sound video are left out and
+    listed in the result.
 
     Args:
         path: The dataset.
-        name: What is looked for, such as "marker_3".
-        detector: Makes the detector for one episode, so that one which follows the feature
-            from image to image starts anew.
-        camera: Name of the camera ("front") or of its feature; None: the only one.
-        progress: Called with the episodes to look at, and gives them back: a hook for a
-            progress bar.
+        name: Name of the feature, such as "marker_3".
+        detector: Factory of the detector for one episode, so that a detector that tracks the
+            feature from image to image starts afresh.
+        camera: Name of the camera ("front") or its feature; None for the only one.
+        progress: Wraps the episodes to search, such as with a progress bar.
 
     Raises:
         DatasetError: There is no such camera, or the metadata are damaged.
@@ -196,8 +182,14 @@ def extract_features(
     done = Extraction(name=cache.name, known=len(folder.episodes) - len(waiting))
     for entry in progress(waiting) if progress else waiting:
         try:
-            segment = _require(segments[entry.index], entry, key)
-            track, images = _look(segment, entry.length, folder.fps, detector())
+            segment = segments[entry.index]
+            if segment is None:
+                raise DatasetError(
+                    "its video is missing; copy it, or load the dataset without image features",
+                    episode=entry.index,
+                    key=key,
+                )
+            track, images = _track(segment, entry.length, folder.fps, detector())
         except DatasetError as error:
             done.left_out[entry.index] = str(error)
             continue
@@ -209,62 +201,49 @@ def extract_features(
     return done
 
 
-def _look(
+def _track(
     segment: VideoSegment, frames: int, fps: float, detect: Detector
 ) -> tuple[FeatureTrack, int]:
-    """The feature along one episode, and how many of its frames have an image."""
+    """Track of the feature along one episode, and the number of frames with an image."""
     pixels, visible = np.zeros((frames, 2)), np.zeros(frames, dtype=bool)
-    seen = set()
+    decoded = set()
     for frame, image in decode(segment, fps):
         if frame >= frames:
             break
-        seen.add(frame)
+        decoded.add(frame)
         pixel = detect(image)
         if pixel is not None:
             pixels[frame], visible[frame] = pixel, True
-    return FeatureTrack(pixels=pixels, visible=visible), len(seen)
+    return FeatureTrack(pixels=pixels, visible=visible), len(decoded)
 
 
 def _camera_key(keys: Sequence[str], camera: str | None) -> str:
     wanted = [key for key in keys if camera is None or key in (camera, image_key(camera))]
     if len(wanted) == 1:
         return wanted[0]
-    what = "say which camera" if camera is None and keys else f"there is no camera {camera!r}"
-    raise DatasetError(f"{what}; the videos are of {', '.join(keys) or 'none'}")
-
-
-def _require(segment: VideoSegment | None, entry: EpisodeEntry, key: str) -> VideoSegment:
-    if segment is None:
-        raise DatasetError(
-            "its video is not here; copy it, or load the dataset without image features",
-            episode=entry.index,
-            key=key,
-        )
-    return segment
-
-
-# Features that were extracted from videos, put into demonstrations.
+    what = "name the camera" if camera is None and keys else f"there is no camera {camera!r}"
+    raise DatasetError(f"{what}; the dataset has videos of {', '.join(keys) or 'none'}")
 
 
 def attach_features(demos: DemonstrationSet, name: str | None = None) -> DemonstrationSet:
     """Demonstrations with a feature that `extract_features` found in their videos.
 
-    `load_demos` and `open_demos` do so by themselves where a dataset has no image feature of
+    `load_demos` and `open_demos` attach it themselves if the dataset has no image feature of
     its own and exactly one was extracted.
 
     Args:
-        demos: Read from a dataset.
-        name: Name of the feature, such as "front.marker_3"; None: the only one.
+        demos: Demonstrations read from a dataset.
+        name: Name of the feature, such as "front.marker_3"; None for the only one.
 
     Raises:
         DatasetError: There is no such feature, or it was not extracted from all episodes.
     """
     root = Path(demos.source)
-    known = feature_names(root) if demos.source else []
+    known = _feature_names(root) if demos.source else []
     chosen = [feature for feature in known if name in (None, feature)]
     if len(chosen) != 1:
         raise DatasetError(
-            f"{'say which feature' if name is None else f'there is no feature {name!r}'}; "
+            f"{'name the feature' if name is None else f'there is no feature {name!r}'}; "
             f"extracted are {', '.join(known) or 'none'}",
             file=demos.source,
         )
@@ -273,21 +252,21 @@ def attach_features(demos: DemonstrationSet, name: str | None = None) -> Demonst
 
 
 def only_feature(root: Path) -> FeatureCache | None:
-    """The feature that was extracted from a dataset; None where that is not exactly one."""
-    names = feature_names(root)
+    """The single feature extracted from a dataset; None if there are none or several."""
+    names = _feature_names(root)
     return FeatureCache(root, names[0]) if len(names) == 1 else None
 
 
-def missing_note(cache: FeatureCache, episodes: Sequence[int]) -> list[str]:
-    """Says in which episodes a feature was not looked for; empty if in none."""
+def missing_note(cache: FeatureCache, episodes: Sequence[int]) -> tuple[str, ...]:
+    """Note on the episodes from which a feature was not extracted; empty if there are none."""
     without = [episode for episode in episodes if not cache.path(episode).is_file()]
     if not without:
-        return []
+        return ()
     first = ", ".join(map(str, without[:5])) + ", ..." * (len(without) > 5)
-    return [
+    return (
         f"{cache.name} was not extracted from {len(without)} episodes ({first}) and counts as "
-        f"not seen there; hrc extract goes on where it was broken off"
-    ]
+        f"not visible there; hrc extract continues an interrupted extraction",
+    )
 
 
 def with_feature(
@@ -296,15 +275,15 @@ def with_feature(
     """The demonstration with the feature of its episode.
 
     Args:
-        demo: Of the dataset.
-        cache: Of the feature.
-        if_known: Seen nowhere, where it was not extracted from the episode.
+        demo: Demonstration from the dataset of the cache.
+        cache: Files of the feature.
+        if_known: Count the feature as not visible if it was not extracted from the episode.
 
     Raises:
-        DatasetError: It was not extracted from this episode.
+        DatasetError: The feature was not extracted from this episode.
     """
     if if_known and not cache.path(demo.episode).is_file():
-        unseen = np.zeros((len(demo), 2)), np.zeros(len(demo), dtype=bool)
-        return replace(demo, feature=unseen[0], feature_visible=unseen[1])
+        hidden = np.zeros(len(demo), dtype=bool)
+        return replace(demo, feature=np.zeros((len(demo), 2)), feature_visible=hidden)
     track = cache.read(demo.episode, len(demo))
     return replace(demo, feature=track.pixels, feature_visible=track.visible)

@@ -1,5 +1,14 @@
-"""What the metadata of a dataset say: its features, our own `meta/hrc_learn.json`, and what
-LeRobot's version 3.0 keeps besides.
+"""Metadata of a dataset: declared features, our sidecar, and the layout of version 3.0.
+
+    data/chunk-000/file-000.parquet            frames, one row group per episode
+    meta/info.json                             features, frame rate, counts
+    meta/stats.json                            statistics of every feature
+    meta/tasks.parquet                         task texts by index
+    meta/episodes/chunk-000/file-000.parquet   place and statistics of each episode
+    meta/hrc_learn.json                        sidecar: units, frames, meaning of columns
+
+LeRobot declares neither units nor reference frames, and drops unknown fields from its own
+files; the sidecar holds them.
 """
 
 import json
@@ -13,44 +22,52 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Shaped, UInt8
 
-from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.format.files import INFO_PATH
+from hrc_learn.demos.issues import DatasetError
 
-# The columns of a dataset as its `meta/info.json` declares them.
-
-INFO_PATH = "meta/info.json"
 NUMERIC = ("float", "int", "uint", "bool")
-"""How the dtypes begin that hold numbers."""
-
-
-# Of one column of numbers; a wrist's force field has some hundred.
+"""Prefixes of the dtypes of numbers."""
+# Bounds of one numeric column; the force field of a wrist sensor has some hundred components.
 _WIDEST, _MOST_AXES = 100_000, 8
+SIDECAR_PATH = "meta/hrc_learn.json"
+SIDECAR_FORMAT = 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Feature:
-    """One column of the frames, as `meta/info.json` declares it."""
+    """One column of the frames, as declared in `meta/info.json`."""
 
     key: str
     dtype: str
     shape: tuple[int, ...]
     names: tuple[str, ...] | None
-    """One name a component, from whichever nesting they were written in."""
+    """One name per component, flattened; None if the dataset gives none."""
 
     @property
     def width(self) -> int:
-        """Components a frame."""
+        """Number of components per frame."""
         return prod(self.shape)
 
     @property
     def numeric(self) -> bool:
+        """True if the column holds numbers."""
         return self.dtype.startswith(NUMERIC)
+
+    @property
+    def is_picture(self) -> bool:
+        """True if the column holds images, encoded as a video or one by one."""
+        return self.dtype in ("video", "image")
+
+    def component(self, index: int) -> str:
+        """Name of a component, or its number if it has none."""
+        return f"component {index}" if self.names is None else self.names[index]
 
 
 def read_features(info: dict) -> dict[str, Feature]:
-    """The declared features.
+    """Declared features by key.
 
     Raises:
-        DatasetError: A declaration is malformed, or gives not one name a component.
+        DatasetError: A declaration is malformed, or its names do not fit its shape.
     """
     features = {}
     for key, declared in info["features"].items():
@@ -79,7 +96,7 @@ def read_features(info: dict) -> dict[str, Feature]:
 
 
 def flatten_names(names: object) -> tuple[str, ...] | None:
-    """Names of components from any of the forms met: flat, nested, in a dict, or none."""
+    """Component names from any form in use: a flat or nested list, a dict, or None."""
     if names is None:
         return None
     if isinstance(names, dict):
@@ -92,41 +109,32 @@ def flatten_names(names: object) -> tuple[str, ...] | None:
     return tuple(flat)
 
 
-# `meta/hrc_learn.json`: what LeRobot's own metadata cannot say.
-#
-# LeRobot declares no units and no frames, and drops fields it does not know from its own
-# files, so they stand in a file beside them.
-
-SIDECAR_PATH = "meta/hrc_learn.json"
-SIDECAR_FORMAT = 1
-
-
 @dataclass(frozen=True, kw_only=True)
 class Sidecar:
-    """Units and meaning of a dataset's columns, as its writer declared them."""
+    """Units and meaning of a dataset's columns, as declared by its writer."""
 
     units: dict[str, str] = field(default_factory=dict)
-    """Role -> unit of its values on disk."""
+    """Unit on disk of each role."""
     columns: dict[str, dict] = field(default_factory=dict)
     """Role -> {"key": feature, "names": components}."""
     joint_names: tuple[str, ...] = ()
     frames: dict[str, str] = field(default_factory=dict)
-    """What poses are relative to ("base") and of ("ee")."""
+    """Reference frames of the poses: "base" and "ee"."""
     details: dict = field(default_factory=dict)
-    """Whatever else the writer was asked to keep."""
+    """Further values given to the writer."""
     contract: dict = field(default_factory=dict)
-    """What each component means, as `read.contract` keeps it; {} where it was not kept."""
+    """Meaning of each component, as in `read.contract`; {} if none is kept."""
 
 
 def sidecar_copy(sidecar: Sidecar, units: Mapping[str, str]) -> dict:
-    """What the file of a copy says, in these units; {} where there is nothing to be said."""
+    """Content of the sidecar file of a copy in these units; {} if there is nothing to say."""
     if not units and sidecar == Sidecar():
         return {}
     return {"format": SIDECAR_FORMAT, **vars(sidecar), "units": dict(units)}
 
 
 def read_sidecar(root: Path) -> Sidecar:
-    """The dataset's sidecar, an empty one where there is none.
+    """The dataset's sidecar, empty if there is no file.
 
     Raises:
         DatasetError: The file is damaged or of a later format.
@@ -138,8 +146,8 @@ def read_sidecar(root: Path) -> Sidecar:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != SIDECAR_FORMAT:
             raise DatasetError(
-                f"format {content['format']} is not known here (only {SIDECAR_FORMAT}); "
-                f"a newer hrc_learn wrote it",
+                f"format {content['format']} is unknown (only {SIDECAR_FORMAT} can be read): "
+                f"a newer hrc_learn wrote the file",
                 file=SIDECAR_PATH,
             )
         return Sidecar(
@@ -150,23 +158,14 @@ def read_sidecar(root: Path) -> Sidecar:
             details=content["details"],
             contract=content.get("contract") or {},
         )
+    except DatasetError:
+        raise
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        if isinstance(error, DatasetError):
-            raise
         raise DatasetError(
-            f"damaged ({error!r}); delete it to have units guessed, or restore it",
+            f"damaged ({error!r}): delete it to have units guessed, or restore it",
             file=SIDECAR_PATH,
         ) from error
 
-
-# What stands where in a LeRobot dataset of version 3.0.
-#
-# data/chunk-000/file-000.parquet            frames, one row group an episode
-# meta/info.json                             features, frame rate, counts
-# meta/stats.json                            statistics of every feature
-# meta/tasks.parquet                         task texts by index
-# meta/episodes/chunk-000/file-000.parquet   where each episode lies, its statistics
-# meta/hrc_learn.json                        units, frames, meaning of columns (our own)
 
 VERSION = "v3.0"
 INDEX_FEATURES = {
@@ -177,16 +176,13 @@ INDEX_FEATURES = {
     },
 }
 """Features that LeRobot adds to every dataset."""
-
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-# Those that LeRobot itself writes by default.
-CHUNK_SIZE = 1000
-FILE_SIZE_MB = 100
-VIDEO_FILE_SIZE_MB = 200
+# LeRobot's own defaults.
+CHUNK_SIZE, FILE_SIZE_MB, VIDEO_FILE_SIZE_MB = 1000, 100, 200
 
-# pandas reads the task texts as the table's index only when told so in its own terms.
+# pandas uses the task texts as the index of the table only with this metadata.
 _PANDAS_INDEX = {
     "index_columns": ["task"],
     "column_indexes": [],
@@ -204,16 +200,20 @@ _PANDAS_INDEX = {
         )
     ],
 }
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+
+Statistics = dict[str, dict[str, list]]
+"""Feature -> statistic (min, max, mean, std, count, q01 ... q99) -> one number a component."""
 
 
 def place(template: str, number: int, **fields: str) -> str:
-    """Path of the file of that number; a chunk holds `CHUNK_SIZE` of them."""
+    """Path of the file of that number; a chunk holds `CHUNK_SIZE` files."""
     chunk, file = divmod(number, CHUNK_SIZE)
     return template.format(chunk_index=chunk, file_index=file, **fields)
 
 
 def data_schema(schema: pa.Schema, features: Mapping[str, dict]) -> pa.Schema:
-    """The schema with the types in Hugging Face's own terms, as LeRobot leaves them."""
+    """The schema with the types in Hugging Face's own terms, as LeRobot writes them."""
     types = {}
     for name in schema.names:
         dtype, shape = features[name]["dtype"], list(features[name]["shape"])
@@ -230,12 +230,12 @@ def data_schema(schema: pa.Schema, features: Mapping[str, dict]) -> pa.Schema:
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """The list of task texts, each at its index."""
+    """Write the list of task texts."""
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(_PANDAS_INDEX)}), path)
 
 
-def info(
+def info_content(
     features: Mapping[str, dict],
     fps: float,
     robot_type: str,
@@ -264,26 +264,19 @@ def info(
 
 
 def write_json(path: Path, content: Mapping) -> None:
+    """Write a JSON object the way LeRobot does."""
     text = json.dumps(content, indent=4, ensure_ascii=False) + "\n"
     path.write_text(text, encoding="utf-8")
 
 
-# Statistics of features, as LeRobot keeps them for every episode and for the whole.
-
-QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-
-Statistics = dict[str, dict[str, list]]
-"""Feature -> statistic (min, max, mean, std, count, q01 ... q99) -> one number a component."""
-
-
 def episode_statistics(features: Mapping[str, Shaped[np.ndarray, "_frames ..."]]) -> Statistics:
     """Statistics of each feature over the frames of one episode."""
-    return {key: _of_columns(np.asarray(values, float)) for key, values in features.items()}
+    return {key: _column_statistics(np.asarray(v, float)) for key, v in features.items()}
 
 
 def image_statistics(images: UInt8[np.ndarray, "_count _height _width 3"]) -> dict[str, list]:
     """Statistics of each colour channel, scaled to 0..1, in the nesting LeRobot expects."""
-    flat = _of_columns(images.reshape(-1, 3) / 255)
+    flat = _column_statistics(images.reshape(-1, 3) / 255)
     nested = {name: [[[value]] for value in values] for name, values in flat.items()}
     return nested | {"count": [len(images)]}
 
@@ -291,16 +284,16 @@ def image_statistics(images: UInt8[np.ndarray, "_count _height _width 3"]) -> di
 def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Statistics:
     """Statistics over all episodes.
 
-    Exact but for the quantiles, which are the means of the episodes' weighted by length:
-    that is how LeRobot itself combines them.
+    They are exact but for the quantiles, which are averaged over the episodes, weighted by
+    length, as LeRobot does.
 
     Args:
-        episodes: By feature and name of the statistic, its values in each episode.
+        episodes: Feature -> statistic -> its values, one row per episode.
     """
     return {key: _combine(stacked) for key, stacked in episodes.items()}
 
 
-def _of_columns(values: np.ndarray) -> dict[str, list]:
+def _column_statistics(values: np.ndarray) -> dict[str, list]:
     values = values.reshape(len(values), -1)
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
     return {

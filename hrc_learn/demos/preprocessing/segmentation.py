@@ -1,4 +1,4 @@
-"""Where the arm rests, and demonstrations cut there."""
+"""Rest of the arm, and demonstrations trimmed or split at it."""
 
 from dataclasses import dataclass, replace
 
@@ -8,14 +8,12 @@ from jaxtyping import Bool, Float64
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.preprocessing.filters import local_polynomial
 
-# A part of a demonstration.
-
 
 def cut(demo: Demonstration, start: int, stop: int) -> Demonstration:
-    """Frames `start` to `stop` (not included); time begins at zero again.
+    """Frames `start` to `stop` (exclusive) of a demonstration; time begins at zero again.
 
     Raises:
-        ValueError: That is no range of its frames.
+        ValueError: The range is empty or exceeds the demonstration.
     """
     if not 0 <= start < stop <= len(demo):
         raise ValueError(
@@ -31,52 +29,48 @@ def cut(demo: Demonstration, start: int, stop: int) -> Demonstration:
     )
 
 
-# Where the arm rests: before, between and after its motions.
-
-
 @dataclass(frozen=True, kw_only=True)
 class RestCriterion:
-    """When an arm counts as resting.
+    """Criterion of rest, with hysteresis.
 
-    With hysteresis: a rest begins when the speed falls below the lower bound and ends when it
-    rises above the upper one, so that a speed that hovers about one bound does not chop the
-    recording up. The speed is that of the fastest joint; without joints, that of the end
-    effector.
+    A rest begins when the speed falls below the lower bound and ends when it rises above the
+    upper one, so that a speed close to one bound does not split the recording. The speed is
+    that of the fastest joint, or of the end effector if no joints are recorded.
     """
 
     joint_speed: tuple[float, float] = (0.01, 0.04)
-    """Lower and upper bound [rad/s]."""
+    """Lower and upper bound of the joint speed [rad/s]."""
     linear_speed: tuple[float, float] = (0.003, 0.01)
-    """Lower and upper bound for demonstrations without joints [m/s]."""
+    """Lower and upper bound of the end-effector speed [m/s]."""
     shortest: float = 0.3
-    """Rests shorter than this are part of the motion, as at a turning point [s]."""
+    """Shortest rest [s]; shorter ones, as at a turning point, belong to the motion."""
     window: float = 0.15
-    """Width of the neighbourhood that speeds are estimated from [s]."""
+    """Width of the neighbourhood for speeds [s]."""
 
     def __post_init__(self) -> None:
         for low, high in (self.joint_speed, self.linear_speed):
             if not 0 <= low <= high:
                 raise ValueError(
-                    f"a rest begins below the first speed and ends above the second, which "
-                    f"must not be lower: got {low} and {high}"
+                    f"the lower bound of a rest must not exceed the upper one: got {low} and "
+                    f"{high}"
                 )
 
 
 def resting(
     demo: Demonstration, criterion: RestCriterion | None = None
 ) -> Bool[np.ndarray, " _frames"]:
-    """Whether the arm rests, frame by frame.
+    """Mask of frames in which the arm rests.
 
     Raises:
         ValueError: The demonstration holds neither joint nor Cartesian positions, or too few
-            frames to tell a speed.
+            frames to estimate a speed.
     """
     criterion = criterion or RestCriterion()
     speed, (low, high) = _speed(demo, criterion)
-    verdict = np.where(speed > high, 1, np.where(speed < low, -1, 0))
-    # Between the bounds the last verdict holds; before the first one, that the arm moves.
-    last = np.maximum.accumulate(np.where(verdict != 0, np.arange(len(demo)), -1))
-    still = np.where(last >= 0, verdict[last], 1) < 0
+    state = np.where(speed > high, 1, np.where(speed < low, -1, 0))
+    # Between the bounds the last state persists; the arm moves before the first one.
+    last = np.maximum.accumulate(np.where(state != 0, np.arange(len(demo)), -1))
+    still = np.where(last >= 0, state[last], 1) < 0
     for start, stop in _runs(still):
         if demo.time[stop - 1] - demo.time[start] < criterion.shortest:
             still[start:stop] = False
@@ -86,12 +80,12 @@ def resting(
 def trim_rest(
     demo: Demonstration, criterion: RestCriterion | None = None, keep: float | int = 0.1
 ) -> Demonstration:
-    """The demonstration without the rest before and after its motion.
+    """Trim the rest before and after the motion.
 
     Args:
-        demo: A demonstration.
-        criterion: When the arm rests.
-        keep: Rest left at either end [s], so that the motion still begins and ends in it.
+        demo: The demonstration.
+        criterion: Criterion of rest.
+        keep: Rest left at either end [s], so that the motion begins and ends at rest.
 
     Raises:
         ValueError: As in `resting`, or the arm never moves.
@@ -109,13 +103,13 @@ def split_at_rest(
     shortest: float | int = 0.5,
     keep: float | int = 0.1,
 ) -> list[Demonstration]:
-    """The motions between the rests, each a demonstration of its own.
+    """Split a demonstration into the motions between rests.
 
     Args:
-        demo: A demonstration of several motions, such as the parts of a task.
-        criterion: When the arm rests.
-        shortest: Motions shorter than this are left out [s].
-        keep: Rest left at either end of each [s].
+        demo: Demonstration of several motions, such as the parts of a task.
+        criterion: Criterion of rest.
+        shortest: Duration below which motions are left out [s].
+        keep: Rest left at either end of each motion [s].
 
     Raises:
         ValueError: As in `resting`.
@@ -132,7 +126,7 @@ def _speed(
 ) -> tuple[Float64[np.ndarray, " frames"], tuple[float, float]]:
     values = demo.position if demo.joint_position is None else demo.joint_position
     if values is None:
-        raise ValueError("rest shows in joint positions or positions; neither is recorded")
+        raise ValueError("rest is found in joint positions or positions; neither is recorded")
     _, rates = local_polynomial(demo.time, values, window=criterion.window, degree=2)
     if demo.joint_position is None:
         return np.linalg.norm(rates, axis=1), criterion.linear_speed
@@ -140,7 +134,7 @@ def _speed(
 
 
 def _runs(flags: Bool[np.ndarray, " frames"]) -> list[tuple[int, int]]:
-    """First frame and the one behind the last of every stretch of true flags."""
+    """First frame and exclusive end of every run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

@@ -1,8 +1,8 @@
-"""What every column of a dataset means: inferred once from all its episodes, kept beside it.
+"""Contract of a dataset: the meaning of every column, inferred once and kept with the data.
 
-LeRobot declares neither units nor meanings. A contract states, component by component, the
-role, unit, range, sign and delay, with the evidence for each and how sure it is. It is kept in
-`meta/hrc_learn.json`, may be edited there, and whatever reads the dataset obeys it.
+LeRobot declares neither units nor meanings. A contract states role, unit, range, sign and delay
+of each component, with the evidence and a confidence. It is kept in `meta/hrc_learn.json`, may
+be edited there, and every reader of the dataset obeys it.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
+from hrc_learn.demos.format.dataset_folder import DatasetFolder
 from hrc_learn.demos.format.metadata import (
     SIDECAR_FORMAT,
     SIDECAR_PATH,
@@ -23,20 +23,14 @@ from hrc_learn.demos.format.metadata import (
     read_sidecar,
     write_json,
 )
-from hrc_learn.demos.issue import DatasetError, plain_text
-from hrc_learn.demos.read.column_mapping import ColumnMapping, ColumnSelection
+from hrc_learn.demos.issues import DatasetError, plain_text
+from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, is_discrete
-from hrc_learn.demos.read.roles import (
-    INDEX_KEYS,
-    ROLES,
-    UnitDecision,
-    comes_in,
-    is_hand,
-    joint_of,
-)
+from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES, is_hand, joint_of
+from hrc_learn.demos.read.units import UnitDecision, comes_in
 from hrc_learn.store import new_file
 
-_READ_AS = {
+_QUANTITIES = {
     "arm": "joint_position",
     "finger": "joint_position",
     "velocity": "joint_velocity",
@@ -49,62 +43,63 @@ _READ_AS = {
     "constant": None,
     "other": None,
 }
-"""Role in a contract -> quantity of a demonstration; further roles are called alike in both."""
-
-CONTRACT_ROLES = (*_READ_AS, *(role for role in ROLES if role not in _READ_AS.values()))
-"""What a component can be."""
+"""Role in a contract -> quantity of a demonstration; other roles have the same name in both."""
+CONTRACT_ROLES = (*_QUANTITIES, *(role for role in ROLES if role not in _QUANTITIES.values()))
+"""Roles of a component in a contract."""
+_FOLLOWS = 0.6
+"""R squared above which a state counts as following its command."""
+_FOOTER = 8192
+"""Bytes at the end of a Parquet file that locate its pages and hold their statistics."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComponentContract:
-    """What one component of one feature means."""
+    """Meaning of one component of one feature."""
 
     key: str
     index: int
     name: str
     role: str
-    """One of `CONTRACT_ROLES`."""
+    """Role, one of `CONTRACT_ROLES`."""
     unit: str
-    """On disk; "" where none is known."""
+    """Unit on disk; "" if unknown."""
     low: float
-    """Half a percent of all values lie below."""
+    """0.5 % quantile of all values."""
     high: float
-    """Half a percent of all values lie above."""
+    """99.5 % quantile of all values."""
     sign: int = 0
-    """+1 or -1: which way the state goes when this command grows; 0 where unknown."""
+    """Direction of the state as this command grows, +1 or -1; 0 if unknown."""
     delay: float | None = None
-    """Time until the state follows this command [s]; None where unknown."""
+    """Delay of the state behind this command [s]; None if unknown."""
     confidence: float = 1.0
-    """0 to 1."""
+    """Confidence, 0 to 1."""
     evidence: str = ""
-    """In words."""
+    """Evidence in words."""
+
+    @property
+    def quantity(self) -> str | None:
+        """Quantity of a demonstration that holds the component; None for an extra column."""
+        return _QUANTITIES.get(self.role, self.role)
+
+    def unit_as(self, role: str) -> str:
+        """Unit of the component if it is read as this quantity; "" if unknown."""
+        if self.quantity == role:
+            return self.unit or ROLES[role].unit
+        return self.unit if comes_in(role, self.unit) else ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Contract:
-    """What the components of a dataset mean."""
+    """Meaning of the components of a dataset."""
 
     components: tuple[ComponentContract, ...]
     fingerprint: str
-    """Of the data that it was inferred from."""
+    """Fingerprint of the data it was inferred from."""
 
     def rows(self) -> list[tuple[str, ...]]:
-        """The contract as a table, its head first; components alike in role and unit that
-        follow each other in one feature share a row.
-        """
+        """The contract as a table with its header; similar neighbours share a row."""
         rows = [("column", "role", "unit", "range", "sign", "delay", "sure", "evidence")]
-        groups: list[list[ComponentContract]] = []
-        for part in self.components:
-            last = groups[-1][-1] if groups else None
-            alike = last and all(
-                getattr(part, name) == getattr(last, name)
-                for name in ("key", "role", "unit", "sign", "delay")
-            )
-            if alike:
-                groups[-1].append(part)
-            else:
-                groups.append([part])
-        for group in groups:
+        for group in self._groups():
             first, last = group[0], group[-1]
             name = first.name if len(group) == 1 else f"{first.name} .. {last.name}"
             low, high = min(p.low for p in group), max(p.high for p in group)
@@ -123,8 +118,23 @@ class Contract:
             )
         return rows
 
+    def _groups(self) -> list[list[ComponentContract]]:
+        """Consecutive components of one feature with equal role, unit, sign and delay."""
+        groups: list[list[ComponentContract]] = []
+        for part in self.components:
+            last = groups[-1][-1] if groups else None
+            alike = last and all(
+                getattr(part, name) == getattr(last, name)
+                for name in ("key", "role", "unit", "sign", "delay")
+            )
+            if alike:
+                groups[-1].append(part)
+            else:
+                groups.append([part])
+        return groups
+
     def lines(self) -> Iterator[str]:
-        """The table as text."""
+        """The table as aligned text."""
         rows = self.rows()
         widths = [max(len(row[i]) for row in rows) for i in range(7)]
         for row in rows:
@@ -132,33 +142,33 @@ class Contract:
             yield f"{'  '.join(cells)}  {row[-1]}".rstrip()
 
     def units(self, selections: Mapping[str, ColumnSelection]) -> dict[str, tuple[str, ...]]:
-        """Quantity -> unit of each of its components.
+        """Unit of each component of the selected quantities, by role.
 
-        Args:
-            selections: The columns of each quantity; one with a column of unknown unit is left
-                out.
+        Quantities with a column of unknown unit are left out.
         """
         known = {(part.key, part.index): part for part in self.components}
         units = {
-            role: tuple(_unit_as(role, known.get(place)) for place in selection.columns)
+            role: tuple(
+                known[place].unit_as(role) if place in known else ""
+                for place in selection.columns
+            )
             for role, selection in selections.items()
         }
-        return {role: of_role for role, of_role in units.items() if all(of_role)}
+        return {role: each for role, each in units.items() if all(each)}
 
     def selections(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:
-        """The columns of each quantity.
+        """Columns of each quantity.
 
         Raises:
             DatasetError: A component does not exist, or a quantity has too many or too few.
         """
         found: dict[str, list[ComponentContract]] = {}
         for part in self.components:
-            role = _quantity(part)
             feature = features.get(part.key)
             if feature is None or part.index >= feature.width:
                 raise _faulty(f"{part.key}/{part.name} is no component of the dataset")
-            if role is not None:
-                found.setdefault(role, []).append(part)
+            if part.quantity is not None:
+                found.setdefault(part.quantity, []).append(part)
         for role, parts in found.items():
             width = ROLES[role].width
             if width is not None and len(parts) != width:
@@ -173,49 +183,42 @@ class Contract:
             for role, parts in found.items()
         }
 
-
-def _quantity(part: ComponentContract) -> str | None:
-    """The quantity of a demonstration that a component is read as."""
-    return _READ_AS.get(part.role, part.role)
-
-
-def _unit_as(role: str, part: ComponentContract | None) -> str:
-    """Unit of a component that is read as this quantity; "" where none is known."""
-    if part is None:
-        return ""
-    if _quantity(part) == role:
-        return part.unit or ROLES[role].unit
-    return part.unit if comes_in(role, part.unit) else ""
+    def content(self) -> dict[str, Any]:
+        """The contract as JSON values."""
+        return {
+            "fingerprint": self.fingerprint,
+            "components": [asdict(part) for part in self.components],
+        }
 
 
 def _faulty(message: str, place: str = "contract") -> DatasetError:
     return DatasetError(f"{message}; edit it", file=SIDECAR_PATH, key=place)
 
 
-def contract_of(sidecar: Sidecar) -> Contract | None:
-    """The contract that is kept with a dataset; None where there is none.
+def contract_in(sidecar: Sidecar) -> Contract | None:
+    """Contract kept in a sidecar, or None.
 
     Raises:
-        DatasetError: It is damaged, or names a role that does not exist.
+        DatasetError: The contract is damaged, or names a role that does not exist.
     """
     if not sidecar.contract:
         return None
     content: object = sidecar.contract
     if not isinstance(content, dict):
         raise _faulty(f"must be an object, got {content!r}")
-    components, of_data = content.get("components"), content.get("fingerprint")
+    components, origin = content.get("components"), content.get("fingerprint")
     if not isinstance(components, list):
         raise _faulty(f"must be a list, got {components!r}", "contract.components")
-    if not isinstance(of_data, str):
-        raise _faulty(f"must be text, got {of_data!r}", "contract.fingerprint")
+    if not isinstance(origin, str):
+        raise _faulty(f"must be text, got {origin!r}", "contract.fingerprint")
     parts: dict[tuple[str, int], ComponentContract] = {}
     for number, entry in enumerate(components):
         place = f"contract.components[{number}]"
         part = _component(entry, place)
         if (part.key, part.index) in parts:
-            raise _faulty(f"is of component {part.index} of {part.key}, as one before", place)
+            raise _faulty(f"repeats component {part.index} of {part.key}", place)
         parts[part.key, part.index] = part
-    return Contract(components=tuple(parts.values()), fingerprint=of_data)
+    return Contract(components=tuple(parts.values()), fingerprint=origin)
 
 
 def _is_number(value: object) -> bool:
@@ -237,11 +240,11 @@ _FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "confidence": _NUMBER,
     "evidence": _TEXT,
 }
-"""Field of a `ComponentContract` -> what it must be, in words and as a test."""
+"""Field of a `ComponentContract` -> requirement, in words and as a test."""
 
 
 def _component(entry: object, place: str) -> ComponentContract:
-    """One component from its JSON object, which somebody may have edited."""
+    """One component from its JSON object, which may have been edited."""
     if not isinstance(entry, dict):
         raise _faulty(f"must be an object, got {entry!r}", place)
     required = [f.name for f in fields(ComponentContract) if f.default is MISSING]
@@ -264,30 +267,18 @@ def _component(entry: object, place: str) -> ComponentContract:
 
 
 def keep_contract(root: Path, contract: Contract) -> None:
-    """Write the contract beside the data; what else the file says stays."""
-    sidecar = replace(read_sidecar(root), contract=contract_content(contract))
+    """Write the contract into the sidecar, keeping the rest of its content."""
+    sidecar = replace(read_sidecar(root), contract=contract.content())
     with new_file(root / SIDECAR_PATH) as part:
         write_json(part, {"format": SIDECAR_FORMAT, **vars(sidecar)})
 
 
-def contract_content(contract: Contract) -> dict[str, Any]:
-    """The contract as JSON values."""
-    return {
-        "fingerprint": contract.fingerprint,
-        "components": [asdict(part) for part in contract.components],
-    }
-
-
-_FOOTER = 8192
-"""Bytes at the end of a Parquet file that say where its pages lie, and what is in them."""
-
-
 def fingerprint(folder: DatasetFolder) -> str:
-    """Changes when columns, episodes or data do; reads the end of each data file."""
+    """Fingerprint of columns, episodes and data; reads only the end of each data file."""
     said = [folder.version, folder.fps, [(e.index, e.length) for e in folder.episodes]]
     said.append([(f.key, f.dtype, f.shape, f.names) for f in folder.features.values()])
     digest = hashlib.sha256(json.dumps(said).encode())
-    for file in sorted(folder.files()):
+    for file in sorted(folder.files):
         path = folder.root / file
         if path.is_file():
             with path.open("rb") as stream:
@@ -297,50 +288,19 @@ def fingerprint(folder: DatasetFolder) -> str:
     return digest.hexdigest()[:16]
 
 
-def changed_since(folder: DatasetFolder, contract: Contract | None) -> str | None:
-    """What is to be said where a dataset is no longer the one of its contract."""
-    if contract is None or contract.fingerprint == fingerprint(folder):
-        return None
-    return (
-        f"the data changed since the contract in {SIDECAR_PATH} was kept: "
-        f"hrc check --keep-contract makes it anew"
-    )
-
-
-def contract_notes(root: Path) -> list[str]:
-    """What is to be said of the contract by whoever reads a dataset in another way.
-
-    Raises:
-        DatasetError: The contract or the metadata are damaged.
-    """
-    contract = contract_of(read_sidecar(root))
-    if contract is None:
-        return []
-    folder = open_folder(root)
-    contract.selections(folder.features)  # names what does not exist
-    changed = changed_since(folder, contract)
-    return [] if changed is None else [changed]
-
-
-# What the episodes say.
-
-# R squared from which a state is said to follow a command.
-_FOLLOWS = 0.6
-
-
 def infer_contract(
     folder: DatasetFolder,
     mapping: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
     profiles: Sequence[EpisodeProfile],
 ) -> Contract:
-    """A contract from what all episodes show.
+    """Infer a contract from the profiles of episodes.
 
     Args:
         folder: The dataset.
-        mapping: What its columns mean by their names.
+        mapping: Meaning of its columns by their names.
         decisions: Unit of each quantity.
-        profiles: Of its episodes.
+        profiles: Profiles of its episodes.
     """
     taken = {
         column: (role, number)
@@ -351,14 +311,14 @@ def infer_contract(
     places: dict[str, dict[int, int]] = {}
     """Role -> number of its component -> place among the parts."""
     for feature in folder.features.values():
-        known = [p for p in profiles if feature.key in p.columns]
+        known = [
+            (p.columns[feature.key], p.length) for p in profiles if feature.key in p.columns
+        ]
         if not feature.numeric or feature.key in INDEX_KEYS or not known:
             continue
-        low = np.quantile([p.columns[feature.key].levels[0] for p in known], 0.05, axis=0)
-        high = np.quantile([p.columns[feature.key].levels[-1] for p in known], 0.95, axis=0)
-        discrete = np.mean(
-            [is_discrete(p.columns[feature.key], p.length) for p in known], axis=0
-        )
+        low = np.quantile([p.levels[0] for p, _ in known], 0.05, axis=0)
+        high = np.quantile([p.levels[-1] for p, _ in known], 0.95, axis=0)
+        discrete = np.mean([is_discrete(p, length) for p, length in known], axis=0)
         for index in range(min(feature.width, len(low))):
             role, number = taken.get((feature.key, index), (None, 0))
             part = ComponentContract(
@@ -371,35 +331,37 @@ def infer_contract(
                 high=float(high[index]),
             )
             if role is None:
-                parts.append(_unnamed(part, float(discrete[index]), feature.key))
+                parts.append(_describe_extra(part, float(discrete[index])))
             else:
                 places.setdefault(role, {})[number] = len(parts)
-                parts.append(_of_role(part, number, decisions[role], profiles, folder.fps))
-    # A quantity is read in the order of the contract: of x, y, z, w on disk the w comes first.
+                parts.append(_describe(part, number, decisions[role], profiles, folder.fps))
+    # A quantity is read in the order of the contract: x, y, z, w on disk become w, x, y, z.
     ordered = list(parts)
-    for of_role in places.values():
-        for there, number in zip(sorted(of_role.values()), sorted(of_role), strict=True):
-            ordered[there] = parts[of_role[number]]
+    for numbers in places.values():
+        for there, number in zip(sorted(numbers.values()), sorted(numbers), strict=True):
+            ordered[there] = parts[numbers[number]]
     return Contract(components=tuple(ordered), fingerprint=fingerprint(folder))
 
 
-def _unnamed(part: ComponentContract, discrete: float, key: str) -> ComponentContract:
+def _describe_extra(part: ComponentContract, discrete: float) -> ComponentContract:
+    """Complete the contract of a component that no quantity uses."""
     if part.low == part.high:
         return replace(part, role="constant", evidence="never changes")
     if discrete > 0.5:
-        is_command = key.startswith("action") and is_hand(part.name)
+        is_command = part.key.startswith("action") and is_hand(part.name)
         role = "gripper command" if is_command else "flag"
         return replace(part, role=role, evidence="switches between few levels")
     return replace(part, confidence=0.5, evidence="the name says nothing")
 
 
-def _of_role(
+def _describe(
     part: ComponentContract,
     number: int,
     decision: UnitDecision,
     profiles: Sequence[EpisodeProfile],
     fps: float,
 ) -> ComponentContract:
+    """Complete the contract of a component that a quantity uses."""
     role, hand = decision.role, is_hand(part.name)
     names = {
         "joint_position": "finger" if hand else "arm",
@@ -422,27 +384,23 @@ def _of_role(
     if not fit > _FOLLOWS:
         return part
     sign = int(np.sign(slope))
-    shown = (
-        f"state follows it with slope {slope:.2f}, R2 {fit:.2f}, "
-        f"delay of {agreeing} in {len(tracked)} episodes"
-    )
     if role == "joint_velocity":
-        shown = f"slope {slope:.2f} against differences of the position, R2 {fit:.2f}"
-        return replace(part, sign=sign, evidence=shown)
-    return replace(part, sign=sign, delay=delay / fps, evidence=shown)
+        evidence = f"slope {slope:.2f} against differences of the position, R2 {fit:.2f}"
+        return replace(part, sign=sign, evidence=evidence)
+    evidence = (
+        f"state follows it with slope {slope:.2f}, R2 {fit:.2f}, "
+        f"same delay in {agreeing} of {len(tracked)} episodes"
+    )
+    return replace(part, sign=sign, delay=delay / fps, evidence=evidence)
 
 
 def _agreement(tracked: Sequence[Tracking], number: int) -> tuple[float, float, float, int]:
-    """Median fit, slope and delay [frames] over episodes, and how many share the delay."""
+    """Median fit, slope and delay [frames] over episodes, and the number with that delay."""
     fits = np.array([t.fit[number] for t in tracked])
     slopes = np.array([t.slope[number] for t in tracked])
     delays = np.array([t.delay for t in tracked])
     if not np.isfinite(fits).any():
         return np.nan, np.nan, np.nan, 0
     delay = float(np.median(delays))
-    return (
-        float(np.nanmedian(fits)),
-        float(np.nanmedian(slopes)),
-        delay,
-        int((np.abs(delays - delay) <= 2).sum()),
-    )
+    agreeing = int((np.abs(delays - delay) <= 2).sum())
+    return float(np.nanmedian(fits)), float(np.nanmedian(slopes)), delay, agreeing

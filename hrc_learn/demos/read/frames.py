@@ -1,6 +1,6 @@
-"""Frames of episodes as raw arrays, just as they are on disk, and when each was taken."""
+"""Frames of episodes as raw arrays, in the types and units they have on disk."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import groupby, pairwise
 
 import numpy as np
@@ -8,22 +8,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float64, Shaped
 
-from hrc_learn.demos.format.dataset_folder import (
-    DatasetFolder,
-    EpisodeEntry,
-    open_parquet,
-    read_table,
-    row_group_starts,
-)
-from hrc_learn.demos.issue import DatasetError
-
-# Frames of episodes as raw arrays, just as they are on disk.
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
+from hrc_learn.demos.format.files import open_parquet, read_table, row_group_starts
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.units import Quantities
 
 RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]
-"""Column -> its values during one episode, in the type and unit they have on disk."""
+"""Column -> its values during one episode, in the type and unit on disk."""
 
 _BATCH_ROWS = 2**16
 """Frames read at a time: enough for the speed of the disk, few enough for any memory."""
+_ALONE = 64
+"""Episodes read one by one after a batch that cannot be read."""
 
 
 def read_frames(
@@ -31,36 +28,142 @@ def read_frames(
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
     """Read columns of episodes, in the order of `entries`.
 
-    No more than some 65,000 frames are held at a time, or one row group where that is larger;
-    no row group is read twice.
+    At most about 65,000 frames are held at a time, or one row group if that is larger; no row
+    group is read twice.
 
     Args:
         folder: The dataset.
         entries: Episodes wanted, in the order they lie on disk.
-        keys: Columns wanted; LeRobot's own index columns come along where they exist.
+        keys: Columns wanted; LeRobot's own index columns are added where they exist.
 
     Raises:
         DatasetError: A file or column is missing or damaged, a column is not as wide as
-            declared, or the rows are not those the metadata promise.
+            declared, or the rows are not those that the metadata promise.
     """
     for file, group in groupby(entries, key=lambda entry: entry.file):
-        yield from _read_file(folder, file, list(group), keys)
+        listed = list(group)
+        parquet = open_parquet(folder.root, file, listed[0].index)
+        require_rows(file, listed, parquet.metadata.num_rows, folder.promised_rows[file])
+        existing = parquet.schema_arrow.names
+        for key in keys:
+            if key not in existing:
+                raise DatasetError(
+                    "the column is declared in meta/info.json, but missing", file=file, key=key
+                )
+        indices = [k for k in ("timestamp", "episode_index", "task_index") if k in existing]
+        wanted = [*dict.fromkeys([*keys, *indices])]
+        for batch in _batches(listed, row_group_starts(parquet.metadata)):
+            yield from _read_batch(folder, parquet, batch, wanted)
 
 
-_ALONE = 64
-"""Episodes read one by one where one of those to come cannot be read."""
+def _batches(
+    entries: Sequence[EpisodeEntry], group_starts: Sequence[int]
+) -> Iterator[list[EpisodeEntry]]:
+    """Split episodes, in the order of their rows, at boundaries of row groups."""
+    batch: list[EpisodeEntry] = []
+    rows, last_group = 0, -1
+    for entry in entries:
+        ends = [entry.start, entry.start + max(entry.length, 1) - 1]
+        first, last = np.searchsorted(group_starts, ends, side="right") - 1
+        skips = first > last_group + 1
+        if batch and (skips or (rows >= _BATCH_ROWS and first > last_group)):
+            yield batch
+            batch, rows = [], 0
+        batch.append(entry)
+        rows += entry.length
+        last_group = last
+    if batch:
+        yield batch
+
+
+def _read_batch(
+    folder: DatasetFolder,
+    parquet: pq.ParquetFile,
+    entries: list[EpisodeEntry],
+    keys: Sequence[str],
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    """Episodes of one file, read together."""
+    file = entries[0].file
+    rows = slice(
+        min(entry.start for entry in entries),
+        max(entry.start + entry.length for entry in entries),
+    )
+    table = read_table(parquet, file, keys, rows)
+    columns = {}
+    for key in table.column_names:
+        try:
+            columns[key] = to_numpy(table.column(key))
+        except BadRowError as error:
+            row = error.row + rows.start
+            entry = next(e for e in entries if e.start <= row < e.start + e.length)
+            raise DatasetError(
+                str(error), **entry.location, frame=row - entry.start, key=key
+            ) from error
+        if (fault := width_fault(folder, file, key, columns[key])) is not None:
+            raise fault
+    for entry in entries:
+        start = entry.start - rows.start
+        frames = {key: values[start : start + entry.length] for key, values in columns.items()}
+        _require_episode(entry, frames)
+        yield entry, frames
+
+
+def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised: int) -> None:
+    """Check the number of frames in a file against the list of episodes.
+
+    Raises:
+        DatasetError: The file holds more or fewer frames.
+    """
+    if rows != promised:
+        raise DatasetError(
+            f"holds {rows} frames, but the list of episodes promises {promised}: frames were "
+            f"lost or repeated, or the metadata belong to another copy",
+            file=file,
+            episode=entries[0].index if len(entries) == 1 else None,
+        )
+
+
+def width_fault(
+    folder: DatasetFolder, file: str, key: str, values: np.ndarray
+) -> DatasetError | None:
+    """Fault of a column that is not as wide as declared, or None."""
+    feature = folder.features.get(key)
+    if feature is None or not len(values) or values.shape[1] == feature.width:
+        return None
+    return DatasetError(
+        f"has {values.shape[1]} components, but meta/info.json declares the shape "
+        f"{list(feature.shape)}",
+        file=file,
+        key=key,
+    )
+
+
+def _require_episode(entry: EpisodeEntry, frames: RawFrames) -> None:
+    if not entry.length:
+        raise DatasetError("has no frames", **entry.location)
+    if "episode_index" not in frames:
+        return
+    wrong = np.flatnonzero(frames["episode_index"] != entry.index)
+    if len(wrong):
+        raise DatasetError(
+            f"the frame belongs to episode {int(frames['episode_index'][wrong[0], 0])} by its "
+            f"episode_index: the offsets in the list of episodes are wrong",
+            **entry.location,
+            frame=int(wrong[0]),
+            key="episode_index",
+        )
 
 
 def each_or_fault[T](
     count: int, following: Callable[[int], Iterable[T]], alone: Callable[[int], T]
 ) -> Iterator[T | DatasetError]:
-    """What is read of every episode, many of them together, or why one cannot be read.
+    """Read every episode, many together, and give the error of each that cannot be read.
 
     Args:
-        count: Episodes.
-        following: Reads all from one on; ends with an error, maybe that of a later one, as
-            many are read together.
-        alone: Reads one by itself.
+        count: Number of episodes.
+        following: Reads all episodes from a place on; an error may belong to a later episode,
+            as many are read together.
+        alone: Reads one episode.
     """
     done = 0
     while done < count:
@@ -81,10 +184,7 @@ def each_or_fault[T](
 def read_each(
     folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
 ) -> Iterator[RawFrames | DatasetError]:
-    """Columns of every episode, in any order, or why it cannot be read; else as `read_frames`.
-
-    One that cannot be read does not keep the others from being read.
-    """
+    """Read columns of every episode, in any order; a fault does not stop the others."""
 
     def following(first: int) -> Iterator[RawFrames]:
         for run in disk_runs(entries[first:]):
@@ -98,7 +198,7 @@ def read_each(
 
 
 def disk_runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
-    """Cut a sequence into runs of episodes that lie on disk in this order."""
+    """Split a sequence into runs of episodes that lie on disk in this order."""
     place = [(entry.file, entry.start) for entry in entries]
     cuts = [0]
     for before, here in pairwise(place):
@@ -107,125 +207,27 @@ def disk_runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
         yield [entry for _, entry in run]
 
 
-def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:
-    """The columns of one episode as views into those of its file."""
-    return {key: values[start : start + length] for key, values in columns.items()}
+def select_quantities(
+    frames: RawFrames, selections: Mapping[str, ColumnSelection]
+) -> Quantities:
+    """Values of every role in the units on disk."""
+    return {role: _values(frames, selection.columns) for role, selection in selections.items()}
 
 
-def _read_file(
-    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], keys: Sequence[str]
-) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    parquet = open_parquet(folder.root, file, entries[0].index)
-    require_rows(file, entries, parquet.metadata.num_rows, folder.promised_rows[file])
-    existing = parquet.schema_arrow.names
-    for key in keys:
-        if key not in existing:
-            raise DatasetError(
-                "the column is declared in meta/info.json, but missing", file=file, key=key
-            )
-    indices = [k for k in ("timestamp", "episode_index", "task_index") if k in existing]
-    wanted = [*dict.fromkeys([*keys, *indices])]
-    for batch in _batches(entries, row_group_starts(parquet.metadata)):
-        yield from _read_batch(folder, file, parquet, batch, wanted)
-
-
-def _batches(
-    entries: Sequence[EpisodeEntry], group_starts: Sequence[int]
-) -> Iterator[list[EpisodeEntry]]:
-    """Split episodes, in the order of their rows, where no row group spans the cut."""
-    batch: list[EpisodeEntry] = []
-    rows, last_group = 0, -1
-    for entry in entries:
-        ends = [entry.start, entry.start + max(entry.length, 1) - 1]
-        first, last = np.searchsorted(group_starts, ends, side="right") - 1
-        skips = first > last_group + 1
-        if batch and (skips or (rows >= _BATCH_ROWS and first > last_group)):
-            yield batch
-            batch, rows = [], 0
-        batch.append(entry)
-        rows += entry.length
-        last_group = last
-    if batch:
-        yield batch
-
-
-def _read_batch(
-    folder: DatasetFolder,
-    file: str,
-    parquet: pq.ParquetFile,
-    entries: list[EpisodeEntry],
-    keys: Sequence[str],
-) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    rows = slice(
-        min(entry.start for entry in entries),
-        max(entry.start + entry.length for entry in entries),
-    )
-    table = read_table(parquet, file, keys, rows)
-    columns = {}
-    for key in table.column_names:
-        try:
-            columns[key] = to_numpy(table.column(key))
-        except BadRowError as error:
-            row = error.row + rows.start
-            entry = next(e for e in entries if e.start <= row < e.start + e.length)
-            raise DatasetError(
-                str(error), **entry.location, frame=row - entry.start, key=key
-            ) from error
-        _require_width(folder, file, key, columns[key])
-    for entry in entries:
-        frames = slice_frames(columns, entry.start - rows.start, entry.length)
-        _require_episode(file, entry, frames)
-        yield entry, frames
-
-
-def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised: int) -> None:
-    """Refuse a file that holds more or fewer frames than the list of episodes promises.
-
-    Raises:
-        DatasetError: It does.
-    """
-    if rows != promised:
-        raise DatasetError(
-            f"holds {rows} frames, but the list of episodes promises {promised}: frames were "
-            f"lost or repeated, or the metadata belong to another copy",
-            file=file,
-            episode=entries[0].index if len(entries) == 1 else None,
-        )
-
-
-def _require_width(folder: DatasetFolder, file: str, key: str, values: np.ndarray) -> None:
-    feature = folder.features.get(key)
-    if feature is not None and len(values) and values.shape[1] != feature.width:
-        raise DatasetError(
-            f"has {values.shape[1]} components, but meta/info.json declares the shape "
-            f"{list(feature.shape)}",
-            file=file,
-            key=key,
-        )
-
-
-def _require_episode(file: str, entry: EpisodeEntry, frames: RawFrames) -> None:
-    if not entry.length:
-        raise DatasetError("has no frames", **entry.location)
-    if "episode_index" not in frames:
-        return
-    wrong = np.flatnonzero(frames["episode_index"] != entry.index)
-    if len(wrong):
-        raise DatasetError(
-            f"the frame belongs to episode {int(frames['episode_index'][wrong[0], 0])} by its "
-            f"episode_index: the offsets in the list of episodes are wrong",
-            file=file,
-            episode=entry.index,
-            frame=int(wrong[0]),
-            key="episode_index",
-        )
-
-
-# When each frame was taken.
+def _values(
+    frames: RawFrames, columns: Sequence[tuple[str, int]]
+) -> Float64[np.ndarray, "frames components"]:
+    keys = {key for key, _ in columns}
+    if len(keys) > 1:
+        return np.stack([frames[key][:, index] for key, index in columns], axis=1).astype(float)
+    values, indices = frames[keys.pop()], [index for _, index in columns]
+    if indices == list(range(indices[0], indices[-1] + 1)):  # a view: no copy before astype
+        return values[:, indices[0] : indices[-1] + 1].astype(float)
+    return values[:, indices].astype(float)
 
 
 def recorded_stamps(folder: DatasetFolder, frames: RawFrames) -> Float64[np.ndarray, " frames"]:
-    """LeRobot's own stamps of one episode, 1/fps apart where there are none [s]."""
+    """LeRobot's own stamps of one episode, or stamps 1/fps apart if there are none [s]."""
     if "timestamp" in frames:
         return frames["timestamp"][:, 0].astype(float)
     return np.arange(len(next(iter(frames.values())))) / folder.fps
@@ -240,7 +242,7 @@ def frame_timestamps(
     """Stamps of one episode [s].
 
     A column of true stamps is preferred. LeRobot's own `timestamp` is frame / fps by
-    definition, and where it is so to the resolution of float32, that is computed anew.
+    definition; if it agrees with that to the resolution of float32, it is computed in float64.
 
     Raises:
         DatasetError: The stamps do not increase.
@@ -252,9 +254,9 @@ def frame_timestamps(
     if len(stalled):
         k = int(stalled[0])
         raise DatasetError(
-            f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s; "
-            f"drop the repeated frames, or have frames taken 1/fps apart "
-            f"(mapping={{'time': None}} where the column is one of true stamps)",
+            f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s: "
+            f"drop the repeated frames (hrc repair), or take frames as 1/fps apart "
+            f"(mapping={{'time': None}} if the column is one of true stamps)",
             **entry.location,
             frame=k + 1,
             key=key,
@@ -266,11 +268,8 @@ def frame_timestamps(
     return time
 
 
-# Columns of Parquet files as arrays.
-
-
 class BadRowError(ValueError):
-    """A row of a column that holds no usable value; `row` counts from the table's start."""
+    """A row without a usable value; `row` counts from the start of the table."""
 
     def __init__(self, row: int, message: str):
         super().__init__(message)
@@ -278,7 +277,7 @@ class BadRowError(ValueError):
 
 
 def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
-    """Values of a column, in their own type; lists and nested lists are laid flat.
+    """Values of a Parquet column in their own type, nested lists flattened.
 
     Raises:
         BadRowError: A value is missing, or rows differ in their number of components.
@@ -289,7 +288,9 @@ def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
         raise BadRowError(0, f"cannot be read: {error}") from error
     rows = len(array)
     while True:
-        _refuse_nulls(array, rows)
+        if array.null_count:
+            at = int(np.flatnonzero(_without_pandas(array.is_null()))[0])
+            raise BadRowError(at * rows // len(array), "holds no value (null)")
         if isinstance(array, pa.ExtensionArray):
             array = array.storage
         elif pa.types.is_fixed_size_list(array.type):
@@ -298,13 +299,12 @@ def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
             array = _flatten_ragged(array, rows)
         else:
             break
-    if not (pa.types.is_integer(array.type) or pa.types.is_floating(array.type)) and (
-        not pa.types.is_boolean(array.type)
-    ):
+    kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
+    if not any(is_kind(array.type) for is_kind in kinds):
         raise BadRowError(0, f"holds {array.type}, not numbers")
     values = _without_pandas(array)
     if rows and len(values) % rows:
-        raise BadRowError(0, f"{len(values)} numbers do not share out among {rows} frames")
+        raise BadRowError(0, f"{len(values)} numbers cannot be divided among {rows} frames")
     return values.reshape(rows, len(values) // rows if rows else 0)
 
 
@@ -318,14 +318,8 @@ def _flatten_ragged(array: pa.Array, rows: int) -> pa.Array:
     return array.flatten()
 
 
-def _refuse_nulls(array: pa.Array, rows: int) -> None:
-    if array.null_count:
-        at = int(np.flatnonzero(_without_pandas(array.is_null()))[0])
-        raise BadRowError(at * rows // len(array), "holds no value (null)")
-
-
 def _without_pandas(array: pa.Array) -> Shaped[np.ndarray, " values"]:
-    """Values of an array of numbers; its own `to_numpy` imports pandas, for a second."""
+    """Values of an array of numbers; pyarrow's own `to_numpy` imports pandas for a second."""
     if pa.types.is_boolean(array.type):  # packed to bits, which numpy cannot view
         return np.from_dlpack(array.cast(pa.uint8())).astype(bool)
     return np.from_dlpack(array)

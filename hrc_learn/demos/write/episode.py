@@ -1,4 +1,4 @@
-"""One episode of a recording: gathered frame by frame, put into columns, kept as a file."""
+"""One recorded episode: its frames, its columns as LeRobot keeps them, and its file."""
 
 import json
 from collections.abc import Collection, Mapping, Sequence
@@ -11,102 +11,102 @@ import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float64, Int64, Shaped
 
+from hrc_learn.demos.demonstration import float_array
 from hrc_learn.demos.format.metadata import SIDECAR_FORMAT, Statistics
-from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.roles import ROLES
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.geometry import quaternion
-from hrc_learn.store import new_file, resolved
-
-# How recorded quantities become the columns of a LeRobot dataset.
-#
-# One `observation.state` as lerobot-record writes it (every quantity of the robot, told apart
-# by name), so that LeRobot's own tools and viewers understand the dataset.
+from hrc_learn.store import new_file
 
 STATE_KEY = "observation.state"
 TIME_KEY = "observation.time"
+_METADATA_KEY = b"hrc_learn"
+
+Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]
+"""Quantity -> values of one episode."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Column:
-    """One recorded quantity in its place within the dataset."""
+class RecordedColumn:
+    """One recorded quantity and its place in the dataset."""
 
     given: str
-    """Keyword under which a frame gives it: a field of `Demonstration`, or a feature key."""
+    """Keyword of a frame: a field of `Demonstration`, or a feature key."""
     role: str | None
-    """Role under which the reader finds it; None for a feature of the user's own."""
+    """Role under which the reader finds it; None for a user-defined feature."""
     key: str
     """Feature of the dataset that holds it."""
     names: tuple[str, ...]
-    """Names of its components within that feature."""
+    """Component names within that feature; in `_COLUMNS`, `{joint}` stands for each joint."""
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where one keyword of a frame goes; `{joint}` stands for each joint in turn."""
-
-    given: str
-    role: str
-    key: str
-    names: tuple[str, ...]
-
-
-_PLACES = (
-    _Place("joint_position", "joint_position", STATE_KEY, ("{joint}.pos",)),
-    _Place("gripper", "gripper", STATE_KEY, ("gripper.pos",)),
-    _Place("joint_velocity", "joint_velocity", STATE_KEY, ("{joint}.vel",)),
-    _Place("joint_effort", "joint_effort", STATE_KEY, ("{joint}.torque",)),
-    _Place("position", "position", STATE_KEY, ("ee.x", "ee.y", "ee.z")),
-    _Place("orientation", "rotation_vector", STATE_KEY, ("ee.wx", "ee.wy", "ee.wz")),
-    _Place("feature", "feature", "observation.image_feature", ("u", "v")),
-    _Place("feature_visible", "feature_visible", "observation.image_feature", ("visible",)),
-    _Place("human_effort", "human_effort", "observation.human_effort", ("{joint}.effort",)),
-    _Place("command_position", "command_position", "action", ("{joint}.pos",)),
-    _Place("command_velocity", "command_velocity", "action", ("{joint}.vel",)),
-    _Place("time", "time", TIME_KEY, ("time",)),
+# One `observation.state` for every quantity of the robot, distinguished by name, as written by
+# lerobot-record: LeRobot's own tools and viewers understand it.
+_COLUMNS = tuple(
+    RecordedColumn(given=given, role=role or given, key=key, names=names)
+    for given, role, key, names in (
+        ("joint_position", "", STATE_KEY, ("{joint}.pos",)),
+        ("gripper", "", STATE_KEY, ("gripper.pos",)),
+        ("joint_velocity", "", STATE_KEY, ("{joint}.vel",)),
+        ("joint_effort", "", STATE_KEY, ("{joint}.torque",)),
+        ("position", "", STATE_KEY, ("ee.x", "ee.y", "ee.z")),
+        ("orientation", "rotation_vector", STATE_KEY, ("ee.wx", "ee.wy", "ee.wz")),
+        ("feature", "", "observation.image_feature", ("u", "v")),
+        ("feature_visible", "", "observation.image_feature", ("visible",)),
+        ("human_effort", "", "observation.human_effort", ("{joint}.effort",)),
+        ("command_position", "", "action", ("{joint}.pos",)),
+        ("command_velocity", "", "action", ("{joint}.vel",)),
+        ("time", "", TIME_KEY, ("time",)),
+    )
 )
-
 FRAME_WIDTHS = {
-    place.given: 4 if place.given == "orientation" else ROLES[place.role].width
-    for place in _PLACES
+    column.given: 4 if column.given == "orientation" else ROLES[str(column.role)].width
+    for column in _COLUMNS
 }
-"""Numbers a frame gives under each keyword; None: one a joint."""
+"""Keyword of a frame -> number of values; None for one per joint."""
 
 
 def columns_for(
     given: Collection[str], joint_names: Sequence[str], features: Mapping[str, Sequence[str]]
-) -> list[Column]:
-    """Columns that hold what a frame gives, in the order of the dataset.
+) -> list[RecordedColumn]:
+    """Columns for the content of a frame, in the order of the dataset.
 
     Args:
         given: Keywords of the frame: fields of `Demonstration`, and keys of `features`.
         joint_names: Joints of the robot.
-        features: Further features: key and the names of its components.
+        features: User-defined features: key -> component names.
     """
     columns = [
-        Column(
-            given=place.given,
-            role=place.role,
-            key=place.key,
-            names=_expand(place.names, joint_names),
+        RecordedColumn(
+            given=column.given,
+            role=column.role,
+            key=column.key,
+            names=_joint_components(column.names, joint_names),
         )
-        for place in _PLACES
-        if place.given in given
+        for column in _COLUMNS
+        if column.given in given
     ]
     own = [
-        Column(given=key, role=None, key=key, names=tuple(names))
+        RecordedColumn(given=key, role=None, key=key, names=tuple(names))
         for key, names in features.items()
     ]
     return columns + own
 
 
-def lerobot_features(columns: Sequence[Column], dtype: str) -> dict[str, dict]:
-    """Features as `meta/info.json` declares them, without LeRobot's index columns."""
+def _joint_components(names: tuple[str, ...], joint_names: Sequence[str]) -> tuple[str, ...]:
+    if len(names) == 1 and "{joint}" in names[0]:
+        return tuple(names[0].format(joint=joint) for joint in joint_names)
+    return names
+
+
+def lerobot_features(columns: Sequence[RecordedColumn], dtype: str) -> dict[str, dict]:
+    """Features as declared in `meta/info.json`, without LeRobot's index columns."""
     names: dict[str, list[str]] = {}
     for column in columns:
         names.setdefault(column.key, []).extend(column.names)
     return {
         key: {
-            # A Unix stamp in float32 is good to two minutes only.
+            # In float32, a Unix stamp has a resolution of two minutes.
             "dtype": "float64" if key == TIME_KEY else dtype,
             "shape": [len(components)],
             "names": components,
@@ -116,12 +116,12 @@ def lerobot_features(columns: Sequence[Column], dtype: str) -> dict[str, dict]:
 
 
 def sidecar_content(
-    columns: Sequence[Column],
+    columns: Sequence[RecordedColumn],
     joint_names: Sequence[str],
     frames: Mapping[str, str],
     details: Mapping[str, object],
 ) -> dict:
-    """What the file of a dataset with these columns says."""
+    """Content of the sidecar file for these columns."""
     known = {column.role: column for column in columns if column.role is not None}
     return {
         "format": SIDECAR_FORMAT,
@@ -137,9 +137,9 @@ def sidecar_content(
 
 
 def encode(
-    columns: Sequence[Column], episode: Mapping[str, Shaped[np.ndarray, "_frames ..."]]
+    columns: Sequence[RecordedColumn], episode: Episode
 ) -> dict[str, Float64[np.ndarray, "_frames _width"]]:
-    """Features of one episode from what its frames gave."""
+    """Features of one episode from its quantities."""
     parts: dict[str, list[np.ndarray]] = {}
     for column in columns:
         values = np.asarray(episode[column.given], dtype=np.float64)
@@ -149,30 +149,27 @@ def encode(
     return {key: np.concatenate(arrays, axis=1) for key, arrays in parts.items()}
 
 
-def _expand(names: tuple[str, ...], joint_names: Sequence[str]) -> tuple[str, ...]:
-    if len(names) == 1 and "{joint}" in names[0]:
-        return tuple(names[0].format(joint=joint) for joint in joint_names)
-    return names
-
-
 def rotation_vectors(
     orientation: Float64[np.ndarray, "frames 4"],
 ) -> Float64[np.ndarray, "frames 3"]:
-    # A gripper that points down has turned by about pi, where the shortest rotation
-    # vector jumps to its opposite; the unwrapped one is what a policy can learn from.
+    """Rotation vectors [rad] without jumps.
+
+    A gripper that points down has turned by about pi, where the shortest rotation vector jumps
+    to its opposite; a policy can learn from the unwrapped one.
+    """
     shortest = quaternion.log(torch.from_numpy(orientation))
     return quaternion.unwrap_log(shortest).numpy()
 
 
-# The open episode of a recording: frames gathered, completed, and examined.
-
-Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]
-
-
 class EpisodeBuffer:
-    """Frames of one episode, each giving the same quantities."""
+    """Frames of one episode, all with the same quantities."""
 
     def __init__(self, joint_names: Sequence[str], features: Mapping[str, Sequence[str]]):
+        """
+        Args:
+            joint_names: Joints of the robot.
+            features: User-defined features: key -> component names.
+        """
         self._widths = {
             **{name: width or len(joint_names) for name, width in FRAME_WIDTHS.items()},
             **{key: len(names) for key, names in features.items()},
@@ -183,11 +180,11 @@ class EpisodeBuffer:
         return len(next(iter(self._rows.values()), ()))
 
     def append(self, values: Mapping[str, object]) -> None:
-        """Copy one frame in.
+        """Copy one frame.
 
         Raises:
-            ValueError: A quantity is unknown, missing, new, or of the wrong length; the
-                frame is left out then.
+            ValueError: A quantity is unknown, missing, new, or of the wrong length; the frame
+                is then not added.
         """
         if not len(self):
             self._rows = {name: [] for name in values}
@@ -207,7 +204,7 @@ class EpisodeBuffer:
                 f"{name!r} is no quantity of a frame; known are {', '.join(self._widths)}. "
                 f"Declare others as features={{'observation.{name}': [names of components]}}."
             )
-        row, width = np.array(value, dtype=np.float64), self._widths[name]
+        row, width = float_array(value).copy(), self._widths[name]
         if row.size != width or row.ndim > 1:
             raise ValueError(
                 f"frame {len(self)}: {name} needs {width} numbers, got shape {row.shape}"
@@ -216,17 +213,17 @@ class EpisodeBuffer:
 
 
 def describe_difference(given: Collection[str], expected: Collection[str]) -> str:
-    """What a frame or an episode gives too little or too much, in words."""
+    """Missing and surplus quantities of a frame or an episode, in words."""
     missing, new = sorted(set(expected) - set(given)), sorted(set(given) - set(expected))
     parts = [f"lacks {', '.join(missing)}"] * bool(missing)
     parts += [f"gives {', '.join(new)} besides"] * bool(new)
-    return f"{' and '.join(parts)}: all give what the first frame gave"
+    return f"{' and '.join(parts)}: all frames need the quantities of the first"
 
 
 def complete(episode: Episode, fps: float) -> Episode:
-    """The episode with stamps and visibility filled in where its frames gave none.
+    """The episode with default stamps and visibility where its frames gave none.
 
-    A feature that was not seen need not be finite; it is written as zero.
+    A feature that was not visible need not be finite; it is written as zero.
     """
     length = len(next(iter(episode.values())))
     episode = {"time": np.arange(length) / fps, **episode}
@@ -238,8 +235,8 @@ def complete(episode: Episode, fps: float) -> Episode:
     return episode
 
 
-def examine(episode: Episode) -> None:
-    """Refuse what no reader could use.
+def require_valid(episode: Episode) -> None:
+    """Check that readers can use an episode.
 
     Raises:
         ValueError: A value is not finite, time does not increase, or an orientation is no
@@ -261,44 +258,41 @@ def examine(episode: Episode) -> None:
             )
 
 
-_METADATA_KEY = b"hrc_learn"
-
-
 @dataclass(frozen=True, kw_only=True)
 class RecordingHeader:
-    """What all episodes of a recording have in common; plain JSON values only."""
+    """Properties common to all episodes of a recording, as JSON values."""
 
     fps: float
     robot_type: str
     features: dict[str, dict]
-    """As in `meta/info.json`, LeRobot's index columns included."""
+    """Features as in `meta/info.json`, with LeRobot's index columns."""
     sidecar: dict
     """Content of `meta/hrc_learn.json`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StagedEpisode:
-    """One saved episode."""
+    """One saved episode of a recording."""
 
     header: RecordingHeader
     tasks: list[str]
-    """Texts of the tasks it shows, at least one."""
+    """Texts of its tasks, at least one."""
     statistics: Statistics
     table: pa.Table
 
 
-def staging_folder(root: Path) -> Path:
-    """Where the recording of the dataset `root` is kept until it is whole."""
-    root = resolved(root)
-    return root.with_name(root.name + ".recording")
-
-
 def episode_path(folder: Path, index: int) -> Path:
+    """File of a saved episode in the folder of a recording."""
     return folder / f"episode_{index:06d}.parquet"
 
 
+def episode_number(path: Path) -> int:
+    """Index of the episode in a file."""
+    return int(path.stem.rpartition("_")[2])
+
+
 def write_episode(path: Path, episode: StagedEpisode) -> None:
-    """Write one episode so that `path` exists only once it is complete and on disk."""
+    """Write one episode; `path` exists only once it is complete and on disk."""
     metadata = {
         "header": vars(episode.header),
         "tasks": episode.tasks,
@@ -310,7 +304,7 @@ def write_episode(path: Path, episode: StagedEpisode) -> None:
 
 
 def read_episode(path: Path) -> StagedEpisode:
-    """Read an episode that `write_episode` wrote."""
+    """Read an episode written by `write_episode`."""
     table = pq.read_table(path)
     metadata = json.loads(table.schema.metadata[_METADATA_KEY])
     return StagedEpisode(
@@ -325,11 +319,11 @@ def staged_paths(folder: Path, first: int = 0) -> list[Path]:
     """Files of the saved episodes, in order.
 
     Args:
-        folder: The staging folder.
-        first: Index of the first one: the episodes of the dataset that is appended to.
+        folder: Folder of the recording.
+        first: Index of the first episode: the number of episodes of the extended dataset.
 
     Raises:
-        DatasetError: None was saved, or one in the middle is gone.
+        DatasetError: No episode was saved, or one in the middle is missing.
     """
     paths = sorted(folder.glob("episode_*.parquet"))
     if not paths:
@@ -350,11 +344,11 @@ def to_table(
     features: Mapping[str, Mapping],
     others: Mapping[str, pa.Array | pa.ChunkedArray] | None = None,
 ) -> pa.Table:
-    """Arrow table of one episode: a number or a list of fixed length a frame.
+    """Arrow table of one episode: a number or a list of fixed length per frame.
 
     Args:
-        values: Numbers by feature, (frames, components).
-        features: As in `meta/info.json`, in the order of the columns.
+        values: Feature -> numbers (frames, components).
+        features: Features as in `meta/info.json`, in the order of the columns.
         others: Columns that hold no numbers, such as images and texts.
     """
     others = others or {}
@@ -373,13 +367,13 @@ def _to_arrow(values: np.ndarray, dtype: str, shape: Sequence[int]) -> pa.Array:
     contiguous = np.ascontiguousarray(values, dtype=dtype)
     if contiguous.dtype == bool:
         flat = pa.array(contiguous.reshape(-1))  # packed to bits
-        return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
-    # Not pa.array(): it imports pandas, which would hold up the first episode for a second.
-    buffers = [None, pa.py_buffer(contiguous)]
-    flat = pa.Array.from_buffers(
-        pa.from_numpy_dtype(contiguous.dtype), contiguous.size, buffers
-    )
-    if len(shape) > 1:  # lists of lists, as Hugging Face keeps arrays of several axes
+    else:
+        # pa.array() would import pandas and delay the first episode by a second.
+        buffers = [None, pa.py_buffer(contiguous)]
+        kind = pa.from_numpy_dtype(contiguous.dtype)
+        flat = pa.Array.from_buffers(kind, contiguous.size, buffers)
+    if len(shape) > 1 and contiguous.dtype != bool:
+        # Lists of lists, as Hugging Face keeps arrays of several axes.
         for length in reversed(shape):
             ends = np.arange(len(flat) // length + 1, dtype=np.int32) * length
             buffers = [None, pa.py_buffer(ends)]
@@ -392,12 +386,12 @@ def _to_arrow(values: np.ndarray, dtype: str, shape: Sequence[int]) -> pa.Array:
 def index_columns(
     fps: float, episode: int, first: int, task_index: Int64[np.ndarray, " _frames"]
 ) -> dict[str, np.ndarray]:
-    """The columns by which LeRobot counts, of one episode.
+    """LeRobot's index columns of one episode.
 
     Args:
         fps: Frame rate [1/s].
-        episode: Its index.
-        first: Index of its first frame among all of the dataset.
+        episode: Episode index.
+        first: Index of its first frame within the dataset.
         task_index: Task of each frame.
     """
     frame = np.arange(len(task_index))

@@ -8,15 +8,19 @@ from typing import Any, Literal
 import numpy as np
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, how_to_recover, open_folder
+from hrc_learn.demos.format.dataset_folder import (
+    DatasetFolder,
+    open_folder,
+    recovery_advice,
+    staging_folder,
+)
 from hrc_learn.demos.format.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
 from hrc_learn.demos.format.videos import CameraRecorder, Image, video_features
-from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.write.assembly import begin, discard, finish
+from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.write.episode import (
-    Column,
     Episode,
     EpisodeBuffer,
+    RecordedColumn,
     RecordingHeader,
     StagedEpisode,
     columns_for,
@@ -24,19 +28,19 @@ from hrc_learn.demos.write.episode import (
     describe_difference,
     encode,
     episode_path,
-    examine,
     index_columns,
     lerobot_features,
+    require_valid,
     sidecar_content,
-    staging_folder,
     to_table,
     write_episode,
 )
+from hrc_learn.demos.write.recovery import begin, discard, finish
 from hrc_learn.store import DATASET, Claim
 
 
 class DatasetWriter:
-    """Records episodes frame by frame and leaves a LeRobot dataset behind.
+    """Recorder of episodes, frame by frame, into a LeRobot dataset.
 
         with DatasetWriter(root, fps=50, robot_type="panda", joint_names=names) as writer:
             writer.start_episode("put the bottle on the shelf")
@@ -44,10 +48,18 @@ class DatasetWriter:
             ...
             writer.save_episode()
 
-    Saved episodes wait in `ROOT.recording/`; `finalize`, which leaving the `with` block
-    calls, turns them into the dataset in one step. If the recording breaks off, by an
-    exception or a kill, the episodes saved until then stay there and `recover_dataset`
-    makes the dataset of them, or adds them to the one they were appended to.
+    Saved episodes wait in `ROOT.recording/`; `finalize`, which the end of the `with` block
+    calls, turns them into the dataset in one step. If the recording is interrupted, by an
+    exception or a kill, the saved episodes stay there, and `recover_dataset` makes a dataset
+    of them or appends them to the dataset being extended.
+
+    Attributes:
+        root: Folder of the dataset.
+        fps: Frame rate [1/s].
+        robot_type: Name of the robot.
+        joint_names: Names of the joints.
+        features: User-defined features: key -> component names.
+        episodes: Number of episodes, those of an extended dataset included.
     """
 
     def __init__(
@@ -67,25 +79,23 @@ class DatasetWriter:
         """Claim the folder; nothing is written into `root` before `finalize`.
 
         Args:
-            root: Folder of the dataset, which must not exist, unless it is appended to.
-            fps: Frame rate [1/s]. True stamps are kept beside it where frames give `time`.
-            robot_type: Name of the robot, as LeRobot's metadata keep it.
+            root: Folder of the dataset; it must not exist, except with `append`.
+            fps: Frame rate [1/s]. True stamps are kept in addition if frames give `time`.
+            robot_type: Name of the robot in LeRobot's metadata.
             joint_names: Joints, in the order of the values of `joint_position` and the like.
-            features: Further features: key, such as "observation.shelf", and the names of
-                its components.
-            cameras: Cameras whose images are kept as videos: name -> height, width [px].
+            features: Further features: key, such as "observation.shelf" -> component names.
+            cameras: Cameras whose images are stored as videos: name -> height, width [px].
             dtype: Type on disk. Policies that train on the dataset expect float32.
-            frames: Names of the frames poses are given in, such as
+            frames: Reference frames of the poses, such as
                 {"base": "panda_link0", "ee": "panda_hand_tcp"}.
-            details: Anything else worth keeping, as JSON values.
-            append: Add episodes to the dataset `root`, which a `DatasetWriter` wrote with the
-                same settings. It stays as it is, and readable, until `finalize` puts the
-                longer one in its place.
+            details: Further values to keep with the dataset, as JSON values.
+            append: Append episodes to the dataset `root`, written by a `DatasetWriter` with the
+                same settings. It stays readable until `finalize` replaces it by the longer one.
 
         Raises:
             BusyError: Another process is recording this dataset.
             FileExistsError: `root`, or an interrupted recording of it, is already there.
-            ValueError: An argument makes no sense, or is not that of the dataset appended to.
+            ValueError: An argument is invalid, or differs from the dataset to append to.
             DatasetError: The dataset to append to cannot be read.
         """
         self.root = Path(root)
@@ -105,7 +115,7 @@ class DatasetWriter:
         self._dtype = dtype
         self._frames_of_poses = dict(frames or {})
         self._details = dict(details or {})
-        self._columns: list[Column] = []
+        self._columns: list[RecordedColumn] = []
         self._task: str | None = None
         self._buffer = EpisodeBuffer(self.joint_names, self.features)
         self._tasks: dict[str, int] = {}
@@ -144,19 +154,19 @@ class DatasetWriter:
                 discard(self._staging)
         if self._new_episodes:
             error.add_note(
-                f"The {self._new_episodes} episodes saved before this are kept in "
-                f"{self._staging}; {how_to_recover(self.root)} makes a dataset of them."
+                f"The {self._new_episodes} episodes saved so far are kept in "
+                f"{self._staging}; {recovery_advice(self.root)} makes a dataset of them."
             )
 
     def start_episode(self, task: str) -> None:
-        """Begin an episode; `task` says what is shown, in words.
+        """Begin an episode of a task, described in words.
 
         Raises:
-            RuntimeError: The episode before has neither been saved nor discarded.
+            RuntimeError: The previous episode was neither saved nor discarded.
         """
         if self._task is not None:
             raise RuntimeError(
-                f"the episode before still holds {len(self._buffer)} unsaved frames: call "
+                f"the previous episode still holds {len(self._buffer)} unsaved frames: call "
                 f"save_episode() or discard_episode() first"
             )
         self._task = task
@@ -164,35 +174,35 @@ class DatasetWriter:
     def add_frame(self, *, images: Mapping[str, Image] | None = None, **values: Any) -> None:
         """Add one frame to the open episode.
 
-        The first episode saved fixes which quantities are recorded; all later ones
-        give the same.
+        The first saved episode determines the recorded quantities; all later frames must give
+        the same ones.
 
         Args:
-            images: RGB image (height, width, 3) uint8 of every camera, by its name.
+            images: Camera name -> RGB image (height, width, 3), uint8.
             values: Fields of `Demonstration` by name, one row each (`time` [s],
                 `joint_position` [rad], `orientation` as (w, x, y, z), `feature` [px], ...),
-                and the features declared at the start by their key. Without `time`, frames
-                are taken to be 1/fps apart. Arrays are copied.
+                and the declared features by key, as arrays, lists or tensors; they are
+                copied. Without `time`, frames are 1/fps apart.
 
         Raises:
             RuntimeError: No episode is open.
             ValueError: A quantity is unknown, missing, new, or of the wrong length.
         """
         self._open_task()
-        self._images.examine(images or {})
+        self._images.validate(images or {})
         self._buffer.append(values)
         self._images.append(images or {})
 
     def save_episode(self) -> int:
-        """Keep the open episode, safe from whatever happens later.
+        """Save the open episode to disk.
 
         Returns:
-            Its index in the dataset.
+            Index of the episode in the dataset.
 
         Raises:
             RuntimeError: No episode is open.
-            ValueError: It is empty, holds values that are not finite, or its time does not
-                increase. The episode is discarded then.
+            ValueError: The episode is empty, holds values that are not finite, or its time
+                does not increase. It is then discarded.
         """
         task, episode = self._open_task(), self._buffer.arrays()
         try:
@@ -203,14 +213,14 @@ class DatasetWriter:
     def add_episode(self, demonstration: Demonstration) -> int:
         """Save a whole demonstration as one episode.
 
-        Of its `extra`, the features declared at the start are written.
+        The declared features are taken from its `extra`.
 
         Returns:
-            Its index in the dataset.
+            Index of the episode in the dataset.
 
         Raises:
             RuntimeError: An episode is open.
-            ValueError: Its joints are not the dataset's, or as in `save_episode`.
+            ValueError: The joints differ from the dataset's, or as in `save_episode`.
         """
         if self._task is not None:
             raise RuntimeError("save or discard the open episode before adding another")
@@ -227,17 +237,17 @@ class DatasetWriter:
         return self._save(episode, demonstration.task)
 
     def write_draft(self, task: str, frames: Sequence[Mapping[str, Any]]) -> None:
-        """Keep frames that are no episode yet, in case that the power fails now.
+        """Save the frames of an unfinished episode, so that a power failure does not lose them.
 
-        `recover_dataset` makes an episode of them. The next draft, and the next episode saved,
-        replace them.
+        `recover_dataset` makes an episode of them. The next draft or saved episode replaces
+        them.
 
         Args:
-            task: What is shown, in words.
-            frames: Values of each, as `add_frame` takes them.
+            task: Task in words.
+            frames: Values of each frame, as in `add_frame`.
 
         Raises:
-            RuntimeError: The dataset has cameras, whose images a draft does not hold.
+            RuntimeError: The dataset has cameras; a draft cannot hold images.
             ValueError: As in `add_frame` and `save_episode`.
         """
         if self._video_features:
@@ -249,11 +259,11 @@ class DatasetWriter:
         write_episode(episode_path(self._staging, self.episodes), staged)
 
     def discard_draft(self) -> None:
-        """Forget the draft, if any."""
+        """Delete the draft, if any."""
         episode_path(self._staging, self.episodes).unlink(missing_ok=True)
 
     def discard_episode(self) -> None:
-        """Forget the open episode, if any."""
+        """Delete the open episode, if any."""
         self._task, self._buffer = None, EpisodeBuffer(self.joint_names, self.features)
         self._images.discard()
 
@@ -286,7 +296,7 @@ class DatasetWriter:
         return self.episodes - (len(self._earlier.episodes) if self._earlier else 0)
 
     def _continue(self) -> DatasetFolder:
-        """Go on counting where the dataset ends that is appended to."""
+        """Continue the counts of the dataset to append to."""
         folder, sidecar = open_folder(self.root), read_sidecar(self.root)
         for name, theirs, ours in (
             ("frame rate", folder.fps, self.fps),
@@ -319,13 +329,13 @@ class DatasetWriter:
 
     def _staged(
         self, episode: Episode, task: str, number: int
-    ) -> tuple[list[Column], StagedEpisode]:
-        """The columns of an episode, and the episode as the next file of the recording.
+    ) -> tuple[list[RecordedColumn], StagedEpisode]:
+        """Columns of an episode, and the episode ready to be written.
 
         Args:
-            episode: Its quantities.
-            task: What is shown, in words.
-            number: Index of that task.
+            episode: Quantities of the episode.
+            task: Task in words.
+            number: Index of the task.
         """
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
@@ -335,7 +345,7 @@ class DatasetWriter:
             if self._columns and columns != self._columns:
                 first = [column.given for column in self._columns]
                 raise ValueError(describe_difference(episode.keys(), first))
-            examine(episode)
+            require_valid(episode)
         except ValueError as error:
             raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
         values = encode(columns, episode) | index_columns(
@@ -355,7 +365,7 @@ class DatasetWriter:
         )
         return columns, staged
 
-    def _header(self, columns: Sequence[Column]) -> RecordingHeader:
+    def _header(self, columns: Sequence[RecordedColumn]) -> RecordingHeader:
         return RecordingHeader(
             fps=self.fps,
             robot_type=self.robot_type,

@@ -1,4 +1,4 @@
-"""Demonstrations made of plain arrays: in memory, or in .npz, .npy and .csv files."""
+"""Demonstrations from plain arrays: in memory, or in .npz, .npy and .csv files."""
 
 import csv
 import math
@@ -12,20 +12,21 @@ import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.reader import to_quaternion
-from hrc_learn.demos.read.roles import meaning_of_component, unit_factor
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.quantities import meaning_of_component, to_quaternion
+from hrc_learn.demos.read.units import unit_factor
 
-# Arrays read from .npz, .npy and .csv files.
-
-Table = dict[str, Float64[np.ndarray, "_demos _frames _components"]]
+ArrayTable = dict[str, Float64[np.ndarray, "_demos _frames _components"]]
 """Array or column name -> its values, demonstration by demonstration."""
 
 UNNAMED = "array"
 """Name of an array whose columns have none."""
+_TIME_NAMES = ("t", "time", "timestamp", "stamp")
+_UNREADABLE = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
+"""Exceptions of numpy for files that are truncated, damaged or of another kind."""
 
 
-def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
+def read_arrays(path: Path, columns: Sequence[str] = ()) -> ArrayTable:
     """Read the arrays of a file.
 
     Arrays of one axis are columns, of two axes (frames, components), of three (demonstrations,
@@ -56,10 +57,6 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
     raise DatasetError("is neither .npz, .npy nor .csv", file=path)
 
 
-_UNREADABLE = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
-"""What numpy raises of files that are truncated, damaged or of another kind."""
-
-
 def _load(path: Path):
     try:
         return np.load(path, allow_pickle=False)
@@ -67,23 +64,23 @@ def _load(path: Path):
         raise DatasetError(f"cannot be read as numpy arrays: {error}", file=path) from error
 
 
-def _read_npz(path: Path) -> Table:
-    """The arrays of a file that can be tables of numbers."""
+def _read_npz(path: Path) -> ArrayTable:
+    """Arrays of a file that can be tables of numbers."""
     file = _load(path)
     if isinstance(file, np.ndarray):
         raise DatasetError("holds a single array: its name should end in .npy", file=path)
-    table: Table = {}
+    table: ArrayTable = {}
     with file:
         for name in file.files:
             try:
                 array = file[name]
             except _UNREADABLE as error:
                 raise DatasetError(
-                    f"cannot be read as an array of numbers ({error}): save it anew",
+                    f"cannot be read as an array of numbers ({error}): save it again",
                     file=path,
                     key=name,
                 ) from error
-            # Of a member that is no array, numpy gives the bytes.
+            # numpy returns bytes for a member that is no array.
             if isinstance(array, np.ndarray) and _is_numeric(array):
                 table[name] = _three_axes(array, path, name)
     return table
@@ -107,7 +104,7 @@ def _three_axes(array: np.ndarray, path: Path, name: str) -> np.ndarray:
     return array if array.ndim == 3 else array[None]
 
 
-def _split(array: np.ndarray, columns: Sequence[str], path: Path) -> Table:
+def _split(array: np.ndarray, columns: Sequence[str], path: Path) -> ArrayTable:
     if not columns:
         return {UNNAMED: array}
     if len(columns) != array.shape[-1]:
@@ -118,8 +115,15 @@ def _split(array: np.ndarray, columns: Sequence[str], path: Path) -> Table:
 
 
 def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
-    """Header, [] where there is none, and numbers of a file with commas or semicolons."""
-    lines = _read_lines(path)
+    """Header ([] if there is none) and numbers of a file with any usual delimiter."""
+    try:
+        # Spreadsheets mark UTF-8 by a byte order mark.
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise DatasetError(
+            f"is not encoded in UTF-8 ({error.reason} at byte {error.start}): save it as UTF-8",
+            file=path,
+        ) from error
     first = next((line for line in lines if line.strip()), "")
     delimiter = max(",;\t", key=first.count)
     if delimiter not in first:
@@ -149,17 +153,6 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     return header, np.array([[float(field) for field in row] for _, row in numbers])
 
 
-def _read_lines(path: Path) -> list[str]:
-    try:
-        # Spreadsheets mark UTF-8 by a byte order mark.
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise DatasetError(
-            f"is not encoded in UTF-8 ({error.reason} at byte {error.start}): save it as UTF-8",
-            file=path,
-        ) from error
-
-
 def _are_numbers(fields: Sequence[str]) -> bool:
     try:
         [float(field) for field in fields]
@@ -168,83 +161,88 @@ def _are_numbers(fields: Sequence[str]) -> bool:
     return True
 
 
-# Demonstrations made of plain arrays.
-
-_TIME_NAMES = ("t", "time", "timestamp", "stamp")
-
-
 @dataclass(frozen=True, kw_only=True)
 class ArraySources:
-    """Which arrays hold what: a name, or several joined by commas. None: by their names."""
+    """Arrays that hold each quantity: one name, or several joined by commas.
+
+    None finds the arrays by their names.
+    """
 
     joints: str | None = None
     """Joint positions."""
     position: str | None = None
     """Position of the end effector."""
     orientation: str | None = None
-    """Its orientation: 4 columns are a quaternion, 3 a rotation vector."""
+    """Orientation of the end effector: a quaternion (4 columns) or a rotation vector (3)."""
     time: str | None = None
-    """Stamps."""
+    """Time stamps."""
 
 
-def demonstrations_from_table(
-    table: Table,
+@dataclass(frozen=True, kw_only=True)
+class ArrayOptions:
+    """Interpretation of arrays as demonstrations."""
+
+    units: Mapping[str, str] | None = None
+    """Units by role ("joint_position", "position", "time"); SI units if not given."""
+    quaternion_order: str = "wxyz"
+    """Order of quaternion components, "wxyz" or "xyzw"."""
+    joint_names: Sequence[str] = ()
+    """Joint names; joint1, joint2, ... if not given."""
+    duration: float | int | None = None
+    """Duration of each demonstration [s] if there are no stamps."""
+    fps: float | int | None = None
+    """Frame rate [1/s] if there are no stamps; with stamps, it is only recorded."""
+    task: str = ""
+    """Task shown."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("duration", self.duration), ("fps", self.fps)):
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"{name} must be positive, got {value}")
+
+
+def demonstrations_from_arrays(
+    table: ArrayTable,
     sources: ArraySources,
+    options: ArrayOptions,
     *,
     path: Path,
-    units: Mapping[str, str] | None = None,
-    quaternion_order: str = "wxyz",
-    joint_names: Sequence[str] = (),
-    duration: float | int | None = None,
-    fps: float | int | None = None,
-    task: str = "",
 ) -> list[Demonstration]:
-    """Make demonstrations of arrays.
+    """Make demonstrations from arrays.
 
     Args:
         table: Arrays by name.
-        sources: Which of them hold what.
-        path: Where they come from, for errors.
-        units: Units by role ("joint_position", "position", "time"); SI where not given.
-        quaternion_order: "wxyz" or "xyzw".
-        joint_names: Names of the joints; joint1, joint2, ... where not given.
-        duration: Length of each demonstration [s] where there are no stamps.
-        fps: Frame rate [1/s] where there are no stamps; with them, it is only recorded.
-        task: What the demonstrations show.
+        sources: Arrays that hold each quantity.
+        options: Units, names and time base.
+        path: Origin of the arrays, for errors.
 
     Raises:
-        DatasetError: An array is missing, has a wrong shape, or holds values no
-            demonstration can have; says which, and at which frame.
-        ValueError: The duration or the frame rate is not positive.
+        DatasetError: An array is missing, has a wrong shape, or holds values that no
+            demonstration can have; names the array and the frame.
     """
-    for name, value in (("duration", duration), ("fps", fps)):
-        if value is not None and not 0 < value < math.inf:
-            raise ValueError(f"{name} must be positive, got {value}")
     found = _find(table, sources, path)
     if not {"joints", "position"} & found.keys():
         raise DatasetError(
-            f"say which arrays are joints or poses (joints, position, orientation); it holds "
+            f"name the arrays of joints or poses (joints, position, orientation); it holds "
             f"{', '.join(table)}",
             file=path,
         )
-    demos = max(len(values) for values in found.values())
-    made = []
-    for index in range(demos):
+    count = max(len(values) for values in found.values())
+    demos = []
+    for index in range(count):
         episode = {
-            name: _scaled(name, values[index if len(values) > 1 else 0], units or {})
+            name: _scaled(name, values[index if len(values) > 1 else 0], options.units or {})
             for name, values in found.items()
         }
         try:
-            made.append(
-                _demonstration(episode, quaternion_order, joint_names, duration, fps, task)
-            )
+            demos.append(_demonstration(episode, options))
         except ValueError as error:
             raise DatasetError(str(error), file=path, episode=index) from error
-    return made
+    return demos
 
 
-def _find(table: Table, sources: ArraySources, path: Path) -> Table:
-    """The arrays that hold joints, position, orientation and time."""
+def _find(table: ArrayTable, sources: ArraySources, path: Path) -> ArrayTable:
+    """Arrays of joints, position, orientation and time."""
     chosen = {name: text.split(",") for name, text in vars(sources).items() if text}
     by_name = {name: ns for name, ns in _by_name(table).items() if name not in chosen}
     if chosen.keys() & {"joints", "position", "orientation"}:
@@ -258,7 +256,7 @@ def _find(table: Table, sources: ArraySources, path: Path) -> Table:
                 file=path,
                 key=name,
             )
-        found[name] = _side_by_side(name, arrays, table, path)
+        found[name] = _joined(name, arrays, table, path)
     shapes = {name: values.shape[:2] for name, values in found.items()}
     frames = {shape[1] for shape in shapes.values()}
     counts = {shape[0] for shape in shapes.values()} - {1}
@@ -269,25 +267,26 @@ def _find(table: Table, sources: ArraySources, path: Path) -> Table:
     return found
 
 
-def _side_by_side(
-    name: str, arrays: Sequence[str], table: Table, path: Path
+def _joined(
+    name: str, arrays: Sequence[str], table: ArrayTable, path: Path
 ) -> Float64[np.ndarray, "demos frames components"]:
+    """Arrays concatenated along their components."""
     first, *others = arrays
     for other in others:
         for axis, counted in enumerate(("demonstrations", "frames")):
             one, two = table[first].shape[axis], table[other].shape[axis]
             if one != two:
                 raise DatasetError(
-                    f"{first!r} has {one} {counted}, {other!r} has {two}: make them alike, or "
-                    f"name arrays that are",
+                    f"{first!r} has {one} {counted}, {other!r} has {two}: bring them to the "
+                    f"same number, or name other arrays",
                     file=path,
                     key=name,
                 )
     return np.concatenate([table[array] for array in arrays], axis=-1)
 
 
-def _by_name(table: Table) -> dict[str, list[str]]:
-    """What columns are by their names alone; joints, where nothing else fits."""
+def _by_name(table: ArrayTable) -> dict[str, list[str]]:
+    """Quantity -> arrays by their names alone; unknown columns are joints."""
     found: dict[str, list[str]] = {}
     for name, values in table.items():
         meaning = meaning_of_component(name)
@@ -307,23 +306,15 @@ def _scaled(name: str, values: np.ndarray, units: Mapping[str, str]) -> np.ndarr
     return values * unit_factor(role, units[role]) if role in units else values
 
 
-def _demonstration(
-    episode: Mapping[str, np.ndarray],
-    quaternion_order: str,
-    joint_names: Sequence[str],
-    duration: float | int | None,
-    fps: float | int | None,
-    task: str,
-) -> Demonstration:
+def _demonstration(episode: Mapping[str, np.ndarray], options: ArrayOptions) -> Demonstration:
     for name, values in episode.items():
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             raise ValueError(f"{name} is {values[*bad[0]]} at frame {bad[0][0]}")
-    frames = len(next(iter(episode.values())))
-    time = _stamps(episode.get("time"), frames, duration, fps)
+    time = _stamps(episode, options)
     joints = episode.get("joints")
     width = 0 if joints is None else joints.shape[1]
-    names = tuple(joint_names) or tuple(f"joint{i + 1}" for i in range(width))
+    names = tuple(options.joint_names) or tuple(f"joint{i + 1}" for i in range(width))
     if joints is not None and len(names) != width:
         raise ValueError(f"{len(names)} joint names for {width} columns of joints")
     return Demonstration(
@@ -332,9 +323,9 @@ def _demonstration(
         joint_position=joints,
         joint_names=names if joints is not None else (),
         position=episode.get("position"),
-        orientation=_orientation(episode.get("orientation"), quaternion_order),
-        task=task,
-        fps=fps or _nominal_rate(time),
+        orientation=_orientation(episode.get("orientation"), options.quaternion_order),
+        task=options.task,
+        fps=options.fps or _nominal_rate(time),
     )
 
 
@@ -347,24 +338,23 @@ def _orientation(values: np.ndarray | None, quaternion_order: str) -> np.ndarray
     return to_quaternion(role, np.ascontiguousarray(values))
 
 
-def _stamps(
-    given: np.ndarray | None, frames: int, duration: float | int | None, fps: float | int | None
-) -> np.ndarray:
+def _stamps(episode: Mapping[str, np.ndarray], options: ArrayOptions) -> np.ndarray:
+    frames = len(next(iter(episode.values())))
     if frames < 2:
         raise ValueError(f"a demonstration needs at least two frames, got {frames}")
-    if given is not None:
-        return given[:, 0]
-    if duration is not None:
-        return np.linspace(0.0, duration, frames)
-    if fps is not None:
-        return np.arange(frames) / fps
+    if "time" in episode:
+        return episode["time"][:, 0]
+    if options.duration is not None:
+        return np.linspace(0.0, options.duration, frames)
+    if options.fps is not None:
+        return np.arange(frames) / options.fps
     raise ValueError(
-        "there are no stamps: say which array holds them (time), or give duration or fps"
+        "there are no stamps: name the array that holds them (time), or give duration or fps"
     )
 
 
 def _nominal_rate(time: np.ndarray) -> float:
-    """LeRobot counts frames at a whole rate; the stamps themselves are kept beside it."""
+    """Whole frame rate, as LeRobot counts frames; true stamps are kept in their own column."""
     step = float(np.median(np.diff(time)))
-    # Stamps that do not increase are refused by `Demonstration`.
+    # `Demonstration` rejects stamps that do not increase.
     return float(max(1, round(1 / step))) if step > 0 else 1.0

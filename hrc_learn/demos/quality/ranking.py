@@ -1,6 +1,6 @@
-"""Episodes of a dataset ranked by how doubtful they are, and grouped by how alike.
+"""Ranking of a dataset's episodes by how doubtful they are, and clusters of similar ones.
 
-A ranking decides nothing: it says where to look first, and why.
+A ranking decides nothing: it tells a person which episodes to look at first, and why.
 """
 
 from collections import Counter
@@ -13,77 +13,95 @@ from jaxtyping import Float64, Int64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
-from hrc_learn.demos.issue import DatasetError, Issue, plain_text
+from hrc_learn.demos.issues import DatasetError, Issue, plain_text
 from hrc_learn.demos.preprocessing import resting
-from hrc_learn.demos.read.column_mapping import MappingSpec
+from hrc_learn.demos.quality.check import check_dataset
+from hrc_learn.demos.quality.episode_checks import motion_sketch
+from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.frames import each_or_fault
-from hrc_learn.demos.read.reader import DemonstrationSource, open_demos
-from hrc_learn.demos.validation.check import check_dataset
+from hrc_learn.demos.read.source import open_demos
 
 MEASURES = {
-    "distance": "distance from the most similar episodes, over the usual one",
+    "distance": "distance from the most similar episodes, relative to the usual one",
     "duration": "s",
-    "idle": "share of the time at rest",
-    "jerk": "log of the dimensionless jerk",
-    "late": "share of frames that came late",
+    "idle": "fraction of the time at rest",
+    "jerk": "logarithm of the dimensionless jerk",
+    "late": "fraction of late frames",
 }
-"""What is measured of each episode, and its unit."""
+"""Measure of an episode -> its meaning or unit."""
 
 Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
+
+# Doubt added by one finding: an error alone outranks all that is merely unusual.
+_ERROR, _WARNING, _REPEAT = 10.0, 1.0, 3.0
+_UNUSUAL = 4.0
+"""Robust spreads (1.4826 times the median deviation) above which a measure is unusual: one in
+16,000 for a normal distribution."""
+_PHASES = 20
+"""Points along the motion at which episodes are compared."""
+_DIMENSIONS = 16
+"""Principal components for distances: a neighbour search in more is far slower."""
+_NEIGHBOURS = 3
+_REACH = 2.0
+"""Radius of a cluster, in usual distances to the third neighbour."""
+_SAME = 0.05
+"""Fraction of the usual distance to the nearest episode below which an episode is a repeat."""
+_BATCH = 32
+"""Points whose neighbours are found at once."""
 
 
 @dataclass(kw_only=True)
 class EpisodeQuality:
-    """What speaks for looking at one episode."""
+    """Measures of one episode, and the reasons to look at it."""
 
     episode: int
     length: int
-    """Frames."""
+    """Number of frames."""
     task: str
     measures: dict[str, float] = field(default_factory=dict)
-    """By the names of `MEASURES`; empty where the episode cannot be read."""
+    """Values by the names of `MEASURES`; empty if the episode cannot be read."""
     score: float = 0.0
-    """How doubtful: 0 where nothing speaks against it."""
+    """Doubt, 0 without any reason."""
     reasons: list[str] = field(default_factory=list)
-    """Why, the weightiest first."""
+    """Reasons, the weightiest first."""
     cluster: int = -1
-    """Episodes alike share a number; -1: like no other."""
+    """Number of the cluster of similar episodes; -1 for none."""
     place: tuple[float, float] | None = None
-    """On a map on which episodes alike lie close: their two main components."""
+    """First two principal components: similar episodes are close on this map."""
     resembles: int | None = None
-    """An episode that this one nearly repeats."""
+    """Index of an episode that this one nearly repeats."""
     start: int = 0
-    """First frame of the motion: what lies before is rest."""
+    """First frame of the motion; the arm rests before."""
     stop: int = 0
-    """Where the motion ends (not included)."""
+    """End of the motion (exclusive)."""
     broken: bool = False
-    """Whether it has errors."""
+    """True if the episode has errors."""
 
     def doubt(self, weight: float, reason: str) -> None:
-        """Add a reason to look at it."""
+        """Add a reason to look at the episode."""
         self.score += weight
         self.reasons.append(reason)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ranking:
-    """The episodes of a dataset, the most doubtful first."""
+    """Episodes of a dataset, the most doubtful first."""
 
     path: Path
     episodes: tuple[EpisodeQuality, ...]
     notes: tuple[str, ...] = ()
-    """What is wrong with the dataset as a whole."""
+    """Faults of the dataset as a whole."""
 
     @property
     def clusters(self) -> dict[int, list[int]]:
-        """Number of each group of episodes alike -> its episodes; -1: those like no other."""
+        """Cluster number -> episode indices; -1 for episodes without a cluster."""
         groups: dict[int, list[int]] = {}
         for quality in sorted(self.episodes, key=lambda q: (q.cluster, q.episode)):
             groups.setdefault(quality.cluster, []).append(quality.episode)
         return groups
 
     def rows(self) -> list[tuple[str, ...]]:
-        """The ranking as a table, its head first."""
+        """The ranking as a table with its header."""
         rows = [("episode", "doubt", "group", "frames", *MEASURES, "why")]
         for q in self.episodes:
             measured = (f"{q.measures[m]:.3g}" if m in q.measures else "-" for m in MEASURES)
@@ -97,7 +115,7 @@ class Ranking:
         """The ranking as text.
 
         Args:
-            most: Episodes shown; None: all.
+            most: Number of episodes shown; None for all.
         """
         head, *rows = self.rows()
         shown = [head, *rows[:most]]
@@ -106,21 +124,15 @@ class Ranking:
             cells = (f"{cell:>{w}}" for cell, w in zip(row, widths, strict=False))
             yield f"{'  '.join(cells)}  {row[-1]}".rstrip()
         if len(rows) > len(shown) - 1:
-            yield f"and {len(rows) - len(shown) + 1} episodes less doubtful (--full)"
+            yield f"and {len(rows) - len(shown) + 1} less doubtful episodes (--full)"
         groups = {k: v for k, v in self.clusters.items() if k >= 0}
         alone = len(self.clusters.get(-1, ()))
         sizes = ", ".join(str(len(v)) for v in groups.values())
         yield (
-            f"{len(groups)} groups of episodes alike ({sizes or 'none'}); {alone} like no other"
+            f"{len(groups)} groups of similar episodes ({sizes or 'none'}); "
+            f"{alone} without a group"
         )
         yield from self.notes
-
-
-# What one episode weighs: an error alone puts it before all that are merely unusual.
-_ERROR, _WARNING, _REPEAT = 10.0, 1.0, 3.0
-_UNUSUAL = 4.0
-"""Spreads (1.4826 times the median deviation) from which a measure is unusual: one in 16,000
-of a normal distribution."""
 
 
 def rank_episodes(
@@ -129,42 +141,40 @@ def rank_episodes(
     units: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Ranking:
-    """Find out which episodes of a dataset a person should look at first.
+    """Rank the episodes of a dataset by how doubtful they are.
 
-    By what `check_dataset` finds in each, by how far its motion is from the most similar ones,
-    and by what is unusual of its duration, rests, smoothness and stamps. Memory grows with the
-    number of episodes, by some kilobytes each, and not with their lengths.
+    The score counts the findings of `check_dataset`, the distance of the motion from the most
+    similar ones, and unusual durations, rests, jerk and late frames. Memory grows by a few
+    kilobytes per episode, independent of its length.
 
     Args:
-        path: The dataset's folder.
-        mapping: Where quantities are that are not found by name, as in `load_demos`.
+        path: Folder of the dataset.
+        mapping: Columns by role, as in `load_demos`.
         units: Units on disk by role, as in `load_demos`.
-        progress: Called with the episodes one after another, and gives them back: a hook for
-            a progress bar.
+        progress: Wraps the episodes, such as with a progress bar.
 
     Raises:
         DatasetError: The dataset cannot be read as a whole.
     """
     root = Path(path)
     report = check_dataset(root, mapping, units)
-    folder = open_folder(root)
     qualities = {
         e.index: EpisodeQuality(
             episode=e.index, length=e.length, task=" / ".join(e.tasks), stop=e.length
         )
-        for e in folder.episodes
+        for e in open_folder(root).episodes
     }
     notes = [f"error: {issue}" for issue in report.errors if issue.episode not in qualities]
     for quality, issue in _one_of_each_kind(qualities, report.errors):
         quality.broken = True
-        quality.doubt(_ERROR, _said(issue))
+        quality.doubt(_ERROR, _reason(issue))
     for quality, issue in _one_of_each_kind(qualities, report.warnings, len(qualities) // 2):
-        quality.doubt(_WARNING, _said(issue))
+        quality.doubt(_WARNING, _reason(issue))
     shapes: dict[int, Float64[np.ndarray, " numbers"]] = {}
     for quality, demo in _demonstrations(root, mapping, units, qualities, progress):
         _measure(quality, demo)
         if (motion := _motion(demo)) is not None:
-            shapes[quality.episode] = _shape(motion)
+            shapes[quality.episode] = motion_sketch(motion, _PHASES)
     _compare(qualities, shapes)
     _mark_unusual([q for q in qualities.values() if q.measures])
     ranked = sorted(qualities.values(), key=lambda q: (-q.score, q.episode))
@@ -174,12 +184,12 @@ def rank_episodes(
 def _one_of_each_kind(
     qualities: Mapping[int, EpisodeQuality], issues: Iterable[Issue], most: int | None = None
 ) -> Iterator[tuple[EpisodeQuality, Issue]]:
-    """The weightiest finding of each kind in an episode.
+    """The most severe issue of each kind in each episode.
 
     Args:
-        qualities: The episodes.
-        issues: What was found.
-        most: Kinds that more episodes share tell none from the others; None: no such limit.
+        qualities: Episodes by index.
+        issues: Issues of the dataset.
+        most: Number of episodes above which a kind distinguishes none; None for no limit.
     """
     worst: dict[tuple, Issue] = {}
     for issue in issues:
@@ -193,7 +203,7 @@ def _one_of_each_kind(
             yield qualities[episode], issue
 
 
-def _said(issue: Issue) -> str:
+def _reason(issue: Issue) -> str:
     where = f"{issue.key}: " if issue.key else ""
     return plain_text(f"{where}{issue.message}")
 
@@ -205,12 +215,12 @@ def _demonstrations(
     qualities: Mapping[int, EpisodeQuality],
     progress: Progress | None,
 ) -> Iterator[tuple[EpisodeQuality, Demonstration]]:
-    """Episodes that can be read, one at a time; of the others, why not."""
+    """Readable episodes, one at a time; the error of each other one becomes its doubt."""
     entries = open_folder(root).episodes
     try:
-        source: DemonstrationSource = open_demos(root, mapping=mapping, units=units)
+        source = open_demos(root, mapping=mapping, units=units)
     except DatasetError as error:
-        if error.finding.episode is None:
+        if error.episode is None:
             raise
         sound = [e.index for e in entries if not qualities[e.index].broken]
         if not sound:
@@ -229,22 +239,11 @@ def _demonstrations(
 
 
 def _motion(demo: Demonstration) -> Float64[np.ndarray, "frames components"] | None:
-    """What moves, grippers included."""
+    """Joints or position, and the gripper."""
     parts = [demo.joint_position if demo.joint_position is not None else demo.position]
     parts += [None if demo.gripper is None else demo.gripper[:, None]]
     known = [part for part in parts if part is not None]
     return np.concatenate(known, axis=1) if known else None
-
-
-_PHASES = 20
-"""Points along the motion at which episodes are compared."""
-
-
-def _shape(motion: Float64[np.ndarray, "frames components"]) -> Float64[np.ndarray, " numbers"]:
-    """The motion at even phases, whatever its duration."""
-    phase = np.linspace(0, 1, len(motion))
-    at = np.linspace(0, 1, _PHASES)
-    return np.stack([np.interp(at, phase, column) for column in motion.T], axis=1).ravel()
 
 
 def _measure(quality: EpisodeQuality, demo: Demonstration) -> None:
@@ -259,7 +258,7 @@ def _measure(quality: EpisodeQuality, demo: Demonstration) -> None:
     quality.measures["jerk"] = log_dimensionless_jerk(demo.time, motion)
     try:
         rest = resting(demo)
-    except ValueError:  # too few frames to tell a speed
+    except ValueError:  # too few frames to estimate a speed
         return
     quality.measures["idle"] = float(rest.mean())
     moving = np.flatnonzero(~rest)
@@ -274,15 +273,16 @@ def log_dimensionless_jerk(
 ) -> float:
     """Natural logarithm of the integral of the squared jerk times duration^5 / length^2.
 
-    Neither units, nor speed, nor size change it; less is smoother (Hogan and Sternad 2009,
-    "Sensitivity of smoothness measures to movement duration, amplitude, and arrests").
+    It depends on neither units, speed nor size, and is smaller for smoother motions (Hogan and
+    Sternad 2009, "Sensitivity of smoothness measures to movement duration, amplitude, and
+    arrests").
 
     Args:
-        time: [s], increasing.
-        motion: In any unit.
+        time: Increasing times [s].
+        motion: Positions in any unit.
 
     Returns:
-        NaN where nothing moves.
+        The measure; NaN if nothing moves.
     """
     values = motion
     for _ in range(3):
@@ -294,31 +294,19 @@ def log_dimensionless_jerk(
     return float(np.log(square * (time[-1] - time[0]) ** 5 / length**2))
 
 
-# Episodes against each other.
-
-_DIMENSIONS = 16
-"""Principal components that distances are taken in: neighbours in more cost far more."""
-_NEIGHBOURS = 3
-_REACH = 2.0
-"""Usual distances to the third neighbour within which episodes are of one group."""
-_SAME = 0.05
-"""Share of the usual distance to the nearest episode within which one repeats the other."""
-
-
 def _compare(
     qualities: Mapping[int, EpisodeQuality],
     shapes: Mapping[int, Float64[np.ndarray, " numbers"]],
 ) -> None:
-    """Groups of episodes alike, repeats, and those far from all others."""
+    """Find clusters, repeats, and the distance of each episode from its neighbours."""
     from scipy.spatial import KDTree
 
     widths = {len(shape) for shape in shapes.values()}
     if len(shapes) <= _NEIGHBOURS or len(widths) != 1:
         return
     indices = [*shapes]
-    points = _principal(np.stack([*shapes.values()]))
-    tree = KDTree(points)
-    distances, found = tree.query(points, k=_NEIGHBOURS + 1)
+    points = _principal_components(np.stack([*shapes.values()]))
+    distances, found = KDTree(points).query(points, k=_NEIGHBOURS + 1)
     neighbours = np.asarray(found)
     usual = float(np.median(distances[:, 1]))
     reach = float(np.median(distances[:, -1]))
@@ -330,7 +318,7 @@ def _compare(
         quality.cluster = int(labels[number])
         quality.place = float(points[number, 0]), float(points[number, 1])
         quality.measures["distance"] = float(distances[number, 1:].mean() / reach)
-        # Of two episodes alike the later one repeats.
+        # The later one of two similar episodes is the repeat.
         near = neighbours[number][distances[number] < _SAME * usual]
         earlier = [indices[i] for i in near if indices[i] < index]
         if earlier:
@@ -338,18 +326,18 @@ def _compare(
             quality.doubt(_REPEAT, f"nearly repeats episode {quality.resembles}")
 
 
-def _principal(
+def _principal_components(
     shapes: Float64[np.ndarray, "episodes numbers"],
 ) -> Float64[np.ndarray, "episodes dimensions"]:
-    """Shapes in their principal components, every component of the motion counted alike."""
+    """Principal components of the shapes, all components of the motion weighted equally."""
     columns = shapes.reshape(len(shapes), _PHASES, -1)
     scale = np.maximum(np.median(np.ptp(columns, axis=1), axis=0), 1e-9)
-    # A component that rests in most episodes must not drown the others.
+    # A component that rests in most episodes must not dominate.
     scale = np.maximum(scale, 0.05 * scale.max())
     centred = ((columns - np.median(columns, axis=0)) / scale).reshape(len(shapes), -1)
-    # Values that are far off would take all components for themselves.
+    # Outliers would determine all components.
     centred = np.clip(centred, -20, 20)
-    # Of the smaller of the two products, whose main axes span the same space.
+    # The smaller of both products, whose principal axes span the same space.
     if centred.shape[1] <= len(centred):
         axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1][:, :_DIMENSIONS]
         return centred @ axes / np.sqrt(_PHASES)
@@ -358,31 +346,27 @@ def _principal(
     return vectors[:, ::-1][:, :_DIMENSIONS] * main / np.sqrt(_PHASES)
 
 
-_FRONT = 32
-"""Points whose neighbours are looked up at once."""
-
-
 def density_clusters(
     points: Float64[np.ndarray, "points dimensions"], radius: float, neighbours: int
 ) -> Int64[np.ndarray, " points"]:
-    """Groups of points that lie close to each other, by density (DBSCAN).
+    """Clusters of close points by density (DBSCAN).
 
-    Ester et al. 1996, "A density-based algorithm for discovering clusters": points with enough
-    others about them are cores, cores within reach of each other are of one group, and other
-    points of that of a core within reach.
+    Points with enough neighbours are cores, cores within the radius share a cluster, and other
+    points belong to the cluster of a core within the radius (Ester et al. 1996, "A
+    density-based algorithm for discovering clusters").
 
     Args:
-        points: To be grouped.
-        radius: Reach.
-        neighbours: Others within reach that make a point a core.
+        points: Points to cluster.
+        radius: Largest distance of neighbours.
+        neighbours: Number of neighbours that make a point a core.
 
     Returns:
-        Number of each point's group, the largest group 0; -1 for points of none.
+        Cluster of each point, the largest cluster 0; -1 for none.
     """
     from scipy.spatial import KDTree
 
     tree = KDTree(points)
-    # A point is within reach of itself.
+    # Each point is its own neighbour.
     core = tree.query_ball_point(points, radius, return_length=True) > neighbours
     labels = np.full(len(points), -1)
     for group, seed in enumerate(np.flatnonzero(core)):
@@ -391,48 +375,64 @@ def density_clusters(
         labels[seed] = group
         front = np.array([seed])
         while len(front):
-            # Some at a time: all pairs of points of a dense group are too many to hold.
-            near = tree.query_ball_point(points[front[:_FRONT]], radius)
+            # In batches: all pairs of a dense cluster are too many to hold.
+            near = tree.query_ball_point(points[front[:_BATCH]], radius)
             reached = np.unique(np.concatenate([*near]).astype(int))
             new = reached[labels[reached] < 0]
             labels[new] = group
-            front = np.concatenate([front[_FRONT:], new[core[new]]])
+            front = np.concatenate([front[_BATCH:], new[core[new]]])
     known, sizes = np.unique(labels[labels >= 0], return_counts=True)
     order = {int(label): rank for rank, label in enumerate(known[np.argsort(-sizes)])}
     return np.array([order.get(int(label), -1) for label in labels])
 
 
+@dataclass(frozen=True)
+class _Unusual:
+    """Test of one measure for unusual values."""
+
+    reason: str
+    least: float
+    """Smallest difference from the usual value that counts."""
+    spread: float
+    """Lower bound of the spread, for datasets of nearly equal episodes."""
+
+
+_TESTS = {
+    "distance": _Unusual(
+        "moves unlike all others: {value:.1f} times as far from the nearest", 1.0, 0.25
+    ),
+    "duration": _Unusual("takes {value:.1f} s, {usual:.1f} s are usual", 0.0, 0.05),
+    "idle": _Unusual(
+        "rests for {percent:.0f} % of the time, {usual_percent:.0f} % are usual", 0.1, 0.025
+    ),
+    "jerk": _Unusual("moves jerkily: e^{excess:.1f} times the usual jerk", 1.0, 0.25),
+    "late": _Unusual(
+        "{percent:.0f} % of its frames came late, {usual_percent:.0f} % are usual", 0.02, 0.005
+    ),
+}
+
+
 def _mark_unusual(qualities: Sequence[EpisodeQuality]) -> None:
-    """Weigh what is unusual among the measures."""
-    says = {
-        "distance": "moves unlike all others: {value:.1f} times as far from the nearest",
-        "duration": "takes {value:.1f} s, {usual:.1f} s are usual",
-        "idle": "rests for {percent:.0f} % of the time, {usual_percent:.0f} % are usual",
-        "jerk": "moves jerkily: e^{excess:.1f} times the usual jerk",
-        "late": "{percent:.0f} % of its frames came late, {usual_percent:.0f} % are usual",
-    }
-    least = {"distance": 1.0, "duration": 0.0, "idle": 0.1, "jerk": 1.0, "late": 0.02}
-    for name, text in says.items():
+    """Add a doubt for each unusual measure; durations are compared by their logarithms."""
+    for name, test in _TESTS.items():
         known = [q for q in qualities if np.isfinite(q.measures.get(name, np.nan))]
         if len(known) < 4:
             continue
+        is_duration = name == "duration"
         values = np.array([q.measures[name] for q in known])
-        if name == "duration":
+        if is_duration:
             values = np.log(np.maximum(values, 1e-9))
         usual = float(np.median(values))
-        spread = 1.4826 * float(np.median(np.abs(values - usual)))
-        # Where nearly all are alike the least difference would count.
-        spread = max(spread, {"duration": 0.05}.get(name, 0.25 * least[name]))
+        spread = max(1.4826 * float(np.median(np.abs(values - usual))), test.spread)
         for quality, value in zip(known, values, strict=True):
             off = (value - usual) / spread
-            both_ways = name == "duration"
-            if not (abs(off) if both_ways else off) > _UNUSUAL:
+            if not (abs(off) if is_duration else off) > _UNUSUAL:
                 continue
-            if abs(value - usual) < least[name]:
+            if abs(value - usual) < test.least:
                 continue
             own = quality.measures[name]
-            shown = float(np.exp(usual)) if name == "duration" else usual
-            reason = text.format(
+            shown = float(np.exp(usual)) if is_duration else usual
+            reason = test.reason.format(
                 value=own,
                 usual=shown,
                 percent=100 * own,

@@ -1,7 +1,8 @@
-"""Images of a dataset as data: decoded into tensors beside the frames they belong to."""
+"""Images of a dataset, decoded into tensors, one for each frame of an episode."""
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
@@ -9,35 +10,40 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from hrc_learn.demos.format.dataset_folder import (
-    EpisodeEntry,
-    open_folder,
-    open_parquet,
-    read_table,
-)
-from hrc_learn.demos.format.metadata import INFO_PATH
+from hrc_learn.demos.demonstration import Demonstration
+from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.format.files import INFO_PATH, open_parquet, read_table
 from hrc_learn.demos.format.videos import Image, Segments, decode, decode_image, read_segments
-from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.issues import DatasetError
 
 Images = Mapping[str, UInt8[Tensor, "frames 3 height width"]]
-"""By camera: RGB from 0 to 255. In memory the colours of a pixel lie together
+"""Camera -> RGB images, 0 to 255. In memory, the colours of a pixel are adjacent
 (`torch.channels_last`)."""
+StampedImages = tuple[Float[np.ndarray, " images"], tuple[bytes, ...]]
+"""Times [s], and a JPEG file for each."""
+Thumbnails = dict[str, StampedImages]
+"""Images by camera name, without LeRobot's prefix."""
 
 _SKIP_SECONDS = 2.0
-"""Longer gaps between images wanted are sought over: key frames are rarely further apart."""
+"""Gap between wanted images above which the video is sought: key frames are rarely farther
+apart."""
+_THUMBNAIL_RATE = 5.0
+"""Thumbnails per second: a hand-guided arm moves by a few centimetres between two."""
+_THUMBNAIL_HEIGHT = 240
+"""Largest height of a thumbnail [px]."""
 
 
 class ImageReader:
-    """Reads the images of any episode, from videos and from columns of images.
+    """Reader of the images of any episode, from videos or from columns of images.
 
         reader = ImageReader(path)
         images = reader.read(3, size=(240, 320))["observation.images.front"]
         images.shape  # (frames of the episode, 3, 240, 320)
 
-    Holds no file open between calls.
+    No file stays open between calls.
 
     Attributes:
         cameras: Features that hold images.
@@ -45,21 +51,23 @@ class ImageReader:
 
     def __init__(self, path: str | Path):
         """
+        Args:
+            path: Folder of the dataset.
+
         Raises:
             DatasetError: The metadata cannot be read.
         """
         self._folder = open_folder(path)
         self._entries = {entry.index: entry for entry in self._folder.episodes}
-        features = self._folder.features.items()
-        self.cameras = tuple(key for key, f in features if f.dtype in ("video", "image"))
+        self.cameras = tuple(k for k, f in self._folder.features.items() if f.is_picture)
         self._segments: dict[int, Segments] = read_segments(self._folder, missing=True)
 
     def available(self, episode: int) -> tuple[str, ...]:
-        """Cameras of which an episode has images here."""
-        return tuple(key for key in self.cameras if self._is_here(episode, key))
+        """Cameras whose images of an episode exist."""
+        return tuple(key for key in self.cameras if self._exists(episode, key))
 
     def length(self, episode: int) -> int:
-        """Frames of an episode.
+        """Number of frames of an episode.
 
         Raises:
             DatasetError: There is no such episode.
@@ -67,10 +75,10 @@ class ImageReader:
         return self._entry(episode).length
 
     def size(self, camera: str) -> tuple[int, int]:
-        """Height and width of a camera's images as declared [px].
+        """Declared height and width of a camera's images [px].
 
         Raises:
-            DatasetError: None are.
+            DatasetError: No height and width are declared.
         """
         feature = self._folder.features[camera]
         if len(feature.shape) != 3:
@@ -84,7 +92,7 @@ class ImageReader:
         height, width = feature.shape[1:] if first else feature.shape[:2]
         return int(height), int(width)
 
-    def _is_here(self, episode: int, key: str) -> bool:
+    def _exists(self, episode: int, key: str) -> bool:
         if self._folder.features[key].dtype == "image":
             return True
         segment = self._segments.get(episode, {}).get(key)
@@ -97,13 +105,13 @@ class ImageReader:
         frames: Sequence[int] | None = None,
         size: tuple[int, int] | None = None,
     ) -> Images:
-        """Images of one episode, those of several cameras decoded at once.
+        """Images of one episode; several cameras are decoded in parallel.
 
         Args:
-            episode: Its index.
-            cameras: Features wanted; None: all.
-            frames: Frames of the episode wanted, in any order; None: all.
-            size: Height and width to scale to [px]; None: as they are.
+            episode: Episode index.
+            cameras: Features wanted; None for all.
+            frames: Frames of the episode wanted, in any order; None for all.
+            size: Height and width to scale to [px]; None keeps the size.
 
         Raises:
             DatasetError: There is no such episode, camera or frame; a video is missing, is
@@ -114,13 +122,13 @@ class ImageReader:
         wanted = range(entry.length) if frames is None else frames
         if not keys or not len(wanted):
             return {}
-        with ThreadPoolExecutor(len(keys)) as pool:  # PyAV decodes without the interpreter
-            done = pool.map(lambda key: self._read_camera(entry, key, wanted, size), keys)
+        with ThreadPoolExecutor(len(keys)) as pool:  # PyAV releases the interpreter lock
+            done = pool.map(lambda key: self._read_camera(episode, key, wanted, size), keys)
             return dict(zip(keys, done, strict=True))
 
     def _read_camera(
         self,
-        entry: EpisodeEntry,
+        episode: int,
         camera: str,
         wanted: Sequence[int],
         size: tuple[int, int] | None,
@@ -128,7 +136,7 @@ class ImageReader:
         ordered = sorted({*wanted})
         place = {frame: number for number, frame in enumerate(ordered)}
         images: np.ndarray | None = None
-        for frame, image in self.stream(entry.index, camera, ordered, size):
+        for frame, image in self.stream(episode, camera, ordered, size):
             if images is None:
                 images = np.empty((len(ordered), *image.shape), np.uint8)
             images[place[frame]] = image
@@ -165,9 +173,9 @@ class ImageReader:
                 **entry.location,
             )
         if self._folder.features[camera].dtype == "image":
-            yield from self._of_column(entry, camera, wanted, size)
+            yield from self._from_column(entry, camera, wanted, size)
         else:
-            yield from self._of_video(entry, camera, wanted, size)
+            yield from self._from_video(entry, camera, wanted, size)
 
     def _entry(self, episode: int) -> EpisodeEntry:
         if episode not in self._entries:
@@ -178,7 +186,7 @@ class ImageReader:
             )
         return self._entries[episode]
 
-    def _of_video(
+    def _from_video(
         self,
         entry: EpisodeEntry,
         camera: str,
@@ -186,24 +194,26 @@ class ImageReader:
         size: tuple[int, int] | None,
     ) -> Iterator[tuple[int, Image]]:
         segment, fps = self._segments.get(entry.index, {}).get(camera), self._folder.fps
-        place = {"episode": entry.index, "key": camera}
         if segment is None or not segment.file.is_file():
-            file = None if segment is None else segment.file
-            raise DatasetError("its video is not here", file=file, **place)
+            raise DatasetError(
+                "its video is missing",
+                file=None if segment is None else segment.file,
+                episode=entry.index,
+                key=camera,
+            )
         for run in _runs(wanted, max(1, round(_SKIP_SECONDS * fps))):
-            first, last = run[0], run[-1]
             part = replace(
                 segment,
-                start=segment.start + first / fps,
-                stop=segment.start + (last + 1) / fps,
+                start=segment.start + run[0] / fps,
+                stop=segment.start + (run[-1] + 1) / fps,
             )
-            missing, last_seen = iter(run), -1
+            missing, last = iter(run), -1
             expected = next(missing)
             for offset, image in decode(part, fps, size, skip=_unwanted(run)):
-                frame = first + offset
-                if frame <= last_seen:
-                    continue  # a second image for the same frame
-                last_seen = frame
+                frame = run[0] + offset
+                if frame <= last:
+                    continue  # a second image of the same frame
+                last = frame
                 if frame != expected:
                     break
                 yield frame, image
@@ -212,14 +222,15 @@ class ImageReader:
                     break
             if expected is not None:
                 raise DatasetError(
-                    f"holds no image of frame {expected}: the recording was broken off, or "
+                    f"holds no image of frame {expected}: the recording was interrupted, or "
                     f"the video is that of another episode",
                     file=segment.file,
+                    episode=entry.index,
                     frame=expected,
-                    **place,
+                    key=camera,
                 )
 
-    def _of_column(
+    def _from_column(
         self,
         entry: EpisodeEntry,
         camera: str,
@@ -242,8 +253,8 @@ class ImageReader:
                 ) from error
 
 
-def _runs(frames: Sequence[int], gap: int) -> Iterator[Sequence[int]]:
-    """Ascending frames, parted where more than `gap` lie between two."""
+def _runs(frames: Sequence[int], gap: int) -> Iterator[list[int]]:
+    """Ascending frames, split where two are more than `gap` apart."""
     numbers = np.asarray(frames)
     for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > gap) + 1):
         if len(run):
@@ -251,7 +262,7 @@ def _runs(frames: Sequence[int], gap: int) -> Iterator[Sequence[int]]:
 
 
 def _unwanted(run: Sequence[int]) -> Callable[[int], bool] | None:
-    """Says of images of a run, counted from its first, which need not be converted."""
+    """Filter of the images of a run, counted from its first, that need no conversion."""
     if len(run) == run[-1] - run[0] + 1:
         return None
     wanted = {frame - run[0] for frame in run}
@@ -269,11 +280,64 @@ def load_images(
     return ImageReader(path).read(episode, cameras, frames, size)
 
 
-def jpeg(image: Image, quality: int = 4) -> bytes:
-    """An image as a JPEG file.
+def thumbnails(
+    path: str | Path, demos: Iterable[Demonstration], most: int = 200
+) -> tuple[dict[int, Thumbnails], list[str]]:
+    """Small images of episodes: enough to see the motion.
 
     Args:
-        image: RGB.
+        path: Folder of the dataset.
+        demos: Demonstrations of it, with all their frames or some spread evenly over them.
+        most: Largest number of images per camera and episode: 200 take about 2 MB.
+
+    Returns:
+        Images by episode index, and one line for each video that cannot be read.
+
+    Raises:
+        DatasetError: The metadata cannot be read.
+    """
+    reader, found, missing = ImageReader(path), {}, []
+    wanted = [(demo, camera) for demo in demos for camera in reader.available(demo.episode)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV releases the interpreter lock
+        read = pool.map(lambda pair: _thumbnails(reader, *pair, most), wanted)
+        for (demo, camera), images in zip(wanted, read, strict=True):
+            if isinstance(images, DatasetError):
+                missing.append(str(images))
+            else:
+                # The whole rest of the key: left.rgb and right.rgb are two cameras.
+                name = camera.removeprefix("observation.images.")
+                found.setdefault(demo.episode, {})[name] = images
+    return found, missing
+
+
+def _thumbnails(
+    reader: ImageReader, demo: Demonstration, camera: str, most: int
+) -> StampedImages | DatasetError:
+    """Thumbnails of one camera, or the error of its video."""
+    last = reader.length(demo.episode) - 1
+    count = min(last + 1, most, 1 + int(demo.duration * _THUMBNAIL_RATE))
+    frames = sorted({*np.linspace(0, last, count).astype(int).tolist()})
+    try:
+        size = thumbnail_size(*reader.size(camera))
+        files = tuple(
+            jpeg(image) for _, image in reader.stream(demo.episode, camera, frames, size)
+        )
+    except DatasetError as error:
+        return error
+    return np.interp(frames, np.linspace(0, last, len(demo)), demo.time), files
+
+
+def thumbnail_size(height: int, width: int) -> tuple[int, int]:
+    """Height and width of a thumbnail [px], even because chroma is halved."""
+    scale = min(1.0, _THUMBNAIL_HEIGHT / height) / 2
+    return 2 * max(1, round(scale * height)), 2 * max(1, round(scale * width))
+
+
+def jpeg(image: Image, quality: int = 4) -> bytes:
+    """The image as a JPEG file.
+
+    Args:
+        image: RGB image.
         quality: Quantiser of FFmpeg's encoder, 2 (best) to 31.
     """
     import av

@@ -1,4 +1,4 @@
-"""What a person decided about each episode, kept beside the dataset, and a cleaned copy."""
+"""Decisions on the episodes of a dataset, kept next to it, and the curated copy."""
 
 import json
 from collections.abc import Mapping
@@ -7,35 +7,40 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.column_mapping import MappingSpec
-from hrc_learn.demos.repair import RepairOptions, RepairReport, repair_dataset
-from hrc_learn.demos.repair.repair import Progress
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.quality.repair import (
+    Progress,
+    RepairOptions,
+    RepairReport,
+    repair_dataset,
+)
+from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.store import new_file
 
 Verdict = Literal["accept", "cut", "reject"]
+_FORMAT = 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """What becomes of one episode."""
+    """Decision on one episode."""
 
     verdict: Verdict
     start: int = 0
-    """First frame that stays, of a cut."""
+    """First frame kept by a cut."""
     stop: int = 0
-    """Where those that stay end (not included), of a cut."""
+    """End of the frames kept by a cut (exclusive)."""
 
 
 Decisions = dict[int, Decision]
-"""By episode; those that are not named are accepted."""
+"""Episode index -> decision; episodes without one are accepted."""
 
 
-def decision(verdict: str, length: int, start: int = 0, stop: int = 0) -> Decision:
-    """A decision that makes sense for an episode of so many frames.
+def decide(verdict: str, length: int, start: int = 0, stop: int = 0) -> Decision:
+    """A valid decision on an episode of this length [frames].
 
     Raises:
-        ValueError: There is no such verdict, or the cut leaves fewer than two frames.
+        ValueError: The verdict is unknown, or the cut keeps fewer than two frames.
     """
     if verdict not in get_args(Verdict):
         raise ValueError(f"{verdict!r} is none of {', '.join(get_args(Verdict))}")
@@ -50,56 +55,53 @@ def decision(verdict: str, length: int, start: int = 0, stop: int = 0) -> Decisi
 
 
 def decisions_path(root: Path) -> Path:
-    """Where the decisions about a dataset are kept: beside it."""
+    """File of the decisions on a dataset, next to it."""
     root = root.resolve()
     return root.with_name(f"{root.name}.curation.json")
 
 
-_DECISIONS_FORMAT = 1
-
-
 def read_decisions(root: Path) -> Decisions:
-    """What was decided before about the episodes of a dataset; empty where nothing was.
+    """Decisions kept for the episodes of a dataset.
 
     Raises:
-        DatasetError: The file is damaged, or of another dataset.
+        DatasetError: The file is damaged, or belongs to another dataset.
     """
     path, entries = decisions_path(root), {e.index: e for e in open_folder(root).episodes}
     if not path.is_file():
         return {}
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        decided: Decisions = {}
+        decisions: Decisions = {}
         for name, said in content["decisions"].items():
             entry = entries[int(name)]
             if said["length"] != entry.length:
                 raise DatasetError(
                     f"decides on {said['length']} frames of the episode, which has "
-                    f"{entry.length}: it is of another dataset; delete it to begin anew",
+                    f"{entry.length}: it belongs to another dataset; delete it to begin anew",
                     file=path,
                     episode=entry.index,
                 )
-            decided[entry.index] = decision(
+            decisions[entry.index] = decide(
                 said["verdict"], entry.length, said["start"], said["stop"]
             )
+    except DatasetError:
+        raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, DatasetError):
-            raise
         raise DatasetError(
             f"holds no decisions on this dataset ({error!r}); delete it to begin anew",
             file=path,
         ) from error
-    return decided
+    return decisions
 
 
 def keep_decisions(root: Path, decisions: Mapping[int, Decision]) -> None:
-    """Write the decisions beside the dataset, which is not touched."""
+    """Write the decisions next to the dataset, which is not changed."""
     lengths = {entry.index: entry.length for entry in open_folder(root).episodes}
     content = {
-        "format": _DECISIONS_FORMAT,
+        "format": _FORMAT,
         "decisions": {
-            str(index): asdict(decided) | {"length": lengths[index]}
-            for index, decided in sorted(decisions.items())
+            str(index): asdict(decision) | {"length": lengths[index]}
+            for index, decision in sorted(decisions.items())
         },
     }
     with new_file(decisions_path(root)) as part:
@@ -115,22 +117,22 @@ def write_curated(
     units: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> RepairReport:
-    """Write what is left of a dataset into a new one of version 3.0.
+    """Write the accepted and cut episodes into a new dataset of version 3.0.
 
-    Values stay as they are; videos are copied and cut by saying where each episode begins and
-    ends in them. The old dataset is not touched.
+    Values stay as they are. Videos are copied, and cut by their times in the list of episodes.
+    The old dataset is not changed.
 
     Args:
         path: The dataset.
-        out: Folder of the new one, which must not exist.
-        decisions: By episode; those that are not named are accepted.
-        mapping: As in `load_demos`.
-        units: As in `load_demos`.
-        progress: As in `repair_dataset`.
+        out: Folder of the new dataset, which must not exist.
+        decisions: Decisions by episode; episodes without one are accepted.
+        mapping: Columns by role, as in `load_demos`.
+        units: Units on disk by role, as in `load_demos`.
+        progress: Wraps the episodes, as in `repair_dataset`.
 
     Raises:
-        DatasetError: No episode is left, or one that is cannot be read.
-        FileExistsError: There is something at `out`.
+        DatasetError: No episode is left, or an accepted one cannot be read.
+        FileExistsError: `out` exists.
     """
     entries = {entry.index: entry for entry in open_folder(path).episodes}
     unknown = sorted({*decisions} - {*entries})
@@ -138,19 +140,16 @@ def write_curated(
         raise DatasetError(
             "there is no such episode to decide on", file=path, episode=unknown[0]
         )
-    kept = {
-        index: slice(0, entry.length) if decided is None else slice(decided.start, decided.stop)
-        for index, entry in entries.items()
-        for decided in (_cut(decisions.get(index)),)
-        if not (index in decisions and decisions[index].verdict == "reject")
-    }
+    kept = {}
+    for index, entry in entries.items():
+        decision = decisions.get(index, Decision(verdict="accept"))
+        if decision.verdict == "cut":
+            kept[index] = slice(decision.start, decision.stop)
+        elif decision.verdict == "accept":
+            kept[index] = slice(0, entry.length)
     if not kept:
         raise DatasetError("every episode is rejected: nothing is left to write", file=path)
     options = RepairOptions(trim=False, drop_late=False, unwrap=False, fix_signs=False)
     return repair_dataset(
         path, out, options, mapping=mapping, units=units, progress=progress, kept=kept
     )
-
-
-def _cut(decided: Decision | None) -> Decision | None:
-    return decided if decided is not None and decided.verdict == "cut" else None

@@ -1,0 +1,191 @@
+"""Issues of a dataset with their place: raised by readers, listed in validation reports."""
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+_UNPRINTABLE = re.compile(
+    # Control characters, and those that reverse the direction of text or hide it.
+    "[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
+)
+_LONGEST_NAME = 300
+_FIGURE_OR_QUOTE = re.compile(r"[-+]?\d[\d.e+-]*|'[^']*'")
+
+
+def plain_text(text: str) -> str:
+    """Text from a file, safe to print in a terminal: escapes removed, length bounded."""
+    shown = _UNPRINTABLE.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+    return shown if len(shown) <= _LONGEST_NAME else f"{shown[:_LONGEST_NAME]}..."
+
+
+@dataclass(frozen=True, kw_only=True)
+class Issue:
+    """One fault or oddity of a dataset and its place."""
+
+    message: str
+    """The fault, and the remedy."""
+    file: str | None = None
+    """Faulty file, relative to the dataset where possible."""
+    episode: int | None = None
+    """Episode index."""
+    frame: int | None = None
+    """First frame concerned, counted from the start of the episode."""
+    key: str | None = None
+    """Column (feature) concerned, with the component in brackets where one is to blame."""
+    components: tuple[str, ...] = ()
+    """Names of the components concerned."""
+    severity: float = 0.0
+    """Size of the fault, comparable among issues of one kind."""
+    level: Literal["error", "warning"] = "error"
+    check: str = ""
+    """Name of the check that found it; "" for errors raised while reading."""
+
+    @property
+    def kind(self) -> tuple[str, str]:
+        """Column and text; equal if issues differ in place, components and figures only."""
+        column = (self.key or "").split(" (")[0]
+        words = (w for w in self.message.split() if w.strip(".,:;") not in self.components)
+        text = _FIGURE_OR_QUOTE.sub("#", " ".join(words))
+        return column, " ".join(w for w in text.split() if "." not in w.strip(".,:;"))[:120]
+
+    def __str__(self) -> str:
+        episode = None if self.episode is None else f"episode {self.episode}"
+        frame = None if self.frame is None else f"frame {self.frame}"
+        place = ", ".join(part for part in (self.file, episode, frame, self.key) if part)
+        return plain_text(f"{place}: {self.message}" if place else self.message)
+
+
+warning = partial(Issue, level="warning")
+
+
+class DatasetError(ValueError):
+    """A dataset that cannot be read; `file`, `episode`, `frame` and `key` locate the fault."""
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        file: str | Path | None = None,
+        episode: int | None = None,
+        frame: int | None = None,
+        key: str | None = None,
+    ):
+        name = None if file is None else str(file)
+        self.issue = Issue(message=message, file=name, episode=episode, frame=frame, key=key)
+        self.file, self.episode, self.frame, self.key = name, episode, frame, key
+        super().__init__(str(self.issue))
+
+
+class UnitsWarning(UserWarning):
+    """Values were converted from units that the dataset does not declare."""
+
+
+_KINDS_SHOWN = 16
+"""Lines of errors, and of warnings, in a summary: both fit on one screen."""
+_PLACES_SHOWN = 8
+
+
+@dataclass(kw_only=True)
+class ValidationReport:
+    """Errors and warnings about one dataset."""
+
+    path: Path
+    errors: list[Issue] = field(default_factory=list)
+    """Faults that lose data or mislead a reader."""
+    warnings: list[Issue] = field(default_factory=list)
+    """Oddities worth a look before training."""
+    episodes: int = 0
+    """Readable episodes."""
+    frames: int = 0
+    """Frames of the readable episodes."""
+    contract: Any = None
+    """Contract of the columns (`read.contract.Contract`); None if nothing could be read."""
+
+    @property
+    def ok(self) -> bool:
+        """True if there are no errors; warnings are allowed."""
+        return not self.errors
+
+    def add(self, issue: Issue) -> None:
+        """Append an issue to the errors or the warnings."""
+        (self.errors if issue.level == "error" else self.warnings).append(issue)
+
+    def add_error(self, error: DatasetError) -> None:
+        """Append the issue of a reading error, unless it is listed already."""
+        if error.issue not in self.errors:
+            self.errors.append(error.issue)
+
+    def attempt[T](self, read: Callable[[], T]) -> T | None:
+        """Result of a step of the check, or None and an error in the report if it fails.
+
+        Foreign data can fail in unforeseen ways; the check reports them instead of crashing.
+        """
+        try:
+            return read()
+        except DatasetError as error:
+            self.add_error(error)
+        except Exception as error:
+            text = f"{type(error).__name__}: {str(error)[:200]}"
+            self.add(Issue(message=f"cannot be examined further ({text})", file=str(self.path)))
+        return None
+
+    def run[**P](
+        self,
+        name: str,
+        check: Callable[P, Iterable[Issue]],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> None:
+        """Run a check and file its issues under the name of the check."""
+
+        def collect() -> None:
+            for issue in check(*args, **kwargs):
+                self.add(replace(issue, check=name))
+
+        self.attempt(collect)
+
+    def lines(self, full: bool = False) -> Iterator[str]:
+        """The report as text; issues of one kind share a line that names the worst place.
+
+        Args:
+            full: Give every issue a line of its own.
+        """
+        for level, issues in (("error", self.errors), ("warning", self.warnings)):
+            if full:
+                yield from (f"{level}: {issue}" for issue in issues)
+                continue
+            kinds: dict[tuple[str, str], list[Issue]] = {}
+            for issue in issues:
+                kinds.setdefault(issue.kind, []).append(issue)
+            # One broken file causes errors of many kinds: the first ones explain the rest.
+            for alike in list(kinds.values())[:_KINDS_SHOWN]:
+                yield f"{level}: {_summary(alike)}"
+            if len(kinds) > _KINDS_SHOWN:
+                yield f"{level}: and {len(kinds) - _KINDS_SHOWN} more kinds (--full)"
+        yield (
+            f"{self.path}: {self.episodes} episodes, {self.frames} frames, "
+            f"{len(self.errors)} errors, {len(self.warnings)} warnings"
+        )
+
+    def records(self) -> list[dict]:
+        """Every issue as a dictionary of its fields."""
+        return [vars(issue) for issue in (*self.errors, *self.warnings)]
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+
+def _summary(alike: list[Issue]) -> str:
+    """The worst issue of a kind, and the places of the others."""
+    worst = max(alike, key=lambda issue: issue.severity)
+    if len(alike) == 1:
+        return str(worst)
+    others = [issue for issue in alike if issue is not worst]
+    places = dict.fromkeys(issue.episode for issue in others if issue.episode is not None)
+    shown = ", ".join(map(str, [*places][:_PLACES_SHOWN]))
+    more = ", ..." if len(places) > _PLACES_SHOWN else ""
+    where = f"; episodes {shown}{more}" if places else ""
+    return f"{worst} (and {len(others)} times more{where})"

@@ -1,0 +1,1 @@
+"""Quality of datasets: validation, repair, and the selection of episodes."""

@@ -1,0 +1,396 @@
+"""Validation of a dataset before anything is learned from it."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hrc_learn.demos.demonstration import JOINT_FIELDS
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
+from hrc_learn.demos.format.metadata import SIDECAR_PATH
+from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
+from hrc_learn.demos.quality import consistency_checks as consistency
+from hrc_learn.demos.quality import episode_checks, structure_checks
+from hrc_learn.demos.quality.episode_checks import ColumnSummary, MotionRecord, motion_sketch
+from hrc_learn.demos.quality.structure_checks import read_metadata, read_sound_episodes
+from hrc_learn.demos.quality.tracking_checks import command_tracking
+from hrc_learn.demos.quality.video_checks import check_videos
+from hrc_learn.demos.read.columns import (
+    ColumnMapping,
+    MappingSpec,
+    parse_mapping,
+    replaced_roles,
+)
+from hrc_learn.demos.read.contract import Contract, infer_contract
+from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quantities
+from hrc_learn.demos.read.opened_dataset import OpenedDataset
+from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
+from hrc_learn.demos.read.units import (
+    Quantities,
+    UnitDecision,
+    unit_factor,
+    units_from_episodes,
+)
+
+_KEPT_BYTES = 2**24
+"""Size of the frames kept for the second pass [bytes]; larger datasets are read twice."""
+
+METADATA_CHECKS: dict[str, Callable[[DatasetFolder], Iterable[Issue]]] = {
+    "statistics exist": structure_checks.statistics_exist,
+    "task texts": structure_checks.task_texts,
+    "component names": structure_checks.component_names,
+    "offsets": structure_checks.offsets,
+    "unlisted files": structure_checks.unlisted_files,
+}
+RAW_EPISODE_CHECKS: dict[
+    str, Callable[[DatasetFolder, EpisodeEntry, RawFrames], Iterable[Issue]]
+] = {
+    "indices": structure_checks.indices,
+    "finite values": lambda folder, entry, frames: episode_checks.finite_values(
+        folder.features, entry, frames
+    ),
+    "repetitions": lambda _, entry, frames: episode_checks.repetitions(entry, frames),
+    "episode length": lambda folder, entry, _: episode_checks.episode_length(entry, folder.fps),
+    "stamps": lambda folder, entry, frames: (
+        episode_checks.stamps(
+            entry, "timestamp", frames["timestamp"][:, 0].astype(float), folder.fps
+        )
+        if "timestamp" in frames
+        else ()
+    ),
+}
+SUMMARY_CHECKS: dict[
+    str, Callable[[DatasetFolder, Mapping[str, ColumnSummary]], Iterable[Issue]]
+] = {
+    "column ranges": episode_checks.column_ranges,
+    "statistics fit": structure_checks.statistics_fit,
+}
+MOTION_CHECKS: dict[str, Callable[[MotionRecord], Iterable[Issue]]] = {
+    "motion present": episode_checks.motion_present,
+    "rest at the ends": episode_checks.rest_at_ends,
+    "spikes and jumps": episode_checks.spikes_and_jumps,
+    "joint speeds": episode_checks.joint_speeds,
+    "copied commands": episode_checks.copied_commands,
+    "frozen encoders": episode_checks.frozen_encoders,
+}
+CONSISTENCY_CHECKS: dict[
+    str, Callable[[consistency.FeatureProfiles, float], Iterable[Issue]]
+] = {
+    "sizes": lambda feature, _: consistency.sizes(feature),
+    "holds": consistency.holds,
+    "noise": lambda feature, _: consistency.noise(feature),
+    "switches": lambda feature, _: consistency.switches(feature),
+    "exchanged columns": lambda feature, _: consistency.exchanged_columns(feature),
+}
+
+
+def check_dataset(
+    path: str | Path,
+    mapping: MappingSpec | None = None,
+    units: Mapping[str, str] | None = None,
+    speed_limits: Mapping[str, float | int] | None = None,
+) -> ValidationReport:
+    """Validate a LeRobot dataset of version 2.0, 2.1 or 3.0.
+
+    Everything that can be read is examined, one episode at a time, whatever else is broken.
+
+    Args:
+        path: Folder of the dataset.
+        mapping: Columns of quantities that are not found by name, as in `load_demos`.
+        units: Units on disk by role, as in `load_demos`.
+        speed_limits: Joint -> largest speed [rad/s]; 12 rad/s by default.
+
+    Raises:
+        DatasetError: `mapping` or `units` name what does not exist.
+        ValueError: `speed_limits` name no joint, or a limit is not positive.
+    """
+    for role, unit in (units or {}).items():
+        unit_factor(role, unit)
+    report = ValidationReport(path=Path(path))
+    folder = read_metadata(report.path, report)
+    if folder is None:
+        return report
+    for name, check in METADATA_CHECKS.items():
+        report.run(name, check, folder)
+    parse_mapping(mapping or {}, folder.features)
+    if speed_limits:
+        _require_limits(folder, mapping, speed_limits)
+    survey = _Survey(folder, report)
+    survey.check_raw_episodes()
+    for name, check in SUMMARY_CHECKS.items():
+        report.run(name, check, folder, survey.columns)
+    report.attempt(lambda: check_videos(folder, report))
+    report.attempt(
+        lambda: _check_content(survey, mapping or {}, units or {}, speed_limits or {})
+    )
+    return report
+
+
+def _require_limits(
+    folder: DatasetFolder, mapping: MappingSpec | None, speed_limits: Mapping[str, float | int]
+) -> None:
+    """Raise ValueError if a limit has no joint, or is not positive."""
+    try:
+        names = OpenedDataset.of(folder, mapping).columns.joint_names
+    except DatasetError:
+        return  # reported with the columns
+    for name, limit in speed_limits.items():
+        if name not in names:
+            raise ValueError(
+                f"speed_limits: {folder.root} has no joint {name!r}; there are "
+                f"{', '.join(names) or 'none'}"
+            )
+        if not limit > 0:
+            raise ValueError(f"speed_limits: that of {name} must be positive, but is {limit}")
+
+
+class _Survey:
+    """Readable episodes of a dataset, first without and then with the meaning of columns.
+
+    Attributes:
+        columns: Range of each feature over all episodes.
+    """
+
+    def __init__(self, folder: DatasetFolder, report: ValidationReport):
+        self.folder = folder
+        self.report = report
+        self.columns: dict[str, ColumnSummary] = {}
+        self._kept: list[tuple[EpisodeEntry, RawFrames]] | None = []
+
+    def check_raw_episodes(self) -> None:
+        """Run the checks that need no meaning of the columns."""
+        folder, report, size = self.folder, self.report, 0
+        for entry, frames in read_sound_episodes(folder, report):
+            for name, check in RAW_EPISODE_CHECKS.items():
+                report.run(name, check, folder, entry, frames)
+            for key, values in frames.items():
+                self.columns.setdefault(key, ColumnSummary()).add(values)
+            report.episodes += 1
+            report.frames += entry.length
+            size += sum(values.nbytes for values in frames.values())
+            if self._kept is None or size >= _KEPT_BYTES:
+                self._kept = None
+            else:
+                # Views into a file's columns would keep all of them in memory.
+                kept = {key: values.copy() for key, values in frames.items()}
+                self._kept.append((entry, kept))
+
+    def episodes(self) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+        """The same episodes once more; nothing is reported twice."""
+        if self._kept is not None:
+            yield from self._kept
+        else:
+            yield from read_sound_episodes(self.folder, ValidationReport(path=self.report.path))
+
+
+def _check_content(
+    survey: _Survey,
+    mapping: MappingSpec,
+    units: Mapping[str, str],
+    speed_limits: Mapping[str, float | int],
+) -> None:
+    """Find the quantities and their units; check every motion, and episodes against others.
+
+    Raises:
+        DatasetError: The mapping, the units or the sidecar are wrong.
+    """
+    folder, report = survey.folder, survey.report
+    dataset = OpenedDataset.of(folder, mapping)
+    columns = dataset.columns
+    if dataset.contract_note is not None:
+        report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
+    profiles: dict[int, EpisodeProfile] = {}
+
+    def quantities() -> Iterator[tuple[EpisodeEntry, Quantities]]:
+        for entry, frames in survey.episodes():
+            found = None
+            if _is_sound(frames, columns):
+                found = select_quantities(frames, columns.selections)
+            profiles[entry.index] = profile_episode(entry.index, frames, found, folder.fps)
+            if found is not None:
+                yield entry, found
+
+    decisions, faults = units_from_episodes(
+        columns.selections, quantities(), folder.fps, dataset.declared_units, units
+    )
+    for fault in faults:
+        report.add_error(fault)
+    report.run("guesses", _guesses, columns, decisions if profiles else {})
+    report.run("joint sets", _joint_sets, columns)
+    _check_motions(survey, columns, decisions, profiles, speed_limits, faults)
+    _check_consistency(folder, columns, profiles, report)
+    report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
+    if dataset.contract is not None:
+        overruled = replaced_roles(mapping) | {*units}
+        report.contract = _renewed(
+            dataset.contract, report.contract, folder, columns, overruled
+        )
+
+
+def _check_motions(
+    survey: _Survey,
+    columns: ColumnMapping,
+    decisions: Mapping[str, UnitDecision],
+    profiles: Mapping[int, EpisodeProfile],
+    speed_limits: Mapping[str, float | int],
+    faults: list[DatasetError],
+) -> None:
+    """Check the motion of every sound episode whose units are known."""
+    folder, report = survey.folder, survey.report
+    doubtful = {fault.episode for fault in faults}
+    usual = _usual_motion(columns, decisions, profiles)
+    sketches = []
+    for entry, frames in survey.episodes():
+        if not _is_sound(frames, columns):
+            continue
+        raw = select_quantities(frames, columns.selections)
+        scaled = {role: v * decisions[role].factor for role, v in raw.items()}
+        time = scaled["time"][:, 0] if "time" in scaled else recorded_stamps(folder, frames)
+        episode = MotionRecord(
+            entry=entry,
+            time=time,
+            raw=raw,
+            quantities=scaled,
+            joint_names=columns.joint_names,
+            speed_limits=speed_limits,
+            usual=usual,
+        )
+        report.run("orientations", episode_checks.orientation_values, episode)
+        if entry.index not in doubtful:
+            if "time" in scaled:
+                report.run(
+                    "true stamps", episode_checks.stamps, entry, "time", time, folder.fps
+                )
+            for name, check in MOTION_CHECKS.items() if episode.is_ordered else ():
+                report.run(name, check, episode)
+        if episode.motion is not None:
+            span = float(np.ptp(episode.motion, axis=0).max())
+            sketches.append((entry, motion_sketch(episode.motion), span))
+    report.run("duplicates", episode_checks.duplicates, sketches)
+
+
+def _check_consistency(
+    folder: DatasetFolder,
+    columns: ColumnMapping,
+    profiles: Mapping[int, EpisodeProfile],
+    report: ValidationReport,
+) -> None:
+    """Compare every episode with the others."""
+    entries = {entry.index: entry for entry in folder.episodes}
+    report.run("episode lengths", consistency.lengths, [entries[i] for i in profiles])
+    report.run("command tracking", command_tracking, folder, columns, entries, profiles)
+    for feature in consistency.feature_profiles(folder, entries, profiles):
+        for name, check in CONSISTENCY_CHECKS.items():
+            report.run(name, check, feature, folder.fps)
+
+
+def _renewed(
+    kept: Contract,
+    inferred: Contract,
+    folder: DatasetFolder,
+    columns: ColumnMapping,
+    overruled: set[str],
+) -> Contract:
+    """The inferred contract with the names, roles and units of the kept one.
+
+    Args:
+        kept: Contract kept with the data, perhaps edited.
+        inferred: Contract of the current data.
+        folder: The dataset.
+        columns: Columns as they are read now.
+        overruled: Quantities whose columns or units the caller gives.
+    """
+    known = {(part.key, part.index): part for part in kept.components}
+    quantities: dict[tuple[str, int], set[str]] = {}
+    for selections in (kept.selections(folder.features), columns.selections):
+        for role, selection in selections.items():
+            for column in selection.columns:
+                quantities.setdefault(column, set()).add(role)
+    parts = []
+    for part in inferred.components:
+        column = (part.key, part.index)
+        old = known.get(column)
+        if old is not None:
+            same = (part.role, part.unit) == (old.role, old.unit)
+            if same or quantities.get(column, set()) & overruled:
+                part = replace(part, name=old.name)
+            else:
+                part = replace(old, low=part.low, high=part.high)
+        parts.append(part)
+    return replace(inferred, components=tuple(parts))
+
+
+def _usual_motion(
+    columns: ColumnMapping,
+    decisions: Mapping[str, UnitDecision],
+    profiles: Mapping[int, EpisodeProfile],
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Usual fast step and span of joints and commands in SI units, by role."""
+    usual = {}
+    for role in ("joint_position", "command_position"):
+        if role not in columns.selections:
+            continue
+        places = columns.selections[role].columns
+        known = [
+            [(p.columns[key], index) for key, index in places]
+            for p in profiles.values()
+            if all(k in p.columns and i < len(p.columns[k].start) for k, i in places)
+        ]
+        if known:
+            steps = [[column.step[i] for column, i in episode] for episode in known]
+            spans = [[column.span[i] for column, i in episode] for episode in known]
+            factor = decisions[role].factor
+            usual[role] = (
+                np.median(steps, axis=0) * factor,
+                np.median(spans, axis=0) * factor,
+            )
+    return usual
+
+
+def _is_sound(frames: RawFrames, mapping: ColumnMapping) -> bool:
+    """True if all columns of the quantities exist and are finite."""
+    columns = [column for s in mapping.selections.values() for column in s.columns]
+    return all(
+        key in frames
+        and len(frames[key]) > 1
+        and index < frames[key].shape[1]
+        and np.isfinite(frames[key][:, index].astype(float)).all()
+        for key, index in columns
+    )
+
+
+def _guesses(mapping: ColumnMapping, decisions: Mapping[str, UnitDecision]) -> Iterator[Issue]:
+    """Guesses of columns and units; joint sets are reported in detail by their own check."""
+    unmatched = tuple(f"{role} is of other joints" for role in mapping.unmatched)
+    for note in mapping.notes:
+        if not note.startswith(unmatched):
+            yield warning(message=note)
+    for decision in decisions.values():
+        if decision.note:
+            yield warning(message=decision.note)
+
+
+def _joint_sets(mapping: ColumnMapping) -> Iterator[Issue]:
+    """Quantities of the same joints, and joints or poses at all."""
+    for role, others in mapping.unmatched.items():
+        message = (
+            f"{role} is of the joints {', '.join(others)}, the rest of "
+            f"{', '.join(mapping.joint_names)}"
+        )
+        if set(others) < set(mapping.joint_names):
+            advice = "it is left among the extra columns"
+        elif len(others) == len(mapping.joint_names):
+            advice = (
+                f"leader and follower? Left among the extra columns; --mapping {role} KEY "
+                f"pairs them in their order"
+            )
+        else:
+            advice = (
+                f"they cannot be matched; left among the extra columns. Name them alike, or "
+                f"map one of them (--mapping {role} KEY[0:7])"
+            )
+        yield warning(message=f"{message}: {advice}", key=role)
+    if not any(role in mapping.selections for role in (*JOINT_FIELDS, "position")):
+        text = "no joints and no poses found among the columns: name them (mapping={...})"
+        yield Issue(message=text)

@@ -1,0 +1,458 @@
+"""Checks of single episodes: values, stamps and motion."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float64, Shaped
+
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
+from hrc_learn.demos.format.metadata import Feature
+from hrc_learn.demos.issues import Issue, warning
+from hrc_learn.demos.read.frames import RawFrames
+from hrc_learn.demos.read.quantities import (
+    INDEX_KEYS,
+    ORIENTATION_ROLES,
+    is_hand,
+    to_quaternion,
+)
+from hrc_learn.demos.read.units import Quantities
+
+_SATURATED = 0.25
+"""Fraction of frames at an end of the range above which a component is reported."""
+_REPEATED = 0.05
+"""Tolerated fraction of repeated frames."""
+_RATE_TOLERANCE = 0.05
+_JITTER_TOLERANCE = 0.10
+_GAP = 1.6
+"""Multiple of the usual step above which a frame was lost in between."""
+# A shorter episode is a false start.
+_SHORT_FRAMES, _SHORT_SECONDS = 10, 0.5
+_FASTEST_ARM = 12.0
+"""Largest joint speed of an arm [rad/s]; faster steps are faults of the recording."""
+_STILL_SECONDS = 1.0
+"""Longest rest before or after the motion that is not reported [s]."""
+_SMALLEST_MOTION = 1e-4
+"""Smallest motion [rad or m]; encoders and trackers resolve no less."""
+_SAME_EPISODE = 1e-3
+"""Largest difference of two copies of an episode, relative to the span of the motion."""
+# A spike or jump exceeds this multiple of the usual fast step, and this fraction of the range.
+_SPIKE, _SPIKE_FRACTION, _JUMP, _JUMP_FRACTION = 4.0, 0.03, 8.0, 0.1
+_LEAST_SPIKE, _LEAST_JUMP = 0.03, 0.1
+"""Sizes below which spikes and jumps are noise [rad]."""
+
+
+def finite_values(
+    features: Mapping[str, Feature], entry: EpisodeEntry, frames: RawFrames
+) -> Iterator[Issue]:
+    """Values that are finite."""
+    for key, values in frames.items():
+        bad = np.argwhere(~np.isfinite(values.astype(float)))
+        if len(bad):
+            frame, component = (int(i) for i in bad[0])
+            name = features[key].component(component)
+            yield Issue(
+                message=f"{name} is {values[frame, component]} ({len(bad)} values are not "
+                f"finite); hrc repair --drop-bad-frames (or --drop-bad-episodes) makes a copy "
+                f"without",
+                **entry.location,
+                frame=frame,
+                key=key,
+            )
+
+
+def repetitions(entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
+    """Frames that repeat the previous one: the robot was read too fast, or stood still."""
+    if entry.length < 3:
+        return
+    same = repeated_frames(frames)[1:]
+    if same.all():
+        yield warning(
+            message="the state never changes: the recorder lost the robot",
+            **entry.location,
+            frame=0,
+            key="observation.state",
+        )
+    elif same.mean() > _REPEATED:
+        yield warning(
+            message=f"{100 * same.mean():.0f} % of the frames repeat the one before; the "
+            f"recording is faster than the robot reports, or the robot stood still; hrc repair "
+            f"drops them",
+            **entry.location,
+            frame=int(same.argmax()) + 1,
+        )
+
+
+def repeated_frames(frames: RawFrames) -> Bool[np.ndarray, " frames"]:
+    """Mask of frames whose observations equal the previous ones, clocks excepted."""
+    length = len(next(iter(frames.values())))
+    state = [v for key, v in frames.items() if key.startswith("observation.")]
+    state = [v for v in state if not is_clock(v)]
+    if not state or length < 2:
+        return np.zeros(length, dtype=bool)
+    same = np.logical_and.reduce([(v[1:] == v[:-1]).all(1) for v in state])
+    return np.concatenate([[False], same])
+
+
+def is_clock(values: np.ndarray) -> bool:
+    """True for a single component that increases with every frame."""
+    return values.shape[1] == 1 and bool((np.diff(values[:, 0]) > 0).all())
+
+
+def episode_length(entry: EpisodeEntry, fps: float) -> Iterator[Issue]:
+    """Episodes long enough for a demonstration."""
+    seconds = entry.length / fps
+    if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:
+        text = f"only {entry.length} frames ({seconds:.2g} s): a false start?"
+        yield warning(message=text, **entry.location)
+
+
+def stamps(
+    entry: EpisodeEntry, key: str, time: Float64[np.ndarray, " frames"], fps: float
+) -> Iterator[Issue]:
+    """Time stamps [s]: order, offset, rate, gaps and jitter."""
+    steps = np.diff(time)
+    if not np.isfinite(time).all() or not len(steps):
+        return  # values that are not finite are reported as such
+    place = {**entry.location, "key": key}
+    stalled = np.flatnonzero(steps <= 0)
+    if len(stalled):
+        k = int(stalled[0])
+        yield Issue(
+            message=f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s "
+            f"({len(stalled)} times); hrc repair drops the repeated frames",
+            frame=k + 1,
+            **place,
+        )
+        return
+    usual = float(np.median(steps))
+    if key == "timestamp" and abs(time[0]) > 0.5 / fps:
+        yield warning(
+            message=f"begins at {time[0]:.6g} s, not at 0: LeRobot's stamps count from the "
+            f"start of the episode",
+            frame=0,
+            **place,
+        )
+    if abs(usual * fps - 1) > _RATE_TOLERANCE:
+        yield warning(
+            message=f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
+            f"{fps:g}; hrc repair --fps {round(1 / usual)} resamples to the true rate",
+            **place,
+        )
+    gaps = np.flatnonzero(steps > _GAP * usual)
+    if len(gaps):
+        lost = int(np.rint(steps[gaps] / usual - 1).sum())
+        yield warning(
+            message=f"{len(gaps)} gaps, about {lost} frames lost; the first is "
+            f"{1e3 * steps[gaps[0]]:.4g} ms long; hrc repair --fps {fps:g} fills them in",
+            frame=int(gaps[0]) + 1,
+            **place,
+        )
+    jitter = float(np.quantile(np.abs(np.delete(steps, gaps) - usual), 0.95)) / usual
+    if jitter > _JITTER_TOLERANCE:
+        yield warning(
+            message=f"steps vary by {100 * jitter:.0f} % (95th percentile); hrc repair "
+            f"--fps {fps:g} resamples",
+            **place,
+        )
+
+
+class ColumnSummary:
+    """Range and saturation of one feature, gathered episode by episode."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.finite = True
+        self.low = self.high = np.zeros(0)
+        self._at_low = self._at_high = np.zeros(0)
+
+    def add(self, values: Shaped[np.ndarray, "frames components"]) -> None:
+        """Include an episode."""
+        if not len(values) or not self.finite:
+            return
+        values = values.astype(float)
+        if not np.isfinite(values).all() or (self.count and values.shape[1] != len(self.low)):
+            self.finite = False
+            return
+        low, high = values.min(0), values.max(0)
+        at_low, at_high = (values == low).sum(0), (values == high).sum(0)
+        if self.count:
+            at_low = _count_at_end(low, self.low, at_low, self._at_low)
+            at_high = _count_at_end(-high, -self.high, at_high, self._at_high)
+            low, high = np.minimum(low, self.low), np.maximum(high, self.high)
+        self.low, self.high, self._at_low, self._at_high = low, high, at_low, at_high
+        self.count += len(values)
+
+    @property
+    def at_end(self) -> Float64[np.ndarray, " components"]:
+        """Fraction of the frames at the more frequent end of the range."""
+        return np.maximum(self._at_low, self._at_high) / max(self.count, 1)
+
+    @property
+    def binary(self) -> Bool[np.ndarray, " components"]:
+        """Mask of components with two values, such as a gripper that is open or closed."""
+        return self._at_low + self._at_high >= self.count
+
+
+def _count_at_end(
+    end: np.ndarray, other: np.ndarray, count: np.ndarray, others: np.ndarray
+) -> np.ndarray:
+    """Number of values at the lower of two ends."""
+    return np.where(end < other, count, np.where(end > other, others, count + others))
+
+
+def column_ranges(
+    folder: DatasetFolder, columns: Mapping[str, ColumnSummary]
+) -> Iterator[Issue]:
+    """Components that change, and do not stay at an end of their range."""
+    for key in sorted({*columns} - {*INDEX_KEYS}):
+        summary, feature = columns[key], folder.features[key]
+        if not summary.count or not summary.finite:
+            continue
+        constant = summary.low == summary.high
+        if constant.any():
+            yield warning(message=f"never changes: {_names(feature, constant)}", key=key)
+        at_end = summary.at_end
+        saturated = (at_end > _SATURATED) & ~constant & ~summary.binary
+        if saturated.any() and key.startswith(("observation.state", "action", "state")):
+            yield warning(
+                message=f"sits at an end of its range for up to "
+                f"{100 * at_end[saturated].max():.0f} % of the frames: "
+                f"{_names(feature, saturated)}",
+                key=key,
+            )
+
+
+def _names(feature: Feature, chosen: np.ndarray) -> str:
+    if chosen.all() and len(chosen) > 1:
+        return "all components"
+    return ", ".join(feature.component(int(i)) for i in np.flatnonzero(chosen))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionRecord:
+    """Motion of one sound episode in SI units, with the values usual in the dataset."""
+
+    entry: EpisodeEntry
+    time: Float64[np.ndarray, " frames"]
+    """True stamps if there are any, LeRobot's otherwise [s]."""
+    raw: Quantities
+    """Values in the units on disk."""
+    quantities: Quantities
+    """Values in SI units."""
+    joint_names: tuple[str, ...]
+    speed_limits: Mapping[str, float | int]
+    """Joint -> largest speed [rad/s]."""
+    usual: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """Role -> usual fast step (99 % quantile) and usual range of each joint [rad]."""
+
+    @property
+    def motion(self) -> Float64[np.ndarray, "frames _"] | None:
+        """Joint positions, or the end-effector position if no joints are known."""
+        return self.quantities.get("joint_position", self.quantities.get("position"))
+
+    @property
+    def is_ordered(self) -> bool:
+        """True if time increases; otherwise speeds make no sense."""
+        return bool((np.diff(self.time) > 0).all())
+
+
+def orientation_values(episode: MotionRecord) -> Iterator[Issue]:
+    """Valid orientations, and quaternions of continuous sign."""
+    role = next((role for role in ORIENTATION_ROLES if role in episode.raw), None)
+    if role is None:
+        return
+    values = (episode.raw if role == "pose_matrix" else episode.quantities)[role]
+    try:
+        to_quaternion(role, values)
+    except ValueError as error:
+        yield Issue(message=str(error), **episode.entry.location, key=role)
+        return
+    if role.startswith("quaternion"):
+        flips = np.flatnonzero((values[1:] * values[:-1]).sum(1) < 0)
+        if len(flips):
+            yield warning(
+                message=f"the quaternion changes its sign {len(flips)} times without turning; "
+                f"load_demos makes it continuous, hrc repair does so on disk",
+                **episode.entry.location,
+                frame=int(flips[0]) + 1,
+                key=role,
+            )
+
+
+def motion_present(episode: MotionRecord) -> Iterator[Issue]:
+    """Motion at all: no primitive can be fitted to an arm at rest."""
+    if episode.motion is None:
+        return
+    span = float(np.ptp(episode.motion, axis=0).max())
+    if span < _SMALLEST_MOTION:
+        yield Issue(
+            message=f"moves by {span:.2g} in all: nothing was demonstrated; leave the episode "
+            f"out",
+            **episode.entry.location,
+        )
+
+
+def rest_at_ends(episode: MotionRecord) -> Iterator[Issue]:
+    """Rest before or after the motion, which a fit would reproduce."""
+    motion, time = episode.motion, episode.time
+    span = 0.0 if motion is None else float(np.ptp(motion, axis=0).max())
+    if motion is None or span == 0:
+        return  # reported as a state that never changes
+    # Half a percent of the motion exceeds the noise of encoders.
+    away = np.abs(motion - motion[0]).max(1) > 0.005 * span
+    not_there = np.abs(motion - motion[-1]).max(1) > 0.005 * span
+    arrived = len(time) - 1 - int(not_there[::-1].argmax())
+    for place, seconds, frame in (
+        ("begins", float(time[away.argmax()] - time[0]), 0),
+        ("ends", float(time[-1] - time[arrived]), arrived),
+    ):
+        if seconds > _STILL_SECONDS:
+            yield warning(
+                message=f"{place} with {seconds:.1f} s of standing still: hrc repair trims it",
+                **episode.entry.location,
+                frame=frame,
+            )
+
+
+def spikes_and_jumps(episode: MotionRecord) -> Iterator[Issue]:
+    """Frames out of line with both neighbours, and steps far beyond those usual here."""
+    for role, (step, span) in episode.usual.items():
+        steps = np.diff(episode.quantities[role], axis=0)
+        smooth = (step > 0) & (step < 0.2 * span)  # other joints switch between levels
+        there, back = steps[:-1], steps[1:]
+        bound = np.maximum(_SPIKE * step, _SPIKE_FRACTION * span) + _LEAST_SPIKE
+        spike = (there * back < 0) & smooth
+        spike &= np.minimum(np.abs(there), np.abs(back)) > bound
+        bound = np.maximum(_JUMP * step, _JUMP_FRACTION * span) + _LEAST_JUMP
+        jump = (np.abs(steps) > bound) & smooth
+        jump[:-1] &= ~spike
+        jump[1:] &= ~spike
+        for odd, what in ((spike, "leaps away for one frame"), (jump, "jumps")):
+            if not odd.any():
+                continue
+            size = np.where(odd, np.abs(steps[: len(odd)]) / np.maximum(step, 1e-9), 0.0)
+            frame, joint = divmod(int(size.argmax()), size.shape[1])
+            name = episode.joint_names[joint]
+            yield warning(
+                message=f"{name} {what} by {steps[frame, joint]:.3g}, "
+                f"{size[frame, joint]:.0f} times its usual fast step; "
+                f"{int(odd.any(1).sum())} such frames in the episode",
+                **episode.entry.location,
+                frame=frame + 1,
+                key=f"{role} ({name})",
+                components=(name,),
+                severity=float(size.max()),
+            )
+
+
+def joint_speeds(episode: MotionRecord) -> Iterator[Issue]:
+    """Speeds that a joint can reach: no lost frames, glitches or wrapped encoders."""
+    joints, names = episode.quantities.get("joint_position"), episode.joint_names
+    if joints is None:
+        return
+    change = np.diff(joints, axis=0)
+    speed = np.abs(change) / np.diff(episode.time)[:, None]
+    # Fingers are faster, and often counted in units of their own.
+    usual = {name: np.inf if is_hand(name) else _FASTEST_ARM for name in names}
+    limits = np.array([episode.speed_limits.get(name, usual[name]) for name in names])
+    too_fast = (speed > limits).any(1)
+    if not too_fast.any():
+        return
+    frame = int(too_fast.argmax())
+    joint = int((speed[frame] / limits).argmax())
+    step = change[frame, joint]
+    # The tolerance is the usual motion within a frame.
+    wrapped = abs(abs(step) - 2 * np.pi) < 0.3
+    cause = (
+        "the encoder wrapped: hrc repair unwraps it"
+        if wrapped
+        else "a glitch, or frames were lost: look at it, or leave the episode out"
+    )
+    yield warning(
+        message=f"{names[joint]} jumps by {step:.3g} rad in one frame "
+        f"({speed[frame, joint]:.3g} rad/s, limit {limits[joint]:.3g}); {cause}. "
+        f"{int(too_fast.sum())} such frames in the episode",
+        **episode.entry.location,
+        frame=frame + 1,
+        key=f"joint_position ({names[joint]})",
+        components=(names[joint],),
+    )
+
+
+def copied_commands(episode: MotionRecord) -> Iterator[Issue]:
+    """Actions that differ from the state: a copy teaches a policy to stand still."""
+    joints = episode.quantities.get("joint_position")
+    command = episode.quantities.get("command_position")
+    if joints is not None and command is not None and np.array_equal(joints, command):
+        yield warning(
+            message="is a copy of the state at the same frame; a policy learns to stay where "
+            "it is",
+            **episode.entry.location,
+            key="action",
+        )
+
+
+def frozen_encoders(episode: MotionRecord) -> Iterator[Issue]:
+    """Joints that follow their command; fingers may stop at an object."""
+    joints = episode.quantities.get("joint_position")
+    command = episode.quantities.get("command_position")
+    if joints is None or command is None or "joint_position" not in episode.usual:
+        return
+    if joints.shape != command.shape or len(joints) < 20:
+        return
+    span = episode.usual["joint_position"][1]
+    for joint, name in enumerate(episode.joint_names):
+        if not span[joint] > 0 or is_hand(name):
+            continue
+        moves = np.flatnonzero(np.diff(joints[:, joint]) != 0)
+        edges = np.concatenate([[-1], moves, [len(joints) - 1]])
+        longest = int(np.diff(edges).argmax())
+        first, last = int(edges[longest]) + 1, int(edges[longest + 1])
+        if last - first < 10:
+            continue
+        commanded = float(np.ptp(command[first : last + 1, joint]))
+        if commanded > 0.25 * span[joint] and commanded > 0.02:
+            yield warning(
+                message=f"{name} stays exactly the same for {last - first} frames while its "
+                f"command moves by {commanded:.3g}: the encoder froze?",
+                **episode.entry.location,
+                frame=first,
+                key=f"joint_position ({name})",
+                components=(name,),
+                severity=commanded,
+            )
+
+
+def duplicates(
+    motions: Sequence[tuple[EpisodeEntry, Float64[np.ndarray, " numbers"], float]],
+) -> Iterator[Issue]:
+    """Episodes that show different motions.
+
+    Args:
+        motions: Episode, its motion at a fixed number of phases (`motion_sketch`), and the
+            span of the motion.
+    """
+    from scipy.spatial import KDTree
+
+    if len({sketch.shape for _, sketch, _ in motions}) != 1:
+        return
+    tree = KDTree(np.stack([sketch for _, sketch, _ in motions]))
+    for number, (entry, sketch, span) in enumerate(motions):
+        close = tree.query_ball_point(sketch, _SAME_EPISODE * span, p=np.inf)
+        if span and min(close) < number:
+            earlier = motions[min(close)][0]
+            yield warning(
+                message=f"shows the same motion as episode {earlier.index}: recorded once, "
+                f"stored twice?",
+                **entry.location,
+            )
+
+
+def motion_sketch(
+    motion: Float64[np.ndarray, "frames components"], phases: int = 20
+) -> Float64[np.ndarray, " numbers"]:
+    """The motion at evenly spaced phases, independent of its duration."""
+    phase = np.linspace(0, 1, len(motion))
+    at = np.linspace(0, 1, phases)
+    return np.stack([np.interp(at, phase, column) for column in motion.T], axis=1).ravel()

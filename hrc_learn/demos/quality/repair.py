@@ -1,0 +1,335 @@
+"""Repair of a dataset, written as a sound copy of version 3.0."""
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.format.metadata import SIDECAR_PATH, read_sidecar, sidecar_copy, write_json
+from hrc_learn.demos.format.videos import Segments, read_segments
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
+from hrc_learn.demos.quality.frame_edits import (
+    ColumnSemantics,
+    EpisodeEdit,
+    drop_bad_frames,
+    drop_late,
+    drop_repeats,
+    renew_stamps,
+    trim,
+)
+from hrc_learn.demos.quality.value_edits import fix_signs, resample_to_grid, unwrap
+from hrc_learn.demos.read.columns import MappingSpec
+from hrc_learn.demos.read.contract import fingerprint
+from hrc_learn.demos.read.frames import (
+    RawFrames,
+    read_each,
+    recorded_stamps,
+    select_quantities,
+)
+from hrc_learn.demos.read.opened_dataset import OpenedDataset
+from hrc_learn.demos.read.quantities import INDEX_KEYS
+from hrc_learn.demos.read.units import Quantities, units_from_episodes
+from hrc_learn.demos.write.assembly import assemble
+from hrc_learn.demos.write.episode import episode_path
+from hrc_learn.store import DATASET, replacing
+
+Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
+
+_LARGEST_NOTE = 2**20
+"""Largest card, licence or foreign metadata file that is copied [bytes]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepairOptions:
+    """Changes that a repair may make in the copy."""
+
+    trim: bool = True
+    """Trim the rest before and after the motion."""
+    keep_rest: float | int = 0.1
+    """Rest left at either end [s]."""
+    drop_late: bool = True
+    """Drop frames that a column of true stamps has no later than the one before."""
+    drop_repeats: bool = False
+    """Drop frames that repeat the one before, commands included, for up to 0.1 s."""
+    unwrap: bool = True
+    """Remove jumps by whole turns from measured joints and angles of the arm."""
+    unwrap_commands: bool = False
+    """Unwrap commands too, and joints whose command jumps with them."""
+    fix_signs: bool = True
+    """Choose the signs of quaternions such that they do not jump."""
+    drop_bad_frames: bool = False
+    """Drop frames with values that are not finite."""
+    drop_bad_episodes: bool = False
+    """Leave out episodes that cannot be read or repaired."""
+    fps: float | int | None = None
+    """Rate of a regular grid to resample to [1/s]; None keeps the frames."""
+    videos: bool = True
+    """Keep the videos. Resampling, and dropped frames in the middle, would need new ones."""
+    dry_run: bool = False
+    """Report the changes without writing anything."""
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and not self.fps > 0:
+            raise ValueError(f"fps must be positive, got {self.fps}")
+        if self.keep_rest < 0:
+            raise ValueError(f"keep_rest must not be negative, got {self.keep_rest}")
+
+
+@dataclass(kw_only=True)
+class RepairReport:
+    """Changes made to each episode."""
+
+    path: Path
+    """The new dataset."""
+    changes: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    """Index of a kept episode in the old dataset -> its changes."""
+    left_out: dict[int, str] = field(default_factory=dict)
+    """Index of an episode that was left out -> the reason."""
+    notes: list[str] = field(default_factory=list)
+    """Changes to the whole dataset."""
+    frames_before: int = 0
+    """Number of frames of the old dataset."""
+    frames: int = 0
+    """Number of frames of the new dataset."""
+    dry_run: bool = False
+    """True if nothing was written."""
+
+    @property
+    def changed(self) -> int:
+        """Number of episodes with changes."""
+        return sum(map(bool, self.changes.values()))
+
+    def lines(self) -> Iterator[str]:
+        """The report as text."""
+        yield from self.notes
+        for new, (old, changes) in enumerate(self.changes.items()):
+            name = f"episode {old}" if new == old else f"episode {old} (now {new})"
+            yield f"{name}: {'; '.join(changes) or 'unchanged'}"
+        for old, reason in self.left_out.items():
+            yield f"episode {old}: left out: {reason}"
+        yield (
+            f"{self.path}{' (nothing written)' * self.dry_run}: "
+            f"{len(self.changes)} episodes, {self.frames} of "
+            f"{self.frames_before} frames, {self.changed} episodes changed, "
+            f"{len(self.left_out)} left out"
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+
+def repair_dataset(
+    path: str | Path,
+    out: str | Path,
+    options: RepairOptions | None = None,
+    *,
+    mapping: MappingSpec | None = None,
+    units: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
+    kept: Mapping[int, slice] | None = None,
+) -> RepairReport:
+    """Repair a dataset of version 2.0, 2.1 or 3.0 into a new one of version 3.0.
+
+    The old dataset is not changed. Columns keep their keys, names and units. If no column holds
+    true stamps and the frames are not resampled, `observation.time` is added with LeRobot's old
+    stamps, because the new `timestamp` is frame / fps by definition.
+
+    Args:
+        path: The dataset to repair.
+        out: Folder of the new dataset, which must not exist.
+        options: Permitted changes.
+        mapping: Columns of quantities that are not found by name, as in `load_demos`.
+        units: Units on disk by role, as in `load_demos`; kept in the new dataset.
+        progress: Wraps the episodes, such as with a progress bar.
+        kept: Episode index -> frames to keep, for the episodes to keep; None keeps all.
+
+    Raises:
+        DatasetError: An episode cannot be read or repaired, and must not be left out.
+        FileExistsError: `out` exists.
+    """
+    repair = _Repair(Path(path), Path(out), options or RepairOptions(), mapping, units, kept)
+    repair.run(progress)
+    return repair.report
+
+
+class _Repair:
+    """One repair: the old dataset, the permitted changes, and the report."""
+
+    def __init__(
+        self,
+        path: Path,
+        out: Path,
+        options: RepairOptions,
+        mapping: MappingSpec | None,
+        units: Mapping[str, str] | None,
+        kept: Mapping[int, slice] | None,
+    ):
+        folder = open_folder(path)
+        if not folder.episodes:
+            raise DatasetError("the dataset holds no episodes", file=folder.root)
+        self.folder = folder
+        self.out = out
+        self.options = options
+        self.units = units or {}
+        self.kept = kept
+        self.semantics = self._semantics(OpenedDataset.of(folder, mapping))
+        self.rewriter = ColumnRewriter(
+            self.semantics,
+            self.units,
+            fps=options.fps,
+            segments=read_segments(folder) if options.videos else None,
+        )
+        self.report = RepairReport(path=out, notes=self.rewriter.notes, dry_run=options.dry_run)
+
+    def _semantics(self, dataset: OpenedDataset) -> ColumnSemantics:
+        """Meaning of the columns, with units guessed from all finite, readable episodes."""
+        selections = dataset.columns.selections
+
+        def readable() -> Iterator[tuple[EpisodeEntry, Quantities]]:
+            for entry, frames in zip(self.folder.episodes, self._read(), strict=True):
+                # Unreadable episodes are reported, or left out, when they are repaired.
+                if not isinstance(frames, DatasetError):
+                    yield entry, select_quantities(frames, selections)
+
+        decisions, faults = units_from_episodes(
+            selections, readable(), self.folder.fps, dataset.declared_units, self.units
+        )
+        bad = {fault.episode: fault for fault in faults}
+        return ColumnSemantics(dataset=dataset, units=decisions, bad=bad)
+
+    def _read(self) -> Iterator[RawFrames | DatasetError]:
+        """Numeric columns of every episode."""
+        features = self.folder.features.items()
+        keys = [key for key, f in features if f.numeric and key not in INDEX_KEYS]
+        return read_each(self.folder, self.folder.episodes, keys)
+
+    def run(self, progress: Progress | None) -> None:
+        """Repair every episode, and write the new dataset unless it is a dry run."""
+        if self.options.dry_run:
+            for _ in self._edits(progress):
+                pass
+            return
+        with replacing(self.out, DATASET) as target:
+            staging = target / "episodes"
+            staging.mkdir(parents=True)
+            paths: list[Path] = []
+            videos: list[Segments] = []
+            for edit in self._edits(progress):
+                paths.append(episode_path(staging, len(paths)))
+                self.rewriter.stage(paths[-1], edit, self.report.frames - len(edit))
+                videos.append(self.rewriter.videos_of(edit))
+            if not paths:
+                raise DatasetError("no episode could be repaired", file=self.folder.root)
+            assemble(paths, target, videos=videos, tasks=self.rewriter.tasks, link_videos=False)
+            _copy_notes(self.folder.root, target)
+            self._carry_contract(target)
+            shutil.rmtree(staging)
+
+    def _edits(self, progress: Progress | None) -> Iterator[EpisodeEdit]:
+        """Repaired episodes; the report counts them, and those that are left out."""
+        report = self.report
+        entries = progress(self.folder.episodes) if progress else self.folder.episodes
+        for entry, frames in zip(entries, self._read(), strict=True):
+            report.frames_before += entry.length
+            if self.kept is not None and entry.index not in self.kept:
+                report.left_out[entry.index] = "not kept"
+                continue
+            try:
+                edit = self._repaired(entry, frames)
+                self.rewriter.require_writable(edit)
+            except DatasetError as error:
+                if not self.options.drop_bad_episodes:
+                    raise
+                report.left_out[entry.index] = error.issue.message
+                continue
+            report.changes[entry.index] = edit.changes
+            report.frames += len(edit)
+            yield edit
+
+    def _repaired(self, entry: EpisodeEntry, frames: RawFrames | DatasetError) -> EpisodeEdit:
+        """Apply the permitted edits to one episode."""
+        options, semantics = self.options, self.semantics
+        if (fault := semantics.bad.get(entry.index)) is not None:
+            raise fault
+        if isinstance(frames, DatasetError):
+            raise frames
+        edit = self._unedited(entry, frames)
+        if "time" not in semantics.selections:
+            edit = renew_stamps(edit, self.folder.fps)
+        edit = drop_bad_frames(edit, semantics, options.drop_bad_frames)
+        if options.drop_late:
+            edit = drop_late(edit)
+        if options.trim:
+            edit = trim(edit, semantics, options.keep_rest)
+        if options.drop_repeats:
+            edit = drop_repeats(edit)
+        if options.unwrap:
+            edit = unwrap(edit, semantics, options.unwrap_commands)
+        if options.fix_signs:
+            edit = fix_signs(edit, semantics)
+        if options.fps is not None:
+            edit = resample_to_grid(edit, semantics, options.fps)
+        stalled = np.flatnonzero(np.diff(edit.time) <= 0)
+        if len(stalled):
+            raise edit.fault(
+                "stamps must increase; have late frames dropped (drop_late), or leave the "
+                "episode out (drop_bad_episodes)",
+                frame=int(stalled[0]) + 1,
+            )
+        return edit
+
+    def _unedited(self, entry: EpisodeEntry, frames: RawFrames) -> EpisodeEdit:
+        """The frames of an episode that are to be kept."""
+        selections = self.semantics.selections
+        time = recorded_stamps(self.folder, frames)
+        if "time" in selections:
+            ((key, index),) = selections["time"].columns
+            time = frames[key][:, index].astype(float) * self.semantics.units["time"].factor
+        edit = EpisodeEdit(
+            entry=entry,
+            frames={
+                k: v for k, v in frames.items() if k not in INDEX_KEYS or k == "task_index"
+            },
+            time=time,
+            kept=np.arange(entry.length),
+        )
+        if self.kept is None:
+            return edit
+        part = self.kept[entry.index]
+        wanted = np.zeros(entry.length, dtype=bool)
+        wanted[part] = True
+        return edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
+
+    def _carry_contract(self, target: Path) -> None:
+        """Keep the old dataset's contract with the new one, in the units given."""
+        contract = self.semantics.dataset.contract
+        if contract is None:
+            return
+        given = {
+            column: unit
+            for role, unit in self.units.items()
+            if role in self.semantics.selections
+            for column in self.semantics.selections[role].columns
+        }
+        parts = tuple(
+            replace(part, unit=given.get((part.key, part.index), part.unit))
+            for part in contract.components
+        )
+        carried = replace(
+            contract, components=parts, fingerprint=fingerprint(open_folder(target))
+        )
+        sidecar = replace(read_sidecar(target), contract=carried.content())
+        write_json(target / SIDECAR_PATH, sidecar_copy(sidecar, sidecar.units))
+
+
+def _copy_notes(source: Path, target: Path) -> None:
+    """Copy the card, the licence and metadata of other programs."""
+    for path in (*source.glob("*.md"), *source.glob("LICENSE*"), *source.glob("meta/*.json")):
+        there = target / path.relative_to(source)
+        ordinary = path.is_file() and not path.is_symlink()
+        if ordinary and not there.exists() and path.stat().st_size < _LARGEST_NOTE:
+            shutil.copyfile(path, there)

@@ -1,0 +1,322 @@
+"""Checks of metadata and files: missing parts and contradictions.
+
+`read_metadata` and `read_sound_episodes` read as much of a broken dataset as possible and
+report the faults on the way; the other functions are checks, listed in `check`.
+"""
+
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from hrc_learn.demos.format.dataset_folder import (
+    DatasetFolder,
+    EpisodeEntry,
+    dataset_folder,
+    read_episodes,
+    read_info,
+    read_tasks,
+)
+from hrc_learn.demos.format.files import INFO_PATH, open_parquet, read_json
+from hrc_learn.demos.format.metadata import Feature, read_features
+from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, plain_text, warning
+from hrc_learn.demos.quality.episode_checks import ColumnSummary
+from hrc_learn.demos.read.frames import (
+    BadRowError,
+    RawFrames,
+    require_rows,
+    to_numpy,
+    width_fault,
+)
+from hrc_learn.demos.read.opened_dataset import count_faults
+from hrc_learn.demos.read.quantities import INDEX_KEYS
+
+_BATCH_ROWS = 2**14
+_LARGEST_EPISODE = 2**28
+"""Largest episode that is held in memory [bytes]: 75 minutes of 60 numbers at 100 Hz."""
+_MOST_LISTED = 100_000
+_STATISTICS = "meta/stats.json"
+_PLACEHOLDERS = (
+    *("test", "testing", "asdf", "todo", "tbd", "n/a", "na", "none", "null", "xxx", "foo"),
+    *("task", "demo", "placeholder", "untitled"),
+)
+"""Task texts that were typed to get past the question."""
+
+
+def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
+    """Read as much of the metadata as possible; None if episodes cannot be located."""
+    info = report.attempt(lambda: read_info(root))
+    if info is None:
+        return None
+    features: dict[str, Feature] = {}
+    for key, declared in info["features"].items():
+        single = {"features": {key: declared}}
+        features |= report.attempt(lambda single=single: read_features(single)) or {}
+    tasks = report.attempt(lambda: read_tasks(root, info)) or {}
+    episodes = report.attempt(lambda: read_episodes(root, info))
+    if episodes is None:
+        return None
+    folder = dataset_folder(root, info, features, episodes, tasks)
+    report.attempt(lambda: [report.add_error(fault) for fault in count_faults(folder)])
+    return folder
+
+
+def read_sound_episodes(
+    folder: DatasetFolder, report: ValidationReport
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    """Episodes that can be read, with their sound columns.
+
+    Files are read in pieces, and no more rows than the list of episodes promises.
+    """
+    for file, entries in folder.files.items():
+        try:
+            yield from _read_file(folder, file, entries, report)
+        except DatasetError as error:
+            report.add_error(error)
+        except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
+            report.add_error(
+                DatasetError(
+                    f"unreadable: the file is damaged ({type(error).__name__}: {error}); copy "
+                    f"it again",
+                    file=file,
+                    episode=entries[0].index,
+                )
+            )
+
+
+def _read_file(
+    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], report: ValidationReport
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    parquet = open_parquet(folder.root, file, entries[0].index)
+    rows, schema = parquet.metadata.num_rows, parquet.schema_arrow
+    report.attempt(lambda: require_rows(file, entries, rows, folder.promised_rows[file]))
+    report.run("declared columns", _column_faults, folder, file, schema, report)
+    features = {k: f for k, f in folder.features.items() if f.numeric}
+    wanted = [key for key in features if schema.names.count(key) == 1]
+    if not wanted:
+        return
+    limit = max(1000, _LARGEST_EPISODE // (8 * max(sum(features[k].width for k in wanted), 1)))
+    pieces = parquet.iter_batches(batch_size=_BATCH_ROWS, columns=wanted)
+    table, first = pa.table({}), 0
+    too_wide: set[str] = set()
+    for entry in sorted(entries, key=lambda entry: entry.start):
+        end = entry.start + entry.length
+        if end > rows or entry.length <= 0 or entry.start < first:
+            continue
+        if entry.length > limit:
+            text = f"is too long to be examined as a whole: {entry.length} frames"
+            report.add(warning(message=text, **entry.location))
+            end = entry.start + limit
+        while first + len(table) < end and (piece := next(pieces, None)) is not None:
+            arrived = pa.Table.from_batches([piece])
+            table = pa.concat_tables([table, arrived]) if len(table) else arrived
+            if first + len(table) <= entry.start:  # rows between two episodes
+                first, table = first + len(table), table.slice(len(table))
+        part = table.slice(entry.start - first, end - entry.start)
+        frames = _sound_columns(folder, part, entry, too_wide, report)
+        if len(part) == entry.length and frames:
+            yield entry, frames
+        table = table.slice(end - first)
+        first = end
+
+
+def _sound_columns(
+    folder: DatasetFolder,
+    table: pa.Table,
+    entry: EpisodeEntry,
+    too_wide: set[str],
+    report: ValidationReport,
+) -> RawFrames:
+    """Columns of one episode; a wrong width is reported once per file (`too_wide`)."""
+    columns = {}
+    for key in table.column_names:
+        try:
+            columns[key] = to_numpy(table.column(key))
+        except (BadRowError, pa.ArrowException, TypeError) as error:
+            row = error.row if isinstance(error, BadRowError) else 0
+            report.add(Issue(message=str(error), **entry.location, frame=row, key=key))
+            continue
+        fault = width_fault(folder, entry.file, key, columns[key])
+        if fault is not None and key not in too_wide:
+            report.add(fault.issue)
+            too_wide.add(key)
+    return columns
+
+
+def _column_faults(
+    folder: DatasetFolder, file: str, schema: pa.Schema, report: ValidationReport
+) -> Iterator[Issue]:
+    """Columns of a file that are missing, repeated or of another type than declared."""
+    missing = [key for key in INDEX_KEYS if key not in {*folder.features, *schema.names}]
+    for key, feature in folder.features.items():
+        count = schema.names.count(key)
+        if feature.dtype == "video":
+            continue
+        if count > 1:
+            yield Issue(message="the column is there more than once", file=file, key=key)
+        elif count == 0:
+            missing.append(key)
+        elif feature.numeric:
+            kind = _number_type(schema.field(key).type)
+            if kind not in (None, feature.dtype):
+                text = f"holds {kind}, but meta/info.json declares {feature.dtype}"
+                yield warning(message=text, file=file, key=key)
+    for key in missing:
+        if key not in INDEX_KEYS:
+            text = "the column is declared in meta/info.json, but missing"
+            yield Issue(message=text, file=file, key=key)
+        # All files come from one recorder: the first one stands for all.
+        elif not any(issue.key == key for issue in report.warnings):
+            text = "the column is missing: LeRobot cannot open this, hrc repair adds it"
+            yield warning(message=text, file=file, key=key)
+
+
+def _number_type(kind: pa.DataType) -> str | None:
+    """LeRobot's name of the type of the numbers in a column; None if Arrow nests no numbers."""
+    while pa.types.is_nested(kind) and not (pa.types.is_struct(kind) or pa.types.is_map(kind)):
+        if not hasattr(kind, "value_type"):
+            return None
+        kind = kind.value_type
+    return {"double": "float64", "float": "float32"}.get(str(kind), str(kind))
+
+
+def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
+    """LeRobot's index columns: contiguous, of this episode, and of a listed task."""
+    count = np.arange(entry.length)
+    expected = {"frame_index": count, "episode_index": np.full(entry.length, entry.index)}
+    expected["index"] = folder.first_index[entry.index] + count
+    for key, values in expected.items():
+        wrong = np.flatnonzero(frames[key][:, 0] != values) if key in frames else []
+        if len(wrong):
+            k = int(wrong[0])
+            yield Issue(
+                message=f"is {frames[key][k, 0]:g}, expected {values[k]:g}; frames were lost, "
+                f"repeated or moved",
+                **entry.location,
+                frame=k,
+                key=key,
+            )
+    if "task_index" in frames and folder.tasks:
+        known = np.isin(frames["task_index"][:, 0], list(folder.tasks))
+        if not known.all():
+            k = int(known.argmin())
+            yield Issue(
+                message=f"task {frames['task_index'][k, 0]:g} is not in the list of tasks",
+                **entry.location,
+                frame=k,
+                key="task_index",
+            )
+
+
+def statistics_exist(folder: DatasetFolder) -> Iterator[Issue]:
+    """A file of statistics, which policies normalise by."""
+    files = (_STATISTICS, "meta/episodes_stats.jsonl")
+    if not any((folder.root / file).is_file() for file in files):
+        text = "no statistics: LeRobot's policies cannot normalise their inputs"
+        yield warning(message=text, file=_STATISTICS)
+
+
+def statistics_fit(
+    folder: DatasetFolder, columns: Mapping[str, ColumnSummary]
+) -> Iterator[Issue]:
+    """Statistics that agree with the data."""
+    path = folder.root / _STATISTICS
+    if not path.exists():
+        return
+    recorded = read_json(path)
+    for key, summary in columns.items():
+        stated = recorded.get(key)
+        if key in INDEX_KEYS or not summary.finite or not summary.count or stated is None:
+            continue
+        try:
+            low, high, mean, std = (
+                np.asarray(stated[name], float).reshape(-1)
+                for name in ("min", "max", "mean", "std")
+            )
+        except (KeyError, TypeError, ValueError):
+            yield warning(message="statistics are incomplete", file=_STATISTICS, key=key)
+            continue
+        if {len(low), len(high), len(mean), len(std)} != {len(summary.low)}:
+            yield Issue(
+                message=f"statistics of {len(mean)} components for {len(summary.low)}: LeRobot "
+                f"cannot normalise",
+                file=_STATISTICS,
+                key=key,
+            )
+            continue
+        span = np.maximum(summary.high - summary.low, 1e-6)
+        wrong = ~np.isfinite(low + high + mean + std) | (std < 0) | (low > high)
+        # A part of a dataset may keep the statistics of the whole, which enclose it.
+        wrong |= (summary.low < low - 0.02 * span) | (summary.high > high + 0.02 * span)
+        wrong |= (mean < low - 0.02 * span) | (mean > high + 0.02 * span)
+        wrong |= (high - low) > 20 * span + 1
+        if wrong.any():
+            yield warning(
+                message=f"statistics do not fit the data in {wrong.sum()} components: policies "
+                f"would normalise wrongly; hrc repair computes them anew",
+                file=_STATISTICS,
+                key=key,
+            )
+
+
+def unlisted_files(folder: DatasetFolder) -> Iterator[Issue]:
+    """Data files without an episode."""
+    for path in sorted((folder.root / "data").glob("*/*"))[:_MOST_LISTED]:
+        name = str(path.relative_to(folder.root))
+        if name not in folder.files:
+            yield warning(message="belongs to no episode", file=name)
+
+
+def task_texts(folder: DatasetFolder) -> Iterator[Issue]:
+    """Tasks: named, listed once, and known to every episode."""
+    texts, file = list(folder.tasks.values()), "meta/tasks"
+    empty = [index for index, text in folder.tasks.items() if not text.strip()]
+    if empty:
+        yield warning(message=f"task {empty[0]} has no text", file=file)
+    for index, text in folder.tasks.items():
+        if text.strip().lower() in _PLACEHOLDERS:
+            yield warning(
+                message=f"task {index}, {text!r}, does not say what is shown: policies are "
+                f"conditioned on it",
+                file=file,
+            )
+    if len({*texts}) < len(texts):
+        yield warning(message="a task is listed twice", file=file)
+    if folder.info.get("total_tasks", len(texts)) != len(texts):
+        yield warning(
+            message=f"says {folder.info['total_tasks']!r}, but {len(texts)} are listed",
+            file=INFO_PATH,
+            key="total_tasks",
+        )
+    for entry in folder.episodes:
+        unknown = [task for task in entry.tasks if task not in texts]
+        if unknown:
+            text = f"task {unknown[0]!r} is not in the list of tasks"
+            yield warning(message=text, **entry.location)
+
+
+def component_names(folder: DatasetFolder) -> Iterator[Issue]:
+    """Component names: distinct and printable."""
+    for key, feature in folder.features.items():
+        names = feature.names or ()
+        if len({*names}) < len(names):
+            text = "two components have the same name"
+            yield warning(message=text, file=INFO_PATH, key=key)
+        if any(plain_text(name) != name for name in (key, *names)):
+            text = "a name holds unprintable characters"
+            yield warning(message=text, file=INFO_PATH, key=key)
+
+
+def offsets(folder: DatasetFolder) -> Iterator[Issue]:
+    """Episodes that do not overlap in their file, and leave no gap."""
+    for entries in folder.files.values():
+        ordered = sorted(entries, key=lambda entry: entry.start)
+        for before, entry in pairwise(ordered):
+            if entry.start != before.start + before.length:
+                yield Issue(
+                    message=f"begins at row {entry.start}, but episode {before.index} ends at "
+                    f"{before.start + before.length}: offsets and lengths contradict",
+                    **entry.location,
+                )

@@ -1,0 +1,426 @@
+"""Columns of a dataset that hold each quantity: declared, found by name, or given.
+
+Nothing is taken for a quantity by its position alone. The caller's mapping comes first, then
+the contract or sidecar kept with the dataset, then the naming conventions of `quantities`.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from hrc_learn.demos.demonstration import JOINT_FIELDS
+from hrc_learn.demos.format.files import INFO_PATH
+from hrc_learn.demos.format.metadata import SIDECAR_PATH, Feature, Sidecar
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.quantities import (
+    INDEX_KEYS,
+    ORIENTATION_ROLES,
+    ROLES,
+    ComponentMeaning,
+    joint_of,
+    meaning_of_component,
+    names_joint_quantity,
+    role_of_key,
+)
+
+MappingSpec = Mapping[str, str | Sequence[str] | None]
+"""Role -> columns: a feature ("observation.qpos"), a range of one ("observation.state[0:7]"),
+or component names (["j1.pos", "observation.state/j2.pos"]); None leaves the role out."""
+
+_RANGE = re.compile(r"(.+)\[(?:(\d{1,9})|(\d{0,9}):(\d{0,9}))\]")
+_ANY_RANGE = re.compile(r"(.+)\[[^\[\]]*\]")
+_STATE_KEYS = ("observation.state", "observation.states", "state", "states")
+_ACTION_KEYS = ("action", "actions")
+_COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_velocity"}
+_POSES = ("position", *ORIENTATION_ROLES)
+# Content of a pose feature without component names, by its width: the encoding of the
+# orientation after x, y, z, and the assumption to report.
+_CARTESIAN = {
+    6: ("euler_xyz", "x, y, z, roll, pitch, yaw"),
+    7: ("quaternion_xyzw", "x, y, z, qx, qy, qz, qw"),
+    9: ("rotation_6d", "x, y, z and two columns of a matrix"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnSelection:
+    """Columns that hold one quantity."""
+
+    role: str
+    columns: tuple[tuple[str, int], ...]
+    """Feature key and index of the component, for each column."""
+    labels: tuple[str, ...]
+    """Joint names, or component names for quantities without joints."""
+    numbered: bool = False
+    """True if the dataset gives no names, so that the labels only count."""
+
+    def only(self, labels: Sequence[str]) -> "ColumnSelection":
+        """The columns of these labels, in this order."""
+        place = dict(zip(self.labels, self.columns, strict=True))
+        columns = tuple(place[label] for label in labels)
+        return replace(self, columns=columns, labels=tuple(labels))
+
+    def column_name(self, number: int) -> str:
+        """Feature and label of a column, for messages."""
+        return f"{self.columns[number][0]} ({self.labels[number]})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnMapping:
+    """Meaning of the columns of a dataset."""
+
+    selections: dict[str, ColumnSelection]
+    """Columns by role."""
+    joint_names: tuple[str, ...]
+    extra: tuple[str, ...]
+    """Numeric features with components that no role uses."""
+    notes: tuple[str, ...]
+    """Guesses and omissions, one sentence each."""
+    unmatched: dict[str, tuple[str, ...]]
+    """Role -> joints, for quantities of other joints than `joint_names`."""
+
+    def reads_like(self, other: "ColumnMapping") -> bool:
+        """True if both mappings read the same numbers under the same names."""
+
+        def content(mapping: ColumnMapping) -> tuple:
+            columns = {role: s.columns for role, s in mapping.selections.items()}
+            return columns, mapping.joint_names, {*mapping.extra}
+
+        return content(self) == content(other)
+
+
+def map_columns(
+    features: Mapping[str, Feature],
+    sidecar: Sidecar,
+    mapping: MappingSpec | None = None,
+    kept: Mapping[str, ColumnSelection] | None = None,
+) -> ColumnMapping:
+    """Find the quantities among the features.
+
+    Args:
+        features: Features declared by the dataset.
+        sidecar: Declaration of our own writer; its columns make guesses unnecessary.
+        mapping: Role -> columns, as in `load_demos`; None as columns leaves a role out.
+        kept: Columns of a contract kept with the dataset; replaces all guesses.
+
+    Raises:
+        DatasetError: The mapping names a role or column that does not exist, or the sidecar's
+            units or columns are malformed.
+    """
+    _require_well_formed(sidecar)
+    usable = {
+        key: feature
+        for key, feature in features.items()
+        if feature.numeric and key not in INDEX_KEYS
+    }
+    notes: list[str] = []
+    if kept is not None:
+        found = dict(kept)
+    elif sidecar.columns:
+        declared = {
+            role: [f"{column['key']}/{name}" for name in column["names"]]
+            for role, column in sidecar.columns.items()
+        }
+        found = parse_mapping(declared, usable)
+    else:
+        found = _Conventions(notes).find(usable)
+    replaced = replaced_roles(mapping or {})
+    found = {role: selection for role, selection in found.items() if role not in replaced}
+    found |= parse_mapping(mapping or {}, usable)
+    names, found, unmatched = _align_joints(found)
+    notes.extend(
+        f"{role} is of other joints ({', '.join(others)}) than the rest ({', '.join(names)}); "
+        f"left among the extra columns"
+        for role, others in unmatched.items()
+    )
+    taken = {column for selection in found.values() for column in selection.columns}
+    extra = (
+        key
+        for key, feature in usable.items()
+        if any((key, index) not in taken for index in range(feature.width))
+    )
+    return ColumnMapping(
+        selections=found,
+        joint_names=names,
+        extra=tuple(extra),
+        notes=tuple(notes),
+        unmatched=unmatched,
+    )
+
+
+def replaced_roles(mapping: MappingSpec) -> set[str]:
+    """Roles that a caller's mapping replaces: one encoding of an orientation replaces all."""
+    return {*mapping} | ({*ORIENTATION_ROLES} if {*mapping} & {*ORIENTATION_ROLES} else set())
+
+
+def _require_well_formed(sidecar: Sidecar) -> None:
+    """Check the form of the sidecar's units and columns, which may have been edited."""
+    for name in ("units", "columns"):
+        if not isinstance(content := getattr(sidecar, name), dict):
+            raise _malformed(f"must be an object, got {content!r}", name)
+    for role, unit in sidecar.units.items():
+        if not isinstance(unit, str):
+            raise _malformed(f"must be text, got {unit!r}", f"units.{role}")
+    for role, column in sidecar.columns.items():
+        content: dict[str, Any] = column if isinstance(column, dict) else {}
+        names = content.get("names")
+        texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        if not isinstance(content.get("key"), str) or not texts:
+            raise _malformed(
+                'must hold a "key", a feature, and "names", a list of its components',
+                f"columns.{role}",
+            )
+
+
+def _malformed(message: str, key: str) -> DatasetError:
+    return DatasetError(f"{message}; edit it", file=SIDECAR_PATH, key=key)
+
+
+def parse_mapping(
+    mapping: MappingSpec, features: Mapping[str, Feature]
+) -> dict[str, ColumnSelection]:
+    """Columns that a mapping names.
+
+    Raises:
+        DatasetError: A role or a column does not exist, or a role has too many or too few.
+    """
+    selections = {}
+    for role, columns in mapping.items():
+        if role not in ROLES:
+            raise DatasetError(
+                f"mapping names the unknown quantity {role!r}; known are {', '.join(ROLES)}"
+            )
+        if columns is not None:
+            selections[role] = _named_selection(role, columns, features)
+    return selections
+
+
+def _named_selection(
+    role: str, columns: str | Sequence[str], features: Mapping[str, Feature]
+) -> ColumnSelection:
+    if isinstance(columns, str):
+        places = _feature_range(role, columns, features)
+    else:
+        places = [_component(role, name, features) for name in columns]
+    if not places:
+        raise DatasetError(f"mapping gives {role} no columns; None leaves it out")
+    width = ROLES[role].width
+    if width is not None and len(places) != width:
+        raise DatasetError(f"mapping gives {role} {len(places)} columns, it takes {width}")
+    names = [features[key].names for key, _ in places]
+    labels = []
+    for n, (known, (_, index)) in enumerate(zip(names, places, strict=True)):
+        name = f"joint_{n + 1}" if known is None else known[index]
+        labels.append(joint_of(name) if role in JOINT_FIELDS else name)
+    return ColumnSelection(
+        role=role,
+        columns=tuple(places),
+        labels=tuple(labels),
+        numbered=any(known is None for known in names),
+    )
+
+
+def _feature_range(
+    role: str, text: str, features: Mapping[str, Feature]
+) -> list[tuple[str, int]]:
+    """Columns of a whole feature ("key") or of a part of it ("key[2:5]", "key[3]")."""
+    match = None if text in features else _ANY_RANGE.fullmatch(text)
+    key = match[1] if match else text
+    if key not in features:
+        raise DatasetError(
+            f"mapping takes {role} from a feature that does not exist; numeric features are "
+            f"{', '.join(features)}",
+            file=INFO_PATH,
+            key=key,
+        )
+    width = features[key].width
+    first, stop = 0, width
+    if match:
+        bounds = _RANGE.fullmatch(text)
+        if bounds is None:
+            first = stop = 0
+        elif bounds[2]:
+            first, stop = int(bounds[2]), int(bounds[2]) + 1
+        else:
+            first, stop = int(bounds[3] or 0), int(bounds[4] or width)
+    if not first < stop <= width:
+        raise DatasetError(
+            f"mapping takes {role} from {text!r}, which is no range of its {width} components: "
+            f"write [first:stop] or [index], counted from 0",
+            file=INFO_PATH,
+            key=key,
+        )
+    return [(key, index) for index in range(first, stop)]
+
+
+def _component(role: str, name: str, features: Mapping[str, Feature]) -> tuple[str, int]:
+    """Column of a component named "NAME" or "FEATURE/NAME"."""
+    key, slash, component = name.partition("/")
+    places = [
+        (feature.key, index)
+        for feature in features.values()
+        for index, known in enumerate(feature.names or ())
+        if (feature.key, known) == (key, component) or (not slash and known == name)
+    ]
+    if not places:
+        known = ", ".join(n for feature in features.values() for n in feature.names or ())
+        raise DatasetError(
+            f"mapping takes {role} from a component that does not exist; named components "
+            f"are {known or 'none'}",
+            file=INFO_PATH,
+            key=name,
+        )
+    if len(places) > 1:
+        options = ", ".join(f"{key}/{name}" for key, _ in places)
+        raise DatasetError(f"mapping for {role} is ambiguous: write one of {options}", key=name)
+    return places[0]
+
+
+class _Conventions:
+    """Search for quantities by the naming conventions of published datasets."""
+
+    def __init__(self, notes: list[str]):
+        self._notes = notes
+        """Receives the assumptions made."""
+
+    def find(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:
+        whole: dict[str, ColumnSelection] = {}
+        by_component: dict[str, ColumnSelection] = {}
+        for feature in features.values():
+            selections = self._whole_feature(feature)
+            known = whole if selections else by_component
+            for selection in selections or self._components(feature):
+                known.setdefault(selection.role, selection)
+        return by_component | whole
+
+    def _whole_feature(self, feature: Feature) -> list[ColumnSelection]:
+        """Selections of a feature whose key tells its content; [] for all others."""
+        role = role_of_key(feature.key)
+        if role is None or (_is_command(feature) and role not in _COMMANDS):
+            return []
+        named = [meaning_of_component(name) for name in feature.names or ()]
+        if any(meaning and meaning.role in ORIENTATION_ROLES for meaning in named):
+            return [*self._grouped(feature, named)]
+        indices = range(feature.width)
+        if role == "cartesian":
+            return self._unnamed_pose(feature)
+        if role == "feature":
+            visible = [_select("feature_visible", feature, [2])] if feature.width == 3 else []
+            return [_select("feature", feature, indices[:2]), *visible]
+        if role == "quaternion_xyzw" and feature.width == 4:
+            self._notes.append(
+                f"{feature.key}: assumed to be a quaternion in the order x, y, z, w"
+            )
+        width = ROLES[role].width
+        if width is not None and width != feature.width:
+            return []
+        return [_select(_COMMANDS[role] if _is_command(feature) else role, feature, indices)]
+
+    def _unnamed_pose(self, feature: Feature) -> list[ColumnSelection]:
+        indices = range(feature.width)
+        if feature.width == 16:
+            return [_select("pose_matrix", feature, indices)]
+        if feature.width not in (3, *_CARTESIAN):
+            return []
+        selections = [_select("position", feature, indices[:3])]
+        if feature.width in _CARTESIAN:
+            role, content = _CARTESIAN[feature.width]
+            self._notes.append(f"{feature.key}: assumed to be {content}")
+            selections.append(_select(role, feature, indices[3:]))
+        return selections
+
+    def _components(self, feature: Feature) -> Iterator[ColumnSelection]:
+        """Selections of a feature of mixed content, such as `observation.state`."""
+        mixed = feature.key in (*_STATE_KEYS, *_ACTION_KEYS)
+        names = feature.names
+        if names is None:
+            if not mixed:
+                return
+            names = tuple(f"joint_{i + 1}" for i in range(feature.width))
+            self._notes.append(
+                f"{feature.key} names no components: taken for {feature.width} joints"
+            )
+        meanings = [meaning_of_component(name) for name in names]
+        if not mixed:
+            # In other features x, y, z may belong to an object: only explicit names count.
+            meanings = [
+                meaning if names_joint_quantity(name) or name.lower().startswith("ee") else None
+                for name, meaning in zip(names, meanings, strict=True)
+            ]
+        elif not any(map(names_joint_quantity, names)):
+            meanings = [
+                meaning or ComponentMeaning("joint_position", name)
+                for name, meaning in zip(names, meanings, strict=True)
+            ]
+        yield from self._grouped(feature, meanings)
+
+    def _grouped(
+        self, feature: Feature, meanings: Sequence[ComponentMeaning | None]
+    ) -> Iterator[ColumnSelection]:
+        """One selection for each role among the components."""
+        groups: dict[str, dict[str | int, int]] = {}
+        for index, meaning in enumerate(meanings):
+            if meaning is not None:
+                groups.setdefault(meaning.role, {})[meaning.slot] = index
+        for role, slots in groups.items():
+            if _is_command(feature):
+                if role not in _COMMANDS:
+                    continue
+                role = _COMMANDS[role]
+            width = ROLES[role].width
+            if width is not None and len(slots) != width:
+                self._notes.append(
+                    f"{feature.key}: {len(slots)} components look like {role}, which takes "
+                    f"{width}; left among the extra columns"
+                )
+                continue
+            order = sorted(slots) if role in _POSES else list(slots)
+            yield ColumnSelection(
+                role=role,
+                columns=tuple((feature.key, slots[slot]) for slot in order),
+                labels=tuple(map(str, order)),
+                numbered=feature.names is None,
+            )
+
+
+def _select(role: str, feature: Feature, indices: Sequence[int]) -> ColumnSelection:
+    names = feature.names or tuple(f"joint_{i + 1}" for i in range(feature.width))
+    return ColumnSelection(
+        role=role,
+        columns=tuple((feature.key, index) for index in indices),
+        labels=tuple(joint_of(names[i]) for i in indices),
+        numbered=feature.names is None,
+    )
+
+
+def _is_command(feature: Feature) -> bool:
+    return feature.key.startswith(("action.", "action/")) or feature.key in _ACTION_KEYS
+
+
+def _align_joints(
+    found: dict[str, ColumnSelection],
+) -> tuple[tuple[str, ...], dict[str, ColumnSelection], dict[str, tuple[str, ...]]]:
+    """Bring every quantity with one column per joint into the order of the first one.
+
+    Returns:
+        Joint names, selections in that order, and joints of the quantities with other joints.
+    """
+    first = next((found[role] for role in JOINT_FIELDS if role in found), None)
+    if first is None:
+        return (), found, {}
+    aligned, unmatched = {}, {}
+    for role, selection in found.items():
+        if role not in JOINT_FIELDS or selection.labels == first.labels:
+            aligned[role] = selection
+        elif set(selection.labels) >= set(first.labels):
+            aligned[role] = selection.only(first.labels)
+        elif len(selection.labels) == len(first.labels) and (
+            selection.numbered or first.numbered
+        ):
+            aligned[role] = replace(selection, labels=first.labels)
+        else:
+            unmatched[role] = selection.labels
+    named = [s for role, s in aligned.items() if role in JOINT_FIELDS and not s.numbered]
+    names = named[0].labels if first.numbered and named else first.labels
+    return names, aligned, unmatched
