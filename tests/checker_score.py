@@ -81,7 +81,7 @@ class Checker:
         self,
         limit: float = 60.0,
         examine: Examine = examine,
-        modules: Sequence[str] = ("hrc_learn.demos.validation.check",),
+        modules: Sequence[str] = ("hrc_learn.demos.quality.check",),
     ):
         """Prepare.
 

@@ -36,11 +36,10 @@ from lerobot_folders import (  # noqa: E402
 )
 from value_defects import VALUES  # noqa: E402
 
-from hrc_learn.demos import check_dataset  # noqa: E402
+from hrc_learn.demos import check_dataset, repair_dataset  # noqa: E402
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder  # noqa: E402
 from hrc_learn.demos.read.frames import read_frames  # noqa: E402
-from hrc_learn.demos.read.roles import INDEX_KEYS  # noqa: E402
-from hrc_learn.demos.repair import repair_dataset  # noqa: E402
+from hrc_learn.demos.read.quantities import INDEX_KEYS  # noqa: E402
 
 NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]
 HAND_NAMES = [*NAMES[:6], "hand.pos"]

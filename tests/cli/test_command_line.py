@@ -20,7 +20,7 @@ from hrc_learn.cli import arguments as choices
 from hrc_learn.cli._commands import COMMANDS
 from hrc_learn.cli._options import short_help
 from hrc_learn.cli.arguments.dataset import Repair
-from hrc_learn.demos.repair import RepairOptions
+from hrc_learn.demos import RepairOptions
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.experiments.grasping.experiment import VARIANTS
 from hrc_learn.kinematics import MissingModelError

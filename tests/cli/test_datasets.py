@@ -151,7 +151,7 @@ def test_findings_are_written_for_other_programs(recording, tmp_path):
     (tmp_path / "set/meta/stats.json").unlink()
     hrc("check", tmp_path / "set", "--findings", tmp_path / "findings.json")
     (finding,) = json.loads((tmp_path / "findings.json").read_text())
-    assert finding["kind"] == "warning"
+    assert finding["level"] == "warning"
     assert "no statistics" in finding["message"]
     assert finding["file"] == "meta/stats.json"
     assert finding["episode"] is None

@@ -8,7 +8,12 @@ from lerobot_folders import joint_path
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError
-from hrc_learn.demos.read.arrays import ArraySources, demonstrations_from_table, read_table
+from hrc_learn.demos.arrays import (
+    ArrayOptions,
+    ArraySources,
+    demonstrations_from_arrays,
+    read_arrays,
+)
 
 TIME = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.004, 40))
 Q = joint_path(40)
@@ -18,8 +23,10 @@ POSE_COLUMNS = ("px", "py", "pz", "qw", "qx", "qy", "qz")
 
 
 def read(path, columns=(), sources=None, **options):
-    table = read_table(path, columns)
-    return demonstrations_from_table(table, sources or ArraySources(), path=path, **options)
+    table = read_arrays(path, columns)
+    return demonstrations_from_arrays(
+        table, sources or ArraySources(), ArrayOptions(**options), path=path
+    )
 
 
 def test_npz_by_array_names(tmp_path):
@@ -81,7 +88,7 @@ def test_a_byte_order_mark_is_no_part_of_the_first_name(tmp_path, header):
 def test_names_of_several_words_are_not_taken_apart(tmp_path):
     path = tmp_path / "run.csv"
     path.write_text("time,joint position 1,joint position 2\n\n0,1,2\n0.1,3,4\n")
-    assert [*read_table(path)] == ["time", "joint position 1", "joint position 2"]
+    assert [*read_arrays(path)] == ["time", "joint position 1", "joint position 2"]
 
 
 @pytest.mark.parametrize("name", ["duration", "fps"])
@@ -95,7 +102,7 @@ def test_durations_and_rates_are_positive(tmp_path, name, value):
 @pytest.mark.parametrize(
     ("arrays", "sources", "message"),
     [
-        ({"q": Q}, {}, "say which arrays are joints or poses.*it holds q"),
+        ({"q": Q}, {}, "name the arrays of joints or poses.*it holds q"),
         ({"q": Q}, {"joints": "p"}, "no array 'p' for joints; it holds q"),
         ({"q": Q, "t": TIME[:-1]}, {"joints": "q", "time": "t"}, "differ in their numbers"),
         (
@@ -108,7 +115,11 @@ def test_durations_and_rates_are_positive(tmp_path, name, value):
         ({"q": Q}, {"joints": "q"}, "there are no stamps.*duration or fps"),
         ({"q": Q * np.nan, "t": TIME}, {"joints": "q"}, "episode 0: joints is nan at frame 0"),
         ({"q": Q, "t": TIME[::-1]}, {"joints": "q"}, "time must increase.*frame 0"),
-        ({"o": np.ones((40, 4)), "t": TIME}, {"orientation": "o"}, "are joints or poses"),
+        (
+            {"o": np.ones((40, 4)), "t": TIME},
+            {"orientation": "o"},
+            "name the arrays of joints or poses",
+        ),
         (
             {"o": np.ones((40, 4)), "q": Q, "t": TIME},
             {"joints": "q", "orientation": "o"},
@@ -155,14 +166,14 @@ def saved(save, *arrays, **named):
 def test_files_that_are_no_arrays(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(DatasetError, match=message):
-        read_table(tmp_path / name)
+        read_arrays(tmp_path / name)
 
 
 def test_a_missing_file_and_wrong_column_names(tmp_path):
     with pytest.raises(DatasetError, match="not found"):
-        read_table(tmp_path / "none.npy")
+        read_arrays(tmp_path / "none.npy")
     np.save(tmp_path / "a.npy", Q)
     with pytest.raises(DatasetError, match="2 column names for 3 columns"):
-        read_table(tmp_path / "a.npy", ["x", "y"])
+        read_arrays(tmp_path / "a.npy", ["x", "y"])
     with pytest.raises(DatasetError, match="2 joint names for 3 columns"):
         read(tmp_path / "a.npy", fps=10, joint_names=["x", "y"])

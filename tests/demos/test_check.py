@@ -12,7 +12,7 @@ import pytest
 from lerobot_folders import FPS, joint_path, read_info, rewrite, write_folder, write_info
 
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
-from hrc_learn.demos.issue import ValidationReport
+from hrc_learn.demos.issues import ValidationReport, warning
 
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
@@ -533,15 +533,17 @@ def test_a_joint_that_stays_froze_a_finger_may_hold_something(tmp_path, joint, t
     )
     found = [i for i in check_dataset(root).warnings if "stays exactly the same" in i.message]
     assert bool(found) == told
-    assert all(i.names == (joint,) for i in found)
+    assert all(i.components == (joint,) for i in found)
 
 
 def test_findings_that_differ_in_joints_and_figures_alone_share_a_line():
     report = ValidationReport(path=Path("set"))
     for episode, names in enumerate([("elbow",), ("kWrist", "base"), ("base",)]):
         text = f"is noisier by {episode + 0.5} than usual: {', '.join(names)}"
-        report.warning(text, episode=episode, names=names, severity=0.1 * episode)
-    report.warning("is noisier by 3 than usual: spam", episode=3)  # not said to be a name
+        severity = 0.1 * episode
+        report.add(warning(message=text, episode=episode, components=names, severity=severity))
+    # "spam" is not declared to be a component.
+    report.add(warning(message="is noisier by 3 than usual: spam", episode=3))
     first, second, _ = report.lines()
     assert first.endswith("usual: base (and 2 times more; episodes 0, 1)")
     assert second.endswith("usual: spam")

@@ -1,13 +1,15 @@
 """The limits from which an episode is told from the others, by cases on both sides of each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from lerobot_folders import FPS, write_folder
 
 from hrc_learn.demos import check_dataset
 from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.issue import ValidationReport
-from hrc_learn.demos.validation import structure_checks
+from hrc_learn.demos.issues import ValidationReport
+from hrc_learn.demos.quality import structure_checks
 
 STATE = "observation.state"
 JOINTS = ["shoulder.pos", "elbow.pos", "wrist.pos"]
@@ -54,7 +56,9 @@ def test_an_encoder_froze_that_stays_long_and_longer_than_usual(
 
     episodes = [*(episode(usual) for _ in range(ODD)), episode(held)]
     issues = found(tmp_path / "set", episodes, "the encoder froze?")
-    assert [(i.episode, i.names) for i in issues] == ([(ODD, ("elbow.pos",))] if told else [])
+    assert [(i.episode, i.components) for i in issues] == (
+        [(ODD, ("elbow.pos",))] if told else []
+    )
 
 
 def three(second, noise=0):
@@ -80,7 +84,9 @@ def test_a_joint_has_the_other_sign_where_negated_it_is_like_the_others(
 ):
     episodes = [*(three(usual, i) for i in range(ODD)), three(odd, ODD)]
     issues = found(tmp_path / "set", episodes, "has the other sign")
-    assert [(i.episode, i.names) for i in issues] == ([(ODD, ("elbow.pos",))] if told else [])
+    assert [(i.episode, i.components) for i in issues] == (
+        [(ODD, ("elbow.pos",))] if told else []
+    )
     assert all(issue.message.endswith(": elbow.pos") for issue in issues)
 
 
@@ -134,10 +140,9 @@ def test_rows_between_episodes_are_passed_over(tmp_path, monkeypatch):
     values = [k + np.tile(ramp(frames), (3, 1)).T for k, frames in ((1, 13), (2, 40), (3, 11))]
     root = write_folder(tmp_path / "set", [{STATE: q} for q in values], {STATE: JOINTS})
     folder = open_folder(root)
-    (file,) = folder.files()
-    listed = [entry for entry in folder.episodes if entry.index != 1]
-    report = ValidationReport(path=root)
-    pieces = structure_checks._read_pieces(folder, file, listed, report)
+    listed = tuple(entry for entry in folder.episodes if entry.index != 1)
+    folder, report = replace(folder, episodes=listed), ValidationReport(path=root)
+    pieces = structure_checks.read_sound_episodes(folder, report)
     read = {entry.index: frames[STATE] for entry, frames in pieces}
     assert [*read] == [0, 2]
     for index, frames in read.items():

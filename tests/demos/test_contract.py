@@ -12,11 +12,16 @@ from commands import done
 from lerobot_folders import joint_path, write_folder
 from unchecked import shapes_unchecked
 
-from hrc_learn.demos import DatasetError, check_dataset, load_demos
+from hrc_learn.demos import (
+    DatasetError,
+    RepairOptions,
+    check_dataset,
+    load_demos,
+    repair_dataset,
+)
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
-from hrc_learn.demos.read.contract import contract_content, keep_contract
-from hrc_learn.demos.read.reader import keep_first_contract
-from hrc_learn.demos.repair import RepairOptions, repair_dataset
+from hrc_learn.demos.read.contract import keep_contract
+from hrc_learn.demos.read.opened_dataset import open_dataset
 
 STATE = "observation.state"
 NAMES = ["shoulder.pos", "elbow.pos", "gripper.pos"]
@@ -45,6 +50,11 @@ def kept(root):
     contract = check_dataset(root).contract
     assert contract is not None
     return contract
+
+
+def keep_first_contract(root):
+    """The note of the reader on the contract that it keeps."""
+    return open_dataset(root).keep_first_contract()[1]
 
 
 def named(contract, key, name):
@@ -126,7 +136,7 @@ def test_a_contract_that_makes_no_sense_is_refused(root, change, message):
     [
         ("index", "0", r"contract.components\[0\]: index must be a whole number"),
         ("index", -1, r"contract.components\[0\]: index must be .* at least 0, got -1"),
-        ("index", 1, r"contract.components\[1\]: is of component 1 of action"),
+        ("index", 1, r"contract.components\[1\]: repeats component 1 of action"),
         ("name", None, r"contract.components\[0\]: name must be text, got None"),
         ("unit", 5, r"contract.components\[0\]: unit must be text, got 5"),
         ("sign", 2, r"contract.components\[0\]: sign must be -1, 0 or 1, got 2"),
@@ -134,7 +144,7 @@ def test_a_contract_that_makes_no_sense_is_refused(root, change, message):
     ],
 )
 def test_an_entry_that_was_edited_wrongly_is_named(root, place, value, message):
-    content = contract_content(kept(root))
+    content = kept(root).content()
     content["components"].sort(key=lambda entry: (entry["key"], entry["index"]))
     content["components"][0][place] = value
     edit_sidecar(root, contract=content)
@@ -218,7 +228,7 @@ def test_columns_keep_their_unit_as_another_quantity(hand):
 
 
 def test_what_is_kept_is_plain_json(root):
-    content = contract_content(kept(root))
+    content = kept(root).content()
     assert json.loads(json.dumps(content)) == content
 
 
@@ -291,7 +301,7 @@ def test_what_cannot_be_understood_or_written_is_said(root, tmp_path, monkeypatc
     def refuse(*_):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("hrc_learn.demos.read.reader.keep_contract", refuse)
+    monkeypatch.setattr("hrc_learn.demos.read.opened_dataset.keep_contract", refuse)
     assert "Permission denied" in keep_first_contract(root)
 
 

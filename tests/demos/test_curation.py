@@ -13,16 +13,20 @@ from lerobot_folders import write_folder
 
 from hrc_learn.cli.commands import curate
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
-from hrc_learn.demos.curation import (
+from hrc_learn.demos.images import load_images
+from hrc_learn.demos.quality.decisions import (
     Decision,
+    decide,
+    decisions_path,
     keep_decisions,
-    rank_episodes,
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.curation.decisions import decision, decisions_path
-from hrc_learn.demos.curation.ranking import density_clusters, log_dimensionless_jerk
-from hrc_learn.demos.read.images import load_images
+from hrc_learn.demos.quality.ranking import (
+    density_clusters,
+    log_dimensionless_jerk,
+    rank_episodes,
+)
 from hrc_learn.teleoperation.curation_page import CurationPage
 
 NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]
@@ -130,7 +134,7 @@ def test_the_table_shows_the_worst_and_counts_the_rest(ranking):
     lines = [*ranking.lines(most=3)]
     assert lines[0].split()[:3] == ["episode", "doubt", "group"]
     assert lines[1].split()[0] == str(ranking.episodes[0].episode)
-    assert "and 11 episodes less doubtful" in lines[4]
+    assert "and 11 less doubtful episodes" in lines[4]
 
 
 def test_jerk_knows_neither_units_nor_pace():
@@ -175,7 +179,7 @@ def test_decisions_are_kept_beside_the_dataset(odd, tmp_path):
     content = json.loads(decisions_path(root).read_text())
     content["decisions"]["3"]["length"] += 1
     decisions_path(root).write_text(json.dumps(content))
-    with pytest.raises(DatasetError, match="of another dataset"):
+    with pytest.raises(DatasetError, match="belongs to another dataset"):
         read_decisions(root)
     decisions_path(root).write_text("[1]")
     with pytest.raises(DatasetError, match="holds no decisions"):
@@ -185,8 +189,8 @@ def test_decisions_are_kept_beside_the_dataset(odd, tmp_path):
 @pytest.mark.parametrize("cut", [(-1, 10), (5, 6), (5, 5), (9, 3), (0, 101)])
 def test_cuts_that_leave_nothing_or_do_not_exist_are_refused(cut):
     with pytest.raises(ValueError, match="no part"):
-        decision("cut", 100, *cut)
-    assert decision("cut", 100, 98, 100).stop == 100
+        decide("cut", 100, *cut)
+    assert decide("cut", 100, 98, 100).stop == 100
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])

@@ -63,7 +63,7 @@ def test_every_defect_is_found_and_located(copy, name):
         load_demos(copy.root)
     assert not NETWORK.search(str(raised.value))
     if name != "one episode missing":  # its counts disagree, which is told before the gap
-        assert_place(raised.value.finding, defect, copy)
+        assert_place(raised.value.issue, defect, copy)
 
 
 @pytest.mark.parametrize("name", HARMLESS)

@@ -92,7 +92,7 @@ def test_a_set_slices_and_iterates_like_a_tuple():
 
 
 def test_sets_hold_one_robot():
-    with pytest.raises(ValueError, match="share their joints"):
+    with pytest.raises(ValueError, match="need the same joints"):
         DemonstrationSet([demonstration(), demonstration(joint_names=("x", "y", "z"))])
     with pytest.raises(ValueError, match="no padded form"):
         DemonstrationSet([]).padded()

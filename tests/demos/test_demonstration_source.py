@@ -17,7 +17,7 @@ from hrc_learn.demos import (
     open_demos,
 )
 from hrc_learn.demos.read import frames
-from hrc_learn.demos.read.episodes import open_reader
+from hrc_learn.demos.read.opened_dataset import open_dataset
 
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
@@ -105,11 +105,14 @@ def test_frames_are_read_once_and_a_batch_at_a_time(tmp_path, monkeypatch):
 
 
 def test_nothing_is_read_where_no_unit_must_be_guessed(tmp_path, monkeypatch):
-    reader = open_reader(write(tmp_path / "set"), None, None, None, None)
+    dataset = open_dataset(write(tmp_path / "set"))
+    entries = dataset.folder.episodes
     rows = count_rows(monkeypatch)
-    assert reader.survey({"joint_position": "rad"})["joint_position"].unit == "rad"
+    assert (
+        dataset.survey_units(entries, {"joint_position": "rad"})["joint_position"].unit == "rad"
+    )
     assert not rows
-    reader.survey({})
+    dataset.survey_units(entries, {})
     assert sum(rows) == sum(LENGTHS)
 
 

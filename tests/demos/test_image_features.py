@@ -7,12 +7,13 @@ from lerobot_folders import joint_path, write_folder
 from hrc_learn.demos import (
     DatasetError,
     DatasetWriter,
+    RepairOptions,
     attach_features,
     extract_features,
     load_demos,
     open_demos,
+    repair_dataset,
 )
-from hrc_learn.demos.repair import RepairOptions, repair_dataset
 
 SIZE = (48, 64)
 FRAMES = (45, 50)
@@ -128,7 +129,7 @@ def test_several_features_are_chosen_among(tmp_path):
     assert demos[0].feature is None
     assert_tracks(attach_features(demos, "front.spot"))
     assert not attach_features(demos, "front.nothing")[0].feature_visible.any()
-    with pytest.raises(DatasetError, match=r"say which feature.*front\.nothing, front\.spot"):
+    with pytest.raises(DatasetError, match=r"name the feature.*front\.nothing, front\.spot"):
         attach_features(demos)
     with pytest.raises(DatasetError, match="no feature 'left'"):
         attach_features(demos, "left")
@@ -139,7 +140,7 @@ def test_several_features_are_chosen_among(tmp_path):
     [
         (lambda video: video.write_bytes(video.read_bytes()[:200]), "cannot be decoded"),
         (lambda video: video.write_bytes(b""), "cannot be decoded"),
-        (lambda video: video.unlink(), "its video is not here"),
+        (lambda video: video.unlink(), "its video is missing"),
     ],
 )
 def test_a_bad_video_is_listed_and_keeps_none_of_the_others_out(tmp_path, bad, said):
@@ -169,5 +170,5 @@ def test_what_cannot_be_looked_at_is_told(tmp_path):
     with pytest.raises(DatasetError, match=r"no camera 'side'; .*observation\.images\.front"):
         extract_features(root, "spot", lambda: brightest, camera="side")
     bare = write_folder(tmp_path / "bare", [{"state": joint_path()}], {})
-    with pytest.raises(DatasetError, match="the videos are of none"):
+    with pytest.raises(DatasetError, match="has videos of none"):
         extract_features(bare, "spot", lambda: brightest)

@@ -13,7 +13,7 @@ from hrc_learn.demos import DatasetError, ImageReader, load_demos, load_images
 from hrc_learn.demos.format import videos
 from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.format.videos import decode_image, read_segments
-from hrc_learn.demos.read.images import jpeg
+from hrc_learn.demos.images import jpeg
 
 
 @pytest.fixture(params=["v3.0", "v2.1"])
@@ -91,10 +91,10 @@ def test_a_video_without_the_last_images_names_the_first_that_is_missing(tmp_pat
     write_video(path, length - 10)
     with pytest.raises(DatasetError, match="holds no image") as caught:
         load_images(root, 2)
-    assert (caught.value.finding.episode, caught.value.finding.frame) == (2, length - 10)
+    assert (caught.value.issue.episode, caught.value.issue.frame) == (2, length - 10)
     assert len(load_images(root, 2, frames=range(length - 10))[CAMERA]) == length - 10
     path.unlink()
-    with pytest.raises(DatasetError, match="not here"):
+    with pytest.raises(DatasetError, match="is missing"):
         load_images(root, 2)
     assert ImageReader(root).available(2) == ()
     path.write_bytes(b"no video")

@@ -19,9 +19,15 @@ from lerobot_folders import (
 )
 from scipy.spatial.transform import Rotation
 
-from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
-from hrc_learn.demos.read.reader import keep_first_contract
-from hrc_learn.demos.repair import RepairOptions, repair_dataset
+from hrc_learn.demos import (
+    DatasetError,
+    DatasetWriter,
+    RepairOptions,
+    check_dataset,
+    load_demos,
+    repair_dataset,
+)
+from hrc_learn.demos.read.opened_dataset import open_dataset
 
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
@@ -51,7 +57,7 @@ def test_what_is_sound_stays_as_it_is_in_every_version(tmp_path, version, withou
     how = {"version": version, "without": without, "tasks": ("reach", "place")}
     report, demos = repaired(tmp_path, motions, RepairOptions(trim=False), **how)
     assert report.changed == 0
-    assert "episode 1: as it was" in str(report)
+    assert "episode 1: unchanged" in str(report)
     info = read_info(tmp_path / "new")
     assert (info["codebase_version"], info["robot_type"]) == ("v3.0", "test")
     assert [demo.task for demo in demos] == ["reach", "place"]
@@ -209,7 +215,7 @@ def test_bad_episodes_go_only_when_asked_for(tmp_path):
     assert list(report.changes) == [0, 3]
     assert list(report.left_out) == [1, 2]
     assert "truncated" in report.left_out[2]
-    assert "episode 3 (now 1): as it was" in str(report)
+    assert "episode 3 (now 1): unchanged" in str(report)
     assert check_dataset(tmp_path / "new").ok
     assert [demo.task for demo in load_demos(tmp_path / "new")] == ["a", "d"]
 
@@ -380,7 +386,7 @@ def test_resampling_goes_on_where_joints_and_commands_wrap(tmp_path, turn, unit,
 
 def test_units_given_to_a_repair_overrule_an_older_contract(tmp_path):
     root = write(tmp_path / "old", [joint_path(60, seed=k) for k in range(2)])
-    keep_first_contract(root, {"joint_position": "rad"})
+    open_dataset(root).keep_first_contract({"joint_position": "rad"})
     repair_dataset(
         root, tmp_path / "new", RepairOptions(trim=False), units={"joint_position": "deg"}
     )

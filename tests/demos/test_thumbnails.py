@@ -9,7 +9,7 @@ from clean_sets import CAMERA, SIZE, bar, write_set
 
 from hrc_learn.demos import load_demos, load_images, thumbnails
 from hrc_learn.demos.format.videos import decode_image
-from hrc_learn.demos.read import thumbnails as module
+from hrc_learn.demos.images import thumbnail_size
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])
@@ -47,12 +47,7 @@ def test_of_long_episodes_only_so_many_are_taken(tmp_path):
     np.testing.assert_allclose(np.diff(time), demo.duration / 3, atol=1 / demo.fps)
 
 
-def test_two_cameras_of_the_same_last_word_are_told_apart():
-    names = {module._name(f"observation.images.{side}.rgb") for side in ("left", "right")}
-    assert names == {"left.rgb", "right.rgb"}
-
-
 def test_tall_images_are_scaled_to_even_sides():
-    assert module._small((480, 641)) == (240, 320)
-    assert module._small((241, 97)) == (240, 96)
-    assert module._small((100, 75)) == (100, 76)
+    assert thumbnail_size(480, 641) == (240, 320)
+    assert thumbnail_size(241, 97) == (240, 96)
+    assert thumbnail_size(100, 75) == (100, 76)

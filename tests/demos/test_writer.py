@@ -384,7 +384,7 @@ def test_a_folder_of_somebody_else_is_no_recording(tmp_path):
     assert recover_all(tmp_path) == []
     with pytest.raises(FileNotFoundError, match="no interrupted recording"):
         recover_dataset(tmp_path / "set")
-    with pytest.raises(FileExistsError, match="is left alone: move it away"):
+    with pytest.raises(FileExistsError, match="is not touched: move it away"):
         writing(tmp_path / "set")
     left = {str(path.relative_to(other)) for path in other.rglob("*") if path.is_file()}
     assert left == files

@@ -11,9 +11,10 @@ from lerobot_folders import write_folder
 from page_in_browser import chromium, wait_until
 
 from hrc_learn.demos import load_demos
-from hrc_learn.demos.curation import rank_episodes, read_decisions
 from hrc_learn.demos.format.videos import decode_image
-from hrc_learn.demos.read.images import load_images
+from hrc_learn.demos.images import load_images
+from hrc_learn.demos.quality.decisions import read_decisions
+from hrc_learn.demos.quality.ranking import rank_episodes
 from hrc_learn.teleoperation.curation_page import CurationPage
 from hrc_learn.teleoperation.gate import AddressConfig
 

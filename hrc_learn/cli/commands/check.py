@@ -9,12 +9,17 @@ from rich.progress import track
 
 from hrc_learn.cli._run import configuration, write_values
 from hrc_learn.cli.arguments.dataset import Check, Recover, Repair
-from hrc_learn.demos import check_dataset, load_demos, recover_all
+from hrc_learn.demos import (
+    RepairOptions,
+    check_dataset,
+    load_demos,
+    recover_all,
+    repair_dataset,
+)
 from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
-from hrc_learn.demos.issue import ValidationReport
-from hrc_learn.demos.read.contract import Contract, contract_content, keep_contract
-from hrc_learn.demos.repair import RepairOptions, repair_dataset
+from hrc_learn.demos.issues import ValidationReport
+from hrc_learn.demos.read.contract import Contract, keep_contract
 from hrc_learn.jacobian import camera_placements
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 from hrc_learn.store import new_folder, write_json, write_text
@@ -79,7 +84,7 @@ def _write(args: Check, report: ValidationReport, counts: Mapping[str, int]) -> 
             write_text(folder / "findings.json", findings)
             write_json(folder / "metrics.json", counts)
             if report.contract is not None:
-                text = json.dumps(contract_content(report.contract), indent=2) + "\n"
+                text = json.dumps(report.contract.content(), indent=2) + "\n"
                 write_text(folder / "contract.json", text)
     if args.findings is not None:
         write_text(args.findings, findings)

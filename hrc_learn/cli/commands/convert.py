@@ -11,7 +11,12 @@ from rich.progress import track
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments.dataset import Extract, ImportArrays
 from hrc_learn.demos import DatasetWriter, Demonstration, Detector, extract_features
-from hrc_learn.demos.read.arrays import ArraySources, demonstrations_from_table, read_table
+from hrc_learn.demos.arrays import (
+    ArrayOptions,
+    ArraySources,
+    demonstrations_from_arrays,
+    read_arrays,
+)
 from hrc_learn.demos.write.episode import rotation_vectors
 from hrc_learn.vision import MarkerDetector, centre
 
@@ -107,10 +112,7 @@ def _read(args: ImportArrays, path: Path) -> list[Demonstration]:
         orientation=args.orientation,
         time=args.time,
     )
-    return demonstrations_from_table(
-        read_table(path, [name for name in args.columns.split(",") if name]),
-        sources,
-        path=path,
+    options = ArrayOptions(
         units={
             "joint_position": args.joint_unit,
             "position": args.position_unit,
@@ -122,6 +124,8 @@ def _read(args: ImportArrays, path: Path) -> list[Demonstration]:
         fps=args.fps,
         task=path.stem if args.task is None else args.task,
     )
+    table = read_arrays(path, [name for name in args.columns.split(",") if name])
+    return demonstrations_from_arrays(table, sources, options, path=path)
 
 
 def extract(args: Extract) -> int:

@@ -12,15 +12,15 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments.dataset import Curate
 from hrc_learn.cli.commands.check import columns
-from hrc_learn.demos.curation import (
+from hrc_learn.demos.quality.decisions import (
     Decisions,
-    Ranking,
+    decide,
+    decisions_path,
     keep_decisions,
-    rank_episodes,
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.curation.decisions import decision, decisions_path
+from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
 
 _SHOWN = 20
 """Episodes of a ranking that fit on a screen."""
@@ -98,18 +98,18 @@ def _as_typed(args: Curate, ranking: Ranking) -> Decisions:
             f"{max(lengths)}"
         )
     for episode in args.accept:
-        decisions[episode] = decision("accept", lengths[episode])
+        decisions[episode] = decide("accept", lengths[episode])
     for episode, text in args.cut.items():
         try:
             start, stop = (int(part) for part in text.split(":"))
-            decisions[episode] = decision("cut", lengths[episode], start, stop)
+            decisions[episode] = decide("cut", lengths[episode], start, stop)
         except ValueError as error:
             raise ValueError(
                 f"--cut {episode} {text}: give the first frame that stays and the one after "
                 f"the last, such as 30:410, of {lengths[episode]} ({error})"
             ) from error
     for episode in args.reject:
-        decisions[episode] = decision("reject", lengths[episode])
+        decisions[episode] = decide("reject", lengths[episode])
     if args.accept or args.cut or args.reject:
         keep_decisions(args.dataset, decisions)
     return decisions

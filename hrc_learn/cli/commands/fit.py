@@ -17,8 +17,7 @@ from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_valu
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.commands.check import columns
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos, thumbnails
-from hrc_learn.demos.read.contract import contract_notes
-from hrc_learn.demos.read.reader import keep_first_contract
+from hrc_learn.demos.read.opened_dataset import open_dataset
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
 from hrc_learn.learning.fit_report import fit_report
 from hrc_learn.learning.model_choice import best_models, keep_best
@@ -55,11 +54,10 @@ def fit_primitives(args: FitPrimitives) -> None:
         _fit_streamed(args, console)
         return
     _refuse_unused_context(args)
-    _keep_contract(args, console)
-    source = open_demos(args.dataset, **_wanted(args))
+    source = open_demos(args.dataset, **_wanted(args), keep_contract=args.keep_contract)
     demos = sampled(source)
     for note in demos.notes:
-        console.print(f"note: {note}")
+        console.print(f"note: {note}", soft_wrap=True)
     if _is_sample(demos, source):
         console.print(f"note: {_OF_A_SAMPLE}", soft_wrap=True)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
@@ -140,13 +138,6 @@ _OF_A_SAMPLE = (
 )
 
 
-def _keep_contract(args: FitPrimitives, console: Console) -> None:
-    """Keep what the columns mean, unless the caller says what they mean."""
-    wanted = args.keep_contract and not args.mapping
-    if wanted and (done := keep_first_contract(args.dataset, args.units)):
-        console.print(f"note: {done}", soft_wrap=True)
-
-
 def _wanted(args: FitPrimitives) -> dict[str, Any]:
     """What to read of the dataset, and how."""
     return {
@@ -197,8 +188,10 @@ def _fit_policy(args: FitPrimitives, console: Console) -> None:
     if args.n_basis is None:
         raise ValueError("--as-lerobot-policy needs a number of basis functions: --n-basis 50")
     if (args.dataset / "meta/info.json").is_file():
-        _keep_contract(args, console)
-        for note in contract_notes(args.dataset):
+        dataset, kept = open_dataset(args.dataset), ""
+        if args.keep_contract:
+            dataset, kept = dataset.keep_first_contract()
+        for note in filter(None, (kept, dataset.contract_note)):
             console.print(f"note: {note}", soft_wrap=True)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status("Fitting a policy"):

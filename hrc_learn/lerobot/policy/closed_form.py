@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.read.episodes import select_episodes
 from hrc_learn.demos.read.frames import read_frames
+from hrc_learn.demos.read.opened_dataset import select_episodes
 from hrc_learn.dmp import JointDMP, Response, RidgeFit, fit_ridge
 from hrc_learn.lerobot.policy.networks import ContextualMotion
 

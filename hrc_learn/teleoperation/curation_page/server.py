@@ -18,21 +18,19 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
-from hrc_learn.demos.curation import (
-    MEASURES,
+from hrc_learn.demos.format.dataset_folder import open_folder
+from hrc_learn.demos.format.metadata import Feature
+from hrc_learn.demos.images import ImageReader, jpeg
+from hrc_learn.demos.issues import plain_text
+from hrc_learn.demos.quality.decisions import (
     Decision,
-    Ranking,
+    decide,
     keep_decisions,
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.curation.decisions import decision
-from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.format.metadata import Feature
-from hrc_learn.demos.issue import plain_text
-from hrc_learn.demos.read.column_mapping import MappingSpec
-from hrc_learn.demos.read.images import ImageReader, jpeg
-from hrc_learn.demos.validation.data_checks import component_name
+from hrc_learn.demos.quality.ranking import MEASURES, Ranking
+from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.teleoperation.gate.address import AddressConfig, listening_socket, tls_context
 from hrc_learn.teleoperation.gate.admission import HEADERS, Admission
 from hrc_learn.teleoperation.gate.gate import Content, static_contents
@@ -269,7 +267,7 @@ class CurationPage:
                 self.decisions.pop(episode, None)
             else:
                 try:
-                    made = decision(str(said["verdict"]), self._lengths[episode], start, stop)
+                    made = decide(str(said["verdict"]), self._lengths[episode], start, stop)
                 except ValueError as error:
                     raise RefusedError(400, str(error)) from error
                 self.decisions[episode] = made
@@ -331,7 +329,7 @@ def _charts(
         charts.append(("gripper", "", {"state": demo.gripper}))
     for key, values in demo.extra.items():
         if 0 < values.shape[1] <= 12:
-            names = [component_name(features.get(key), i) for i in range(values.shape[1])]
+            names = [features[key].component(i) for i in range(values.shape[1])]
             charts.append((key, "", dict(zip(names, values.T, strict=True))))
     return charts
 

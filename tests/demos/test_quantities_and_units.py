@@ -4,13 +4,13 @@ import math
 
 import pytest
 
-from hrc_learn.demos.read.roles import (
+from hrc_learn.demos.read.quantities import (
     ComponentMeaning,
-    decide_units,
     is_hand,
     meaning_of_component,
     role_of_key,
 )
+from hrc_learn.demos.read.units import decide_units
 
 
 @pytest.mark.parametrize(
