@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -108,7 +109,7 @@ def _check_camera(
     for number, (path, shown) in enumerate(by_file.items()):
         ordered = sorted(shown, key=lambda item: item[1].start)
         file, first = _VideoFile(folder=folder, key=key, path=path, shown=ordered), shown[0][0]
-        place = {"file": file.name, "episode": first, "key": key}
+        place: dict[str, Any] = {"file": file.name, "episode": first, "key": key}
         if number == _MOST_FILES:
             text = f"{len(by_file) - number} further videos were not examined"
             report.add(warning(message=text, file=file.name, key=key))
@@ -194,7 +195,7 @@ def _size_and_rate(file: _VideoFile, stream: _Stream) -> Iterator[Issue]:
 def _length(file: _VideoFile, stream: _Stream) -> Iterator[Issue]:
     """Number of images per episode, end of the file, and overlaps of episodes."""
     fps, is_v3, lengths = file.folder.fps, file.folder.is_v3, file.lengths
-    place = {"file": file.name, "key": file.key}
+    place: dict[str, Any] = {"file": file.name, "key": file.key}
     for index, segment in file.shown:
         length = lengths[index]
         images = round((segment.stop - segment.start) * fps) if is_v3 else stream.images
