@@ -299,7 +299,7 @@ def thumbnails(
     reader, found, missing = ImageReader(path), {}, []
     wanted = [(demo, camera) for demo in demos for camera in reader.available(demo.episode)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV releases the interpreter lock
-        read = pool.map(lambda pair: _thumbnails(reader, *pair, most), wanted)
+        read = pool.map(lambda pair: _thumbnails(reader, pair[0], pair[1], most), wanted)
         for (demo, camera), images in zip(wanted, read, strict=True):
             if isinstance(images, DatasetError):
                 missing.append(str(images))

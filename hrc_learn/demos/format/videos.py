@@ -200,9 +200,10 @@ def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Image:
 
     try:
         with av.open(io.BytesIO(content or b""), "r") as container:
-            return _rgb(next(container.decode(video=0)), size)
+            image = _rgb(next(container.decode(video=0)), size)
     except (av.FFmpegError, IndexError, StopIteration) as error:
         raise DatasetError(f"holds an image that cannot be decoded ({error})") from error
+    return image
 
 
 def _rgb(image: Any, size: tuple[int, int] | None) -> Image:
