@@ -202,11 +202,7 @@ class ArrayOptions:
 
 
 def demonstrations_from_arrays(
-    table: ArrayTable,
-    sources: ArraySources,
-    options: ArrayOptions,
-    *,
-    path: Path,
+    table: ArrayTable, sources: ArraySources, options: ArrayOptions, *, path: Path
 ) -> list[Demonstration]:
     """Make demonstrations from arrays.
 

@@ -127,11 +127,7 @@ class ImageReader:
             return dict(zip(keys, done, strict=True))
 
     def _read_camera(
-        self,
-        episode: int,
-        camera: str,
-        wanted: Sequence[int],
-        size: tuple[int, int] | None,
+        self, episode: int, camera: str, wanted: Sequence[int], size: tuple[int, int] | None
     ) -> UInt8[Tensor, "frames 3 height width"]:
         ordered = sorted({*wanted})
         place = {frame: number for number, frame in enumerate(ordered)}

@@ -133,11 +133,7 @@ class ValidationReport:
         return None
 
     def run[**P](
-        self,
-        name: str,
-        check: Callable[P, Iterable[Issue]],
-        *args: P.args,
-        **kwargs: P.kwargs,
+        self, name: str, check: Callable[P, Iterable[Issue]], *args: P.args, **kwargs: P.kwargs
     ) -> None:
         """Run a check and file its issues under the name of the check."""
 

@@ -191,8 +191,7 @@ def delete_files(folder: Path, patterns: Iterable[str]) -> bool:
     """
     patterns = tuple(patterns)
     delete_entries(
-        folder,
-        [e for e in entries(folder) if e.endswith("/") or matches(e, patterns)],
+        folder, [e for e in entries(folder) if e.endswith("/") or matches(e, patterns)]
     )
     return not folder.exists()
 

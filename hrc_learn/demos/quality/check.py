@@ -341,10 +341,7 @@ def _usual_motion(
             steps = [[column.step[i] for column, i in episode] for episode in known]
             spans = [[column.span[i] for column, i in episode] for episode in known]
             factor = decisions[role].factor
-            usual[role] = (
-                np.median(steps, axis=0) * factor,
-                np.median(spans, axis=0) * factor,
-            )
+            usual[role] = (np.median(steps, axis=0) * factor, np.median(spans, axis=0) * factor)
     return usual
 
 

@@ -8,12 +8,7 @@ from typing import Literal, get_args
 
 from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.quality.repair import (
-    Progress,
-    RepairOptions,
-    RepairReport,
-    repair_dataset,
-)
+from hrc_learn.demos.quality.repair import Progress, RepairOptions, RepairReport, repair_dataset
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.store import new_file
 

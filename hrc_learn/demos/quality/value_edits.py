@@ -168,10 +168,7 @@ def resample_to_grid(
         time=moved.time + edit.time[0],
         kept=edit.kept[nearest],
         resampled=True,
-        changes=(
-            *edit.changes,
-            f"resampled {len(edit)} frames to {len(moved)} at {fps:g} Hz",
-        ),
+        changes=(*edit.changes, f"resampled {len(edit)} frames to {len(moved)} at {fps:g} Hz"),
     )
 
 

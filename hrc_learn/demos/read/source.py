@@ -13,11 +13,7 @@ from hrc_learn.demos.demonstration import (
     joint_columns,
 )
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.image_features import (
-    missing_note,
-    only_feature,
-    with_feature,
-)
+from hrc_learn.demos.image_features import missing_note, only_feature, with_feature
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.frames import disk_runs, frame_timestamps

@@ -18,11 +18,7 @@ from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES, is_hand
 
 _DIMENSIONS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180, "tick": 2 * math.pi / 4096},
-    "angular velocity": {
-        "rad/s": 1.0,
-        "deg/s": math.pi / 180,
-        "tick/s": 2 * math.pi / 4096,
-    },
+    "angular velocity": {"rad/s": 1.0, "deg/s": math.pi / 180, "tick/s": 2 * math.pi / 4096},
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "torque": {"N m": 1.0, "N mm": 1e-3},

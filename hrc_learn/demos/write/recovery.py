@@ -92,11 +92,7 @@ def finish(root: Path, claim: Claim) -> None:
             )
         paths = staged_paths(staging, episodes or 0)
         with replacing(
-            claim,
-            DATASET,
-            overwrite=episodes is not None,
-            others="keep",
-            source=header["id"],
+            claim, DATASET, overwrite=episodes is not None, others="keep", source=header["id"]
         ) as new:
             assemble(paths, new, earlier=None if episodes is None else root)
     discard(staging)

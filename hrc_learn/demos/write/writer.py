@@ -349,10 +349,7 @@ class DatasetWriter:
         except ValueError as error:
             raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
         values = encode(columns, episode) | index_columns(
-            self.fps,
-            self.episodes,
-            self._saved_frames,
-            np.full(len(episode["time"]), number),
+            self.fps, self.episodes, self._saved_frames, np.full(len(episode["time"]), number)
         )
         header = self._header(columns)
         if self._earlier is not None:
