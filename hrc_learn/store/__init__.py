@@ -1,25 +1,24 @@
-"""Files and folders that are whole or not there at all, however the writing ends.
+"""Files and folders that are complete or absent, however their writing ends.
 
-Whatever is written takes shape in a workspace beside its place, on the same file system:
+A file or folder takes shape in a workspace next to its place, on the same file system:
 
-    .NAME.writing/lock        held by the one process that writes NAME, and says which
-    .NAME.writing/new         what is being written
-    .NAME.writing/old         what had the name before
-    .NAME.writing/owned.json  the parts of `old` that may be deleted
+    .NAME.writing/lock        held by the one process that writes NAME, and names it
+    .NAME.writing/new         new content
+    .NAME.writing/old         previous content
+    .NAME.writing/owned.json  parts of `old` that may be deleted
 
 A folder replaces another in three steps, each on disk before the next: `owned.json` is written,
-NAME is renamed to `old`, `new` is renamed to NAME. So the contents of a workspace tell how far
-a killed process came, and the next writer of NAME, or `recover`, mends it under the lock:
+NAME is renamed to `old`, `new` is renamed to NAME. The content of a workspace therefore tells
+how far a killed process came, and the next writer of NAME, or `recover`, completes it:
 
-    new          not finished, or not acknowledged: removed
-    old and new  between the two renames, so `new` is whole: it takes the name
-    old          after them: the owned parts of `old` are removed
+    new          unfinished: removed
+    old and new  between the two renames, so `new` is complete: it takes the name
+    old          after both renames: the owned parts of `old` are removed
 
-Two renames instead of one exchange, because every file system and operating system has them.
+Two renames are used instead of an exchange because every file system supports them.
 
-Of an older result only what its manifest lists is ever deleted, and a folder that holds
-anything else is not replaced. A path through a symbolic link keeps the link and replaces what
-it points to.
+Only files that the manifest of an older result lists are ever deleted, and a folder with other
+files is not replaced. A path through a symbolic link keeps the link and replaces its target.
 """
 
 from hrc_learn.store._claim import BusyError as BusyError

@@ -1,4 +1,4 @@
-"""The sole right to write something, the steps by which it takes its name, and mending."""
+"""Exclusive right to write a path, the steps of a replacement, and its recovery."""
 
 import contextlib
 import itertools
@@ -27,47 +27,48 @@ from hrc_learn.store._disk import (
 from hrc_learn.store._ownership import Kind, owned_entries, write_manifest
 
 SUFFIX = ".writing"
-"""End of the name of a workspace."""
+"""Suffix of a workspace."""
 _LOCK, _NEW, _OLD, _OWNED = "lock", "new", "old", "owned.json"
-# Between two attempts at a lock that is waited for [s]: short beside any work worth a lock.
+# Time between two attempts at a lock [s]: short compared with any work under a lock.
 _POLL = 0.05
 
 
 class InTheWayError(FileExistsError, ValueError):
-    """Something is at the path that may not be replaced."""
+    """The path is taken by something that may not be replaced."""
 
 
 class BusyError(FileExistsError):
-    """Another process is writing there."""
+    """Another process is writing to the path."""
 
 
 class Claim:
-    """The sole right to write one file or folder, until it is released.
+    """Exclusive right to write one file or folder, until it is released.
 
     Attributes:
-        target: What is to be written, symbolic links resolved.
-        new: Where it takes shape.
-        mended: What an interrupted writer had left and what became of it, in words.
+        target: Path to be written, symbolic links resolved.
+        workspace: Folder next to the target.
+        new: Place of the new content in the workspace.
+        mended: Actions taken on the leftovers of an interrupted writer, in words.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, wait: bool = False):
-        """Take the lock, and mend what a killed process has left.
+        """Take the lock, and complete or remove the leftovers of a killed process.
 
         Args:
-            path: What is to be written; its folder must exist.
+            path: Path to be written; its folder must exist.
             wait: Wait for another writer to end instead of raising.
 
         Raises:
-            BusyError: Another process is writing there.
-            FileNotFoundError: Its folder does not exist.
-            InTheWayError: The workspace's name is taken by a folder of other origin.
+            BusyError: Another process is writing to the path.
+            FileNotFoundError: The folder of the path does not exist.
+            InTheWayError: A foreign folder has the name of the workspace.
         """
         self.target = resolved(path)
         if not self.target.parent.is_dir():
             raise FileNotFoundError(f"there is no folder {self.target.parent}")
         self.workspace = workspace_of(self.target)
         self.new = self.workspace / _NEW
-        # What is written inside another workspace is brought to disk with all that is in there.
+        # A workspace inside another one is synced to disk together with that one.
         self._sync = not any(_is_workspace(parent.name) for parent in self.target.parents)
         self._old = self.workspace / _OLD
         self._owned = self.workspace / _OWNED
@@ -85,38 +86,39 @@ class Claim:
         self.release()
 
     def release(self) -> None:
-        """Remove what was not committed, and let others write."""
+        """Remove uncommitted content, and let others write."""
         if self._lock.closed:
             return
         try:
             self.clear()
-            if os.name == "nt":  # which deletes no open file
+            if os.name == "nt":  # Windows deletes no open file
                 self._lock.close()
-            # While it is held: who has opened it meanwhile sees it gone, and begins anew.
+            # Deleted while held: a process that has opened it meanwhile notices and retries.
             (self.workspace / _LOCK).unlink(missing_ok=True)
         finally:
             self._lock.close()
-        with contextlib.suppress(OSError):  # another process is in it already
+        with contextlib.suppress(OSError):  # another process uses it already
             self.workspace.rmdir()
 
     def require_replaceable(
         self, kind: Kind, overwrite: bool, *, foreign: bool = False, adopt: bool = False
     ) -> None:
-        """Raise InTheWayError if there is something at the target that may not be replaced.
+        """Check that the target may be written.
 
         Args:
-            kind: What is to be written.
-            overwrite: Whether an older one may be replaced.
-            foreign: Whether that may hold files of other origin.
-            adopt: Of `owned_entries`.
+            kind: Kind of the new folder.
+            overwrite: Allow an older folder of this kind to be replaced.
+            foreign: Allow the older folder to hold foreign files.
+            adopt: As in `owned_entries`.
+
+        Raises:
+            InTheWayError: The target exists and may not be replaced.
         """
         path = self.target
         if not os.path.lexists(path):
             return
         if not overwrite:
-            raise InTheWayError(
-                f"{path} exists: choose another folder, or allow to overwrite it"
-            )
+            raise InTheWayError(f"{path} exists: choose another folder, or allow overwriting")
         owned = owned_entries(path, kind, adopt=adopt)
         if owned is None:
             raise InTheWayError(
@@ -128,11 +130,11 @@ class Claim:
             more = f" and {len(others) - 1} more" if len(others) > 1 else ""
             raise InTheWayError(
                 f"{path} holds more than a {kind.name}, {others[0]}{more}, which would be "
-                f"lost: move that elsewhere, or choose another folder"
+                f"lost: move it elsewhere, or choose another folder"
             )
 
     def commit_file(self, part: Path) -> None:
-        """Give a finished file in the workspace its name."""
+        """Move a finished file from the workspace to the target."""
         if self._sync:
             sync_file(part)
         os.replace(part, self.target)
@@ -142,28 +144,32 @@ class Claim:
     def commit(
         self, kind: Kind, overwrite: bool = False, *, keep: bool = False, source: str = ""
     ) -> None:
-        """Give the finished folder `new` its name.
+        """Move the finished folder `new` to the target.
 
         Args:
-            kind: What it is.
-            overwrite: Replace an older one.
-            keep: Carry files of other origin over from it.
-            source: Kept in the manifest, see `source_of`.
+            kind: Kind of the folder.
+            overwrite: Replace an older folder.
+            keep: Carry foreign files over from the older folder.
+            source: Source kept in the manifest, see `source_of`.
+
+        Raises:
+            FileNotFoundError: Nothing was written.
+            InTheWayError: The target exists and may not be replaced.
         """
         if not self.new.is_dir():
             raise FileNotFoundError(f"nothing was written for {self.target}")
         try:
-            # Files that were put there since the work began are kept aside in the end.
+            # Files added to the target meanwhile are set aside in the end.
             self.require_replaceable(kind, overwrite, foreign=True, adopt=keep)
         except InTheWayError as error:
-            error.add_note(f"What was written is in {self.set_aside(self.new, 'new')}.")
+            error.add_note(f"The new content is in {self.set_aside(self.new, 'new')}.")
             raise
         replaces, owned = os.path.lexists(self.target), set()
         if kind.manifest:
             write_manifest(self.new, kind, source)
         if replaces:
             owned = owned_entries(self.target, kind, adopt=keep) or set()
-            if keep:  # after the manifest: they are not ours in the new one either
+            if keep:  # after the manifest: carried files are foreign in the new folder too
                 owned |= carry_over(entries(self.target) - owned, self.target, self.new)
         if replaces:
             dump_json(self._owned, sorted(owned))
@@ -180,15 +186,15 @@ class Claim:
         self.clear()
 
     def clear(self) -> list[str]:
-        """Finish or undo what is in the workspace, and leave only the lock there.
+        """Complete or undo a replacement, and leave only the lock in the workspace.
 
         Returns:
-            What was done, in words.
+            Actions taken, in words.
         """
         done = []
         name = self.target
         if os.path.lexists(self._old) and os.path.lexists(self.new):
-            if os.path.lexists(self.target):  # something took the name between the renames
+            if os.path.lexists(self.target):  # created by others between the renames
                 for place, word in ((self._old, "kept"), (self.new, "new")):
                     done.append(f"{self.set_aside(place, word)}: left from a replacement")
             else:
@@ -199,26 +205,26 @@ class Claim:
             delete_entries(self._old, listed if isinstance(listed, list) else [])
             if os.path.lexists(self._old):
                 kept = self.set_aside(self._old, "kept")
-                warnings.warn(f"{kept} is what {name} held besides results", stacklevel=2)
-                done.append(f"{kept}: held by {name} besides results")
+                warnings.warn(f"{kept} holds the foreign files of {name}", stacklevel=2)
+                done.append(f"{kept}: foreign files of {name}")
             else:
-                done.append(f"{name}: removed the one it replaced")
+                done.append(f"{name}: removed the replaced folder")
         rest = [place for place in self.workspace.iterdir() if place.name != _LOCK]
         for place in rest:
             delete(place)
         if any(place.name == _NEW for place in rest):
-            done.append(f"{name}: removed what was left unfinished")
+            done.append(f"{name}: removed unfinished content")
         return done
 
     def rename(self, source: Path, target: Path) -> None:
-        """Rename between workspace and the folder around it, and bring both to disk."""
+        """Rename between the workspace and its parent folder, and sync both to disk."""
         os.rename(source, target)
         if self._sync:
             sync_folder(self.target.parent)
             sync_folder(self.workspace)
 
     def set_aside(self, place: Path, word: str) -> Path:
-        """Give something in the workspace a visible name beside the target."""
+        """Give an entry of the workspace a visible name next to the target."""
         names = itertools.chain([word], (f"{word}-{n}" for n in itertools.count(2)))
         free = (self.target.with_name(f"{self.target.name}.{name}") for name in names)
         there = next(path for path in free if not os.path.lexists(path))
@@ -233,7 +239,7 @@ class Claim:
             try:
                 file = path.open("a+", encoding="utf-8")
             except FileNotFoundError:
-                continue  # its last writer has just removed the workspace
+                continue  # the last writer has just removed the workspace
             try:
                 if not try_lock(file):
                     if not wait:
@@ -252,7 +258,7 @@ class Claim:
 
 
 def resolved(path: str | os.PathLike[str]) -> Path:
-    """The absolute path that symbolic links lead to, whether something is there or not."""
+    """Absolute path without symbolic links; it need not exist."""
     return Path(path).resolve()
 
 
@@ -261,7 +267,7 @@ def _is_workspace(name: str) -> bool:
 
 
 def workspace_of(target: Path) -> Path:
-    """Where something is written until it is whole."""
+    """Workspace of a path."""
     if not target.name:
         raise InTheWayError(f"{target} cannot be written: name a file or a folder in it")
     return target.with_name(f".{target.name}{SUFFIX}")
@@ -274,22 +280,20 @@ def _require_ours(workspace: Path) -> None:
         return
     except NotADirectoryError:
         names = {"?"}
-    # Again, as another process may just have removed its lock and with it all of it.
+    # Checked again: another process may just have removed its lock and the workspace.
     if names and _LOCK not in names and os.path.lexists(workspace):
-        raise InTheWayError(
-            f"{workspace} is in the way, and not of hrc_learn: move it elsewhere"
-        )
+        raise InTheWayError(f"{workspace} is no workspace of hrc_learn: move it elsewhere")
 
 
 def recover(path: str | os.PathLike[str]) -> list[str]:
-    """Mend what interrupted writers left, of a path and of anything below it.
+    """Complete or remove the leftovers of interrupted writers, at a path and below it.
 
     Args:
-        path: What was being written, or a folder of such things. What is still being written
-            below it is left alone.
+        path: Path that was being written, or a folder of such paths. Paths below it that are
+            still being written are left alone.
 
     Returns:
-        What was done, in words.
+        Actions taken, in words.
 
     Raises:
         BusyError: `path` itself is being written.
@@ -297,18 +301,18 @@ def recover(path: str | os.PathLike[str]) -> list[str]:
     target = resolved(path)
     done = _recover_one(target) if _is_interrupted(target) else []
     for other in list(_interrupted_below(target)):
-        # In use, or of other origin, or not ours to write.
+        # In use, foreign, or not writable.
         with contextlib.suppress(FileExistsError, PermissionError):
             done += _recover_one(other)
     return done
 
 
 def settle(path: str | os.PathLike[str]) -> None:
-    """Finish an interrupted replacement that has left nothing at `path`, for who reads it."""
+    """Complete an interrupted replacement that left nothing at `path`, before it is read."""
     place = resolved(path)
     while not place.exists() and place != place.parent:
         if _is_interrupted(place):
-            # Who may not mend it, or comes while it is written, sees that nothing is there.
+            # Without write access, or while it is being written, nothing is there to read.
             with contextlib.suppress(OSError):
                 _recover_one(place)
         place = place.parent
@@ -326,5 +330,5 @@ def _is_interrupted(target: Path) -> bool:
 def _interrupted_below(folder: Path) -> Iterator[Path]:
     for place, folders, _ in os.walk(folder):
         for name in filter(_is_workspace, list(folders)):
-            folders.remove(name)  # what is in there goes with it
+            folders.remove(name)  # workspaces inside belong to this one
             yield Path(place) / name[1 : -len(SUFFIX)]

@@ -1,4 +1,4 @@
-"""Locks on files, and what lies in folders: listed, brought to disk, carried over, deleted."""
+"""Disk operations: file locks, listing, syncing, carrying over and deleting."""
 
 import contextlib
 import errno
@@ -12,7 +12,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, TextIO
 
-# Of file systems that have no locks, such as some network ones. Not every system has each.
+# Errors of file systems without locks, such as some network ones; not every OS has each.
 _NO_LOCKS = {
     getattr(errno, name)
     for name in ("ENOTSUP", "EOPNOTSUPP", "ENOSYS", "ENOLCK", "EINVAL")
@@ -21,12 +21,12 @@ _NO_LOCKS = {
 
 
 def try_lock(file: TextIO) -> bool:
-    """Lock an open file, unless another process has done so."""
+    """Lock an open file; False if another process holds the lock."""
     try:
         if os.name == "nt":
             import msvcrt
 
-            # One byte far behind the text: others must be able to read that.
+            # One byte far behind the text, which other processes must be able to read.
             file.seek(2**30)
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore
         else:
@@ -36,7 +36,7 @@ def try_lock(file: TextIO) -> bool:
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             return False
-        # The best there is then: to believe what the file says of its writer.
+        # Without locks, the process named in the file decides.
         file.seek(0)
         number = file.read().partition(" ")[0]
         return not (number.isdecimal() and is_alive(int(number)))
@@ -44,7 +44,7 @@ def try_lock(file: TextIO) -> bool:
 
 
 def sign(file: TextIO) -> None:
-    """Say in a locked file who holds it."""
+    """Write the process and host into its locked file."""
     file.seek(0)
     file.truncate()
     file.write(f"{os.getpid()} {socket.gethostname()}\n")
@@ -52,7 +52,7 @@ def sign(file: TextIO) -> None:
 
 
 def holder(path: Path) -> str:
-    """Who holds the lock on a file, in words."""
+    """Holder of the lock on a file, in words."""
     with contextlib.suppress(OSError):
         number, _, host = path.read_text(encoding="utf-8").strip().partition(" ")
         if number:
@@ -61,7 +61,7 @@ def holder(path: Path) -> str:
 
 
 def is_at(file: TextIO, path: Path) -> bool:
-    """Whether an open file still has that name."""
+    """True if an open file still has that name."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except FileNotFoundError:
@@ -69,9 +69,9 @@ def is_at(file: TextIO, path: Path) -> bool:
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process of this machine is running, as far as can be told."""
+    """True if a process of this machine may be running."""
     if os.name == "nt":
-        return True  # signal 0 is no question there: it would end the process
+        return True  # signal 0 would end the process on Windows
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -82,7 +82,7 @@ def is_alive(pid: int) -> bool:
 
 
 def entries(folder: Path) -> set[str]:
-    """Everything in a folder, by relative path with /; folders end in one, links are files."""
+    """Relative paths of all entries of a folder; folders end in "/", links count as files."""
     found = set()
     for place, folders, files in os.walk(folder):
         base = Path(place).relative_to(folder)
@@ -94,12 +94,12 @@ def entries(folder: Path) -> set[str]:
 
 
 def dump_json(path: Path, content: object) -> None:
-    """Write a file of JSON; what JSON does not know becomes text."""
+    """Write a JSON file; values unknown to JSON become text."""
     path.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
-    """Content of a file of JSON; None where there is none."""
+    """Content of a JSON file; None if there is none."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -107,7 +107,7 @@ def read_json(path: Path) -> Any:
 
 
 def sync_tree(folder: Path) -> None:
-    """Bring a folder and all that is in it to disk."""
+    """Sync a folder and its content to disk."""
     for place, _, files in os.walk(folder):
         for name in files:
             if not (Path(place) / name).is_symlink():
@@ -116,19 +116,19 @@ def sync_tree(folder: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Bring the contents of a file to disk."""
-    # Windows syncs only what is open for writing, others also what may not be written.
+    """Sync the content of a file to disk."""
+    # Windows syncs only files open for writing; other systems also read-only ones.
     with path.open("r+b" if os.name == "nt" else "rb") as file:
         os.fsync(file.fileno())
 
 
 def sync_folder(path: Path) -> None:
-    """Bring the names in a folder to disk, where the system can."""
+    """Sync the names in a folder to disk, if the system supports it."""
     if os.name == "nt":
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        # Some network file systems refuse, and keep names in order by themselves.
+        # Some network file systems refuse; they keep the order of names themselves.
         with contextlib.suppress(OSError):
             os.fsync(descriptor)
     finally:
@@ -136,13 +136,13 @@ def sync_folder(path: Path) -> None:
 
 
 def carry_over(names: Iterable[str], source: Path, target: Path) -> set[str]:
-    """Give entries of a folder a second name in another.
+    """Give entries of a folder a second name in another one.
 
     Returns:
-        Those that are there now: not a file whose name is taken by one of other content.
+        Entries carried over; a file whose name is taken by other content is not.
     """
     carried = set()
-    for entry in sorted(names):  # folders before what is in them
+    for entry in sorted(names):  # folders before their content
         here, there = source / entry, target / entry
         if entry.endswith("/"):
             there.mkdir(exist_ok=True, parents=True)
@@ -159,7 +159,7 @@ def carry_over(names: Iterable[str], source: Path, target: Path) -> set[str]:
 
 
 def delete(place: Path) -> None:
-    """Delete a file or folder, with all that is in it."""
+    """Delete a file, or a folder with its content."""
     if place.is_dir() and not place.is_symlink():
         shutil.rmtree(place)
     else:
@@ -167,10 +167,10 @@ def delete(place: Path) -> None:
 
 
 def delete_entries(folder: Path, names: Iterable[str]) -> None:
-    """Delete these entries of a folder, and the folder if nothing else is in it."""
-    # Only what is found in the folder: a list of another origin may say "../elsewhere".
-    for entry in sorted(entries(folder) & set(names), reverse=True):  # what is inside first
-        with contextlib.suppress(OSError):  # what cannot be deleted stays, and so is seen
+    """Delete entries of a folder, and the folder if it is empty then."""
+    # Only entries found in the folder: a foreign list may name "../elsewhere".
+    for entry in sorted(entries(folder) & set(names), reverse=True):  # content first
+        with contextlib.suppress(OSError):  # entries that cannot be deleted remain visible
             if entry.endswith("/"):
                 (folder / entry).rmdir()
             else:
@@ -180,14 +180,14 @@ def delete_entries(folder: Path, names: Iterable[str]) -> None:
 
 
 def delete_files(folder: Path, patterns: Iterable[str]) -> bool:
-    """Delete a folder of temporary files, but no file that does not look like one of them.
+    """Delete a folder of temporary files, but no other file in it.
 
     Args:
-        folder: Which.
-        patterns: Of relative paths with /; * matches / too.
+        folder: The folder.
+        patterns: Patterns of the temporary files' relative paths; * matches / too.
 
     Returns:
-        Whether the folder is gone.
+        True if the folder is gone.
     """
     patterns = tuple(patterns)
     delete_entries(
@@ -197,5 +197,5 @@ def delete_files(folder: Path, patterns: Iterable[str]) -> bool:
 
 
 def matches(entry: str, patterns: Iterable[str]) -> bool:
-    """Whether an entry is of one of these patterns."""
+    """True if an entry matches one of the patterns."""
     return any(fnmatchcase(entry, pattern) for pattern in patterns)

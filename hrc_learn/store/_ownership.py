@@ -1,4 +1,4 @@
-"""What of a folder was written here, and so may be deleted when another takes its name."""
+"""Ownership of files: those written by this package may be deleted with their folder."""
 
 import os
 from collections.abc import Mapping
@@ -9,25 +9,25 @@ from typing import Any
 from hrc_learn.store._disk import dump_json, entries, matches, read_json
 
 MADE_BY = "made_by.json"
-"""File in each folder of results: what it was made from."""
+"""File in each folder of results that records its inputs."""
 MANIFEST = ".manifest.json"
-"""File in a folder that lists all others."""
+"""File that lists all other files of a folder."""
 _FORMAT, _VERSION = "hrc_learn manifest", 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """A kind of folder that this package writes; only another of its kind may replace one."""
+    """Kind of folder that this package writes; only a folder of the same kind replaces it."""
 
     name: str
     mark: str
-    """File by which a folder without a manifest is known."""
+    """File that identifies a folder without a manifest."""
     says: tuple[str, str] | None = None
-    """Field and value that this file, of JSON, must hold; None: it need only be there."""
+    """Field and value that this JSON file must hold; None if its existence is enough."""
     files: tuple[str, ...]
-    """Patterns of the files that a folder without a manifest owns; * matches / too."""
+    """Patterns of the files owned by a folder without a manifest; * matches / too."""
     manifest: bool = True
-    """Whether such a folder gets a manifest; not where `files` is all that it can hold."""
+    """True if such a folder gets a manifest; not needed if it holds `files` only."""
 
 
 _MODEL_FILES = ("config.json", "model.safetensors")
@@ -60,7 +60,7 @@ DATASET = Kind(
         "videos/*/chunk-*/file-*.mp4",
     ),
 )
-# Files are those that programs wrote before there were manifests.
+# Files written by programs before there were manifests.
 RESULTS = Kind(
     name="folder of results",
     mark=MADE_BY,
@@ -79,29 +79,30 @@ RESULTS = Kind(
             for model in _MODELS
             for file in _MODEL_FILES
         ),
-        # A checkpoint of the policy.
+        # Checkpoint of a policy.
         *(*_MODEL_FILES, "policy_preprocessor*", "policy_postprocessor*"),
     ),
 )
 
 
 def owned_entries(folder: Path, kind: Kind, *, adopt: bool = False) -> set[str] | None:
-    """What of a folder its writer made, and so may be deleted with it.
+    """Entries of a folder that its writer made, and that may be deleted with it.
 
     Args:
-        folder: Of the kind, or not.
-        kind: What it should be.
-        adopt: Take the folder for one of the kind, and all files with the names of such a
-            one's for its own, whatever mark and manifest say.
+        folder: The folder.
+        kind: Expected kind.
+        adopt: Accept the folder as one of the kind, and all files with matching names as its
+            own, regardless of mark and manifest.
 
     Returns:
-        Relative paths with /, those of folders with one at the end; None: not of the kind.
+        Relative paths, those of folders with "/" at the end; None for a folder of another
+        kind.
     """
     if not folder.is_dir():
         return None
     present = entries(folder)
     if not present:
-        return set()  # nothing that could be lost
+        return set()  # nothing could be lost
     manifest = _read_manifest(folder)
     if manifest is not None and manifest.get("kind") != kind.name:
         return None
@@ -115,7 +116,7 @@ def owned_entries(folder: Path, kind: Kind, *, adopt: bool = False) -> set[str] 
 
 
 def write_manifest(folder: Path, kind: Kind, source: str) -> None:
-    """List what is in a folder, all of it ours."""
+    """Write the manifest of a folder, whose whole content was written here."""
     content = {
         "format": _FORMAT,
         "version": _VERSION,
@@ -127,7 +128,7 @@ def write_manifest(folder: Path, kind: Kind, source: str) -> None:
 
 
 def source_of(folder: str | os.PathLike[str]) -> str:
-    """What the writer of a folder gave as its source; empty where there is none."""
+    """Source given by the writer of a folder; "" if there is none."""
     return str((_read_manifest(Path(folder)) or {}).get("source", ""))
 
 
@@ -138,9 +139,9 @@ def _read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def _listed(folder: Path, manifest: Mapping[str, Any]) -> set[str]:
-    """What a manifest lists, and what those of the folders list that it lists.
+    """Entries of a manifest, and those of the manifests of the folders it lists.
 
-    A folder that somebody put into this one later is none of them, whatever its manifest says.
+    A foreign folder added later is not listed, whatever its own manifest says.
     """
     listed = {str(entry) for entry in manifest["entries"]} | {MANIFEST}
     for entry in [entry for entry in listed if entry.endswith("/")]:

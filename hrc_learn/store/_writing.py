@@ -1,4 +1,4 @@
-"""Writing files and folders that are whole or not there at all."""
+"""Writing of files and folders that are complete or absent."""
 
 import json
 import math
@@ -15,21 +15,21 @@ from hrc_learn.store._ownership import MADE_BY, RESULTS, Kind
 
 @contextmanager
 def new_file(path: str | os.PathLike[str] | Claim) -> Iterator[Path]:
-    """A place to write a file, which takes its name only when it is complete.
+    """Temporary place for a new file, which takes its name when it is complete.
 
     Args:
-        path: Where the file will be; replaces one that is there. Its folder must exist. Or the
-            claim to it, which is kept.
+        path: Path of the file, whose folder must exist, or the claim to it, which stays held.
+            An existing file is replaced.
 
     Yields:
-        The place to write to, of the same name.
+        Path to write to, with the same file name.
 
     Raises:
         BusyError: Another process is writing this file.
         InTheWayError: There is a folder of that name.
     """
     if not isinstance(path, Claim) and _is_device(path):
-        yield Path(path)  # such as /dev/stdout: there is nothing to replace
+        yield Path(path)  # such as /dev/stdout, which cannot be replaced
         return
     with _claimed(path) as claim:
         if claim.target.is_dir():
@@ -49,23 +49,23 @@ def replacing(
     others: Literal["refuse", "keep"] = "refuse",
     source: str = "",
 ) -> Iterator[Path]:
-    """A place to build a folder, which takes its name only when it is complete.
+    """Temporary place for a new folder, which takes its name when it is complete.
 
     Args:
-        path: Where the folder will be, or the claim to it, which is kept.
-        kind: What it is.
-        overwrite: Replace an older folder of the kind; any other is never touched.
-        others: What becomes of files of other origin in the older one. "refuse": it is not
-            replaced. "keep": they are carried over; the older one needs no mark then, and what
-            has the name of a file of the kind counts as one.
-        source: What it is made from, in a word, which `source_of` reads.
+        path: Path of the folder, or the claim to it, which stays held.
+        kind: Kind of the folder.
+        overwrite: Replace an older folder of the same kind; others are never touched.
+        others: Treatment of foreign files in the older folder: "refuse" does not replace it,
+            "keep" carries them over. With "keep" the older folder needs no mark, and files
+            with names of the kind count as its own.
+        source: Identifier of the source, for `source_of`.
 
     Yields:
-        A path beside `path` at which nothing is yet.
+        Path that does not exist yet.
 
     Raises:
         BusyError: Another process is writing this folder.
-        InTheWayError: There is something at `path` that may not be replaced.
+        InTheWayError: `path` exists and may not be replaced.
     """
     keep = others == "keep"
     if not isinstance(path, Claim):
@@ -80,19 +80,19 @@ def replacing(
 def new_folder(
     path: str | os.PathLike[str], made_by: Mapping[str, Any], overwrite: bool = False
 ) -> Iterator[Path]:
-    """A folder of results to fill, which takes its name only when it is complete.
+    """Temporary folder for results, which takes its name when it is complete.
 
     Args:
-        path: Where it will be.
-        made_by: What it is made from, kept inside as JSON; paths and the like as text.
+        path: Path of the folder.
+        made_by: Inputs of the results, kept inside as JSON; other values as text.
         overwrite: Replace an older folder of results.
 
     Yields:
-        The empty folder.
+        Empty folder.
 
     Raises:
         BusyError: Another process is writing this folder.
-        InTheWayError: There is something at `path` that may not be replaced.
+        InTheWayError: `path` exists and may not be replaced.
     """
     with replacing(path, RESULTS, overwrite) as folder:
         folder.mkdir()
@@ -101,17 +101,17 @@ def new_folder(
 
 
 def read_made_by(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a folder of results was made from.
+    """Inputs of a folder of results.
 
     Raises:
-        FileNotFoundError: It says nothing of that.
+        FileNotFoundError: The folder does not record its inputs.
     """
     settle(folder)
     return json.loads((Path(folder) / MADE_BY).read_text(encoding="utf-8"))
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file, UTF-8; its folder is made where missing."""
+    """Write a text file in UTF-8; its folder is created if missing."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with new_file(path) as part:
@@ -122,22 +122,22 @@ def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
     """Write measured values as one flat JSON object.
 
     Args:
-        path: File to write; its folder is made where missing.
-        values: Name -> number. Numbers that are not finite become null, as JSON has none.
+        path: File to write; its folder is created if missing.
+        values: Name -> number. Numbers that are not finite become null.
     """
     content = {name: _plain(value) for name, value in values.items()}
     write_text(path, json.dumps(content, indent=2) + "\n")
 
 
 def _plain(value: Any) -> float | int | bool | None:
-    # numpy's and torch's scalars come as their plain counterparts.
+    # Scalars of numpy and torch become Python numbers.
     plain = value.item() if hasattr(value, "item") else value
     return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 @contextmanager
 def _claimed(path: str | os.PathLike[str] | Claim) -> Iterator[Claim]:
-    """A claim for as long as it takes, or one that is there already."""
+    """A new claim for the duration of the context, or the given one, which stays held."""
     if not isinstance(path, Claim):
         with Claim(path) as claim:
             yield claim

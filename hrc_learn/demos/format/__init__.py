@@ -1,1 +1,1 @@
-"""What stands where in a LeRobot dataset."""
+"""Format of LeRobot datasets: metadata, files and videos."""

@@ -12,7 +12,7 @@ from hrc_learn.demos.read.profiles import ColumnProfile, EpisodeProfile, is_disc
 from hrc_learn.demos.read.quantities import meaning_of_component
 
 FEWEST = 3
-"""Fewest episodes among which one can be told from the rest."""
+"""Fewest episodes among which one can be compared with the others."""
 _IMPOSSIBLE = 1e12
 """Size that no sensor reports: flipped bits, or memory that was never written."""
 _IMPLAUSIBLE = 1e3

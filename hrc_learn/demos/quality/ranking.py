@@ -351,7 +351,7 @@ def density_clusters(
 ) -> Int64[np.ndarray, " points"]:
     """Clusters of close points by density (DBSCAN).
 
-    Points with enough neighbours are cores, cores within the radius share a cluster, and other
+    Points with enough neighbours are cores, cores within the radius form a cluster, and other
     points belong to the cluster of a core within the radius (Ester et al. 1996, "A
     density-based algorithm for discovering clusters").
 

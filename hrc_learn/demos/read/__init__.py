@@ -1,1 +1,1 @@
-"""From a dataset's columns to demonstrations in SI units."""
+"""Reading of datasets: from columns to demonstrations in SI units."""

@@ -97,7 +97,7 @@ class Contract:
     """Fingerprint of the data it was inferred from."""
 
     def rows(self) -> list[tuple[str, ...]]:
-        """The contract as a table with its header; similar neighbours share a row."""
+        """The contract as a table with its header; similar neighbours are one row."""
         rows = [("column", "role", "unit", "range", "sign", "delay", "sure", "evidence")]
         for group in self._groups():
             first, last = group[0], group[-1]

@@ -147,7 +147,7 @@ class OpenedDataset:
                 )
 
     def sample(self, most: int) -> Sequence[EpisodeEntry]:
-        """At most `most` episodes, spread evenly over the dataset."""
+        """Subset of `most` episodes, spread evenly over the dataset."""
         every = self.folder.episodes
         places = np.linspace(0, len(every) - 1, min(len(every), most))
         return [every[int(place)] for place in places]

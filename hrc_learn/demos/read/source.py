@@ -205,7 +205,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         return self.convert(episode)
 
     def spread(self, most: int) -> "DemonstrationSource":
-        """At most `most` demonstrations, spread evenly over the sequence and still unread."""
+        """Subset of `most` demonstrations, spread evenly over the sequence and still unread."""
         places = np.linspace(0, len(self) - 1, min(len(self), most)).astype(int)
         return self._part(self._entries[place] for place in places.tolist())
 
