@@ -20,6 +20,7 @@ from hostile_trials import (
     run_plant_trials,
     run_poison_trials,
 )
+from printed_estimator import PrintedEstimator
 from torch import Tensor
 
 from hrc_learn.experiments.metric_table import Metric
@@ -31,7 +32,6 @@ from hrc_learn.jacobian import (
     KalmanConfig,
     KalmanEstimator,
     PaperEstimator,
-    PrintedEstimator,
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
 )

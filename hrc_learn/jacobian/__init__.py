@@ -24,7 +24,6 @@ from hrc_learn.jacobian.learning_estimators import KalmanConfig as KalmanConfig
 from hrc_learn.jacobian.learning_estimators import KalmanEstimator as KalmanEstimator
 from hrc_learn.jacobian.learning_estimators import LeastSquaresConfig as LeastSquaresConfig
 from hrc_learn.jacobian.learning_estimators import PaperEstimator as PaperEstimator
-from hrc_learn.jacobian.learning_estimators import PrintedEstimator as PrintedEstimator
 from hrc_learn.jacobian.learning_estimators import (
     RecursiveLeastSquaresEstimator as RecursiveLeastSquaresEstimator,
 )
@@ -36,7 +35,6 @@ from hrc_learn.jacobian.model_selection import HeldOutSamples as HeldOutSamples
 from hrc_learn.jacobian.model_selection import cross_validate as cross_validate
 from hrc_learn.jacobian.model_selection import maximize_evidence as maximize_evidence
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian
-from hrc_learn.jacobian.network import nominal_network as nominal_network
 from hrc_learn.jacobian.network import stack_networks as stack_networks
 from hrc_learn.jacobian.perspective import MarkerCamera as MarkerCamera
 from hrc_learn.jacobian.perspective import depth_gradient as depth_gradient

@@ -1,9 +1,8 @@
-"""What a moved camera sees, told as if it had not been moved.
+"""Correction of the pixels of a moved camera to those of the camera before its motion.
 
-`CameraWatch` notices the motion; all frames since then tell it better and better. With it, the
-map from places to pixels is known again: that of the demonstrations, seen from elsewhere. The
-pixel of the tool's marker is corrected by where the tool is, that of an object by the plane on
-which the demonstrations found it.
+`CameraWatch` detects the motion; all frames since then refine its estimate. With the motion,
+the map from positions to pixels is known again. The pixel of the tool's marker is corrected by
+the tool pose, that of an object by the plane on which the demonstrations found objects.
 """
 
 from __future__ import annotations
@@ -25,28 +24,28 @@ from hrc_learn.jacobian.camera_motion import (
     refined_twist,
 )
 
+# Frames of the marker used for the motion estimate: half a minute at 20 Hz.
 _FRAMES = 600
-"""Of the marker from which a motion is found: half a minute at 20 a second."""
+# Frames needed to detect a motion. One, because wrong pixels soon guide the arm out of the
+# region of the demonstrations, where no motion can be detected.
 _FEWEST = 1
-"""Frames that tell a motion to begin with: until then what is seen leads the arm astray, soon
-to where no demonstration went and nothing can be told."""
+# Largest root mean square error [px] between object pixels and the positions of grasps: people
+# grasp an object some millimetres from its marker.
 _AGREEMENT = 10.0
-"""Root mean square [px] up to which pixels of objects and the places they were taken from are
-of the same camera: people grasp an object some millimetres from where its marker is."""
+# Gauss-Newton steps, enough for an offset of decimetres seen from a distance of one metre.
 _REFINEMENTS = 20
-"""Steps of Gauss and Newton for an offset of decimetres seen from a metre away."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectPlane:
-    """Where objects lie: a plane across the base's z axis, in the frame of a `MarkerCamera`.
+    """Horizontal plane on which objects lie, in the base frame of a `MarkerCamera`.
 
-    That frame is the base's but for what the demonstrations do not tell of the marker's place
-    on the tool, so a height that was measured is not this one.
+    That frame differs from the base frame by the part of the marker's position on the tool that
+    the demonstrations do not determine, so a measured height is not this one.
     """
 
     height: float
-    """[m]"""
+    """Height of the plane [m]."""
 
     @staticmethod
     def fit(
@@ -54,47 +53,47 @@ class ObjectPlane:
         places: Float[np.ndarray, "episodes 3"],
         pixels: Float[np.ndarray, "episodes 2"],
     ) -> ObjectPlane:
-        """Find it from where objects were seen and where the tool took them.
+        """Fit the plane to the pixels of objects and the positions of their grasps.
 
-        The objects are at one offset from the tool when it takes them, which leads the rays of
-        their pixels through them all.
+        All objects have the same offset from the tool when grasped, which is found by least
+        squares on the pixels.
 
         Args:
-            reference: The camera.
-            places: Of the tool in the base frame when it took the object [m]; four or more, in
-                different places.
-            pixels: Where the camera had seen the object (u, v) [px].
+            reference: Camera of the demonstrations.
+            places: Positions of the tool in the base frame at the grasp [m]; four or more
+                different ones.
+            pixels: Pixels of the objects (u, v) before the grasp [px].
 
         Raises:
-            ValueError: There are too few, or the pixels are not those of what was taken.
+            ValueError: There are too few demonstrations, or pixels and grasps do not agree.
         """
         if len(places) < 4:
             raise ValueError(
-                f"where objects lie takes four demonstrations or more, got {len(places)}."
+                f"the objects' plane needs four or more demonstrations, got {len(places)}."
             )
         camera = reference.camera
         offset, errors = np.zeros(3), pixels
         for _ in range(_REFINEMENTS):
             seen = camera.from_base(places + offset)
             errors = pixels - camera.project(seen)
-            # A camera that moves sees a point move the other way.
+            # Points move opposite to the camera.
             jacobian = -camera.motion_jacobian(seen)[..., 3:] @ camera.rotation_matrix
             step, *_ = np.linalg.lstsq(jacobian.reshape(-1, 3), errors.ravel(), rcond=None)
             offset = offset + step
         off = float(np.sqrt((errors**2).sum(-1).mean()))
         if not off <= _AGREEMENT:
             raise ValueError(
-                f"the object's pixels and the places it was taken from are {off:.0f} px apart: "
-                "they are of different things, or it was moved in between."
+                f"object pixels and grasp positions disagree by {off:.0f} px: they belong to "
+                "different objects, or the objects were moved in between."
             )
         return ObjectPlane(height=float((places + offset)[:, 2].mean()))
 
 
 class CameraCorrection:
-    """Follows a camera's motions, and undoes what they do to pixels.
+    """Estimates the motion of a camera and corrects pixels for it.
 
     Attributes:
-        motion: Of the camera from where it stood in the demonstrations; None while it is there.
+        motion: Motion of the camera since the demonstrations; None: no motion detected.
     """
 
     def __init__(self, reference: CameraReference):
@@ -105,20 +104,20 @@ class CameraCorrection:
         self._twist = np.zeros(6)
 
     def clear(self) -> None:
-        """Before another episode: the clock begins anew, the camera stays where it is."""
+        """Prepare for another episode: the clock restarts, the camera motion is kept."""
         self._watch.clear()
         known = () if self.motion is None else self._frames
-        # Frames of former episodes are older than any window.
+        # Frames of earlier episodes are older than any window.
         self._frames = deque(((-np.inf, f[1], f[2]) for f in known), maxlen=_FRAMES)
 
     def update(
         self, time: float, pose: Pose, pixel: Float[np.ndarray, "2"]
     ) -> CameraMotion | None:
-        """Take one frame in which the marker was found, as of `CameraWatch.update`.
+        """Add one frame in which the marker was found; arguments as for `CameraWatch.update`.
 
         Returns:
-            The camera's motion when it has been noticed with this frame: at first, and when
-            the camera was moved again.
+            The camera motion, if it is detected with this frame: the first one, and each
+            further one.
         """
         camera = self._reference.camera
         point = camera.points(Pose(pose.position.double(), pose.orientation.double()))
@@ -131,26 +130,26 @@ class CameraCorrection:
             self._forget(time)
             return None
         if noticed is None:
-            self._find(steps=1)  # from where the frame before has led
+            self._find(steps=1)  # starts from the estimate of the last frame
             return None
         self._watch.clear()
         if self.motion is not None and len(self._frames) < FEWEST_FRAMES:
             there = camera.project(point)
             if np.linalg.norm(pixel - there) < np.linalg.norm(corrected - there):
-                # A marker was wrong in the first frames: the camera stands where it stood.
+                # The marker was wrong in the first frames: the camera has not moved.
                 self.motion, self._twist = None, np.zeros(6)
                 self._frames.clear()
             else:
                 self._find()
             return None
         if self.motion is not None and self._find() <= self._reference.threshold:
-            return None  # it is known better now, that is all
+            return None  # a better estimate of the same motion
         self._forget(time)
         self._find()
         return self.motion
 
     def marker(self, pose: Pose, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """Where the camera would have seen the tool's marker from where it stood [px]."""
+        """Pixel of the tool's marker corrected for the camera motion [px]."""
         if self.motion is None:
             return pixel
         camera = self._reference.camera
@@ -161,7 +160,7 @@ class CameraCorrection:
     def object(
         self, plane: ObjectPlane, pixel: Float[np.ndarray, "2"]
     ) -> Float[np.ndarray, "2"]:
-        """Where it would have seen what lies on a plane [px]."""
+        """Pixel of a point on a plane corrected for the camera motion [px]."""
         if self.motion is None:
             return pixel
         camera = self._reference.camera
@@ -169,12 +168,12 @@ class CameraCorrection:
         return camera.project(camera.from_base(place))
 
     def _forget(self, time: float) -> None:
-        """What is older than the window in which a motion is noticed."""
+        """Drop frames older than the time window of the detection."""
         while self._frames and self._frames[0][0] < time - self._reference.window:
             self._frames.popleft()
 
     def _find(self, steps: int = 5) -> float:
-        """The motion that all frames tell; what it leaves of the last window, rms [px]."""
+        """Fit the motion to all frames; returns the error in the last window, rms [px]."""
         camera = self._reference.camera
         points, pixels = (np.array([f[i] for f in self._frames]) for i in (1, 2))
         self._twist = refined_twist(camera, points, pixels, self._twist, steps)

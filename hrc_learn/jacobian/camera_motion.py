@@ -1,13 +1,13 @@
-"""Notices that a camera was moved: the robot's own marker is not seen where it must be.
+"""Detection of camera motion: the robot's own marker is not seen where it should be.
 
-Demonstrations tell where a camera sees the marker of a tool at any pose of it (`MarkerCamera`).
-A camera that turned by w and moved by v sees it elsewhere, to first order by e = L (w, v) with
-the derivatives L of the pixel by the camera's twist (its interaction matrix). Over the last
-seconds, e is fitted by one such motion; how much of it that explains, as the root mean square
-over the frames, is compared with what the demonstrations themselves show at most when each of
-them is left out of the fit. Errors of calibration, lens and stamps are within that, and so do
-not raise an alarm. Where no demonstration went, nothing is known of these errors, and nothing
-is compared.
+A camera model fitted to demonstrations (`MarkerCamera`) predicts the pixel of the tool's marker
+at any tool pose. A camera that turned by w and moved by v sees the marker with the error e = L
+(w, v), to first order, where L is the interaction matrix: the derivative of the pixel by the
+camera twist. Over the last seconds, one such motion is fitted to e. Its explained displacement,
+the root mean square over the frames, is compared with the largest one in the demonstrations
+themselves, each held out of the fit. That threshold covers errors of calibration, lens and time
+stamps. Outside the region of the demonstrations these errors are unknown, and nothing is
+compared.
 """
 
 from __future__ import annotations
@@ -27,44 +27,44 @@ from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.perspective import MarkerCamera
 from hrc_learn.jacobian.samples import FOLDS, ImageDemonstration
 
+# Prior standard deviation of a motion [rad, m]: that of a tripod that was knocked. It resolves
+# rotations and translations that look alike in the image.
 _PLAUSIBLE = np.array([0.1] * 3 + [0.1] * 3)
-"""Prior standard deviation of a motion [rad, m]: settles which of a turn and a shift that look
-alike is meant, by taking both as likely for a tripod that was knocked."""
+# Largest motion in these standard deviations: beyond it, the camera would not see the table.
 _FARTHEST = 5.0
-"""Of these a camera has not moved by more: it would not see the table any longer."""
 FEWEST_FRAMES = 10
-"""Frames with the marker in view below which nothing is said."""
+"""Frames with a visible marker below which no motion is reported."""
+# Errors are clipped at this multiple of their median: a half-covered marker is off by pixels in
+# a frame or two, a moved camera in all frames.
 _OUTLIER = 3.0
-"""Errors count no more than so many medians of all in view: a marker half covered is off by
-pixels in a frame or two, a moved camera in all of them."""
+# Gauss-Newton steps: three are enough for ten degrees.
 _REFINEMENTS = 5
-"""Steps of Gauss and Newton: three are enough for ten degrees."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMotion:
-    """How a camera moved from where it stood during the demonstrations."""
+    """Motion of a camera since the demonstrations."""
 
     rotation: tuple[float, float, float]
     """Rotation vector about the camera's axes (x right, y down, z along the view) [rad]."""
     translation: tuple[float, float, float]
-    """Along the same axes [m]."""
+    """Translation along the same axes [m]."""
     displacement: float
-    """Root mean square over the frames of what it explains in the image [px]."""
+    """Explained displacement in the image, root mean square over the frames [px]."""
 
     @property
     def angle(self) -> float:
-        """[rad]"""
+        """Angle of the rotation [rad]."""
         return float(np.linalg.norm(self.rotation))
 
     @property
     def distance(self) -> float:
-        """[m]"""
+        """Length of the translation [m]."""
         return float(np.linalg.norm(self.translation))
 
     @property
     def twist(self) -> Float[np.ndarray, "6"]:
-        """As `MarkerCamera.moved` takes it [rad, m]."""
+        """Rotation vector and translation, as for `MarkerCamera.moved` [rad, m]."""
         return np.array([*self.rotation, *self.translation])
 
     def __str__(self) -> str:
@@ -76,21 +76,21 @@ class CameraMotion:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraReference:
-    """A camera as the demonstrations saw it, and how exactly they tell."""
+    """A camera as seen in demonstrations, and the threshold for its motion."""
 
     camera: MarkerCamera
-    """Fitted to all of them."""
+    """Camera fitted to all demonstrations."""
     threshold: float
-    """Displacement beyond which the camera was moved [px]."""
+    """Displacement above which the camera has moved [px]."""
     window: float
-    """Over which the threshold was measured [s]."""
+    """Time window of the threshold [s]."""
     lower: tuple[float, float, float]
-    """Corner of the box in which demonstrations showed the marker, in the camera frame [m]."""
+    """Lower corner of the box of demonstrated marker positions, in the camera frame [m]."""
     upper: tuple[float, float, float]
-    """The opposite one."""
+    """Upper corner of that box [m]."""
 
     def covers(self, point: Float[np.ndarray, "3"]) -> bool:
-        """Whether demonstrations showed the marker at or around a point of the camera frame."""
+        """True if a point of the camera frame is within the box of the demonstrations."""
         return bool(((point >= self.lower) & (point <= self.upper)).all())
 
     @staticmethod
@@ -102,18 +102,19 @@ class CameraReference:
         window: float = 1.0,
         margin: float = 2.5,
     ) -> CameraReference:
-        """Learn where the marker must be seen, and how far off it is without any motion.
+        """Learn the camera and the largest displacement without any motion.
 
         Args:
-            demonstrations: Of one camera that stood still, two or more; read several times.
-            fps: Of their frames [1/s].
-            image_size: Width and height [px].
-            window: Time over which a motion is looked for [s]; half of it passes, on the
-                average, before a small one counts in full.
-            margin: Threshold over the largest displacement in demonstrations held out.
+            demonstrations: Two or more demonstrations with one fixed camera; read several
+                times.
+            fps: Frame rate [1/s].
+            image_size: Width and height of the image [px].
+            window: Time window for a motion [s]. A small motion counts in full after half of
+                it, on average.
+            margin: Threshold relative to the largest displacement in held-out demonstrations.
 
         Raises:
-            ValueError: Fewer than two demonstrations, or the marker is hardly seen in them.
+            ValueError: There are fewer than two demonstrations, or they hardly show the marker.
         """
         if len(demonstrations) < 2:
             raise ValueError(
@@ -135,35 +136,34 @@ class CameraReference:
                 largest = max(largest, _largest_displacement(watch, demo, fps))
         if not largest:
             raise ValueError(
-                f"the marker is never seen in {FEWEST_FRAMES} frames within {window} s of a "
-                "demonstration: there is nothing to compare with."
+                f"no demonstration shows the marker {FEWEST_FRAMES} times within {window} s: "
+                "record some in which the camera sees the marker."
             )
         camera = _camera_of(demonstrations, image_size)
         return _reference(camera, demonstrations, margin * largest, window)
 
     def content(self) -> dict[str, Any]:
-        """As JSON takes it."""
+        """The fields as JSON values."""
         return asdict(self)
 
     @staticmethod
     def from_content(content: dict[str, Any]) -> CameraReference:
-        """Of what `content` returned, as JSON gave it back.
+        """Reference from the fields returned by `content`.
 
         Raises:
-            ValueError: A field is missing or of another kind.
+            ValueError: A field is missing or has a wrong type.
         """
         try:
             camera = MarkerCamera(**_numbers(content["camera"]))
             return CameraReference(**{**_numbers({**content, "camera": 0.0}), "camera": camera})
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
-                "a camera's reference has camera, threshold, window, lower and upper, this one "
-                f"not: {error}."
+                f"a camera reference needs camera, threshold, window, lower and upper: {error}."
             ) from error
 
 
 def _numbers(content: dict[str, Any]) -> dict[str, Any]:
-    """With tuples where JSON has lists."""
+    """The fields as floats, with tuples for JSON lists."""
     return {
         name: tuple(map(float, value)) if isinstance(value, list | tuple) else float(value)
         for name, value in content.items()
@@ -192,20 +192,20 @@ class _Frame(NamedTuple):
 
 
 class CameraWatch:
-    """Compares frame by frame where a marker is seen with where it must be.
+    """Compares the seen pixel of a marker with the predicted one, frame by frame.
 
     Attributes:
-        reference: What is compared with.
-        displacement: Of the last seconds [px]; 0 while too little is seen.
+        reference: Camera of the demonstrations.
+        displacement: Explained displacement of the last seconds [px]; 0 with too few frames.
     """
 
     def __init__(self, reference: CameraReference, fewest: int = FEWEST_FRAMES):
-        """Compare with a camera that stands still.
+        """Start with a camera at its place.
 
         Args:
-            reference: Of the demonstrations.
-            fewest: Frames from which on a motion is told; of less than 10, the fewer the larger
-                it must be.
+            reference: Camera of the demonstrations.
+            fewest: Number of frames needed to report a motion. Below 10, the threshold grows as
+                frames are missing.
         """
         self.reference = reference
         self.displacement = 0.0
@@ -213,51 +213,44 @@ class CameraWatch:
         self._frames: deque[_Frame] = deque()
 
     def clear(self) -> None:
-        """Forget what was seen: before another episode, or after a pause."""
+        """Forget all frames: before another episode, or after a pause."""
         self.displacement = 0.0
         self._frames.clear()
 
     def update(
         self, time: float, pose: Pose, pixel: Float[np.ndarray, "2"]
     ) -> CameraMotion | None:
-        """Take one frame in which the marker was found.
+        """Add one frame in which the marker was found.
 
-        It does not count where the tool is outside the region of the demonstrations.
+        Frames outside the region of the demonstrations are ignored.
 
         Args:
-            time: Of the image [s], later than the frame's before.
-            pose: Of the tool at that time, unbatched.
-            pixel: Where the marker was seen [px].
+            time: Time of the image [s], later than that of the last frame.
+            pose: Pose of the tool at that time, unbatched.
+            pixel: Pixel of the marker [px].
 
         Returns:
-            The motion since the demonstrations where it is larger than the threshold.
+            The motion since the demonstrations, if it exceeds the threshold.
 
         Raises:
-            ValueError: Time or pixel are not finite, or time does not go on.
+            ValueError: Time or pixel are not finite, or time does not increase.
         """
         if not (np.isfinite(time) and np.isfinite(pixel).all()):
             raise ValueError(
-                f"time and pixel must be finite, got {time} and {pixel}: leave frames out in "
-                "which the marker was not found."
+                f"time and pixel must be finite, got {time} and {pixel}: leave out frames "
+                "without the marker."
             )
         frames = self._frames
         if frames and not time > frames[-1].time:
             raise ValueError(
-                f"time must go on, but {time} follows {frames[-1].time}: call clear() between "
-                "episodes."
+                f"time must increase, but {time} follows {frames[-1].time}: call clear() "
+                "between episodes."
             )
         camera = self.reference.camera
         point = camera.points(_double(pose))
         if self.reference.covers(point):
-            frames.append(
-                _Frame(
-                    time,
-                    point,
-                    pixel,
-                    pixel - camera.project(point),
-                    camera.motion_jacobian(point),
-                )
-            )
+            error, L = pixel - camera.project(point), camera.motion_jacobian(point)
+            frames.append(_Frame(time, point, pixel, error, L))
         while frames and frames[0].time < time - self.reference.window:
             frames.popleft()
         if len(frames) < self._fewest:
@@ -274,12 +267,12 @@ class CameraWatch:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPlacement:
-    """Episodes during which a camera stood still at one place."""
+    """Episodes with the camera at one place."""
 
     episodes: tuple[int, ...]
     """Indices into the demonstrations."""
     motion: CameraMotion
-    """From the first placement."""
+    """Motion from the first placement."""
 
 
 def camera_placements(
@@ -288,21 +281,22 @@ def camera_placements(
     *,
     margin: float = 6.0,
 ) -> list[CameraPlacement]:
-    """Where the camera stood in which episodes, in the order of their recording.
+    """Camera placements of a data set, in the order of recording.
 
-    Camera and marker are found from all episodes together, the camera's motion for each. An
-    episode belongs to the first placement that it differs from by less than `margin` times what
-    neighbouring episodes differ by in the median. A camera that was moved before every second
-    episode or more often is not noticed.
+    Camera and marker are fitted to all episodes together, and the camera's motion to each
+    episode. An episode joins the first placement from which it differs by less than `margin`
+    times the median difference of neighbouring episodes. A camera that was moved every second
+    episode, or more often, is not detected.
 
     Args:
-        demonstrations: In the order of recording; in memory, they are read several times.
-        image_size: Width and height [px].
-        margin: See above.
+        demonstrations: Demonstrations in the order of recording; in memory, as they are read
+            several times.
+        image_size: Width and height of the image [px].
+        margin: Multiple of the median difference.
 
     Returns:
-        One placement where the camera stood still. Episodes in which the marker is hardly seen
-        are in none.
+        One placement if the camera never moved. Episodes that hardly show the marker are in
+        none.
     """
     seen = {
         index: frames
@@ -312,17 +306,7 @@ def camera_placements(
     if len(seen) < 2:
         return []
     chosen = [demonstrations[index] for index in seen]
-    unmoved, twists = chosen, np.zeros((len(chosen), 6))
-    camera = _camera_of(chosen, image_size)
-    for _ in range(_REFINEMENTS):
-        views = [(camera.points(pose), pixel) for pose, pixel in map(_seen, chosen)]
-        twists = np.array([refined_twist(camera, *view, np.zeros(6)) for view in views])
-        # The camera of all stays where the typical episode sees it from.
-        twists -= np.median(twists, axis=0)
-        unmoved = [
-            _as_unmoved(demo, camera, twist) for demo, twist in zip(chosen, twists, strict=True)
-        ]
-        camera = _camera_of(unmoved, image_size)
+    camera, twists = _camera_of_episodes(chosen, image_size)
     jacobians = [camera.motion_jacobian(camera.points(_seen(demo)[0])) for demo in chosen]
 
     def apart(first: int, second: int) -> float:
@@ -354,6 +338,24 @@ def camera_placements(
     ]
 
 
+def _camera_of_episodes(
+    demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
+) -> tuple[MarkerCamera, Float[np.ndarray, "episodes 6"]]:
+    """Camera of the median episode, and its motion from there in each episode."""
+    unmoved, twists = demonstrations, np.zeros((len(demonstrations), 6))
+    camera = _camera_of(demonstrations, image_size)
+    for _ in range(_REFINEMENTS):
+        views = [(camera.points(pose), pixel) for pose, pixel in map(_seen, demonstrations)]
+        twists = np.array([refined_twist(camera, *view, np.zeros(6)) for view in views])
+        twists -= np.median(twists, axis=0)
+        unmoved = [
+            _as_unmoved(demo, camera, twist)
+            for demo, twist in zip(demonstrations, twists, strict=True)
+        ]
+        camera = _camera_of(unmoved, image_size)
+    return camera, twists
+
+
 def _camera_of(
     demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
 ) -> MarkerCamera:
@@ -363,6 +365,7 @@ def _camera_of(
 
 
 def _largest_displacement(watch: CameraWatch, demo: ImageDemonstration, fps: float) -> float:
+    """Largest displacement that a camera watch sees in a demonstration [px]."""
     watch.clear()
     largest = 0.0
     for frame in demo.visible.nonzero()[:, 0].tolist():
@@ -372,7 +375,7 @@ def _largest_displacement(watch: CameraWatch, demo: ImageDemonstration, fps: flo
 
 
 def _seen(demo: ImageDemonstration) -> tuple[Pose, Float[np.ndarray, "_frames 2"]]:
-    """Poses and pixels of the frames in which the marker was found."""
+    """Poses and pixels of the frames with a visible marker."""
     pose = Pose(demo.pose.position[demo.visible], demo.pose.orientation[demo.visible])
     return _double(pose), demo.feature[demo.visible].double().numpy()
 
@@ -386,12 +389,12 @@ def _explained(
     jacobians: Float[np.ndarray, "frames 2 6"],
     already: Float[np.ndarray, "6"] | None = None,
 ) -> tuple[Float[np.ndarray, "6"], float]:
-    """The motion that explains the errors best, and how much of them, rms [px].
+    """Most plausible motion for the errors, and the displacement it explains, rms [px].
 
-    Of a camera that has moved by `already`, all of which is to be plausible.
+    `already` is the motion applied so far, which the prior includes.
     """
     size = np.linalg.norm(errors, axis=-1)
-    # At least a tenth of a pixel, so that exact images are not all outliers.
+    # At least a tenth of a pixel, so that not all frames of exact images are outliers.
     most = max(_OUTLIER * float(np.median(size)), 0.1)
     errors = errors * np.minimum(1.0, most / np.maximum(size, most))[:, None]
     scaled = jacobians * _PLAUSIBLE
@@ -410,7 +413,7 @@ def refined_twist(
     twist: Float[np.ndarray, "6"],
     steps: int = _REFINEMENTS,
 ) -> Float[np.ndarray, "6"]:
-    """The motion [rad, m] by Gauss-Newton, also where it is large."""
+    """Camera motion [rad, m] by Gauss-Newton, also for large motions."""
     for _ in range(steps):
         seen = from_moved(points, twist)
         errors = pixels - camera.project(seen)
@@ -420,7 +423,7 @@ def refined_twist(
         both = quaternion.log(quaternion.multiply(turn[0], turn[1])).numpy()
         shift = quaternion.rotate(turn[0], torch.from_numpy(step[3:])).numpy()
         twist = np.concatenate([both, twist[3:] + shift])
-        # Two frames that contradict each other would lead to where both are behind the camera.
+        # Two contradictory frames would place both points behind the camera.
         twist = twist * min(1.0, _FARTHEST / float(np.linalg.norm(twist / _PLAUSIBLE)))
     return twist
 
@@ -436,7 +439,7 @@ def from_moved(
 def _as_unmoved(
     demo: ImageDemonstration, camera: MarkerCamera, twist: Float[np.ndarray, "6"]
 ) -> ImageDemonstration:
-    """What the camera would have seen had it not moved."""
+    """The demonstration as seen by the camera before its motion."""
     points = camera.points(_double(demo.pose))
     change = camera.project(from_moved(points, twist)) - camera.project(points)
     return replace(demo, feature=demo.feature.double() - torch.from_numpy(change))
@@ -445,6 +448,7 @@ def _as_unmoved(
 def motion_of(
     twist: Float[np.ndarray, "6"], points: Float[np.ndarray, "frames 3"], camera: MarkerCamera
 ) -> CameraMotion:
+    """Camera motion of a twist, with its displacement of points in the image."""
     turn, shift = twist[:3].tolist(), twist[3:].tolist()
     return CameraMotion(
         rotation=(turn[0], turn[1], turn[2]),

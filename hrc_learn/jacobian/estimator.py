@@ -1,7 +1,8 @@
-"""The interface of online estimators of the image Jacobian, and what most of them share.
+"""The interface of online estimators of the image Jacobian, and their common part.
 
-`FixedEstimator` never changes it. Those that learn compare key frames: pairs of poses and
-images far enough apart to tell motion from noise, which `KeyFrameEstimator` finds online.
+`FixedEstimator` never changes the Jacobian. Learning estimators compare key frames: pairs of
+poses and images far enough apart to distinguish motion from noise, which `KeyFrameEstimator`
+selects online.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from hrc_learn.pytree import pytree
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """One control step as an estimator sees it."""
+    """Measurement of one control step."""
 
     pose: Pose
-    """Of the tool when the image was taken."""
+    """Pose of the tool when the image was taken."""
     feature: Float[Tensor, "*batch rows"]
-    """Image feature [px], u and v of one point or of several in turn; anything, also NaN,
+    """Image feature [px], u and v of one point or of several in turn; any value, also NaN,
     where not `valid`."""
     valid: Bool[Tensor, "*batch"]
-    """Whether the feature is visible and stems from an image not used before."""
+    """True if the feature is visible and from an image not used before."""
     dt: float | Float[Tensor, ""]
-    """Time since the step before [s]."""
+    """Time since the last step [s]."""
     xi_x: Float[Tensor, "*batch rows"]
     """Vision feedback of the controller."""
     xi_r: Float[Tensor, "*batch 6"]
@@ -45,7 +46,7 @@ class Measurement:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class WeightState:
-    """State of an estimator that remembers nothing but the weights."""
+    """State of an estimator that consists of the weights alone."""
 
     weight: Float[Tensor, "*batch entries K"]
     """W [px/m, px/rad], one matrix for each element of the batch."""
@@ -54,9 +55,8 @@ class WeightState:
 class ImageJacobianEstimator(nn.Module, ABC):
     """Adapts the weights of a network while the robot moves.
 
-    Pure: `update` takes a state and returns a new one, so that thousands of robots adapt in
-    one batch. The network supplies the neurons and the weights to start from; it is not
-    changed.
+    `update` is pure: it takes a state and returns a new one, so thousands of robots adapt in
+    one batch. The network supplies the neurons and the initial weights; it is not changed.
     """
 
     def __init__(self, network: RBFImageJacobian):
@@ -67,7 +67,7 @@ class ImageJacobianEstimator(nn.Module, ABC):
     def initial_state(self, *batch: int) -> Any:
         """State before the first step, for a batch of robots.
 
-        Its tensors are of the dtype and device of the network.
+        Its tensors have the dtype and device of the network.
         """
 
     @abstractmethod
@@ -75,35 +75,35 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """State after one control step."""
 
     def restored(self, state: Any) -> Any:
-        """The state, as at the start where it is not of numbers."""
+        """The state, reset where it is not finite."""
         known = all_numbers(state.weight)
         initial = self.network.weight.detach()
         return replace(state, weight=torch.where(known, state.weight, initial))
 
     def resumed(self, state: Any, pause: float) -> Any:
-        """State after a pause in which nobody watched.
+        """State after a pause without images.
 
-        What was seen before it must not be compared with what is seen after it: meanwhile the
-        camera may have been moved.
+        Frames before and after the pause must not be compared: the camera may have been moved
+        meanwhile.
 
         Args:
-            state: At the end of the watching before.
-            pause: [s]
+            state: State before the pause.
+            pause: Duration of the pause [s].
         """
         return state
 
     def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
-        """State that has learned from two frames which the caller chose.
+        """State after learning from two frames chosen by the caller.
 
-        Neighbouring pairs of a motion have the noise of the frame between them in common, of
-        which a filter knows nothing. Means over many images at rest at both ends, one pair,
-        tell more than all pairs of the motion.
+        Neighbouring pairs of a motion share the noise of the frame between them, which a filter
+        does not model. One pair of means over many images, at rest at both ends, is more
+        informative than all pairs of the motion.
 
         Args:
-            state: Before.
-            before: First frame; what perspective adds to the way between both is taken off.
-            now: Second frame, at which the Jacobian is learned; its `dt` should be 0 where
-                time passed in `update`.
+            state: State before.
+            before: First frame, its feature corrected for perspective.
+            now: Second frame, at which the Jacobian is learned; its `dt` should be 0 if that
+                time has already passed in `update`.
         """
         return state
 
@@ -113,31 +113,31 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """J_s_hat at a pose with the weights of a state.
 
         Args:
-            state: Of this estimator.
+            state: State of this estimator.
             r: Position [m] and rotation vector [rad], or a pose.
         """
         return evaluate(state.weight, self.network.basis(r))
 
     def initial_weight(self, *batch: int) -> Float[Tensor, "*batch entries K"]:
-        """The network's weights, once for each element of a batch."""
+        """The network's weights, repeated for each element of a batch."""
         weight = self.network.weight.detach()
         return weight.expand(*batch, *weight.shape).clone()
 
 
 def all_numbers(matrix: Float[Tensor, "*batch rows columns"]) -> Bool[Tensor, "*batch 1 1"]:
-    """Whether all entries are numbers."""
+    """True where all entries are finite."""
     return is_number(matrix).all(-1, keepdim=True).all(-2, keepdim=True)
 
 
 def evaluate(
     weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
 ) -> Float[Tensor, "*batch rows 6"]:
-    """J_s_hat from vec(J_s_hat^T) = W theta."""
+    """J_s_hat from  vec(J_s_hat^T) = W theta."""
     return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 6))
 
 
 class FixedEstimator(ImageJacobianEstimator):
-    """Keeps the network's weights: what every other estimator is measured against."""
+    """Keeps the network's weights: the baseline for all other estimators."""
 
     def initial_state(self, *batch: int) -> WeightState:
         """The network's weights."""
@@ -151,20 +151,20 @@ class FixedEstimator(ImageJacobianEstimator):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class KeyFrame:
-    """The frame that the next one will be compared with."""
+    """Frame with which the next one is compared."""
 
     pose: Pose
-    """Of the tool."""
+    """Pose of the tool."""
     feature: Float[Tensor, "*batch rows"]
-    """Where the feature was [px]."""
+    """Feature at that pose [px]."""
     theta: Float[Tensor, "*batch K"]
     """Neurons at the pose."""
     present: Bool[Tensor, "*batch"]
-    """False until the feature was seen for the first time."""
+    """False until the feature is first seen."""
 
     @staticmethod
     def absent(network: RBFImageJacobian, *batch: int) -> KeyFrame:
-        """Before anything was seen."""
+        """Key frame before the first image."""
         like = network.centers
         upright = like.new_tensor([1.0, 0, 0, 0]).expand(*batch, 4).clone()
         return KeyFrame(
@@ -178,7 +178,7 @@ class KeyFrame:
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class KeyFrameState:
-    """Weights and the frame that the next one is compared with."""
+    """Weights, and the frame with which the next one is compared."""
 
     weight: Float[Tensor, "*batch entries K"]
     """W [px/m, px/rad]."""
@@ -188,27 +188,27 @@ class KeyFrameState:
 
 @dataclass(frozen=True, kw_only=True)
 class LearningConfig(KeyFrameConfig):
-    """What all estimators that learn from key frames have to be told."""
+    """Settings of all estimators that learn from key frames."""
 
     weight_bound: float = 2e4
-    """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
+    """Largest entry of the weights [px/m], rotation scaled with `rotation_scale`."""
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class MotionSample:
-    """Motion from the key frame to now; zero where there is none to learn from."""
+    """Motion from the key frame to the present one; zero without a valid pair."""
 
     twist: Float[Tensor, "*batch 6"]
     """Motion of the tool, linear [m] and angular [rad]."""
     dr: Float[Tensor, "*batch 6"]
-    """The same with rotation counted in metres [m]."""
+    """Motion of the tool with rotation scaled to metres [m]."""
     dx: Float[Tensor, "*batch rows"]
     """Motion of the feature [px]."""
     theta: Float[Tensor, "*batch K"]
-    """Neurons half-way: the mean of both ends."""
+    """Neurons half-way, as the mean of both ends."""
     valid: Bool[Tensor, "*batch"]
-    """Whether there is a pair."""
+    """True where there is a pair to learn from."""
 
     def error(self, weight: Float[Tensor, "*batch entries K"]) -> Float[Tensor, "*batch rows"]:
         """Prediction error dx - J_s_hat dr [px]."""
@@ -217,12 +217,12 @@ class MotionSample:
 
 
 class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
-    """An estimator that learns from pairs of key frames."""
+    """Base of estimators that learn from pairs of key frames."""
 
     config: Config
 
     scale: Tensor
-    """Metres that each component of a twist counts for, (6,)."""
+    """Metres per unit of each component of a twist, (6,)."""
 
     bound: Tensor
     """Largest absolute value of each entry of the weights, (entries, 1)."""
@@ -232,7 +232,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
 
         Args:
             network: Neurons and initial weights.
-            config: Choice of key frames, and what the estimator needs besides.
+            config: Choice of key frames, and settings of the estimator.
         """
         super().__init__(network)
         self.config = config
@@ -244,14 +244,14 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
     def projected(
         self, weight: Float[Tensor, "*batch entries K"]
     ) -> Float[Tensor, "*batch entries K"]:
-        """Weights brought back within their bound, whatever was measured.
+        """Weights clamped to their bound.
 
-        A projection on a convex set takes no estimate further from a truth inside the set.
+        The projection on a convex set never moves an estimate away from a truth inside it.
         """
         return weight.clamp(-self.bound, self.bound)
 
     def restored(self, state: Any) -> Any:
-        """Weights and key frame as at the start where they are not of numbers."""
+        """The state with weights and key frame reset where they are not finite."""
         state = super().restored(state)
         key, batch = state.key, state.weight.shape[:-2]
         pose = key.pose
@@ -273,7 +273,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         return replace(state, key=KeyFrame.absent(self.network, *batch))
 
     def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
-        """One more pair; the key frame stays."""
+        """State after one more pair; the key frame stays."""
         first = KeyFrame(
             pose=before.pose,
             feature=before.feature,
@@ -289,14 +289,14 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         measurement: Measurement,
         theta: Float[Tensor, "*batch K"],
     ) -> tuple[KeyFrame, MotionSample]:
-        """Compare with the key frame; move it here once the tool is `min_step` away.
+        """Compare with the key frame, and move it here once the tool is `min_step` away.
 
-        Where the tool has meanwhile moved further than `max_step`, as after a loss of the
-        feature, the key frame moves without a pair.
+        Where the tool has moved further than `max_step`, for example while the feature was
+        lost, the key frame moves without a pair.
 
         Args:
-            key: Key frame before.
-            measurement: Now.
+            key: Last key frame.
+            measurement: Present measurement.
             theta: Neurons at the pose of the measurement.
         """
         config = self.config
@@ -304,7 +304,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
         moved = measurement.valid & key.present & (distance >= config.least_step)
         valid = moved & (distance <= config.max_step)
-        # What is not valid may be NaN: zero instead, which leaves every weight as it is.
+        # An invalid pair may contain NaN; zeros leave every weight unchanged.
         use = valid.unsqueeze(-1)
         twist = torch.where(use, twist, 0.0)
         pair = MotionSample(

@@ -1,9 +1,9 @@
-"""The model that demonstrations are fitted to: radial basis functions and their weights.
+"""Radial basis functions of the image Jacobian, and the regression of their weights.
 
-The paper calls each of the functions a neuron, and so do we. Weights come from Bayesian ridge
-regression on pairs of key frames: each image row is dx = w . phi + noise with phi = dr (x)
-theta, a Gaussian prior on w and Gaussian noise, so that mean and covariance of w are in closed
-form, from summed statistics alone.
+The paper calls each basis function a neuron. The weights follow from Bayesian ridge regression
+on pairs of key frames: each image row is dx = w . phi + noise with phi = dr (x) theta, a
+Gaussian prior on w and Gaussian noise. Mean and covariance of w then have a closed form in
+summed statistics.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from hrc_learn.jacobian.samples import (
     RegressionStatistics,
 )
 
-# Least distance of outer neurons from the middle [m, rad]: where hardly any motion was
-# demonstrated along a component, closer ones could not be told apart.
+# Least distance of outer neurons from the middle [m, rad]: with hardly any demonstrated motion
+# along a component, closer neurons could not be distinguished.
 _LEAST_REACH = 0.05
-# Width of the neurons over the largest distance from the middle: wide enough to blend from one
-# end of the workspace to the other, narrow enough to tell them apart.
+# Width of the neurons relative to the largest distance from the middle: wide enough to blend
+# over the whole workspace, narrow enough to distinguish its ends.
 _WIDTH_OVER_REACH = 1.5
 
 
@@ -44,12 +44,12 @@ def radial_basis(
     """Gaussian neurons theta_k = exp(-|x - c_k|^2 / (2 width^2)), the paper's (eq_rbf).
 
     Args:
-        inputs: Where to evaluate.
-        centers: One row a neuron.
+        inputs: Points of evaluation.
+        centers: Centre of each neuron.
         width: Standard deviation of the Gaussians, in the unit of `inputs`.
-        normalized: Divide by the sum over neurons. The neurons then sum to one everywhere: a
-            weight that is the same for all of them is reproduced everywhere, and far from all
-            centres the nearest neuron speaks instead of none.
+        normalized: Divide by the sum over neurons. The neurons then sum to one everywhere:
+            equal weights give a constant function, and far from all centres the nearest neuron
+            dominates.
     """
     square = (inputs.unsqueeze(-2) - centers).square().sum(-1)
     exponent = -square / (2 * width.square())
@@ -73,16 +73,16 @@ def paper_grid() -> Float[Tensor, "9 2"]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RBFCenters:
-    """Normalised Gaussians of some components of the tool's pose."""
+    """Normalised Gaussians of selected components of the tool pose."""
 
     centers: Float[Tensor, "K n"]
-    """One row a neuron, one column an input [m, rad]."""
+    """Centre of each neuron (row), one column an input [m, rad]."""
     width: float | Float[Tensor, ""]
     """Standard deviation of the Gaussians, one number in the same units."""
     input_indices: tuple[int, ...] = (0, 1)
-    """Components of (x, y, z, three of a rotation vector) that the neurons see."""
+    """Components of (x, y, z, rotation vector) that are inputs of the neurons."""
     reference: Float[Tensor, "4"] | None = None
-    """Orientation that the rotation vector starts from; None: that of the base."""
+    """Orientation to which the rotation vector is relative; None: that of the base."""
 
     @staticmethod
     def paper() -> RBFCenters:
@@ -91,13 +91,14 @@ class RBFCenters:
 
     @staticmethod
     def around(demonstrations: Sequence[ImageDemonstration]) -> RBFCenters:
-        """Thirteen about the demonstrated poses: the middle, and both ways along all six.
+        """Thirteen neurons about the demonstrated poses: the middle, and both ends of all axes.
 
-        The image Jacobian of a small workspace is nearly linear in position and rotation,
-        which takes these; a grid over six inputs would take hundreds.
+        The image Jacobian of a small workspace is nearly linear in position and rotation, which
+        these represent; a grid over six inputs would need hundreds.
 
         Args:
-            demonstrations: Read one by one, twice; of several processes, each its share.
+            demonstrations: Demonstrations, read one by one, twice. Each of several processes
+                reads a part of them.
         """
         reference = _mean_orientation(demonstrations)
         low, high = _range(demonstrations, reference)
@@ -110,9 +111,8 @@ class RBFCenters:
         )
 
     def basis(self) -> Callable[[Pose], Tensor]:
-        """Activation (time, K) of the neurons at poses (time,).
-
-        Gradients reach centres and width.
+        """Function from poses (time,) to activations (time, K); differentiable in the centres
+        and the width.
         """
 
         def activation(pose: Pose) -> Tensor:
@@ -126,8 +126,8 @@ class RBFCenters:
 def pose_inputs(pose: Pose, reference: Float[Tensor, "4"] | None) -> Float[Tensor, "*batch 6"]:
     """Position [m] and rotation vector from the reference to the orientation [rad].
 
-    A rotation vector jumps at half turns: choose the reference in the middle of what the
-    tool does.
+    A rotation vector jumps at half turns: choose the reference in the middle of the tool's
+    orientations.
     """
     if reference is None:
         return pose.vector()
@@ -163,38 +163,38 @@ def _range(
 
 @dataclass(frozen=True, kw_only=True)
 class ImageJacobianFitConfig(KeyFrameConfig):
-    """Which frames are compared, and what is believed before they are."""
+    """Choice of key frames, noise and prior of a fit."""
 
     pixel_noise: float = 0.5
-    """Standard deviation of the measured feature [px]; enters twice into each difference.
-    Where the held-out error shows more, because the network is too coarse, that is used."""
+    """Standard deviation of the measured feature [px]; enters twice into each difference. A
+    larger held-out error, from a network that is too coarse, replaces it."""
     bias_std: float = 1500.0
-    """Prior standard deviation of the Jacobian's mean over the workspace [px/m]."""
+    """Prior standard deviation of the mean Jacobian of the workspace [px/m]."""
     weight_std: float = 500.0
-    """Prior standard deviation of each neuron's departure from that mean [px/m]."""
+    """Prior standard deviation of each neuron's deviation from the mean [px/m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageJacobianFitReport:
-    """How well a fitted image Jacobian predicts the motion of the feature between key frames.
+    """Prediction errors of a fitted image Jacobian for feature motion between key frames.
 
     Errors are root mean squares of the error's length [px].
     """
 
     pairs: int
-    """Pairs of key frames used."""
+    """Number of pairs of key frames."""
     motion: float
-    """Motion of the feature itself: the error of predicting none [px]."""
+    """Motion of the feature, the error of predicting no motion [px]."""
     error: float
-    """Over the pairs that were fitted [px]."""
+    """Error over the fitted pairs [px]."""
     held_out_error: float
-    """Over pairs that were not: cross-validation by demonstration, or by fifths of a single
-    one [px]. NaN where all pairs fall into one part."""
+    """Cross-validation error by demonstrations, or by fifths of a single one [px]. NaN if all
+    pairs belong to one part."""
     noise: float
-    """Standard deviation of dx in each coordinate that the posterior assumes [px]."""
+    """Standard deviation of each coordinate of dx that the posterior assumes [px]."""
 
     def summary(self) -> dict[str, Any]:
-        """As plain numbers."""
+        """The report as plain numbers."""
         return asdict(self)
 
 
@@ -203,9 +203,9 @@ class Posterior:
     """Distribution of the weights after the fit."""
 
     mean: Float[Tensor, "P 2"]
-    """[px/m], one column an image row."""
+    """Mean of the weights [px/m], one column an image row."""
     covariance: Float[Tensor, "P P"]
-    """Of either image row [(px/m)^2]."""
+    """Covariance of the weights of either image row [(px/m)^2]."""
 
 
 def weight_covariance(
@@ -213,16 +213,16 @@ def weight_covariance(
     bias_std: float | Float[Tensor, ""],
     weight_std: float | Float[Tensor, ""],
 ) -> Float[Tensor, "K K"]:
-    """Prior covariance between neurons, for each entry of the Jacobian alone.
+    """Prior covariance between neurons for a single entry of the Jacobian.
 
-    The entry is a bias, common to all neurons, plus a departure of each. With normalised
-    neurons, which sum to one, that is a constant Jacobian plus a network: what is learned in
-    one place holds everywhere until a place says otherwise.
+    The entry is a bias, common to all neurons, plus a deviation of each. With normalised
+    neurons, which sum to one, that is a constant Jacobian plus a network: an observation at one
+    place applies everywhere until other places are observed.
 
     Args:
-        centers: Of the neurons; gives their number, dtype and device.
+        centers: Centres of the neurons; give their number, dtype and device.
         bias_std: Standard deviation of the bias [px/m].
-        weight_std: Standard deviation of the departures [px/m].
+        weight_std: Standard deviation of the deviations [px/m].
     """
     K = len(centers)
     eye = torch.eye(K, dtype=centers.dtype, device=centers.device)
@@ -232,7 +232,7 @@ def weight_covariance(
 def prior_precision(
     centers: Float[Tensor, "K _"], config: ImageJacobianFitConfig
 ) -> Float[Tensor, "P P"]:
-    """Inverse covariance of the weights before anything was seen."""
+    """Inverse prior covariance of the weights."""
     prior = weight_covariance(centers, config.bias_std, config.weight_std)
     return torch.block_diag(*[torch.linalg.inv(prior)] * 6)
 
@@ -245,12 +245,12 @@ def fit_weights(
     """Fit to all folds; each in turn is held out to measure the error on unseen data.
 
     Args:
-        folds: Statistics of parts of the data that were recorded apart.
-        precision: Of the prior (see `prior_precision`).
+        folds: Statistics of separately recorded parts of the data.
+        precision: Prior precision (see `prior_precision`).
         config: Noise of the feature.
 
     Raises:
-        ValueError: There is no pair at all.
+        ValueError: There is no pair of key frames.
     """
     folds = [fold for fold in folds if fold.count]
     if not folds:
@@ -261,8 +261,8 @@ def fit_weights(
     total = reduce(add, folds)
     noise = 2 * config.pixel_noise**2  # of a difference of two measurements
     held_out = _held_out_square(folds, precision, noise)
-    # The network may be too coarse for the data: then its error is noise to the weights. Half
-    # of it, as the square sums two coordinates. (NaN, with one fold, leaves the noise.)
+    # A network that is too coarse for the data has an error that acts as noise on the weights.
+    # Half of it, as the square sums two coordinates. (NaN, with one fold, keeps the noise.)
     noise = max(noise, held_out / 2)
     posterior = solve(total, precision, noise)
     report = ImageJacobianFitReport(
@@ -281,7 +281,7 @@ def solve(
     """Posterior of the weights for a zero-mean prior.
 
     Args:
-        statistics: Of the data.
+        statistics: Statistics of the data.
         precision: Inverse covariance of the prior.
         noise: Variance of each coordinate of dx [px^2].
     """
@@ -304,6 +304,6 @@ def _held_out_square(
 def weights_without_each(
     folds: Sequence[RegressionStatistics], precision: Float[Tensor, "P P"], noise: float
 ) -> list[Float[Tensor, "P 2"]]:
-    """Posterior means, each of all folds but one."""
+    """Posterior means of all folds but one, for each fold left out."""
     rests = (reduce(add, [*folds[:i], *folds[i + 1 :]]) for i in range(len(folds)))
     return [solve(rest, precision, noise).mean for rest in rests]

@@ -1,9 +1,9 @@
-"""Laws by which the image Jacobian is learned online.
+"""Online learning laws of the image Jacobian.
 
-By gradients: the paper's law; the composite one with the prediction error, which the paper's
-lacks; and Broyden's update of one Jacobian for the whole workspace. Recursively: least squares
-with forgetting, and a Kalman filter. Both of these keep one Gaussian for both image rows, which
-see the same regressors.
+Gradient laws: the paper's law, the composite law with the prediction error, and Broyden's
+update of one Jacobian for the whole workspace. Recursive laws: least squares with forgetting,
+and a Kalman filter. The recursive laws keep one Gaussian for both image rows, whose regressors
+are the same.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from hrc_learn.pytree import pytree
 
 
 class PaperEstimator(ImageJacobianEstimator):
-    """W_dot = -[L theta s^T xi_x']^T,  s = J_s_hat^T xi_x + xi_r      (update)
+    """The paper's law,  W_dot = -[L theta s^T xi_x']^T,  s = J_s_hat^T xi_x + xi_r  (update).
 
     L is a multiple of the identity. The law reduces the energy |s|^2 that the command puts
-    into the task; no measured image motion enters, so it cannot learn a wrong Jacobian
-    right. With Table I's L = 0.25 I weights of 1e3 px/m change by parts in 1e9.
+    into the task. It uses no measured image motion, so it cannot correct a wrong Jacobian. With
+    Table I's L = 0.25 I, weights of 1e3 px/m change by parts in 1e9.
     """
 
     def __init__(self, network: RBFImageJacobian, gain: float = 0.25):
-        """Set up the law.
+        """Prepare the law.
 
         Args:
             network: Neurons and initial weights.
@@ -56,55 +56,10 @@ class PaperEstimator(ImageJacobianEstimator):
         return WeightState(weight=self.initial_weight(*batch))
 
     def update(self, state: WeightState, measurement: Measurement) -> WeightState:
-        """One explicit Euler step of dt."""
+        """Take one explicit Euler step of dt."""
         theta = self.network.basis(measurement.pose)
         rate = paper_rate(state.weight, theta, measurement, self.gain)
         return WeightState(weight=state.weight + measurement.dt * rate)
-
-
-class PrintedEstimator(PaperEstimator):
-    """The paper's law from its initial weights as printed, set when the feature is first seen.
-
-        W(i, j) = vec(J_s0)(i) / sum_k theta_k(r_t0)      (eq_w0)
-
-    Until then the weights are zero. Away from r_t0 the estimate grows or fades with the sum of
-    the neurons, which nothing keeps at its first value.
-    """
-
-    column: Tensor
-    """vec(J_s0), the same for all neurons, (12, 1)."""
-
-    def __init__(self, network: RBFImageJacobian, gain: float = 0.25, *, mixed: bool = True):
-        """Set up the law.
-
-        Args:
-            network: Neurons, and in the first column of its weights vec(J_s0^T), as
-                `RBFImageJacobian.from_jacobian` leaves it there.
-            gain: Diagonal of L.
-            mixed: vec(J_s0) as printed, which mixes the two image rows; False: vec(J_s0^T), as
-                (approxNN_vec) needs it.
-        """
-        neurons = RBFImageJacobian(
-            network.centers,
-            float(network.width),
-            input_indices=network.input_indices,
-            reference=network.reference,
-            normalized=False,
-        )
-        super().__init__(neurons, gain)
-        column = network.weight.detach()[:, 0]
-        if mixed:
-            column = column.unflatten(0, (-1, 6)).mT.flatten()
-        self.register_buffer("column", column[:, None].clone())
-
-    def update(self, state: WeightState, measurement: Measurement) -> WeightState:
-        """The initial weights where the feature is seen for the first time, then the law."""
-        total = self.network.basis(measurement.pose).sum(-1)[..., None, None]
-        waiting = (state.weight == 0).all(-1, keepdim=True).all(-2, keepdim=True)
-        begins = waiting & measurement.valid[..., None, None]
-        weight = torch.where(begins, self.column / total, state.weight)
-        moved = super().update(WeightState(weight=weight), measurement).weight
-        return WeightState(weight=torch.where(waiting & ~begins, weight, moved))
 
 
 def paper_rate(
@@ -113,9 +68,9 @@ def paper_rate(
     measurement: Measurement,
     gain: float,
 ) -> Float[Tensor, "*batch entries K"]:
-    """W_dot of the printed law.
+    """Rate W_dot of the paper's law.
 
-    xi_x'^T s is the outer product of xi_x and s, row by row: so d(J_s_hat)/dt =
+    xi_x'^T s is the outer product of xi_x and s, row by row, so d(J_s_hat)/dt =
     -gain |theta|^2 xi_x s^T at the present pose.
     """
     xi_x = measurement.xi_x.unsqueeze(-1)
@@ -130,15 +85,16 @@ class CompositeConfig(LearningConfig):
     """Gains of the composite law."""
 
     task_gain: float = 0.25
-    """Of the paper's term: diagonal of L."""
+    """Gain of the paper's term, the diagonal of L."""
     prediction_gain: float = 0.5
-    """Fraction of the prediction error that one pair removes, 0 to below 2."""
+    """Fraction of the prediction error removed by one pair, in [0, 2)."""
     noise_floor: float = 2e-3
-    """Motion [m] at which half of that share is believed: below it noise is."""
+    """Motion at which half of that fraction is removed [m]; smaller motions are mostly
+    noise."""
 
 
 class GradientEstimator[Config: LearningConfig](KeyFrameEstimator[Config]):
-    """An estimator that remembers the weights and the last key frame, and nothing else."""
+    """Estimator with weights and the last key frame as its state."""
 
     def initial_state(self, *batch: int) -> KeyFrameState:
         """The network's weights and no key frame."""
@@ -154,8 +110,8 @@ class CompositeEstimator(GradientEstimator[CompositeConfig]):
 
         W <- W + gamma e (x) dr theta^T / (|theta|^2 (|dr|^2 + floor^2))
 
-    so that |e| shrinks by the factor 1 - gamma |dr|^2 / (|dr|^2 + floor^2), never grows for
-    0 < gamma < 2, and pairs of little motion, mostly noise, count for little. Entries of the
+    so |e| shrinks by the factor 1 - gamma |dr|^2 / (|dr|^2 + floor^2), never grows for
+    0 < gamma < 2, and pairs with little motion, mostly noise, count little. The entries of the
     weights are bounded.
     """
 
@@ -163,7 +119,7 @@ class CompositeEstimator(GradientEstimator[CompositeConfig]):
         super().__init__(network, config or CompositeConfig())
 
     def update(self, state: KeyFrameState, measurement: Measurement) -> KeyFrameState:
-        """One step of dt of the paper's term, and one pair if there is a new one."""
+        """One step of dt of the paper's term, and the correction by a new pair."""
         theta = self.network.basis(measurement.pose)
         key, pair = self.advance(state.key, measurement, theta)
         rate = paper_rate(state.weight, theta, measurement, self.config.task_gain)
@@ -172,11 +128,11 @@ class CompositeEstimator(GradientEstimator[CompositeConfig]):
         return KeyFrameState(weight=self.projected(weight), key=key)
 
     def _correction(self, weight: Tensor, pair: MotionSample) -> Tensor:
-        """Normalised gradient step on the prediction error; zero without a pair."""
+        """Normalised gradient step on the prediction error; zero without a new pair."""
         config = self.config
         motion = pair.dr.square().sum(-1) + config.noise_floor**2
         # Normalised neurons never fade. Others do between and beyond the centres: dividing by
-        # their activity there would write far too much into weights that act elsewhere.
+        # their small activity there would change weights far too much that act elsewhere.
         least = 0.0 if self.network.normalized else 1.0
         activity = pair.theta.square().sum(-1).clamp_min(least)
         size = (motion * activity).clamp_min(torch.finfo(motion.dtype).tiny)
@@ -190,13 +146,13 @@ class BroydenConfig(LearningConfig):
     """Step of Broyden's update."""
 
     min_step: float = 2e-3
-    """Least motion between key frames [m]: without a noise model it must be large."""
+    """Least motion between key frames [m]; large, because the update has no noise model."""
     gain: float = 0.5
-    """Fraction of the prediction error that one pair removes, above 0 to 1."""
+    """Fraction of the prediction error removed by one pair, in (0, 1]."""
 
 
 def check_normalised(network: RBFImageJacobian, law: str) -> None:
-    """Raise ValueError unless the same weight of all neurons is a constant Jacobian."""
+    """Raise ValueError unless equal weights of all neurons give a constant Jacobian."""
     if not network.normalized:
         raise ValueError(
             f"{law} a constant Jacobian, which only normalised neurons can represent: build "
@@ -205,13 +161,13 @@ def check_normalised(network: RBFImageJacobian, law: str) -> None:
 
 
 class BroydenEstimator(GradientEstimator[BroydenConfig]):
-    """J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997), everywhere at once.
+    """Broyden's update,  J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997).
 
-    The same change of every neuron changes a network of normalised neurons by a constant.
+    It applies everywhere at once: equal changes of all normalised neurons add a constant.
     """
 
     def __init__(self, network: RBFImageJacobian, config: BroydenConfig | None = None):
-        """Set up the update.
+        """Prepare the update.
 
         Raises:
             ValueError: The network's neurons are not normalised.
@@ -220,10 +176,10 @@ class BroydenEstimator(GradientEstimator[BroydenConfig]):
         check_normalised(network, "Broyden's update adds")
 
     def update(self, state: KeyFrameState, measurement: Measurement) -> KeyFrameState:
-        """One pair if there is a new one."""
+        """Update with a new pair, if there is one."""
         theta = self.network.basis(measurement.pose)
         key, pair = self.advance(state.key, measurement, theta)
-        # dr is zero without a pair: then the floor keeps 0 / 0 away.
+        # dr is zero without a pair; the floor avoids 0 / 0.
         size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
         step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
         change = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
@@ -233,34 +189,35 @@ class BroydenEstimator(GradientEstimator[BroydenConfig]):
 
 @dataclass(frozen=True, kw_only=True)
 class RecursiveConfig(LearningConfig):
-    """What is believed before the first image."""
+    """Noise and prior of recursive estimators."""
 
     pixel_noise: float = 0.5
     """Standard deviation of the measured feature [px]; enters twice into each pair."""
     bias_std: float = 1500.0
-    """Prior standard deviation of the Jacobian as a whole [px/m]."""
+    """Prior standard deviation of the mean Jacobian [px/m]."""
     weight_std: float = 500.0
-    """Prior standard deviation of each neuron's departure from it [px/m]."""
+    """Prior standard deviation of each neuron's deviation from the mean [px/m]."""
 
     def pair_noise(
         self, weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
     ) -> float | Float[Tensor, "*batch 1 1"]:
         """Variance of each coordinate of dx - J_s_hat dr [px^2].
 
-        Both ends of a pair are measured with noise, in the image and in the pose, which the
-        Jacobian turns into pixels: the effective variance of an errors-in-variables model.
+        Both ends of a pair are measured with noise in the image and in the pose, and the
+        Jacobian turns the latter into pixels: the effective variance of an errors-in-variables
+        model.
 
         Args:
-            weight: Of the network [px/m, px/rad].
+            weight: Weights of the network [px/m, px/rad].
             theta: Neurons of the pair.
         """
         pixels = 2 * self.pixel_noise**2
         if self.pose_noise == 0:
             return pixels
         rows = evaluate(weight, theta)
-        # A radian of noise counts as so many metres of it.
+        # Pose noise in radians is scaled to metres.
         metres = rows / component_scale(rows, self.rotation_scale)
-        # The larger of the image rows, as both share one covariance.
+        # The larger image row, as both have one covariance.
         square = metres.square().sum(-1).amax(-1)
         return (pixels + 2 * self.pose_noise**2 * square)[..., None, None]
 
@@ -268,21 +225,21 @@ class RecursiveConfig(LearningConfig):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class RecursiveState(KeyFrameState):
-    """Mean and covariance of the weights, and the frame to compare with next."""
+    """Mean and covariance of the weights, and the last key frame."""
 
     covariance: Float[Tensor, "*batch P P"]
-    """Of one image row, alike for both, in (component, neuron) order [(px/m)^2]."""
+    """Covariance of either image row, in (component, neuron) order [(px/m)^2]."""
 
 
 class RecursiveEstimator[Config: RecursiveConfig](KeyFrameEstimator[Config]):
-    """An estimator that keeps a covariance of the weights."""
+    """Base of estimators that keep a covariance of the weights."""
 
     first_covariance: Tensor
-    """Covariance to start with, (P, P)."""
+    """Initial covariance, (P, P)."""
 
     def __init__(self, network: RBFImageJacobian, config: Config):
         super().__init__(network, config)
-        # The posterior of an offline fit, or else the prior.
+        # The posterior of an offline fit, or the prior.
         covariance = network.covariance
         if covariance is None:
             neurons = weight_covariance(network.centers, config.bias_std, config.weight_std)
@@ -291,7 +248,7 @@ class RecursiveEstimator[Config: RecursiveConfig](KeyFrameEstimator[Config]):
         self.register_buffer("first_covariance", covariance, persistent=False)
 
     def initial_state(self, *batch: int) -> RecursiveState:
-        """The network's weights, the prior (or the fit's posterior), no key frame."""
+        """The network's weights, its posterior or the prior, and no key frame."""
         shape = self.first_covariance.shape
         return RecursiveState(
             weight=self.initial_weight(*batch),
@@ -300,7 +257,7 @@ class RecursiveEstimator[Config: RecursiveConfig](KeyFrameEstimator[Config]):
         )
 
     def restored(self, state: RecursiveState) -> RecursiveState:
-        """As any other's; nor is more believed of initial weights than at the start."""
+        """The state reset where invalid, with the initial covariance for initial weights."""
         known = all_numbers(state.weight) & all_numbers(state.covariance)
         covariance = torch.where(known, state.covariance, self.first_covariance)
         return replace(super().restored(state), covariance=covariance)
@@ -313,15 +270,15 @@ def condition(
     scale: Float[Tensor, "6"],
     noise: float | Float[Tensor, "*batch 1 1"],
 ) -> tuple[Float[Tensor, "*batch entries K"], Float[Tensor, "*batch P P"]]:
-    """Mean and covariance given one more pair; unchanged where there is none.
+    """Mean and covariance conditioned on one more pair; unchanged without one.
 
     With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
 
     Args:
         weight: Mean before.
         covariance: Covariance before.
-        pair: Motion seen.
-        scale: Metres that each component of a twist counts for.
+        pair: Observed motion.
+        scale: Metres per unit of each component of a twist.
         noise: Variance of each coordinate of dx - J_s_hat dr [px^2].
     """
     phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
@@ -329,8 +286,8 @@ def condition(
     spread = (P_phi * phi).sum(-1, keepdim=True) + noise
     change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
     change = change.unflatten(-1, (6, -1)) * scale.unsqueeze(-1)  # (*batch, 2, 6, K)
-    # An outer product of a vector with itself is symmetric to the last bit. That of the gain
-    # and P_phi is not, and forgetting amplifies the difference until the covariance is none.
+    # The outer product of a vector with itself is exactly symmetric. That of the gain and P_phi
+    # is not, and forgetting amplifies the difference until the covariance is indefinite.
     root = P_phi / spread.sqrt()
     return weight + change.flatten(-3, -2), covariance - root.mT * root
 
@@ -340,17 +297,18 @@ class LeastSquaresConfig(RecursiveConfig):
     """Prior, noise and forgetting."""
 
     forgetting: float = 0.99
-    """Weight of all that was learned against each new pair, 0 to 1."""
+    """Weight of earlier pairs relative to each new one, 0 to 1."""
 
 
 class RecursiveLeastSquaresEstimator(RecursiveEstimator[LeastSquaresConfig]):
-    """Weighted least squares over all pairs so far, a pair k ago counting forgetting^k.
+    """Weighted least squares over all pairs; a pair k pairs ago has the weight forgetting^k.
 
-    Forgetting inflates the covariance where nothing new is seen; it is kept from growing
-    beyond the prior, which bounds the gain (no covariance wind-up).
+    Forgetting inflates the covariance where there is no new data. Its trace is bounded by that
+    of the prior, which bounds the gain and prevents covariance wind-up.
     """
 
     largest_trace: Tensor
+    """Trace of the initial covariance."""
 
     def __init__(self, network: RBFImageJacobian, config: LeastSquaresConfig | None = None):
         super().__init__(network, config or LeastSquaresConfig())
@@ -358,10 +316,10 @@ class RecursiveLeastSquaresEstimator(RecursiveEstimator[LeastSquaresConfig]):
         self.register_buffer("largest_trace", trace, persistent=False)
 
     def update(self, state: RecursiveState, measurement: Measurement) -> RecursiveState:
-        """One pair if there is a new one."""
+        """Update with a new pair, if there is one."""
         theta = self.network.basis(measurement.pose)
         key, pair = self.advance(state.key, measurement, theta)
-        # Forgetting is one more pair against a covariance divided by the factor.
+        # Forgetting is a division of the covariance by the factor before the new pair.
         kept = 1 - (1 - self.config.forgetting) * pair.valid.to(state.covariance.dtype)
         weight, covariance = condition(
             state.weight,
@@ -382,28 +340,28 @@ class KalmanConfig(RecursiveConfig):
     """Prior, noise and drift."""
 
     drift: float = 100.0
-    """Random walk of the Jacobian as a whole [px/m/sqrt(s)]."""
+    """Random walk of the mean Jacobian [px/m/sqrt(s)]."""
     watched_drift: float | None = None
-    """The same while images arrive, when a camera that is moved would be noticed; None: as
-    `drift`, which then is that of pauses alone."""
+    """Random walk while images arrive, when a motion of the camera would be noticed; `drift`
+    then applies to pauses alone. None: `drift`."""
 
 
 class KalmanEstimator(RecursiveEstimator[KalmanConfig]):
     """Random walk on a bias Jacobian plus the weights, observed through dx = J_s dr.
 
-    With normalised neurons a bias is the same change of every neuron's weight, so it needs no
-    state of its own, only its covariance. Both image rows see the same regressors and share
-    one covariance.
+    With normalised neurons a bias is an equal change of all weights, so it needs no state of
+    its own, only its covariance. Both image rows have the same regressors and one covariance.
     """
 
     walk: Tensor
+    """Covariance of the random walk per second, (P, P)."""
 
     def __init__(self, network: RBFImageJacobian, config: KalmanConfig | None = None):
-        """Set up the filter.
+        """Prepare the filter.
 
         Args:
-            network: Neurons and initial weights. If fitted offline, its covariance is where
-                the filter starts.
+            network: Neurons and initial weights. The covariance of an offline fit is the
+                initial one of the filter.
             config: Prior, noise and drift.
 
         Raises:
@@ -411,7 +369,7 @@ class KalmanEstimator(RecursiveEstimator[KalmanConfig]):
         """
         super().__init__(network, config or KalmanConfig())
         check_normalised(network, "the filter's drift is")
-        # A drift alike in all neurons, independent between the six components.
+        # An equal drift of all neurons, independent between the six components.
         K = len(network.centers)
         walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
         self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)

@@ -1,9 +1,9 @@
-"""How well held-out image motion is predicted, and the neurons, noise and prior to do it best.
+"""Held-out prediction of image motion, and evidence maximisation over neurons, noise and prior.
 
-Neurons, noise and prior are chosen by evidence maximisation. For given neurons the weights have
-a closed form, and so has the probability of the demonstrated image motion with the weights
-integrated out (type-II maximum likelihood; MacKay 1992, "Bayesian interpolation"). L-BFGS
-maximises it over everything else. The error on demonstrations held out says when to stop.
+For given neurons the weights have a closed form, and so has the probability of the demonstrated
+image motion with the weights integrated out (type-II maximum likelihood; MacKay 1992, "Bayesian
+interpolation"). L-BFGS maximises it over neurons, noise and prior; the error on held-out
+demonstrations decides when to stop.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from hrc_learn.pytree import pytree
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceConfig:
-    """How long to maximise the evidence, and over what."""
+    """Stopping rules and scope of the evidence maximisation."""
 
     rounds: int = 15
-    """Rounds of L-BFGS at most."""
+    """Largest number of rounds of L-BFGS."""
     iterations: int = 5
     """Iterations of a round."""
     patience: int = 3
@@ -54,42 +54,42 @@ class EvidenceConfig:
     hold_out: int = 4
     """Every n-th demonstration is held out to decide when to stop."""
     max_samples: int = 20_000
-    """Pairs that each process learns from, evenly chosen among its own."""
+    """Largest number of pairs per process, evenly chosen."""
     learn_centers: bool = True
-    """Whether the centres move; widths, noise and prior are always learned."""
+    """True if the centres are learned; width, noise and prior always are."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceRound:
-    """Neurons, noise and prior after a round, and how good they are."""
+    """Neurons, noise and prior after a round, and their errors."""
 
     evidence: float
-    """Negative logarithm of the probability of the image motion, per pair."""
+    """Negative log probability of the image motion, per pair."""
     held_out_error: float
-    """Root mean square over the pairs of demonstrations held out [px]."""
+    """Root mean square error over the pairs of held-out demonstrations [px]."""
     neurons: RBFCenters
-    """As they were then."""
+    """Neurons after the round."""
     config: ImageJacobianFitConfig
-    """With noise and prior as they were then."""
+    """Noise and prior after the round."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceResult:
-    """All rounds, of which the best is the result."""
+    """All rounds; the best one is the result."""
 
     rounds: tuple[EvidenceRound, ...]
-    """The first before anything was learned."""
+    """Rounds; the first describes the start."""
     best: int
-    """Which round the result is of."""
+    """Index of the best round."""
 
     @property
     def neurons(self) -> RBFCenters:
-        """As learned."""
+        """Learned neurons."""
         return self.rounds[self.best].neurons
 
     @property
     def config(self) -> ImageJacobianFitConfig:
-        """With noise and prior as learned."""
+        """Learned noise and prior."""
         return self.rounds[self.best].config
 
 
@@ -100,20 +100,21 @@ def maximize_evidence(
     learning: EvidenceConfig | None = None,
     on_round: Callable[[int, EvidenceRound], None] = lambda number, state: None,
 ) -> EvidenceResult:
-    """Improve neurons, noise and prior for the fit that follows.
+    """Learn neurons, noise and prior for a fit.
 
-    Of several processes each learns from its share of the demonstrations; all end with the
-    same result.
+    Each of several processes learns from a part of the demonstrations; all return the same
+    result.
 
     Args:
-        demonstrations: At least as many as `hold_out`; read one by one.
-        neurons: To start from.
-        config: To start from.
-        learning: How long.
-        on_round: Told of every round.
+        demonstrations: At least `hold_out` demonstrations; read one by one.
+        neurons: Initial neurons.
+        config: Initial noise and prior.
+        learning: Stopping rules.
+        on_round: Called with the number and result of each round.
 
     Raises:
-        ValueError: Too few demonstrations, or no pair of key frames in one of the two sets.
+        ValueError: There are too few demonstrations, or one of the two sets has no pair of key
+            frames.
     """
     config, learning = config or ImageJacobianFitConfig(), learning or EvidenceConfig()
     training, held_out = _motions(demonstrations, config, learning)
@@ -136,7 +137,7 @@ def maximize_evidence(
         try:
             optimiser.step(loss)
         except torch.linalg.LinAlgError:
-            break  # a step so long that nothing could be solved: the best so far is kept
+            break  # the step was too long to solve; the best round so far is the result
         rounds.append(model.evaluate(training, held_out))
         on_round(len(rounds) - 1, rounds[-1])
         limit = (1 - learning.min_improvement) * rounds[best].held_out_error
@@ -146,9 +147,9 @@ def maximize_evidence(
 
 
 class NegativeLogEvidence(nn.Module):
-    """Negative log probability of image motion, per pair, weights integrated out.
+    """Negative log probability of image motion per pair, with the weights integrated out.
 
-    Parameters are logarithms where no optimiser step may make a number negative.
+    Positive parameters are represented by their logarithms.
     """
 
     def __init__(
@@ -167,11 +168,11 @@ class NegativeLogEvidence(nn.Module):
         self.log_weight = logarithm(config.weight_std)
 
     def forward(self, motion: MotionSamples) -> Float[Tensor, ""]:
-        """Of the pairs of all processes, each given its own."""
+        """The value over the pairs of all processes, each of which passes its own pairs."""
         total = self.statistics(motion)
         # Variance of a difference of two measurements, each with this deviation.
         noise = 2 * (2 * self.log_noise).exp()
-        # In weights that the prior makes independent and of size one, all is well scaled.
+        # Whitened weights, independent with unit variance under the prior, are well scaled.
         root = torch.block_diag(*[torch.linalg.cholesky(self._prior())] * 6)
         cross = root.mT @ total.cross / noise
         eye = torch.eye(len(root), dtype=root.dtype)
@@ -183,19 +184,19 @@ class NegativeLogEvidence(nn.Module):
         return (misfit + volume) / total.count
 
     def statistics(self, motion: MotionSamples) -> RegressionStatistics:
-        """Sums over the pairs of all processes, for the neurons as they are."""
+        """Sums over the pairs of all processes, for the present neurons."""
         phi = motion.regressors(self.neurons(attached=True).basis())
         return RegressionStatistics.of(phi, motion.dx).over_processes()
 
     def neurons(self, *, attached: bool = False) -> RBFCenters:
-        """As they are; attached: so that gradients reach them."""
+        """The present neurons; `attached` to the graph, so that gradients reach them."""
         centers, width = self.centers, self.log_width.exp()
         if not attached:
             centers, width = centers.detach().clone(), float(width.detach())
         return replace(self._neurons, centers=centers, width=width)
 
     def fit_config(self) -> ImageJacobianFitConfig:
-        """Noise and prior as they are, with the choice of key frames."""
+        """Present noise and prior, with the choice of key frames."""
         return replace(
             self._config,
             pixel_noise=float(self.log_noise.detach().exp()),
@@ -210,7 +211,7 @@ class NegativeLogEvidence(nn.Module):
         precision = prior_precision(self.centers, config)
         noise = 2 * config.pixel_noise**2
         weights = solve(self.statistics(training), precision, noise).mean
-        # Weights of the training pairs alone predict the others.
+        # The weights are fitted to the training pairs alone.
         unseen = self.statistics(held_out)
         error = (unseen.squared_error(weights) / unseen.count) ** 0.5
         return EvidenceRound(
@@ -229,15 +230,15 @@ def _motions(
     config: ImageJacobianFitConfig,
     learning: EvidenceConfig,
 ) -> tuple[MotionSamples, MotionSamples]:
-    """Pairs of this process to learn from, and those held out."""
+    """Training pairs of this process, and its held-out pairs."""
     if len(demonstrations) < learning.hold_out:
         raise ValueError(
-            f"learning holds out every {learning.hold_out}th demonstration, but there are only "
-            f"{len(demonstrations)}: record more, or fit with the neurons as they are."
+            f"every {learning.hold_out}th demonstration is held out, but there are only "
+            f"{len(demonstrations)}: record more, or fit without learning the neurons."
         )
     sets: tuple[list[MotionSamples], list[MotionSamples]] = ([], [])
     for i, demonstration in distributed.share(demonstrations):
-        # By the number among all demonstrations, the same however many processes there are.
+        # Numbered over all demonstrations, so that the set does not depend on the processes.
         is_held_out = (i + 1) % learning.hold_out == 0
         sets[is_held_out].append(demonstration.motion(config))
     for motions in sets:
@@ -259,25 +260,26 @@ class HeldOutSamples:
     """Pairs of key frames, each predicted without its fold of the data."""
 
     position: Float[Tensor, "pairs 3"]
-    """Of the tool half-way [m]."""
+    """Position of the tool half-way [m]."""
     motion: Float[Tensor, "pairs 2"]
-    """Of the image [px]."""
+    """Motion of the feature [px]."""
     error: Float[Tensor, "pairs 2"]
     """Motion less its prediction [px]."""
     uncertainty: Float[Tensor, " pairs"]
-    """Posterior deviation of the Jacobian there over its size, rotation counted in metres."""
+    """Posterior deviation of the Jacobian relative to its size, rotation scaled to metres."""
 
     def by_cell(self, cells: int = 3) -> CellErrors:
         """Errors over a grid on the horizontal plane.
 
         Args:
-            cells: Along each of x and y, equally wide over the range of the pairs.
+            cells: Number of cells along x and along y, equally wide over the range of the
+                pairs.
         """
         place = self.position[:, :2]
         low, high = place.amin(dim=0), place.amax(dim=0)
         edges = torch.stack([torch.linspace(0, 1, cells + 1).double()] * 2, dim=1)
         edges = low + (high - low) * edges
-        # Points on the upper edge, and all where nothing moves along an axis, stay inside.
+        # Points on the upper edge, and all points of an axis without motion, stay inside.
         cell = ((place - low) / (high - low).clamp_min(1e-9) * cells).long().clamp(0, cells - 1)
         flat = cell[:, 0] * cells + cell[:, 1]
 
@@ -299,13 +301,13 @@ class CellErrors:
     """Held-out error in cells of the horizontal plane."""
 
     edges: Float[Tensor, "cells_and_1 2"]
-    """Of the cells along x and y [m]."""
+    """Edges of the cells along x and y [m]."""
     pairs: Int[Tensor, "cells cells"]
-    """In each cell, x first."""
+    """Number of pairs in each cell, x first."""
     relative: Float[Tensor, "cells cells"]
-    """Root mean square of the error over that of the motion; NaN in an empty cell."""
+    """Root mean square error relative to that of the motion; NaN in an empty cell."""
     uncertainty: Float[Tensor, "cells cells"]
-    """Mean of the posterior deviation over the Jacobian's size; NaN in an empty cell."""
+    """Mean relative posterior deviation of the Jacobian; NaN in an empty cell."""
 
 
 def cross_validate(
@@ -313,21 +315,21 @@ def cross_validate(
     network: RBFImageJacobian,
     config: ImageJacobianFitConfig,
 ) -> HeldOutSamples:
-    """Predict every pair with the weights fitted to the other folds of the data.
+    """Predict every pair with weights fitted to the other folds of the data.
 
-    Of several processes, each predicts the pairs of its share.
+    Each of several processes predicts the pairs of its own demonstrations.
 
     Args:
-        demonstrations: That the network was fitted to.
-        network: Just fitted.
-        config: Of that fit.
+        demonstrations: Demonstrations that the network was fitted to.
+        network: Network just fitted.
+        config: Settings of that fit.
 
     Raises:
-        ValueError: The network was loaded, or there is one fold only.
+        ValueError: The network was loaded, or there is only one fold.
     """
     report = network.report
     if report is None:
-        raise ValueError("only a network just fitted knows what it was fitted with.")
+        raise ValueError("a loaded network has no fit report: pass the network just fitted.")
     network = network.double()
     K = len(network.centers)
     folds = statistics_by_fold(network.basis, K, demonstrations, config)
@@ -352,7 +354,7 @@ def cross_validate(
 def relative_uncertainty(
     network: RBFImageJacobian, pose: Pose, config: ImageJacobianFitConfig
 ) -> Float[Tensor, " pairs"]:
-    """Posterior deviation of the Jacobian over its size, rotation counted in metres."""
+    """Posterior deviation of the Jacobian relative to its size, rotation scaled to metres."""
     scale = component_scale(pose.position, config.rotation_scale)
     size = (network(pose) / scale).flatten(-2).norm(dim=-1)
     # Both image rows have the same deviation, which makes the norm over both sqrt(2) times it.

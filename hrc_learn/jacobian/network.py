@@ -1,10 +1,9 @@
-"""The image Jacobian as a network of radial basis functions of the tool's pose."""
+"""The image Jacobian as a network of radial basis functions of the tool pose."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -33,27 +32,27 @@ _UNITS = {"position": "m", "rotation": "rad", "jacobian": "px/m, px/rad", "pixel
 
 
 class RBFImageJacobian(nn.Module):
-    """Estimate J_s_hat of the Jacobian from the tool's twist to the motion of its image.
+    """Estimate J_s_hat of the Jacobian from the tool's twist to the motion of its image
+    feature.
 
         x_dot = J_s(r) r_dot,   vec(J_s_hat(r)^T) = W theta(r)      (approxNN_vec)
 
-    r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear,
-    angular) in the base frame, *not* the derivative of the rotation vector, so that
-    J_s J is the Jacobian from joint velocities to pixels per second. vec stacks columns,
-    which for J_s^T are the rows of J_s.
+    r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear, angular)
+    in the base frame, *not* the derivative of the rotation vector, so J_s J is the Jacobian
+    from joint velocities to pixels per second. vec stacks columns, for J_s^T the rows of J_s.
     """
 
     weight: nn.Parameter
-    """W, (12, K) [px/m and px/rad]; 12 rows more for each further point of the feature."""
+    """W, (12, K) [px/m and px/rad]; 12 more rows for each further point of the feature."""
     centers: Tensor
-    """Of the neurons, (K, n), in the units of the chosen components of r."""
+    """Centres of the neurons, (K, n), in the units of the chosen components of r."""
     width: Tensor
     """Standard deviation of the neurons, one number in the same unit."""
     reference: Tensor | None
-    """Orientation (w, x, y, z) from which the neurons count rotation; None: r itself."""
+    """Orientation (w, x, y, z) to which rotation is relative; None: that of the base."""
     covariance: Tensor | None
     """Posterior covariance of one image row of W, (6 K, 6 K) in (component, neuron) order,
-    with rotation counted in metres (`rotation_scale`); None if not fitted."""
+    with rotation scaled to metres (`rotation_scale`); None if not fitted."""
 
     def __init__(
         self,
@@ -65,18 +64,17 @@ class RBFImageJacobian(nn.Module):
         reference: Float[Tensor, "4"] | None = None,
         normalized: bool = True,
     ):
-        """Build a network; its dtype and device are those of `centers`.
+        """Build a network with the dtype and device of `centers`.
 
         Args:
-            centers: One row a neuron, one column an input.
+            centers: Centre of each neuron (row), one column an input.
             width: Standard deviation of the neurons.
-            weight: W; zero if None.
-            input_indices: Components of r = (x, y, z, three of the rotation vector) that the
-                neurons see. A rotation vector jumps at half turns; prefer positions, or
-                give a reference.
-            reference: Orientation in the middle of those to come: the last three inputs are
+            weight: W; None: zero.
+            input_indices: Components of r = (x, y, z, rotation vector) that are inputs. A
+                rotation vector jumps at half turns; prefer positions, or give a reference.
+            reference: Orientation in the middle of those expected: the last three inputs are
                 then the rotation vector from it (see `pose_inputs`).
-            normalized: Whether neurons are divided by their sum (see `radial_basis`).
+            normalized: Divide the neurons by their sum (see `radial_basis`).
 
         Raises:
             ValueError: Centres and indices do not match, or the width is not positive.
@@ -105,39 +103,17 @@ class RBFImageJacobian(nn.Module):
         width: float,
         *,
         input_indices: Sequence[int] = (0, 1),
-        formulation: Literal["exact", "paper"] = "exact",
-        start: Float[Tensor, "6"] | None = None,
     ) -> RBFImageJacobian:
-        """Start from one guess of the image Jacobian for the whole workspace.
+        """Network that equals one guess of the image Jacobian everywhere.
 
         Args:
             jacobian: J_s0 [px/m, px/rad].
-            centers: Of the neurons.
-            width: Of the neurons.
-            input_indices: Components of r that the neurons see.
-            formulation: "exact" reproduces J_s0 everywhere. "paper" is (eq_w0) as printed:
-                neurons are not normalised, so the estimate grows or fades away from `start`,
-                and the entries of vec(J_s) stand where those of vec(J_s^T) belong, which
-                mixes the two image rows.
-            start: r at which the paper's formulation starts; it alone needs it.
-
-        Raises:
-            ValueError: `start` is missing or superfluous, or the formulation is unknown.
+            centers: Centres of the neurons.
+            width: Standard deviation of the neurons.
+            input_indices: Components of r that are inputs of the neurons.
         """
-        jacobian = jacobian.to(centers)
-        if formulation == "exact":
-            if start is not None:
-                raise ValueError("start is only used by formulation='paper': leave it out.")
-            network = cls(centers, width, input_indices=input_indices)
-            column = jacobian.flatten()
-        elif formulation == "paper":
-            if start is None:
-                raise ValueError("formulation='paper' needs start, the pose vector at t0.")
-            network = cls(centers, width, input_indices=input_indices, normalized=False)
-            column = jacobian.mT.flatten() / network.basis(start).sum()
-        else:
-            raise ValueError(f"formulation must be 'exact' or 'paper', got {formulation!r}.")
-        network.weight.data = column[:, None].repeat(1, len(centers))
+        network = cls(centers, width, input_indices=input_indices)
+        network.weight.data = jacobian.to(centers).flatten()[:, None].repeat(1, len(centers))
         return network
 
     @classmethod
@@ -152,15 +128,15 @@ class RBFImageJacobian(nn.Module):
         input_indices: Sequence[int] = (0, 1),
         config: ImageJacobianFitConfig | None = None,
     ) -> RBFImageJacobian:
-        """Fit to demonstrations in which the camera watched the tool.
+        """Fit to demonstrations in which the camera saw the tool.
 
         Args:
-            poses: Of the tool along each demonstration, (time,).
-            features: Image feature along each [px]; anything where it is not visible.
-            visible: Where the feature was found; None: wherever it is not NaN.
-            centers: Of the neurons.
-            width: Of the neurons.
-            input_indices: Components of r that the neurons see.
+            poses: Poses of the tool along each demonstration, (time,).
+            features: Image feature along each [px]; any value where it is not visible.
+            visible: True where the feature was found; None: wherever it is not NaN.
+            centers: Centres of the neurons.
+            width: Standard deviation of the neurons.
+            input_indices: Components of r that are inputs of the neurons.
             config: Noise, prior and the choice of key frames.
 
         Returns:
@@ -181,11 +157,11 @@ class RBFImageJacobian(nn.Module):
         neurons: RBFCenters,
         config: ImageJacobianFitConfig | None = None,
     ) -> RBFImageJacobian:
-        """Fit to demonstrations read one by one; of several processes, each reads its share.
+        """Fit to demonstrations read one by one; several processes read a part each.
 
         Args:
-            demonstrations: In memory, or a sequence that reads them when asked.
-            neurons: Of the network; its dtype and device are those of their centres.
+            demonstrations: Demonstrations in memory, or a sequence that reads them on access.
+            neurons: Neurons of the network, whose dtype and device are those of their centres.
             config: Noise, prior and the choice of key frames.
 
         Returns:
@@ -214,7 +190,7 @@ class RBFImageJacobian(nn.Module):
 
     @property
     def rows(self) -> int:
-        """Rows of J_s_hat: u and v of every point of the feature."""
+        """Number of rows of J_s_hat: u and v of each point of the feature."""
         return self.weight.shape[0] // 6
 
     def forward(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch rows 6"]:
@@ -237,17 +213,19 @@ class RBFImageJacobian(nn.Module):
     def uncertainty(
         self, r: Pose | Float[Tensor, "*batch 6"], rotation_scale: float = 0.15
     ) -> Float[Tensor, "*batch 6"]:
-        """Posterior standard deviation of the columns of J_s_hat, alike for both rows.
+        """Posterior standard deviation of the columns of J_s_hat, equal for both rows.
 
         Args:
-            r: Where, as for `forward`.
-            rotation_scale: As in the configuration of the fit [m/rad].
+            r: Pose, as for `forward`.
+            rotation_scale: Scale of the fit's configuration [m/rad].
 
         Raises:
             ValueError: The network was not fitted.
         """
         if self.covariance is None:
-            raise ValueError("only a network fitted to demonstrations knows its uncertainty.")
+            raise ValueError(
+                "a network without a fit has no uncertainty: fit it to demonstrations."
+            )
         theta = self.basis(r)
         blocks = self.covariance.unflatten(0, (6, -1)).unflatten(-1, (6, -1))
         blocks = blocks.diagonal(dim1=0, dim2=2)  # (K, K, 6)
@@ -258,7 +236,7 @@ class RBFImageJacobian(nn.Module):
         """Write `config.json` and `model.safetensors` into a folder, replacing an older save.
 
         Raises:
-            ValueError: The folder holds something else.
+            ValueError: The folder holds other files.
         """
         config = {
             "units": _UNITS,
@@ -270,11 +248,11 @@ class RBFImageJacobian(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path) -> RBFImageJacobian:
-        """Read what `save` wrote; the summary of the fit stays in `config.json`.
+        """Read a saved network; the fit report stays in `config.json`.
 
         Raises:
             FileNotFoundError: There is no such folder or file.
-            ValueError: A file is damaged or not ours; the message names file and field.
+            ValueError: A file is damaged or of another kind; the message names file and field.
         """
         saved = SavedModel(folder, _KIND)
         try:
@@ -293,7 +271,7 @@ class RBFImageJacobian(nn.Module):
         return network
 
     def _inputs(self, r: Pose | Tensor) -> Tensor:
-        if max(self.input_indices) < 3:  # saves the logarithm of the orientation
+        if max(self.input_indices) < 3:  # avoids the logarithm of the orientation
             vector = r if isinstance(r, Tensor) else r.position
         elif self.reference is None:
             vector = r if isinstance(r, Tensor) else r.vector()
@@ -304,7 +282,7 @@ class RBFImageJacobian(nn.Module):
 
 
 def _components(vector: Tensor, indices: tuple[int, ...]) -> Tensor:
-    """Some components; a slice where they follow each other, as picking takes far longer."""
+    """Some components; a slice where they are adjacent, which is far faster than indexing."""
     first, after = indices[0], indices[0] + len(indices)
     if indices == tuple(range(first, after)):
         return vector[..., first:after]
@@ -321,10 +299,10 @@ def _checked_indices(indices: Sequence[int], centers: Tensor) -> tuple[int, ...]
 
 
 def stack_networks(networks: Sequence[RBFImageJacobian]) -> RBFImageJacobian:
-    """One network for all points of a feature, from one for each of them.
+    """One network for a feature of several points, from one network for each point.
 
-    Points fitted to the same demonstrations have the same regressors, so their image rows share
-    one covariance: here that of the least certain point.
+    Points fitted to the same demonstrations have the same regressors, so all image rows use
+    one covariance: that of the least certain point.
 
     Raises:
         ValueError: Their neurons differ.
@@ -358,36 +336,3 @@ def _same_neurons(a: RBFImageJacobian, b: RBFImageJacobian) -> bool:
         and (a.input_indices, a.normalized) == (b.input_indices, b.normalized)
         and (not references or (len(references) == 2 and torch.equal(*references)))
     )
-
-
-def nominal_network(
-    model: Callable[[Pose], Tensor],
-    around: Pose,
-    centers: Float[Tensor, "K n"],
-    width: float,
-    *,
-    input_indices: Sequence[int] = (0, 1, 2),
-) -> RBFImageJacobian:
-    """A network that agrees with a model of the image Jacobian at its neurons.
-
-    A rough guess of where the camera stands tells how the Jacobian shrinks with the depth of
-    the marker and how it turns with the tool; one Jacobian for the whole workspace cannot.
-    Online estimators start from it as from any other network.
-
-    Args:
-        model: From poses (K,) to image Jacobians (K, rows, 6), such as
-            `PinholeCamera.image_jacobian`.
-        around: Pose of the tool in the middle of the workspace; supplies the components of r
-            that the neurons do not see.
-        centers: Of the neurons.
-        width: Of the neurons.
-        input_indices: Components of r = (x, y, z, three of the rotation vector) that the
-            neurons see; depth needs z.
-    """
-    network = RBFImageJacobian(centers, width, input_indices=input_indices)
-    r = around.vector().to(centers).expand(len(centers), 6).clone()
-    r[:, list(network.input_indices)] = centers
-    with torch.no_grad():
-        J = model(Pose.from_vector(r))
-    network.weight.data = J.flatten(1).mT.contiguous()
-    return network

@@ -1,12 +1,12 @@
-"""Perspective: how the depth of a point changes with its place, from its image Jacobian.
+"""Perspective: the change of a point's depth with its position, from its image Jacobian.
 
 For a pinhole camera with square pixels, rows r_1, r_2, r_3 of its rotation, and a point at
 depth z that is seen at xi = (x - c) / f, the image Jacobian is
 
     J = f / z (r_12 - xi r_3^T).
 
-Its six entries tell rotation and depth in closed form once focal length f and image centre c
-are known. A point at an offset o then is seen at
+Given the focal length f and the image centre c, the six entries determine rotation and depth in
+closed form. A point at an offset o is then seen at
 
     x + J o / (1 + g^T o),    g = r_3 / z.
 
@@ -29,25 +29,25 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.samples import ImageDemonstration
 
+# Prior standard deviation of the logarithm of the focal length, about the image width: lenses
+# of 30 to 80 degrees are within one standard deviation.
 _FOCAL_SPREAD = 0.5
-"""Prior standard deviation of the logarithm of the focal length, about the image's width:
-lenses of 30 to 80 degrees are within one of it."""
+# Residual beyond which a frame counts less [px]: several times a detector's noise, about the
+# calibration error of an arm.
 _PIXEL_NOISE = 1.0
-"""Residual beyond which a frame counts less [px]: several times a detector's noise, about what
-the calibration of an arm leaves."""
+# Prior standard deviation of the principal point about the middle, relative to the image width:
+# assembled cameras are off by some tens of pixels in two thousand.
 _CENTER_SPREAD = 0.02
-"""Prior standard deviation of the principal point about the middle, over the image's width:
-assembled cameras are off by some tens of pixels in two thousand."""
+# Prior standard deviation of the radial coefficient: all lenses except fish eyes are within it.
 _RADIAL_SPREAD = 0.2
-"""Prior standard deviation of the radial coefficient: lenses but fish eyes are within it."""
+# Least depth of a point [m].
 _NEAREST = 1e-3
-"""Least depth of a point [m]."""
 _TINY = 1e-12
+# Steps of the fixed-point iteration that removes lens distortion. Each leaves a fraction
+# 2 |k1| xi^2 of the error, a tenth at the edge of a wide image.
 _LENS_STEPS = 20
-"""Of the fixed-point iteration that undoes the lens: each leaves 2 |k1| xi^2 of the error, a
-tenth at the edge of a wide image."""
+# Approximate number of frames fitted to: the noise averages out well before.
 _FRAMES = 2000
-"""About so many are fitted to: the noise averages out long before."""
 
 
 def depth_gradient(
@@ -56,13 +56,13 @@ def depth_gradient(
     focal: float,
     center: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Relative change of a point's depth with its place, g = r_3 / z [1/m].
+    """Relative change of a point's depth with its position, g = r_3 / z [1/m].
 
     Args:
-        jacobian: Of the point's pixel by its place [px/m].
-        pixel: Where it is seen [px].
+        jacobian: Derivative of the point's pixel by its position [px/m].
+        pixel: Pixel of the point [px].
         focal: Focal length [px].
-        center: Of the image [px].
+        center: Centre of the image [px].
     """
     xi = (pixel - center) / focal
     _, depth, axis = _camera(jacobian / focal, xi)
@@ -77,11 +77,11 @@ def _camera(
     """First two rows of the rotation, depth, and third row, of a camera of focal length 1."""
     square = 1 + (xi**2).sum(-1)
     # trace(J J^T) z^2 = 2 + |xi|^2
-    # A Jacobian of zeros, of which nothing is known, is one of a camera far away.
+    # A Jacobian of zeros, without information, is that of a camera far away.
     size = np.maximum((jacobian**2).sum((-2, -1)), _TINY)
     depth = np.asarray(np.sqrt((1 + square) / size))
     rows = depth[..., None, None] * jacobian
-    # The rows' cross product is along the ray, r_3 + xi_1 r_1 + xi_2 r_2.
+    # The cross product of the rows is along the ray, r_3 + xi_1 r_1 + xi_2 r_2.
     ray = np.cross(rows[..., 0, :], rows[..., 1, :])
     axis = (ray - (xi[..., None, :] @ rows)[..., 0, :]) / square[..., None]
     axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), _TINY)
@@ -90,11 +90,10 @@ def _camera(
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerCamera:
-    """A camera, and the place of a marker on the tool that it watches, found from motion alone.
+    """A camera and the position of a marker on the tool that it sees, found from motion alone.
 
-    A pinhole with Brown's first radial coefficient. The marker's place and the camera's are
-    found together, so a tool centre point that is off, or a base that was measured wrongly, is
-    within them.
+    The camera is a pinhole with Brown's first radial coefficient. Marker and camera are found
+    together, so they absorb errors of the tool centre point and of the base.
     """
 
     focal: float
@@ -106,9 +105,9 @@ class MarkerCamera:
     rotation: tuple[float, float, float]
     """Rotation vector from base to camera frame (OpenCV's axes) [rad]."""
     shift: tuple[float, float, float]
-    """Of the base's origin in the camera frame [m]."""
+    """Origin of the base in the camera frame [m]."""
     marker: tuple[float, float, float]
-    """Place of the marker in the tool's frame [m]."""
+    """Position of the marker in the tool frame [m]."""
 
     @staticmethod
     def fit(
@@ -118,16 +117,17 @@ class MarkerCamera:
         *,
         lens: bool = True,
     ) -> MarkerCamera:
-        """Find it by robust nonlinear least squares on the pixels.
+        """Fit by robust nonlinear least squares on the pixels.
 
         Args:
-            demonstrations: In which the tool moved and turned, read one by one.
-            network: Image Jacobian fitted to them, to begin with; in float64.
-            image_size: Width and height [px].
-            lens: Whether the principal point and the radial coefficient are found too, or
-                are the image's middle and zero.
+            demonstrations: Demonstrations in which the tool moved and turned, read one by one.
+            network: Image Jacobian fitted to them, in float64; gives the initial guess.
+            image_size: Width and height of the image [px].
+            lens: True: fit principal point and radial coefficient too; False: the middle of the
+                image, and zero.
         """
-        # Of the extras that read demonstrations and simulate; this package does without.
+        # SciPy belongs to extras that read demonstrations or simulate; this package imports
+        # without it.
         from scipy.optimize import least_squares
 
         pose, pixel = _sampled(demonstrations)
@@ -175,21 +175,21 @@ class MarkerCamera:
 
     @property
     def rotation_matrix(self) -> Float[np.ndarray, "3 3"]:
-        """From base to camera frame."""
+        """Rotation from base to camera frame."""
         return _matrix(np.array(self.rotation))
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where points of the camera frame [m] are seen [px]."""
+        """Pixels of points in the camera frame [px]."""
         return _project(points, self.focal, np.array(self.center), self.radial)
 
     def on_plane(
         self, pixel: Float[np.ndarray, "*batch 2"], height: float
     ) -> Float[np.ndarray, "*batch 3"]:
-        """What is seen at a pixel, of a plane across the base's z axis, in the base frame [m].
+        """Points of a horizontal plane seen at pixels, in the base frame [m].
 
         Args:
-            pixel: (u, v) [px].
-            height: Of the plane in the base frame [m].
+            pixel: Pixels (u, v) [px].
+            height: Height of the plane in the base frame [m].
         """
         distorted = (pixel - np.array(self.center)) / self.focal
         xi = distorted
@@ -209,7 +209,7 @@ class MarkerCamera:
         Espiau, Chaumette and Rives (1992) for points, times the lens.
 
         Args:
-            points: In the camera frame [m].
+            points: Points in the camera frame [m].
         """
         x, y, z = np.moveaxis(points, -1, 0)
         z = z.clip(min=_NEAREST)
@@ -226,14 +226,14 @@ class MarkerCamera:
             ],
             axis=-2,
         )
-        # A camera that turns by w and moves by v sees a point move by p x w - v.
+        # For a camera that turns by w and moves by v, points move by p x w - v.
         turned = np.cross(points[..., None, :], np.eye(3)).swapaxes(-1, -2)
         moved = np.concatenate([turned, np.broadcast_to(-np.eye(3), turned.shape)], axis=-1)
         return self.focal * lens @ pinhole @ moved
 
     def moved(self, twist: Float[np.ndarray, "6"]) -> MarkerCamera:
-        """The same camera, turned by a rotation vector [rad] about its own axes, then moved
-        along what were its axes before [m].
+        """The camera turned by a rotation vector [rad] about its own axes, then moved along the
+        axes it had before the turn [m].
         """
         back = _matrix(twist[:3]).T
         return replace(
@@ -250,14 +250,14 @@ def fit_focal_length(
 ) -> float:
     """Focal length of the camera that saw a marker of a moving tool [px].
 
-    Found together with the pose of the camera and the marker's place on the tool, without a
-    lens (see `MarkerCamera.fit`). Motions that do not tell it leave it near the width of the
-    image.
+    It is fitted together with the pose of the camera and the position of the marker, without
+    lens distortion (see `MarkerCamera.fit`). Motions without information on it leave it near
+    the image width.
 
     Args:
-        demonstrations: In which the tool moved, read one by one.
-        network: Image Jacobian fitted to them, to begin with.
-        image_size: Width and height [px].
+        demonstrations: Demonstrations in which the tool moved, read one by one.
+        network: Image Jacobian fitted to them; gives the initial guess.
+        image_size: Width and height of the image [px].
     """
     return MarkerCamera.fit(demonstrations, network, image_size, lens=False).focal
 
@@ -268,7 +268,7 @@ def _project(
     center: Float[np.ndarray, "2"],
     radial: float,
 ) -> Float[np.ndarray, "*batch 2"]:
-    # Points behind the camera are no solution: far off, yet finite.
+    # Points behind the camera are never a solution: keep them far off, yet finite.
     xi = points[..., :2] / points[..., 2:].clip(min=_NEAREST)
     return focal * xi * (1 + radial * (xi**2).sum(-1, keepdims=True)) + center
 
@@ -276,6 +276,7 @@ def _project(
 def _optics(
     optics: Float[np.ndarray, " optics"], middle: Float[np.ndarray, "2"]
 ) -> tuple[Float[np.ndarray, "2"], float]:
+    """Principal point [px] and radial coefficient from the unknowns of a fit."""
     return (middle + optics[:2], float(optics[2])) if len(optics) else (middle, 0.0)
 
 
@@ -300,7 +301,7 @@ def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
 def _sampled(
     demonstrations: Sequence[ImageDemonstration],
 ) -> tuple[Pose, Float[Tensor, "frames 2"]]:
-    """Frames in which the marker was seen, evenly over all demonstrations."""
+    """Poses and pixels of frames with a visible marker, evenly over all demonstrations."""
     every = -(-len(demonstrations) // _FRAMES)
     each = -(-_FRAMES // len(demonstrations))
     positions, orientations, pixels = [], [], []

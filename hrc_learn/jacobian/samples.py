@@ -1,6 +1,6 @@
-"""Samples of image motion: pairs of key frames of demonstrations, and the sums a fit needs.
+"""Samples of image motion: pairs of key frames of demonstrations, and their sums for a fit.
 
-Sums add up over demonstrations and processes, so one demonstration is in memory at a time.
+The sums add up over demonstrations and processes, so one demonstration is in memory at a time.
 """
 
 from __future__ import annotations
@@ -19,37 +19,37 @@ from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.pytree import pytree
 
-# Parts of the data, each of which is held out in turn to measure the error on unseen data.
+# Number of parts of the data, each held out in turn to measure the error on unseen data.
 FOLDS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFrameConfig:
-    """Which frames of a demonstration, or of a run, are compared."""
+    """Choice of key frames, the frames that are compared."""
 
     min_step: float = 2e-4
-    """Least motion between key frames [m], rotation counted with `rotation_scale`; more where
-    `pose_noise` asks for more."""
+    """Least motion between key frames [m], rotation scaled with `rotation_scale`; larger where
+    `pose_noise` requires it."""
     pose_noise: float = 0.0
-    """Standard deviation of each component of a measured pose [m], rotation counted with
-    `rotation_scale`. Pairs of frames nearer than ten times that are motion of the noise: they
-    would shrink the Jacobian towards zero (regression dilution)."""
+    """Standard deviation of each component of a measured pose [m], rotation scaled with
+    `rotation_scale`. Pairs closer than ten times that show mostly noise, which would shrink the
+    Jacobian towards zero (regression dilution)."""
     max_step: float = 0.05
-    """Pairs further apart [m] span a gap in visibility and are left out."""
+    """Largest motion of a pair [m]; a larger one spans a gap in visibility and is left out."""
     rotation_scale: float = 0.15
-    """Metres that a radian counts for [m/rad]: a typical lever arm."""
+    """Metres per radian, a typical lever arm [m/rad]."""
 
     @property
     def least_step(self) -> float:
         """Least motion between key frames, noise considered [m]."""
-        # The estimate shrinks by the ratio of both variances: by 2 % where they are ten apart.
+        # The estimate shrinks by the ratio of the variances: at a factor of ten by 2 %.
         return max(self.min_step, 10.0 * self.pose_noise)
 
 
 @pytree
 @dataclass(frozen=True, eq=False)
 class RegressionStatistics:
-    """Sums over samples: all a linear fit needs to know, in any order and from any machine."""
+    """Sufficient statistics of a linear fit: sums over samples, in any order."""
 
     gram: Float[Tensor, "P P"]
     """Sum of phi phi^T [m^2]."""
@@ -62,7 +62,7 @@ class RegressionStatistics:
 
     @staticmethod
     def of(phi: Float[Tensor, "pairs P"], dx: Float[Tensor, "pairs 2"]) -> RegressionStatistics:
-        """Statistics of some pairs, from their regressors (see `MotionSamples`)."""
+        """Statistics of pairs, from their regressors (see `MotionSamples`)."""
         return RegressionStatistics(phi.mT @ phi, phi.mT @ dx, dx.square().sum(), len(dx))
 
     @staticmethod
@@ -86,25 +86,25 @@ class RegressionStatistics:
     def squared_error(self, weights: Float[Tensor, "P 2"]) -> float:
         """Sum over the pairs of |dx - weights^T phi|^2 [px^2]."""
         change = (weights * (self.gram @ weights - 2 * self.cross)).sum()
-        # Not below zero, where rounding may take the sum of a perfect fit.
+        # Rounding may take the sum of a perfect fit below zero.
         return max(float(self.energy + change), 0.0)
 
 
 @pytree
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
-    """Motion from each key frame of a demonstration to the next one within reach."""
+    """Motion from each key frame of a demonstration to the next one, up to `max_step`."""
 
     before: Pose
-    """Of the tool at the first frame of each pair, (pairs,)."""
+    """Poses of the tool at the first frame of each pair, (pairs,)."""
     after: Pose
-    """At the second."""
+    """Poses of the tool at the second frame, (pairs,)."""
     dr: Float[Tensor, "pairs 6"]
-    """Motion of the tool, rotation counted in metres [m]."""
+    """Motion of the tool, rotation scaled to metres [m]."""
     dx: Float[Tensor, "pairs 2"]
-    """Motion of its image [px]."""
+    """Motion of the image feature [px]."""
     frames: Int[Tensor, "pairs 2"]
-    """Which two frames."""
+    """Indices of both frames."""
 
     @staticmethod
     def of(
@@ -116,9 +116,9 @@ class MotionSamples:
         """Motion along one demonstration.
 
         Args:
-            pose: Of the tool, (time,).
+            pose: Poses of the tool, (time,).
             feature: Image feature [px].
-            visible: Where the feature was found.
+            visible: True where the feature was found.
             config: Choice of key frames.
         """
         keys = key_frames(pose, visible, config)
@@ -142,20 +142,20 @@ class MotionSamples:
 
     @staticmethod
     def joined(motions: Sequence[MotionSamples]) -> MotionSamples:
-        """The pairs of several demonstrations as one."""
+        """The pairs of several demonstrations together."""
         return tree_map(lambda *parts: torch.cat(parts), MotionSamples.empty(), *motions)
 
     def split(self, parts: int) -> list[MotionSamples]:
-        """The pairs in order, in parts of nearly the same number."""
+        """The pairs in order, in parts of nearly equal size."""
         return [self[piece] for piece in torch.arange(len(self.dx)).tensor_split(parts)]
 
     def thinned(self, most: int) -> MotionSamples:
-        """So many of the pairs at most, evenly chosen."""
+        """Evenly chosen pairs, at most `most` of them."""
         pairs = len(self.dx)
         return self if pairs <= most else self[torch.linspace(0, pairs - 1, most).long()]
 
     def __getitem__(self, index: Tensor) -> MotionSamples:
-        """Some of the pairs."""
+        """The pairs at some indices."""
         return tree_map(lambda values: values[index], self)
 
     def regressors(self, basis: Callable[[Pose], Tensor]) -> Float[Tensor, "pairs P"]:
@@ -164,22 +164,22 @@ class MotionSamples:
         Args:
             basis: Neurons at poses, (pairs, K).
         """
-        # The mean of both ends is exact to second order, like the Jacobian half-way.
+        # The mean of both ends is accurate to second order, like the Jacobian half-way.
         theta = (basis(self.before) + basis(self.after)) / 2
         return (self.dr[:, :, None] * theta[:, None, :]).flatten(-2)
 
 
 def component_scale(like: Tensor, rotation_scale: float) -> Float[Tensor, "6"]:
-    """Metres that each component of a twist counts for: 1 a metre, `rotation_scale` a radian.
+    """Metres per unit of each component of a twist: 1 per metre, `rotation_scale` per radian.
 
-    dr times the scale is in metres throughout; a Jacobian divided by it is in px/m throughout.
+    dr times the scale is in metres; a Jacobian divided by it is in px/m.
     """
     return like.new_tensor([1.0] * 3 + [rotation_scale] * 3)
 
 
 def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: KeyFrameConfig) -> Tensor:
     """Indices of visible frames, each at least `min_step` away from the one before."""
-    # For close orientations the distance in R^4 is half the angle between them.
+    # For close orientations, the distance in R^4 is half the angle between them.
     turn = 2 * config.rotation_scale * quaternion.continuous(pose.orientation)
     place = torch.cat([pose.position, turn], dim=-1).detach().cpu().numpy()
     keys: list[int] = []
@@ -194,14 +194,14 @@ class ImageDemonstration:
     """One demonstration during which the camera saw the tool."""
 
     pose: Pose
-    """Of the tool, (time,)."""
+    """Poses of the tool, (time,)."""
     feature: Float[Tensor, "time 2"]
-    """Of the image [px]; anything where it is not visible."""
+    """Image feature [px]; any value where it is not visible."""
     visible: Bool[Tensor, " time"]
-    """Where the feature was found."""
+    """True where the feature was found."""
 
     def motion(self, config: KeyFrameConfig) -> MotionSamples:
-        """Between its key frames, in float64."""
+        """Motion between its key frames, in float64."""
         pose = Pose(self.pose.position.double(), self.pose.orientation.double())
         return MotionSamples.of(pose, self.feature.double(), self.visible, config)
 
@@ -214,9 +214,9 @@ def image_demonstrations(
     """Demonstrations from their columns.
 
     Args:
-        poses: Of the tool along each demonstration, (time,).
+        poses: Poses of the tool along each demonstration, (time,).
         features: Image feature along each [px].
-        visible: Where the feature was found; None: wherever it is not NaN.
+        visible: True where the feature was found; None: wherever it is not NaN.
 
     Raises:
         ValueError: The sequences do not match in number or in length.
@@ -236,9 +236,9 @@ def statistics_by_fold(
     demonstrations: Sequence[ImageDemonstration],
     config: KeyFrameConfig,
 ) -> list[RegressionStatistics]:
-    """Sums over the folds of the data, so that each can be held out in turn.
+    """Sums over each fold of the data, so that each can be held out in turn.
 
-    Each of several processes reads its share of the demonstrations; all get all the sums.
+    Each of several processes reads a part of the demonstrations; all get all the sums.
 
     Args:
         basis: Neurons at poses, (time, neurons) float64.
@@ -253,7 +253,7 @@ def statistics_by_fold(
     with torch.no_grad():
         for fold, motion in samples_by_fold(demonstrations, config):
             part = RegressionStatistics.of(motion.regressors(basis), motion.dx)
-            # The first of a fold takes it to the device of the data.
+            # The first part of a fold sets its device.
             folds[fold] = folds[fold] + part if folds[fold].count else part
     return [fold.over_processes() for fold in folds]
 
@@ -261,7 +261,7 @@ def statistics_by_fold(
 def samples_by_fold(
     demonstrations: Sequence[ImageDemonstration], config: KeyFrameConfig
 ) -> Iterator[tuple[int, MotionSamples]]:
-    """Motion between key frames of this process's share, with the fold it belongs to."""
+    """Motion between key frames in the demonstrations of this process, with its fold."""
     for i, demonstration in distributed.share(demonstrations):
         motion = demonstration.motion(config)
         if len(demonstrations) == 1:

@@ -6,4 +6,4 @@ from hrc_learn.regions.region import AxisRegion as AxisRegion
 from hrc_learn.regions.region import OrientationRegion as OrientationRegion
 from hrc_learn.regions.region import PositionRegion as PositionRegion
 from hrc_learn.regions.region import Region as Region
-from hrc_learn.regions.vision import VisionRegion as VisionRegion
+from hrc_learn.regions.region import VisionRegion as VisionRegion

@@ -1,4 +1,4 @@
-"""Joint-space regions: one repels from the joint limits, one attracts to a posture."""
+"""Regions of joint space: repulsion from the joint limits, attraction to a posture."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from hrc_learn.regions.region import Region
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class JointRegion(Region):
-    """Repels each joint from the nearer of its limits, before it is reached.
+    """Range of the joints; repels each joint from the nearer of its limits.
 
-    With the distance to the limit delta_i, negative past it:
+    With the distance delta_i to the limit, negative past it:
 
         f_i = delta_i - margin,   f_ri = delta_i - reference_margin
         P   = sum_i k_q/2 min(0, f_i)^2 + k_r/2 min(0, f_ri)^2           (jointxp)
 
     `formulation="paper"` is Table I's f_i = delta_i^2 - margin^2. Its push vanishes at the
-    limit and turns outwards past it, because the square forgets the side.
+    limit and points outwards past it, because the square loses the sign.
     """
 
     centre: Float[Tensor, "*#batch n"]
@@ -32,9 +32,9 @@ class JointRegion(Region):
     half_range: Float[Tensor, "*#batch n"]
     """Half of the joint range [rad]."""
     margin: float = static(0.1)
-    """Distance from the limit at which the steep repulsion sets in [rad]."""
+    """Distance from the limit at which the steep repulsion starts [rad]."""
     reference_margin: float = static(0.3)
-    """Distance at which the weak repulsion of the reference region sets in [rad]."""
+    """Distance at which the weak repulsion of the reference region starts [rad]."""
     stiffness: float = static(10.0)
     """k_q."""
     reference_stiffness: float = static(1.0)
@@ -64,7 +64,7 @@ class JointRegion(Region):
         slope = pull + pull_reference  # dP/d delta, at most zero
         if self.formulation == "paper":
             slope = slope * (2 * distance)
-        # The distance to the nearer limit falls on either side of the centre.
+        # The distance to the nearer limit falls on both sides of the centre.
         return P, -torch.sign(offset) * slope
 
     def _depths(self, distance: Tensor) -> tuple[Tensor, Tensor]:
@@ -78,23 +78,23 @@ class JointRegion(Region):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class PostureRegion(Region):
-    """Ball that attracts the joints to a posture, at a speed that levels off with the distance.
+    """Ball about a posture; attracts the joints, with a pull that saturates with the distance.
 
     f = |q - q_g| / tolerance - 1
     P = k s^2 (sqrt(1 + |q - q_g|^2/s^2) - 1)
 
-    Far away a joint-space approach meets neither singularities nor joint limits between two
-    admissible postures, where a straight line of the tool meets both.
+    Between two admissible postures, a joint-space approach meets neither singularities nor
+    joint limits; a straight line of the tool may meet both.
     """
 
     goal: Float[Tensor, "*#batch n"]
-    """Posture to go to [rad], within the joint limits."""
+    """Goal posture within the joint limits [rad]."""
     tolerance: float = static(0.5)
-    """Radius of the region [rad]; inside it other feedback may take over."""
+    """Radius of the region [rad], inside which task-space feedback may take over."""
     stiffness: float = static(2.0)
-    """k, the rate of convergence close to the goal [1/s]."""
+    """k, convergence rate close to the goal [1/s]."""
     saturation: float = static(0.75)
-    """s, the distance from which on the pull hardly grows [rad]; its limit is k s [rad/s]."""
+    """s, distance at which the pull saturates [rad]; its limit is k s [rad/s]."""
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both"]:
         """Region function f at the joint position x [rad]."""

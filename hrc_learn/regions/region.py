@@ -1,12 +1,10 @@
-"""The interface of regions, and the Cartesian ones: a box for the position, cones round a goal
-orientation and round a goal axis.
-"""
+"""Regions of task space: box, orientation cone, axis cone, and ellipse in the image."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import torch
 from jaxtyping import Float
@@ -18,11 +16,11 @@ from hrc_learn.pytree import pytree, static
 
 
 class Region(ABC):
-    """A region f(x) <= 0 of some space and a potential energy P(x) that steers x by it.
+    """A region f(x) <= 0 of some space, and a potential energy P(x) that attracts or repels x.
 
-    The controller moves against xi = dP/dx, the regional feedback vector, which is in closed
-    form. Methods are pure and batched: the leading dimensions of `x` and of the region's own
-    tensors broadcast.
+    The controller moves against the regional feedback xi = dP/dx, which has a closed form.
+    Methods are pure and batched: the leading dimensions of `x` and of the region's tensors
+    broadcast.
     """
 
     @abstractmethod
@@ -46,8 +44,8 @@ class Region(ABC):
         return self.feedback(x)[1]
 
 
-# Region function of the position, twice the half size out, from which on the pull of the
-# saturated form grows no faster than the distance.
+# Region function at twice the half size, beyond which the pull of the saturated form grows
+# linearly with the distance.
 _FAR_OUT = 3.0
 
 
@@ -59,13 +57,13 @@ class PositionRegion(Region):
     f_i = ((r_i - c_i) / h_i)^2 - 1                                      (CaFun)
     P   = sum_i k_c/2 max(0, f_i)^2                                      (CaPeFun)
 
-    k_c has the unit of a potential: the speed it asks for, 2 k_c f (r - c)/h^2, grows as the
-    box shrinks, and near a wall the excess decays at the rate 4 k_c/h^2 [1/s].
+    k_c has the unit of a potential: the requested speed, 2 k_c f (r - c)/h^2, grows as the box
+    shrinks, and near a wall the excess decays at the rate 4 k_c/h^2 [1/s].
 
-    Far from a small box that pull grows with the cube of the distance: the axis that is
-    furthest out leads alone, and a cap on the twist leaves nothing for the turn.
-    `formulation="saturated"` is the same up to twice the half size, f = 3; beyond, the pull
-    grows with the distance, and so leads straight to a box that is small:
+    Far from a small box this pull grows with the cube of the distance: the axis with the
+    largest offset dominates, and a cap on the twist leaves nothing for the rotation.
+    `formulation="saturated"` is equal up to twice the half size, f = 3; beyond, the pull grows
+    linearly, so the tool moves straight to the box:
 
     P = sum_i k_c 3 (f_i - 3/2),   f_i > 3
     """
@@ -73,12 +71,12 @@ class PositionRegion(Region):
     centre: Float[Tensor, "*#batch 3"]
     """Centre of the box [m]."""
     half_size: Float[Tensor, "*#batch 3"]
-    """Half of its edges, all positive [m]."""
+    """Half edges of the box, all positive [m]."""
     rotation: Float[Tensor, "*#batch 4"] | None = None
     """Orientation of the box as a unit quaternion (w, x, y, z); None: along the base axes."""
     stiffness: float | tuple[float, float, float] = static(4e-3)
-    """k_c, one for all or one for each axis of the box. Ten times that of Table I: there the
-    excess near a wall of 0.12 m decays in 9 s, which leaves the tool outside for long."""
+    """k_c, one for all or one for each axis of the box. Ten times Table I's, with which the
+    excess near a wall of 0.12 m takes 9 s to decay."""
     formulation: Literal["paper", "saturated"] = static("paper")
 
     def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
@@ -108,19 +106,19 @@ class PositionRegion(Region):
         return P, gradient
 
     def _in_box(self, x: Tensor) -> Tensor:
-        """Offset from the centre, along the axes of the box [m]."""
+        """Offset from the centre in the frame of the box [m]."""
         offset = x - self.centre
         if self.rotation is None:
             return offset
         return quaternion.rotate(quaternion.conjugate(self.rotation), offset)
 
 
-# Shorter axes are rounding noise. They occur at the goal, deep inside the cone, where the
-# gradient is zero whatever the axis.
+# Shorter axes are rounding noise. They occur only at the goal, inside the cone, where the
+# gradient is zero.
 _SHORTEST_AXIS = 1e-12
-# Smaller components are not divided by: the printed form has poles there.
+# Smaller components are never divisors: the printed form has poles there.
 _LEAST_COMPONENT = 1e-9
-# Below this angle squared the closed form of the last term loses digits, its series none.
+# Below this squared angle the closed form of the last term loses digits; its series does not.
 _SMALL = 1e-3
 
 
@@ -133,17 +131,17 @@ class OrientationRegion(Region):
     P = k_o/2 max(0, f)^2                                                (OrtFun1)
 
     The norm of the quaternion logarithm is *half* the rotation angle phi, so the cone is
-    phi <= 2/alpha_o: 7.6 degrees for alpha_o = 15. The error takes the sign of the shortest
+    phi <= 2/alpha_o: 7.6 degrees for alpha_o = 15. The error has the sign of the shortest
     rotation, so p and -p are the same orientation.
 
-    The gradient belongs to the geometric Jacobian: it is dP over a small rotation of the end
-    effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis n of the error.
+    The gradient is that of the geometric Jacobian, dP over a small rotation of the end effector
+    about the base axes: k_o max(0, f) (alpha_o/2) n with the axis n of the error.
     `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n (orient_diff_potential),
-    which has the same direction and 2 phi times that length.
+    which has the same direction and 2 phi times the length.
 
-    With `coordinates="rotation_vector"` it belongs to the analytic Jacobian: it is dP over the
-    rotation vector of x, J_l^T times the above. `formulation="paper"` is then the printed chain
-    (PartialV2Quat), (JacobianQuatAngAxisDetailed), which is twice as long.
+    With `coordinates="rotation_vector"` the gradient is that of the analytic Jacobian, dP over
+    the rotation vector of x: J_l^T times the above. `formulation="paper"` is then the printed
+    chain (PartialV2Quat), (JacobianQuatAngAxisDetailed), which is twice as long.
     """
 
     goal: Float[Tensor, "*#batch 4"]
@@ -177,7 +175,7 @@ class OrientationRegion(Region):
         half_angle = torch.atan2(sine, error[..., :1])
         f = (self.sharpness * half_angle - 1).clamp(min=0)
         P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
-        # Over the sine, as the vector part of the error is sin(phi/2) n.
+        # Divided by the sine, because the vector part of the error is sin(phi/2) n.
         slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
         if self.coordinates == "rotation_vector":
             if self.formulation == "paper":
@@ -197,16 +195,17 @@ class OrientationRegion(Region):
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class AxisRegion(Region):
-    """All orientations whose z axis is within an angle of the goal's; turns about it are free.
+    """All orientations whose z axis is within an angle of the goal's; rotation about it is
+    free.
 
-    f and P are those of `OrientationRegion`, of the angle phi between both axes. The gradient
-    is dP over a small rotation of the end effector about the base axes. It is across both axes:
-    no turn about the tool's own is asked for. Exactly opposite ones are led about an axis that
-    the goal chooses.
+    f and P are those of `OrientationRegion` for the angle phi between both axes. The gradient
+    is dP over a small rotation of the end effector about the base axes. It is perpendicular to
+    both axes, so it requests no rotation about the tool's own axis. Opposite axes are rotated
+    about an axis chosen by the goal.
     """
 
     goal: Float[Tensor, "*#batch 4"]
-    """An orientation with the wanted z axis, a unit quaternion (w, x, y, z)."""
+    """An orientation with the goal's z axis, a unit quaternion (w, x, y, z)."""
     sharpness: float = static(15.0)
     """alpha_o, two over the tolerated angle [1/rad]."""
     stiffness: float = static(0.02)
@@ -235,14 +234,14 @@ class AxisRegion(Region):
     def _swing(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """sin(phi/2) n in the goal's frame, sin(phi/2) and cos(phi/2).
 
-        The rotation from goal to x is a turn about z, then one by phi about n, across z
-        (swing-twist decomposition).
+        The rotation from goal to x is a rotation about z, then one by phi about n,
+        perpendicular to z (swing-twist decomposition).
         """
         error = quaternion.multiply(quaternion.conjugate(self.goal), x)
         w, i, j, k = error.split(1, dim=-1)
         sine = torch.linalg.vector_norm(error[..., 1:3], dim=-1, keepdim=True)
         cosine = torch.linalg.vector_norm(torch.cat([w, k], dim=-1), dim=-1, keepdim=True)
-        # Of half a turn of the axis any turn about z may be taken for none.
+        # After half a turn of the axis, the rotation about z is arbitrary: choose none.
         half_turn = cosine < _SHORTEST_AXIS
         length = torch.where(half_turn, 1.0, cosine)
         c, s = torch.where(half_turn, 1.0, w / length), torch.where(half_turn, 0.0, k / length)
@@ -253,16 +252,15 @@ class AxisRegion(Region):
 def printed_derivative(
     p: Float[Tensor, "*#batch 4"], goal: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*both 3"]:
-    """Derivative of v_e as the paper prints it: (PartialV2Quat) times J_rot
-    (JacobianQuatAngAxisDetailed).
+    """Printed derivative of v_e: (PartialV2Quat) times J_rot (JacobianQuatAngAxisDetailed).
 
-    It divides by the components of both quaternions and counts the constraint of unit length
+    It divides by the components of both quaternions and counts the unit-length constraint
     twice: along unit quaternions it is twice the true derivative, for which `OrientationRegion`
     has a form without divisions.
 
     Args:
         p: Orientation with p_w >= 0; r_o is its rotation vector.
-        goal: p_g. The sign of the error's real part v_e is made positive.
+        goal: Goal p_g, of either sign.
     """
     g = quaternion.conjugate(goal)  # (v_g, u_g) are components of the inverse
     real = quaternion.multiply(p, g)[..., :1]
@@ -271,7 +269,7 @@ def printed_derivative(
     sign = p.new_tensor([1.0, -1.0, -1.0, -1.0])
     tiny = p.abs() < _LEAST_COMPONENT
     ratio = torch.where(tiny, 0.0, sign * g / torch.where(tiny, 1.0, p))
-    # Each line adds p_i times minus the ratios of the other three.
+    # Each component subtracts p_i times the ratios of the other three.
     over_p = sign * g - p * (ratio.sum(-1, keepdim=True) - ratio)
     return _over_rotation_vector(over_p, quaternion.log(p))
 
@@ -289,3 +287,99 @@ def _over_rotation_vector(over_p: Tensor, r: Tensor) -> Tensor:
         -1, keepdim=True
     )
     return sinc / 2 * over_p[..., 1:] + (along - sinc / 4 * over_p[..., :1]) * r
+
+
+# Normalised distance at which the pull of the saturated form levels off.
+_SATURATION = 0.5
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class VisionRegion(Region):
+    """Ellipse about the target in the image; its potential is minimal at the target.
+
+    f = ((u - u_d) / b_1)^2 + ((v - v_d) / b_2)^2 - 1                    (eq_vision_re_func)
+    P = k_v/2 (1 - min(0, f)^2)                                          (eq_vision_p)
+
+    This pull is zero at the target and at the edge of the ellipse, and so weak near both.
+    `formulation="saturated"` has the same pull close to the target and a nearly constant one
+    further out, anywhere in the image:
+
+    P = 2 k_v s^2 (sqrt(1 + rho^2/s^2) - 1),   rho^2 = f + 1,   s = 1/2
+
+    A feature of several points, such as the corners of a marker, has an ellipse about each of
+    them, and its potential is the mean of theirs.
+    """
+
+    target: Float[Tensor, "*#batch rows"]
+    """Desired feature position (u, v) [px], or u and v of several points in turn."""
+    half_size: Float[Tensor, "*#batch rows"]
+    """Half axes b_1, b_2 of the ellipse, positive [px]. It should lie inside the image."""
+    stiffness: float = static(0.3)
+    """k_v."""
+    formulation: Literal["paper", "saturated"] = static("paper")
+
+    @classmethod
+    def inside_image(
+        cls,
+        target: Float[Tensor, "*batch rows"],
+        image_size: tuple[int, int],
+        border: float = 0.0,
+        **options: Any,
+    ) -> VisionRegion:
+        """Largest ellipse about the target that stays inside the image.
+
+        Args:
+            target: Desired feature position (u, v) [px].
+            image_size: Width and height of the image [px].
+            border: Distance the ellipse keeps from the edge of the image [px].
+            options: The remaining fields.
+
+        Raises:
+            ValueError: The target is not inside the image by more than the border.
+        """
+        # Pixels are numbered from 0 to the size less one.
+        far_edge = target.new_tensor(image_size).repeat(target.shape[-1] // 2) - 1
+        half_size = torch.minimum(target, far_edge - target) - border
+        if not bool((half_size > 0).all()):
+            raise ValueError(
+                f"the vision target must lie more than {border} px inside the image of "
+                f"{image_size[0]} x {image_size[1]} px, but is {target.tolist()}; "
+                "move the target or lower `border`"
+            )
+        return cls(target=target, half_size=half_size, **options)
+
+    def value(self, x: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*both"]:
+        """Region function f at the feature position x [px]; the largest of several points."""
+        scaled = (x - self.target) / self.half_size
+        square = scaled * scaled
+        if square.shape[-1] > 2:
+            return square.unflatten(-1, (-1, 2)).sum(-1).amax(-1) - 1
+        return square.sum(-1) - 1
+
+    def feedback(
+        self, x: Float[Tensor, "*batch rows"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both rows"]]:
+        """Potential and its gradient over the feature position [1/px]; means over points."""
+        scaled = (x - self.target) / self.half_size
+        if scaled.shape[-1] > 2:
+            P, gradient = self._steer(scaled.unflatten(-1, (-1, 2)))
+            points = P.shape[-1]
+            return P.mean(-1), gradient.flatten(-2) / (points * self.half_size)
+        P, gradient = self._steer(scaled)
+        return P, gradient / self.half_size
+
+    def _steer(self, scaled: Tensor) -> tuple[Tensor, Tensor]:
+        """Potential and gradient of a point at its normalised offset."""
+        square = (scaled * scaled).sum(-1, keepdim=True)
+        steer = self._saturated if self.formulation == "saturated" else self._paper
+        P, slope = steer(square)
+        return P.squeeze(-1), slope * scaled
+
+    def _paper(self, square: Tensor) -> tuple[Tensor, Tensor]:
+        f = (square - 1).clamp(max=0)
+        return (0.5 * self.stiffness) * (1 - f * f), (-2 * self.stiffness) * f
+
+    def _saturated(self, square: Tensor) -> tuple[Tensor, Tensor]:
+        root = torch.sqrt(1 + square / _SATURATION**2)
+        return (2 * self.stiffness * _SATURATION**2) * (root - 1), 2 * self.stiffness / root

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from pinhole import Pinhole, wander
+from printed_estimator import PrintedEstimator
 from sampling import generator
 from torch.testing import assert_close
 from unchecked import shapes_unchecked
@@ -23,7 +24,6 @@ from hrc_learn.jacobian import (
     LeastSquaresConfig,
     Measurement,
     PaperEstimator,
-    PrintedEstimator,
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
     paper_grid,
@@ -219,37 +219,20 @@ def test_paper_law_entry_by_entry():
     np.testing.assert_allclose(state.weight.numpy(), W, rtol=1e-14, atol=0)
 
 
-def test_printed_weights_are_those_of_where_the_feature_is_first_seen():
-    """(eq_w0) at the first valid measurement of each robot, and (update) from then on."""
-    poses = wander(3, 2, rng=generator(16))
+def test_printed_weights_are_set_where_the_feature_is_first_seen():
+    """(eq_w0) as printed, vec(J_s0) over the sum of unnormalised neurons, then (update)."""
+    pose = wander(2, rng=generator(16))
     printed = PrintedEstimator(guess())
-    state = printed.initial_state(2)
-    assert not printed.jacobian(state, poses[:, 0]).any()
-    # The second robot sees the feature a step later.
-    for t, valid in enumerate([[False, False], [True, False], [True, True]]):
-        m = measurement(poses[:, t], torch.zeros(2, 2).double(), seed=t, dt=0.01)
-        state = printed.update(state, replace(m, valid=torch.tensor(valid)))
-        if t == 0:
-            assert not state.weight.any()
-    for robot, first in enumerate((1, 2)):
-        start = poses[robot, first]
-        network = RBFImageJacobian.from_jacobian(
-            J0, paper_grid(), 0.1, formulation="paper", start=start.vector()
-        )
-        law = PaperEstimator(network)
-        expected = law.initial_state()
-        for t in range(first, 3):
-            m = measurement(poses[:, t], torch.zeros(2, 2).double(), seed=t, dt=0.01)
-            mine = Measurement(
-                pose=poses[robot, t],
-                feature=m.feature[robot],
-                valid=m.valid[robot],
-                dt=0.01,
-                xi_x=m.xi_x[robot],
-                xi_r=m.xi_r[robot],
-            )
-            expected = law.update(expected, mine)
-        assert_close(state.weight[robot], expected.weight, rtol=1e-12, atol=0)
+    state = printed.initial_state()
+    first = measurement(pose[0], torch.zeros(2).double(), dt=0.01)
+    state = printed.update(state, replace(first, valid=torch.tensor(False)))
+    assert not state.weight.any()
+    state = printed.update(state, replace(first, xi_x=0 * first.xi_x))
+    mixed = J0.mT.flatten().view(2, 6)
+    assert_close(printed.jacobian(state, pose[0]), mixed, rtol=1e-12, atol=1e-9)
+    second = measurement(pose[1], torch.zeros(2).double(), seed=1, dt=0.01)
+    law = PaperEstimator(printed.network)
+    assert_close(printed.update(state, second).weight, law.update(state, second).weight)
 
 
 def test_rows_that_are_not_mixed_are_the_guess_where_it_began():

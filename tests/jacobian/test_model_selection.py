@@ -110,7 +110,7 @@ def test_learning_keeps_what_was_best_on_demonstrations_held_out():
 
 
 def test_too_few_demonstrations_are_refused():
-    with pytest.raises(ValueError, match="holds out every 4th"):
+    with pytest.raises(ValueError, match="every 4th demonstration is held out"):
         maximize_evidence(record(3), RBFCenters.paper())
 
 

@@ -73,25 +73,6 @@ def test_from_jacobian_holds_everywhere():
     assert_close(network(far), J0.expand(2, 2, 6))
 
 
-def test_papers_first_weights_mix_image_rows_and_fade_with_distance():
-    """(eq_w0) as printed: vec(J_s) instead of vec(J_s^T), neurons not normalised."""
-    start = torch.tensor([0.2, 0.5, 0.3, 3.0, 0, 0], dtype=torch.float64)
-    network = RBFImageJacobian.from_jacobian(
-        J0, paper_grid(), 0.1, formulation="paper", start=start
-    )
-    mixed = J0.mT.flatten().view(2, 6)
-    assert_close(network(start), mixed)
-    moved = start + torch.tensor([0.3, 0.0, 0, 0, 0, 0], dtype=torch.float64)
-    assert float(network(moved).norm()) < 0.25 * float(mixed.norm())
-
-
-def test_formulations_ask_for_what_they_need():
-    with pytest.raises(ValueError, match="needs start"):
-        RBFImageJacobian.from_jacobian(J0, paper_grid(), 0.1, formulation="paper")
-    with pytest.raises(ValueError, match="leave it out"):
-        RBFImageJacobian.from_jacobian(J0, paper_grid(), 0.1, start=torch.zeros(6))
-
-
 def test_paper_grid_is_table_one():
     expected = [[0.05 + 0.15 * i, 0.35 + 0.15 * j] for i in range(3) for j in range(3)]
     assert_close(paper_grid(), torch.tensor(expected, dtype=torch.float64))
