@@ -21,7 +21,7 @@ from torch import Tensor
 
 from hrc_learn import cli
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import ArmChoice, FrankaWorkArm, UnreachableError, WorkArm
+from hrc_learn.kinematics import Arm, ArmChoice, UnreachableError
 from hrc_learn.kinematics.inverse import solutions_from
 from hrc_learn.kinematics.registry import MissingModelError
 
@@ -66,11 +66,11 @@ def main(args: Args) -> None:
         cli.write_json(args.json, figures)
 
 
-def _one_by_one(robot: WorkArm, pose: Pose, near: Tensor) -> Tensor:
+def _one_by_one(robot: Arm, pose: Pose, near: Tensor) -> Tensor:
     """The nearest solution: of each position of joint 7 in turn, or from each start."""
     chain, found = robot.chain, []
     low, high = chain.limits.lower, chain.limits.upper
-    if isinstance(robot, FrankaWorkArm):
+    if robot.is_franka:
         for q7 in torch.linspace(float(low[6]), float(high[6]), _SAMPLES):
             try:
                 found.append(robot.chain.inverse(pose, float(q7), near=near))

@@ -34,13 +34,11 @@ from hrc_learn.kinematics import (
     Arm,
     ArmChoice,
     CapsuleArm,
-    FrankaChain,
     LinkCapsule,
     TaskSpace,
     UnreachableError,
     arm,
     clear_posture,
-    comfortable_postures,
     gripper_down,
 )
 from hrc_learn.kinematics.inverse import solutions_from
@@ -108,9 +106,9 @@ class TrialArm:
             1.0,
             quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64)),
         )
-        if isinstance(arm.chain, FrankaChain):
+        if arm.is_franka:
             self.centre = self.scaled(CENTRE)
-            self.postures = comfortable_postures(arm.chain, Pose(self.centre, self.down))
+            self.postures = arm.postures(Pose(self.centre, self.down))
             return
         self.scale, self.down = min(1.0, arm.reach / _PANDA_REACH), gripper_down()
         possible = []

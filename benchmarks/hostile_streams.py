@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter
-from hrc_learn.kinematics import JointLimits, franka_chain
+from hrc_learn.kinematics import JointLimits, arm
 
 STREAMS = ("random", "bang-bang", "resonant", "outward", "chasing", "poisoned")
 """Kinds of commands: new random velocities in each tick or held for a while; signs at ten times
@@ -32,7 +32,7 @@ class StreamConfig:
     """How streams are drawn."""
 
     arm: str = "fr3"
-    """By its name, as for `franka_chain`."""
+    """By its name, as for `arm`."""
     count: int = 120
     """Of streams, as many of each kind."""
     ticks: int = 1000
@@ -76,22 +76,22 @@ def hostile_streams(config: StreamConfig, safety: SafetyFilter | None = None) ->
         safety: The filter; None: one of the arm's limits and `config.safety`.
     """
     rng = torch.Generator().manual_seed(config.seed)
-    arm, count, dt = franka_chain(config.arm), config.count, config.dt
-    safety = safety or SafetyFilter(arm.limits, config.safety)
+    robot, count, dt = arm(config.arm), config.count, config.dt
+    safety = safety or SafetyFilter(robot.limits, config.safety)
     kind = torch.arange(count) % len(STREAMS)
     poisoned = (kind == STREAMS.index("poisoned")).unsqueeze(-1)
     noise = config.noise * (torch.arange(count) % 4 < 2).unsqueeze(-1)
     # The tool's speed is capped on a third of the arms: on the others only the joints' limits.
     uncapped = (torch.arange(count) % 3 > 0).view(-1, 1, 1)
-    command = _commands(config, arm.limits, kind, rng)
-    q = _start(arm.limits, count, rng)
+    command = _commands(config, robot.limits, kind, rng)
+    q = _start(robot.limits, count, rng)
     v = torch.zeros_like(q)
     state = safety.initial_state(q)
     positions, velocities, poisonings = [q], [v], 0
     for k in range(config.ticks - 1):
         reading = q + noise * torch.randn(q.shape, generator=rng, dtype=q.dtype)
         u = command(k * dt, reading, v)
-        J = arm.jacobian(reading).masked_fill(uncapped, 0)
+        J = robot.jacobian(reading).masked_fill(uncapped, 0)
         step = torch.tensor(dt, dtype=q.dtype)
         if float(uniform(rng)) < config.event:
             step = _STEPS[torch.randint(len(_STEPS), (), generator=rng)]

@@ -27,6 +27,7 @@ from hrc_learn import cli
 from hrc_learn.kinematics import Arm, MissingModelError, arm, registered_arms
 from hrc_learn.kinematics._mjcf import read_mjcf
 from hrc_learn.kinematics._urdf import read_urdf
+from hrc_learn.kinematics.described_arm import arm_from_description
 
 # What a user's mistake, or a file's, is told by: `hrc` prints these in one line.
 _TOLD = (ValueError, FileNotFoundError)
@@ -133,7 +134,7 @@ def _arms(path: Path, most: int) -> Iterator[Arm]:
         if loaded == most:
             break
         try:
-            found = Arm.from_description(description, tip=tip)
+            found = arm_from_description(description, tip=tip)
         except _TOLD as error:
             refusals.append(error)
             continue

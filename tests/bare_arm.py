@@ -1,8 +1,8 @@
-"""A Panda without some of its joints, as an arm that nobody has seen."""
+"""A Panda without some of its joints, as an unknown arm."""
 
 import torch
 
-from hrc_learn.kinematics import Arm, CapsuleArm, JointLimits, LinkCapsule, SerialChain, panda
+from hrc_learn.kinematics import Arm, ArmShape, JointLimits, LinkCapsule, SerialChain, panda
 
 
 def bare(left_out=(2,), name="cut", slides=()):
@@ -35,6 +35,11 @@ def bare(left_out=(2,), name="cut", slides=()):
         LinkCapsule(link=link, start=(0.0, 0.0, -0.02), end=(0.0, 0.0, 0.02), radius=0.01)
         for link in (*range(n + 1), n + 2)
     ]
-    body = CapsuleArm(chain, capsules, [(0, 2)])
     masses = (3.0, *(2.0,) * n, 0.0, 0.7)
-    return Arm(name=name, chain=chain, own_body=body, told_masses=masses)
+    return Arm(
+        name=name,
+        chain=chain,
+        shape=ArmShape(masses=masses),
+        capsules=capsules,
+        overlapping=[(0, 2)],
+    )

@@ -16,7 +16,7 @@ from hrc_learn.controller import constrained_velocity
 from hrc_learn.dmp import ContextualDMP, JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
 from hrc_learn.dmp.training import DescentConfig, Tracking, train
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import ArmChoice, panda, panda_capsules, separation, solve_inverse
+from hrc_learn.kinematics import ArmChoice, panda, separation, solve_inverse
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 DOUBLE = torch.float64
@@ -46,20 +46,18 @@ def inverse(device: str):
 
 def analytic_inverse(device: str):
     q = postures(20).to(device)
-    return ArmChoice("panda").work_arm().nearest(panda.forward(q), near=q)
+    return ArmChoice("panda").work_arm().inverse(panda.forward(q), near=q)
 
 
 def self_distance(device: str):
-    return panda_capsules.self_distance(postures(50).to(device))
+    return panda.whole.self_distance(postures(50).to(device))
 
 
 def distance_to_a_person(device: str):
     rng = sampling.generator(1)
     ends = 0.5 * torch.randn(50, 5, 2, 3, generator=rng, dtype=DOUBLE)
     radius = torch.full((50, 5), 0.1, dtype=DOUBLE)
-    found = separation(
-        panda_capsules, postures(50).to(device), ends.to(device), radius.to(device)
-    )
+    found = separation(panda.whole, postures(50).to(device), ends.to(device), radius.to(device))
     return found.distance, found.gradient
 
 

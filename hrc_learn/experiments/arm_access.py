@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Literal
 
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
-from hrc_learn.kinematics import PANDA, FrankaWorkArm, SerialChain, WorkArm, panda
+from hrc_learn.kinematics import Arm, SerialChain, panda
 from hrc_learn.protocols import OpenedArm
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import ArmServer, ServedArm, serve_world
@@ -92,7 +92,7 @@ ArmDriver = Literal["sim", "franky", "franka"]
 """What leads an arm: the simulator itself, or a driver of the real one."""
 
 
-def access_by(driver: ArmDriver, robot: WorkArm = PANDA) -> ArmAccess:
+def access_by(driver: ArmDriver, robot: Arm = panda) -> ArmAccess:
     """How a driver leads the arm of a world.
 
     Args:
@@ -104,7 +104,7 @@ def access_by(driver: ArmDriver, robot: WorkArm = PANDA) -> ArmAccess:
     """
     if driver == "sim":
         return SIMULATED
-    if not isinstance(robot, FrankaWorkArm):
+    if not robot.is_franka:
         raise ValueError(
             f"--arm {driver} drives Franka's arms, not the {robot.name}: leave it out, and the "
             "simulated arm is led without a driver."

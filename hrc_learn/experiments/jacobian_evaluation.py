@@ -21,7 +21,7 @@ from hrc_learn.jacobian import (
     KalmanEstimator,
     RBFImageJacobian,
 )
-from hrc_learn.kinematics import PANDA, WorkArm, gripper_down
+from hrc_learn.kinematics import Arm, gripper_down, panda
 from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from hrc_learn.skills.visual_skill import guessed_network
 from hrc_learn.vision import CameraModel
@@ -95,7 +95,7 @@ class ClosedLoops:
     """[rad]"""
     goals: Goals
     config: StartsConfig
-    robot: WorkArm = PANDA
+    robot: Arm = panda
 
     @classmethod
     def draw(
@@ -105,7 +105,7 @@ class ClosedLoops:
         workspace: Float[Tensor, "2 3"],
         near: Float[Tensor, "joints"],
         config: StartsConfig,
-        robot: WorkArm = PANDA,
+        robot: Arm = panda,
     ) -> "ClosedLoops":
         """Draw them at random.
 
@@ -134,7 +134,7 @@ class ClosedLoops:
         tilted = quaternion.multiply(quaternion.exp(config.tilt * uniform(3)), down)
         return cls(
             camera=turned,
-            start=robot.nearest(Pose(middle + half * uniform(3), tilted), near, samples=9),
+            start=robot.inverse(Pose(middle + half * uniform(3), tilted), near=near, samples=9),
             goals=Goals.at(middle, down[0], target),
             config=config,
             robot=robot,

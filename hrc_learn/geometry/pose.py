@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.arrays import as_tensor
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,13 @@ class Pose:
     """Origin in the parent frame [m]."""
     orientation: Float[Tensor, "*batch 4"]
     """Unit quaternion (w, x, y, z); either sign."""
+
+    def __post_init__(self):
+        # NumPy arrays and lists become tensors; placeholders of tracers pass unchanged.
+        for name in ("position", "orientation"):
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray | list | tuple):
+                object.__setattr__(self, name, as_tensor(value))
 
     @staticmethod
     def from_matrix(T: Float[Tensor, "*batch rows 4"]) -> Pose:

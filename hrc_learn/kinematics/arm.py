@@ -1,381 +1,569 @@
-"""Everything that the rest of the package needs to know of a robot arm, from its description.
+"""A robot arm: its kinematics, limits, shape, gripper and inverse kinematics in one object.
 
-The frames of an arm's links are those of `SerialChain`: each joint's z axis is that along or
-about which it moves, so they may be turned against the frames of the file by a constant, which
-is taken into account wherever something is mounted on a link.
+Link frames are those of `SerialChain`: the z axis of each is the axis of its joint. They may be
+turned against the frames of the description by a constant, which is taken into account
+wherever something is mounted on a link.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.geometry import Pose
-from hrc_learn.kinematics._assembly import (
-    GripperDescription,
-    LinkShape,
-    LinkVisual,
-    assemble,
-)
+from hrc_learn.geometry import MeshFile, Pose, quaternion
+from hrc_learn.geometry.arrays import ArrayLike, as_tensor
+from hrc_learn.kinematics._assembly import GripperDescription, LinkShape, LinkVisual
 from hrc_learn.kinematics._capsule_fit import fit_body
-from hrc_learn.kinematics._description import Description
-from hrc_learn.kinematics._mjcf import read_mjcf
-from hrc_learn.kinematics._urdf import read_urdf
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.collision import CapsuleArm
-from hrc_learn.kinematics.franka import UnreachableError
-from hrc_learn.kinematics.inverse import TaskSpace, solve_inverse
-from hrc_learn.kinematics.limits import complete_limits, read_limits
+from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+from hrc_learn.kinematics.interchange import to_urdf
+from hrc_learn.kinematics.inverse import TaskSpace, solutions_from, solve_inverse, unwound
+from hrc_learn.kinematics.redundancy import best_postures
 
-type LimitsGiven = Mapping[str, Mapping[str, float]] | Path | None
-"""Limits that replace or complete those of a description, see `complete_limits`, or a file."""
-
-# Of arms whose description gives no masses, of the capsules' volume: a guess, a little above
-# water, for aluminium shells with motors and gears in them.
+# Density of aluminium shells with motors and gears in them, a little above water: used for
+# the volume of the capsules where a description gives no masses. A guess.
 _DENSITY = 1200.0  # [kg/m^3]
+_STARTS = 200  # random starts from which `postures` searches
+_SCAN = 57  # solutions among which `inverse` chooses where a joint is redundant
+_POSTURE_SCAN = 29  # positions of joint 7 among which `postures` chooses
+_MARGIN = 0.02  # distance of the scan from the limits of joint 7 [rad]
+_LARGEST_STEP = 0.5  # joint motion between poses of a path that calls for a wider search [rad]
+
+TCP_OFFSET = 0.1034
+"""Fingertips of the Franka hand, along z of the flange [m]."""
+
+# Capsules of the Franka hand in the frame of the tool centre point. The hand is a box of 60 x
+# 200 x 66 mm, which they contain, as they do the open fingers.
+_HAND = (
+    ((0.0, -0.08, -0.0704), (0.0, 0.08, -0.0704), 0.05),
+    ((0.0, -0.035, -0.01), (0.0, 0.035, -0.01), 0.028),
+)
+
+type NullSpace = Literal["arm angle", "free", "none"]
+"""Self-motion that a full pose of the tool leaves: one arm angle (shoulder, elbow and wrist
+with intersecting axes), another self-motion, or none, as for six joints."""
+
+
+class UnreachableError(ValueError):
+    """No joint positions within the limits reach a pose."""
+
+
+@runtime_checkable
+class ClosedForm(Protocol):
+    """Closed-form inverse kinematics of a seven-joint arm."""
+
+    def branches(
+        self, arm: SerialChain, pose: Pose, q7: Float[Tensor, "*#batch"] | float
+    ) -> Float[Tensor, "*batch 4 7"]:
+        """All solutions within the limits for a position of joint 7 [rad], then rows of NaN."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Arm:
-    """A serial arm: its kinematics, its shape, its gripper."""
+class ArmShape:
+    """Appearance, collision shapes and masses of an arm."""
 
-    name: str
-    """Registered name, or the stem of the file."""
-    chain: SerialChain
-    """From the base to the tool centre point, with limits and a posture to start from."""
     visuals: tuple[LinkVisual, ...] = ()
-    """Its real shape; empty where the package that ships the meshes is not installed."""
+    """Meshes; empty where the package that ships them is not installed."""
     gripper: GripperDescription | None = None
-    """None: the description ends at the flange."""
-    description: Path | None = None
-    """File it comes from; None: written in this package."""
-    format: str | None = None
-    """"urdf" or "mjcf", of the file."""
-    base: str | None = None
-    """Link of the file that is the base."""
-    tip: str | None = None
-    """Link of the file that is the flange."""
-    shapes: tuple[LinkShape, ...] = field(default=(), repr=False)
-    """What the capsules of `body` contain."""
-    told_masses: tuple[float | None, ...] = field(default=(), repr=False)
-    """Of base, links, flange and tool [kg], where the description tells."""
-    own_body: CapsuleArm | None = field(default=None, repr=False)
-    """Capsules made by hand, in place of fitted ones."""
+    """None if the description ends at the flange."""
+    shapes: tuple[LinkShape, ...] = ()
+    """Collision shapes that the capsules contain."""
+    masses: tuple[float | None, ...] = ()
+    """Masses of base, links, flange and tool [kg], as far as the description gives them."""
+
+
+class Arm(SerialChain):
+    """A serial arm: kinematics, limits, shape, gripper and inverse kinematics.
+
+    Made by `arm("ur5e")` or `arm("robot.urdf", tip="tcp")`; `panda` and `fr3` are ready-made.
+
+    Attributes:
+        name: Registered name, or the stem of the description's file.
+        description: File of the description; None for arms written in this package.
+        format: "urdf" or "mjcf", the format of that file.
+        base: Link of the file that is the base.
+        tip: Link of the file that is the flange.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        chain: SerialChain,
+        shape: ArmShape | Callable[[], ArmShape] | None = None,
+        capsules: Sequence[LinkCapsule] | None = None,
+        overlapping: Sequence[tuple[int, int]] = (),
+        closed_form: ClosedForm | None = None,
+        description: Path | None = None,
+        format: str | None = None,
+        base: str | None = None,
+        tip: str | None = None,
+    ):
+        """Add a shape and inverse kinematics to a chain.
+
+        Args:
+            name: Name of the arm.
+            chain: Kinematics from the base to the tool centre point, limits, ready posture.
+            shape: Appearance, shapes and masses, or a function that reads them on first use.
+            capsules: Capsules of links and gripper; None fits them to the shapes on first use.
+            overlapping: Pairs of links that overlap by design, besides neighbours.
+            closed_form: Closed-form inverse; None solves numerically.
+            description: File that the arm was read from.
+            format: Format of that file, "urdf" or "mjcf".
+            base: Link of the file that is the base.
+            tip: Link of the file that is the flange.
+        """
+        super().__init__(
+            joint_names=chain.joint_names,
+            mounts=chain.mounts,
+            flange=chain.flange,
+            tcp=chain.tcp,
+            limits=chain.limits,
+            ready=chain.ready,
+            kinds=chain.kinds,
+        )
+        self.name = name
+        self.description, self.format, self.base, self.tip = description, format, base, tip
+        self._shape_source = shape or ArmShape()
+        self._capsules, self._overlapping = capsules, tuple(overlapping)
+        self._closed_form = closed_form
 
     def __repr__(self) -> str:
-        return f"Arm({self.name}, {len(self.joint_names)} joints)"
+        return f"Arm({self.name})"
 
     @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Of the chain, from the base to the tool."""
-        return self.chain.joint_names
+    def chain(self) -> Arm:
+        """The arm itself: an arm is a serial chain."""
+        return self
+
+    @property
+    def joints(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
 
     @property
     def tool_link(self) -> int:
         """Number of the tool centre point's frame."""
-        return len(self.joint_names) + 2
+        return self.joints + 2
+
+    @property
+    def is_franka(self) -> bool:
+        """True for Franka's arms, which have a closed-form inverse."""
+        return self._closed_form is not None
+
+    @property
+    def null_space(self) -> NullSpace:
+        """Self-motion that a full pose of the tool leaves to the joints."""
+        if self.is_franka:
+            return "arm angle"
+        return "none" if self.joints <= 6 else "free"
+
+    # Shape
+
+    @cached_property
+    def shape(self) -> ArmShape:
+        """Appearance, collision shapes and masses, read on first use."""
+        source = self._shape_source
+        return source if isinstance(source, ArmShape) else source()
+
+    @property
+    def visuals(self) -> tuple[LinkVisual, ...]:
+        """Meshes of the links; empty where the package that ships them is not installed."""
+        return self.shape.visuals
+
+    @property
+    def gripper(self) -> GripperDescription | None:
+        """Gripper of the description; None if it ends at the flange."""
+        return self.shape.gripper
+
+    @cached_property
+    def whole(self) -> CapsuleArm:
+        """Capsules that contain all links and the gripper, with the pairs that may touch.
+
+        Fitted on first use unless they were given; a fit takes a few seconds.
+        """
+        if self._capsules is not None:
+            return CapsuleArm(self, self._capsules, self._overlapping)
+        return fit_body(self, [(s.link, s.shape, s.pose) for s in self.shape.shapes])
 
     @cached_property
     def body(self) -> CapsuleArm:
-        """Capsules that contain each link, with the pairs of links that may touch.
-
-        Fitted when first asked for, which takes a few seconds.
-        """
-        if self.own_body is not None:
-            return self.own_body
-        return fit_body(self.chain, [(s.link, s.shape, s.pose) for s in self.shapes])
+        """Capsules of the links without the gripper, which tasks move close to objects."""
+        links = [capsule for capsule in self.whole.capsules if capsule.link <= self.joints]
+        return CapsuleArm(self, links, self.whole.overlapping)
 
     @cached_property
     def reach(self) -> float:
-        """How far the tool centre point gets from joint 2 [m], as far as random states tell."""
-        limits, rng = self.chain.limits, torch.Generator().manual_seed(0)
-        share = torch.rand(5000, len(self.joint_names), generator=rng, dtype=torch.float64)
-        q = limits.lower + (limits.upper - limits.lower) * share
-        apart = self.chain.forward(q).position - self.chain.joint_origins(q)[:, 1]
-        return float(torch.linalg.vector_norm(apart, dim=-1).max())
+        """Largest distance of the tool centre point from joint 2 [m], over random postures."""
+        limits, rng = self.limits, torch.Generator().manual_seed(0)
+        fraction = torch.rand(5000, self.joints, generator=rng, dtype=torch.float64)
+        q = limits.lower + (limits.upper - limits.lower) * fraction
+        offset = self.forward(q).position - self.joint_origins(q)[:, 1]
+        return float(torch.linalg.vector_norm(offset, dim=-1).max())
 
     @cached_property
     def masses(self) -> tuple[float, ...]:
-        """Of base, links, flange and tool [kg].
+        """Masses of base, links, flange and tool [kg].
 
-        Where the description has none, 1200 kg/m^3 times the volume of the link's capsules.
+        Where the description has none: 1200 kg/m^3 times the volume of the link's capsules.
         """
-        count = len(self.joint_names) + 3
-        told = self.told_masses or (None,) * count
-        if all(mass is not None for mass in told):
-            return tuple(mass or 0.0 for mass in told)
+        count = self.joints + 3
+        given = self.shape.masses or (None,) * count
+        if all(mass is not None for mass in given):
+            return tuple(mass or 0.0 for mass in given)
         estimated = [0.0] * count
-        for capsule in self.body.capsules:
+        for capsule in self.whole.capsules:
             length = float(np.linalg.norm(np.subtract(capsule.end, capsule.start)))
             volume = np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius)
             estimated[capsule.link] += _DENSITY * volume
         return tuple(
-            guess if mass is None else mass for mass, guess in zip(told, estimated, strict=True)
+            guess if mass is None else mass
+            for mass, guess in zip(given, estimated, strict=True)
         )
+
+    @property
+    def link_masses(self) -> tuple[float, ...]:
+        """Masses of the moving links [kg]."""
+        return self.masses[1 : self.joints + 1]
+
+    def meshes(self) -> dict[str, tuple[MeshFile, ...]]:
+        """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
+        flange, found = self.flange.numpy(), {}
+        for visual in self.visuals:
+            if visual.link > self.joints + 1 or visual.finger is not None:
+                continue
+            pose = flange @ visual.pose if visual.link == self.joints + 1 else visual.pose
+            turn = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy())).tolist()
+            name = f"link{min(visual.link, self.joints)}"
+            mesh = MeshFile(
+                path=visual.mesh.path,
+                position=tuple(pose[:3, 3].tolist()),
+                orientation=tuple(turn),
+                scale=visual.mesh.scale,
+                colour=visual.colour,
+            )
+            found[name] = (*found.get(name, ()), mesh)
+        return found
+
+    def urdf(self) -> str:
+        """URDF text with the links, joints and limits of this arm, without meshes."""
+        return to_urdf(self, name=self.name)
+
+    # Inverse kinematics
 
     def inverse(
         self,
         pose: Pose,
-        near: Float[Tensor, "*#batch joints"] | None = None,
+        q7: ArrayLike | None = None,
+        near: ArrayLike | None = None,
         *,
         task: TaskSpace = "pose",
+        samples: int = _SCAN,
     ) -> Float[Tensor, "*batch joints"]:
-        """Joint positions that bring the tool centre point to poses, within limits [rad, m].
+        """Joint positions within the limits that bring the tool centre point to poses [rad].
 
-        Numerically, many poses at once (`solve_inverse`, which also tells what was not found).
+        Without `near`, the last batch dimension is a path: the first solution is the one
+        closest to the ready posture, each further one the closest to the solution before, so
+        that neighbouring poses have neighbouring solutions. With `near`, each pose is solved by
+        itself. Not differentiable.
 
         Args:
-            pose: Of the tool centre point in the base frame.
-            near: Configuration to stay close to; the ready posture if None.
-            task: What of the pose matters: an arm of five joints has none for a whole pose.
+            pose: Poses of the tool centre point in the base frame.
+            q7: Position of joint 7 [rad], for arms with a closed-form inverse (Franka's). It
+                settles their redundancy; None leaves it free. Their elbow branch with
+                q4 > -0.467 rad is never returned.
+            near: Configuration to stay close to [rad], one for all poses or one for each.
+            task: Constrained part of the pose; five joints cannot reach a whole pose.
+            samples: Solutions to choose from where a joint is redundant.
 
         Raises:
-            UnreachableError: No such positions were found; names the first such pose.
+            UnreachableError: No solution was found; names the first such pose.
+            ValueError: `q7` was given to an arm without a closed-form inverse.
         """
-        solution = solve_inverse(self.chain, pose, near, task=task)
-        if not bool(solution.found.all()):
-            first = tuple((~solution.found).nonzero()[0].tolist())
-            position = pose.position.expand(*solution.found.shape, 3)[first].tolist()
-            raise UnreachableError(
-                f"no joint positions within the limits of {self.name} were found for pose "
-                f"{list(first)} of {list(solution.found.shape)}, position {position} m, "
-                f"task {task!r}: move it closer to the base, turn it, or ask for less of it"
+        if q7 is not None and self._closed_form is None:
+            raise ValueError(
+                f"{self.name} has no closed-form inverse, so q7 does not apply: pass near= to "
+                "choose among its solutions."
             )
-        return solution.position
+        batch = _batch_of(pose, q7)
+        if near is None and batch:
+            q, missing = self._path(pose, q7, batch, task, samples)
+        else:
+            near = self.ready if near is None else near
+            near = self.joint_positions(as_tensor(near, pose.position))
+            q, missing = self._nearest(pose, q7, near, task, samples)
+        if bool(missing.any()):
+            raise UnreachableError(_explain(self.name, pose, q7, missing))
+        return q
+
+    def solutions(
+        self,
+        pose: Pose,
+        q7: ArrayLike | None = None,
+        *,
+        near: ArrayLike | None = None,
+        samples: int = _SCAN,
+    ) -> Float[Tensor, "*batch solutions joints"]:
+        """Several joint positions for each pose [rad]; rows without a solution are NaN.
+
+        Args:
+            pose: Poses of the tool centre point in the base frame.
+            q7: Position of joint 7 [rad], used by arms with a closed-form inverse: all branches
+                are returned. None scans joint 7. Other arms are solved from random starts.
+            near: Configuration from which the search starts as well [rad]; the ready posture
+                if None.
+            samples: Positions of joint 7, or random starts.
+        """
+        near = self.ready if near is None else as_tensor(near)
+        if self._closed_form is None:
+            return self._numerical_solutions(pose, near.double(), samples)
+        if q7 is not None:
+            angles = q7 if isinstance(q7, float) else as_tensor(q7)
+            return self._closed_form.branches(self, pose, angles)
+        lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
+        batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
+        # A margin from the limits leaves room for corrections.
+        scan = torch.linspace(
+            lower + _MARGIN, upper - _MARGIN, samples, dtype=torch.float64, device=near.device
+        )
+        scan = torch.cat([near[..., 6:7].expand(*batch, 1), scan.expand(*batch, samples)], -1)
+        return self._closed_form.branches(self, _repeated(pose, scan.shape), scan).flatten(
+            -3, -2
+        )
+
+    def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
+        """Distinct joint positions for one pose, the most comfortable first [rad].
+
+        Comfortable postures are far from singularities and from joint limits.
+
+        Args:
+            pose: Pose of the tool centre point, without batch dimensions.
+
+        Raises:
+            UnreachableError: No joint positions within the limits reach the pose.
+        """
+        if self._closed_form is None:
+            found = self.solutions(pose, samples=_STARTS)
+        else:
+            lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
+            scan = torch.linspace(lower, upper, _POSTURE_SCAN, dtype=torch.float64)
+            many = _repeated(pose, scan.shape)
+            found = self._closed_form.branches(self, many, scan).flatten(0, 1)
+        found = found[found.isfinite().all(-1)]
+        if len(found) == 0:
+            raise UnreachableError(_explain(self.name, pose, None, torch.tensor(True)))
+        return best_postures(self, found).to(pose.position)
+
+    def _path(
+        self,
+        pose: Pose,
+        q7: ArrayLike | None,
+        batch: tuple[int, ...],
+        task: TaskSpace,
+        samples: int,
+    ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
+        """Solutions of a path, each close to the one before, and where there is none."""
+        pose = Pose(pose.position.expand(*batch, 3), pose.orientation.expand(*batch, 4))
+        angles = None if q7 is None else as_tensor(q7, pose.position).expand(batch)
+        before, path, missing = self.ready.to(pose.position), [], []
+        for k in range(batch[-1]):
+            angle = None if angles is None else angles[..., k]
+            q, lost = self._next(pose[..., k], angle, before, task, samples)
+            path.append(q)
+            missing.append(lost)
+            before = torch.where(q.isnan(), before, q)
+        return torch.stack(path, dim=-2), torch.stack(missing, dim=-1)
+
+    def _next(
+        self, pose: Pose, q7: Tensor | None, before: Tensor, task: TaskSpace, samples: int
+    ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
+        """Solution for the next pose of a path, close to the one before."""
+        if self._closed_form is None:
+            start = before.double().unsqueeze(-2)
+            q = solutions_from(self, pose, start, task=task).squeeze(-2).to(before)
+            # A comparison with NaN is false, so poses that were not reached are searched, too.
+            if bool(((q - before).abs().amax(-1) < _LARGEST_STEP).all()):
+                return q, torch.zeros_like(q[..., 0], dtype=torch.bool)
+        return self._nearest(pose, q7, before, task, samples)
+
+    def _nearest(
+        self, pose: Pose, q7: ArrayLike | None, near: Tensor, task: TaskSpace, samples: int
+    ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
+        """Solution closest to a configuration, for each pose by itself, and where none is."""
+        if task == "pose":
+            found = self.solutions(pose, q7, near=near, samples=samples)
+            distance = (found - near.to(found).unsqueeze(-2)).norm(dim=-1)
+            least = torch.where(distance.isnan(), torch.inf, distance).min(-1)
+            missing = least.values.isinf()
+            if self._closed_form is not None or not bool(missing.any()):
+                indices = least.indices[..., None, None]
+                return torch.take_along_dim(found, indices, dim=-2).squeeze(-2), missing
+        solution = solve_inverse(self, pose, near, task=task)
+        return solution.position, ~solution.found
+
+    def _numerical_solutions(
+        self, pose: Pose, near: Float[Tensor, "*#batch joints"], samples: int
+    ) -> Float[Tensor, "*batch solutions joints"]:
+        """Solutions from a configuration and from random starts; NaN where one fails."""
+        limits = self.limits
+        # The same starts each time: an answer depends on its arguments alone.
+        rng = torch.Generator().manual_seed(0)
+        # A joint that turns by more than one revolution repeats its poses.
+        low, high = limits.lower.clamp(min=-math.pi), limits.upper.clamp(max=math.pi)
+        random = torch.rand(samples, self.joints, generator=rng, dtype=torch.float64)
+        wish = near.unsqueeze(-2)
+        starts = (low + (high - low) * random).expand(*near.shape[:-1], -1, -1)
+        found = solutions_from(self, pose, torch.cat([wish, starts], dim=-2))
+        return unwound(self, found, wish)
+
+    # Other tools
 
     def with_tool(self, tcp: Float[Tensor, "4 4"]) -> Arm:
         """The same arm with another tool centre point.
 
         Args:
-            tcp: In the frame of the flange.
+            tcp: Tool centre point in the frame of the flange.
         """
-        old = self.chain
-        chain = SerialChain(
-            joint_names=old.joint_names,
-            mounts=old.mounts,
-            flange=old.flange,
-            tcp=tcp,
-            limits=old.limits,
-            ready=old.ready,
-            kinds=old.kinds,
-        )
-        tool = self.tool_link
-        shift = torch.linalg.inv(tcp.double()) @ old.tcp
-        moved = shift.numpy()
-        grip = self.gripper and GripperDescription(
-            joints=tuple(replace(j, pose=moved @ j.pose) for j in self.gripper.joints)
+        shift = torch.linalg.inv(tcp.double()) @ self.tcp
+        moved, tool, shape = shift.numpy(), self.tool_link, self.shape
+        whole = None if self._capsules is None else self.whole.on_chain(self, {tool: shift})
+        gripper = shape.gripper and GripperDescription(
+            joints=tuple(replace(j, pose=moved @ j.pose) for j in shape.gripper.joints)
         )
 
-        def carry(part: Any) -> Any:
+        def carry[Part: (LinkVisual, LinkShape)](part: Part) -> Part:
             return replace(part, pose=moved @ part.pose) if part.link == tool else part
 
-        return replace(
-            self,
-            chain=chain,
-            visuals=tuple(carry(visual) for visual in self.visuals),
-            shapes=tuple(carry(shape) for shape in self.shapes),
-            gripper=grip,
-            own_body=self.own_body and self.own_body.on_chain(chain, {tool: shift}),
+        return Arm(
+            name=self.name,
+            chain=self._chain_with_tool(tcp),
+            shape=ArmShape(
+                visuals=tuple(carry(visual) for visual in shape.visuals),
+                gripper=gripper,
+                shapes=tuple(carry(part) for part in shape.shapes),
+                masses=shape.masses,
+            ),
+            capsules=whole and whole.capsules,
+            overlapping=self._overlapping,
+            closed_form=self._closed_form,
+            description=self.description,
+            format=self.format,
+            base=self.base,
+            tip=self.tip,
         )
 
-    @classmethod
-    def from_urdf(
-        cls,
-        path: str | Path,
-        *,
-        base: str | None = None,
-        tip: str | None = None,
-        package_dirs: Sequence[str | Path] = (),
-        meshes: bool = True,
-        **options: Any,
-    ) -> Arm:
-        """An arm from a URDF file.
-
-        Args:
-            path: Of the file.
-            base: Link to be the base; None: the root.
-            tip: Link to be the flange; None: the only end that the robot has.
-            package_dirs: Folders in which `package://NAME/` is looked for first.
-            meshes: Whether to look for meshes; without, the arm has a shape only as far as the
-                file describes it by boxes, cylinders and spheres.
-            options: `name`, `tool`, `limits` and `ready`, see `from_description`.
+    def with_hand(self) -> Arm:
+        """The same arm with the Franka hand on its flange, whose z axis points away from it.
 
         Raises:
-            ValueError: The file or the choice of links makes no serial chain: see the message.
-            FileNotFoundError: The file or a mesh is not there.
+            ValueError: The arm has too few joints for a full pose of its tool.
         """
-        folders = [Path(folder) for folder in package_dirs]
-        description = read_urdf(Path(path), folders, meshes=meshes)
-        return cls.from_description(description, base=base, tip=tip, **options)
-
-    @classmethod
-    def from_mjcf(
-        cls,
-        path: str | Path,
-        *,
-        base: str | None = None,
-        tip: str | None = None,
-        **options: Any,
-    ) -> Arm:
-        """An arm from an MJCF file, which MuJoCo reads; arguments as for `from_urdf`.
-
-        Bodies and sites are what `base` and `tip` name; without a base it is the world.
-        """
-        return cls.from_description(read_mjcf(Path(path)), base=base, tip=tip, **options)
-
-    @classmethod
-    def from_package(cls, package: str, model: str, **options: Any) -> Arm:
-        """An arm of the packages that fetch models over the network when first used.
-
-        Args:
-            package: `robot_descriptions` or `mujoco_menagerie`.
-            model: Module of the former, such as `ur10e_description`, or folder of the latter,
-                such as `universal_robots_ur10e`.
-            options: As for `from_urdf` or `from_mjcf`.
-
-        Raises:
-            ModuleNotFoundError: The package is not installed.
-            ValueError: It has no such model.
-        """
-        path = _path_from_package(package, model)
-        read = cls.from_mjcf if path.suffix == ".xml" else cls.from_urdf
-        return read(path, **{"name": model, **options})
-
-    @classmethod
-    def from_description(
-        cls,
-        description: Description,
-        *,
-        base: str | None = None,
-        tip: str | None = None,
-        name: str | None = None,
-        tool: Float[Tensor, "4 4"] | None = None,
-        limits: LimitsGiven = None,
-        ready: Sequence[float] | None = None,
-    ) -> Arm:
-        """An arm from what a file was read as.
-
-        Args:
-            description: Of the robot.
-            base: Link to be the base; None: the root.
-            tip: Link to be the flange; None: the only end that the robot has.
-            name: Of the arm; None: the stem of the file.
-            tool: Tool centre point in the frame of the flange, whose z axis is to be the
-                direction in which the tool approaches things; None: the flange itself.
-            limits: What replaces or completes the file's limits; None: the TOML file beside
-                the description named after it, `ur5e.limits.toml` for `ur5e.urdf`, if it is
-                there.
-            ready: A comfortable posture [rad, m]; None: the file's `home`, or one in the middle
-                of the joints' ranges that is far from singularities.
-        """
-        parts = assemble(description, base, tip, tool)
-        chain_limits = complete_limits(
-            [joint.name for joint in parts.moving],
-            parts.kinds,
-            [
-                {
-                    "lower": joint.lower,
-                    "upper": joint.upper,
-                    "velocity": joint.velocity,
-                    "torque": joint.effort,
-                }
-                for joint in parts.moving
-            ],
-            source=str(description.path),
-            overrides=_overrides(description.path, limits),
-        )
-        names = [joint.name for joint in parts.moving]
-        home = description.home
-        if ready is None and home is not None and all(n in home for n in names):
-            ready = [home[n] for n in names]
-        chain = SerialChain(
-            joint_names=names,
-            mounts=torch.from_numpy(parts.mounts),
-            flange=torch.from_numpy(parts.flange),
-            tcp=torch.from_numpy(parts.tcp),
-            limits=chain_limits,
-            ready=chain_limits.middle if ready is None else torch.tensor(ready).double(),
-            kinds=parts.kinds,
-        )
-        if ready is None:
-            chain.ready = comfortable(chain)
-        return cls(
-            name=name or description.path.stem,
-            chain=chain,
-            visuals=parts.visuals,
-            gripper=parts.gripper,
-            description=description.path,
-            format=description.format,
-            base=parts.base,
-            tip=parts.tip,
-            shapes=parts.shapes,
-            told_masses=parts.masses,
-        )
-
-
-def _overrides(path: Path, given: LimitsGiven) -> Mapping[str, Mapping[str, float]] | None:
-    if given is None:
-        beside = path.with_suffix(".limits.toml")
-        return read_limits(beside) if beside.is_file() else None
-    return read_limits(given) if isinstance(given, Path) else given
-
-
-# Of the random postures among which `comfortable` chooses; the choice is the same every time.
-_POSTURES, _SEED = 4096, 0
-
-
-def comfortable(chain: SerialChain) -> Float[Tensor, " joints"]:
-    """A posture to start from where nobody has chosen one [rad, m].
-
-    Of random postures the one with most of four things, each at most one: distance from
-    singularities, distance from limits, the tool pointing down, and the tool in front of the
-    base, at half of its reach.
-    """
-    rng = torch.Generator().manual_seed(_SEED)
-    lower, upper = chain.limits.lower, chain.limits.upper
-    # Joints of more than a turn are as well used around their middle.
-    half = ((upper - lower) / 2).clamp(max=torch.pi)
-    random = torch.rand(_POSTURES, len(lower), generator=rng, dtype=torch.float64)
-    q = chain.limits.middle + (2 * random - 1) * half
-    T, J = chain.transform_and_jacobian(q)
-    smallest = torch.linalg.svdvals(J)[:, -1]
-    position = T[:, :3, 3]
-    reach = torch.linalg.vector_norm(position, dim=-1).amax()
-    wanted = torch.stack([reach / 2, 0 * reach, reach / 4])
-    away = torch.linalg.vector_norm(position - wanted, dim=-1) / reach
-    room = (torch.minimum(q - lower, upper - q) / half).amin(-1)
-    score = smallest / smallest.amax() + room.clamp(max=1) - T[:, 2, 2] - away
-    return q[score.argmax()]
-
-
-def _path_from_package(package: str, model: str) -> Path:
-    """File of a model, fetched by its package where it is not here yet."""
-    try:
-        if package == "robot_descriptions":
-            found = import_module(f"robot_descriptions.{model}")
-            path = getattr(found, "URDF_PATH", None) or getattr(found, "MJCF_PATH", None)
-        elif package == "mujoco_menagerie":
-            path = import_module("mujoco_menagerie").get_model_path(model)
-        else:
+        n = self.joints
+        if n < 6:
             raise ValueError(
-                f"models are fetched by robot_descriptions or mujoco_menagerie, not {package!r}"
+                f"{self.name} has {n} joints, but grasping and placing need the full pose of "
+                "the tool, for which it takes six. With fewer it can servo by position and "
+                "axis (docs/concepts/controller.md)."
             )
-    except ModuleNotFoundError as error:
-        if error.name == package:
-            raise ModuleNotFoundError(
-                f"{model} comes with the package {package.replace('_', '-')}: pip install it",
-                name=package,
-            ) from None
-        raise ValueError(f"{package} has no model {model!r}") from None
-    if path is None:
-        raise ValueError(f"{package} has neither URDF nor MJCF of {model!r}")
-    return Path(path)
+        tcp = torch.eye(4, dtype=torch.float64)
+        tcp[2, 3] = TCP_OFFSET
+        links = tuple(capsule for capsule in self.whole.capsules if capsule.link <= n)
+        return Arm(
+            name=self.name,
+            chain=self._chain_with_tool(tcp),
+            shape=ArmShape(
+                visuals=self.visuals, masses=(*self.masses[:-1], None), shapes=self.shape.shapes
+            ),
+            capsules=(*links, *hand_capsules(n + 2)),
+            overlapping=(*self.whole.overlapping, (n - 1, n + 2), (n, n + 2)),
+            description=self.description,
+            format=self.format,
+            base=self.base,
+            tip=self.tip,
+        )
+
+    def _chain_with_tool(self, tcp: Float[Tensor, "4 4"]) -> SerialChain:
+        return SerialChain(
+            joint_names=self.joint_names,
+            mounts=self.mounts,
+            flange=self.flange,
+            tcp=tcp,
+            limits=self.limits,
+            ready=self.ready,
+            kinds=self.kinds,
+        )
+
+
+def hand_capsules(link: int) -> tuple[LinkCapsule, ...]:
+    """Capsules of the Franka hand and its fingers, mounted on the frame of the tool.
+
+    Args:
+        link: Number of that frame.
+    """
+    return tuple(
+        LinkCapsule(link=link, start=start, end=end, radius=radius)
+        for start, end, radius in _HAND
+    )
+
+
+def comfortable_posture(arm: Arm, pose: Pose) -> Float[Tensor, " joints"]:
+    """Inverse-kinematics solution furthest from singularities and joint limits [rad].
+
+    An arm that servoes around a pose keeps its posture but for small motions, so the posture in
+    which it arrives decides whether it meets a limit there.
+
+    Args:
+        arm: The arm.
+        pose: Pose of the tool centre point, without batch dimensions.
+
+    Raises:
+        UnreachableError: No joint positions within the limits reach the pose.
+    """
+    return arm.postures(pose)[0]
+
+
+def _batch_of(pose: Pose, q7: ArrayLike | None) -> tuple[int, ...]:
+    shapes = [pose.position.shape[:-1], pose.orientation.shape[:-1]]
+    if q7 is not None:
+        shapes.append(as_tensor(q7).shape)
+    return tuple(np.broadcast_shapes(*shapes))
+
+
+def _repeated(pose: Pose, shape: Sequence[int]) -> Pose:
+    """Each pose, once for every entry of the last dimension of `shape`, in float64."""
+    return Pose(
+        pose.position.double().unsqueeze(-2).expand(*shape, 3),
+        pose.orientation.double().unsqueeze(-2).expand(*shape, 4),
+    )
+
+
+def _explain(
+    name: str, pose: Pose, q7: ArrayLike | None, missing: Bool[Tensor, "*batch"]
+) -> str:
+    """Message for the first pose that was not reached."""
+    shape = missing.shape
+    first = tuple(missing.nonzero()[0].tolist()) if shape else ()
+    position = pose.position.expand(*shape, 3)[first].tolist()
+    orientation = quaternion.normalize(pose.orientation).expand(*shape, 4)[first].tolist()
+    which = f"pose {list(first)} of {list(shape)}" if shape else "the pose"
+    where = ", ".join(f"{value:.3f}" for value in position)
+    turned = ", ".join(f"{value:.3f}" for value in orientation)
+    fixed, advice = "", "move the pose towards the base, or turn it"
+    if q7 is not None:
+        angle = as_tensor(q7).expand(shape)[first].item()
+        fixed = f" with joint 7 at {angle:.4f} rad"
+        advice = "try other values of q7, leave it out, or move the pose towards the base"
+    return (
+        f"{which}, position ({where}) m, quaternion wxyz ({turned}), has no solution within "
+        f"the joint limits of {name}{fixed}: {advice}."
+    )

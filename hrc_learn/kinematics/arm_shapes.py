@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Capsule, MeshFile
-from hrc_learn.kinematics import FrankaWorkArm, WorkArm, panda, panda_capsules
+from hrc_learn.kinematics import Arm, panda
 
 # Meshes of the Panda, where the package that ships them is installed (extra `meshes`).
 
@@ -46,7 +46,7 @@ def panda_meshes(body: str) -> tuple[MeshFile, ...]:
 _HAND = ("hand", "finger_left", "finger_right")
 
 
-def arm_meshes(robot: WorkArm, body: str) -> tuple[MeshFile, ...]:
+def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
     """What a link, the hand or a finger of an arm looks like; nothing if that is not known.
 
     Franka's arms look alike, and all arms carry the same hand.
@@ -55,9 +55,9 @@ def arm_meshes(robot: WorkArm, body: str) -> tuple[MeshFile, ...]:
         robot: The arm.
         body: link0, link1, ..., hand, finger_left or finger_right.
     """
-    if isinstance(robot, FrankaWorkArm) or body in _HAND:
+    if robot.is_franka or body in _HAND:
         return panda_meshes(body)
-    return tuple(robot.meshes.get(body, ()))
+    return tuple(robot.meshes().get(body, ()))
 
 
 @cache
@@ -86,7 +86,7 @@ def panda_bodies(joint_position: Float[np.ndarray, "time 7"]) -> tuple[Body, ...
     upright[..., 0] = 1.0
     orientation = np.concatenate([upright, orientation], axis=1)
     shapes = defaultdict(list)
-    for capsule in panda_capsules.capsules:
+    for capsule in panda.whole.capsules:
         shapes[capsule.link].append(
             Capsule(start=capsule.start, end=capsule.end, radius=capsule.radius)
         )

@@ -1,10 +1,9 @@
 """Serial arms: forward kinematics and geometric Jacobians.
 
-The kinematics are there twice: as matrix products, which is fast when run eagerly, and for
-compilers written out number by number. There, products with the zeros and ones of which an
-arm's description mostly consists are left out, and each number is a tensor over the batch
-alone, so that a compiler makes one loop over the batch of it. Run eagerly, those thousand
-operations take far longer.
+Both exist twice. Matrix products are fast when they run eagerly. For compilers the same
+kinematics are written out number by number: products with the zeros and ones of the arm's
+description are left out, and each number is a tensor over the batch alone, so the compiler
+fuses everything into one loop over the batch.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.arrays import ArrayLike, as_tensor
 from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics.limits import JointLimits
 
@@ -115,18 +115,17 @@ def _matrix(rows: list[_Row]) -> Tensor:
 
 
 class SerialChain:
-    """An arm of joints that turn about, or slide along, the z axis of their own frame.
+    """A chain of joints that turn about, or slide along, the z axis of their own frame.
 
-    An axis of any other direction is one of a frame turned by a constant, which the mounts take
-    up (`hrc_learn.kinematics.arm` does this for descriptions in files). The transform from one
-    joint to the next is linear in 1, sin q and cos q, and in q itself for a joint that slides,
-    so all of them come from two or three fused multiply-adds; what remains is one product of
-    matrices a joint. Transforms are kept as their upper three rows (R | p): the last is known.
+    The mounts absorb axes of other directions (`hrc_learn.kinematics.arm` does this for
+    descriptions in files). The transform from one joint to the next is linear in 1, sin q and
+    cos q, and in q for a sliding joint, so all transforms come from two or three fused
+    multiply-adds; one matrix product per joint remains. Transforms are kept as their upper
+    three rows (R | p).
 
-    Joint positions and all that is derived from them are in radians, in metres for joints that
-    slide.
-
-    Methods take any number of leading batch dimensions and follow dtype and device of q.
+    Joint positions are in radians, those of sliding joints in metres. Methods take tensors,
+    NumPy arrays or lists with any number of leading batch dimensions, and follow the dtype and
+    device of a tensor. A wrong number of joints raises a ValueError.
     """
 
     def __init__(
@@ -140,16 +139,16 @@ class SerialChain:
         ready: Float[Tensor, " joints"],
         kinds: Sequence[JointKind] | None = None,
     ):
-        """Describe an arm.
+        """Describe the chain.
 
         Args:
-            joint_names: From the base to the tip.
-            mounts: Frame of each joint at zero in the frame of the joint before (the base).
+            joint_names: Names, from the base to the tip.
+            mounts: Frame of each joint at zero, in the frame of the joint before (the base).
             flange: Flange in the frame of the last joint.
             tcp: Tool centre point in the frame of the flange.
-            limits: Of the joints, in the same order.
+            limits: Joint limits, in the same order.
             ready: A comfortable posture [rad], away from limits and singularities.
-            kinds: How each joint moves; all are revolute if None.
+            kinds: Kind of each joint; all are revolute if None.
 
         Raises:
             ValueError: The number of names, mounts, limits, kinds and joints of `ready` differ.
@@ -189,17 +188,36 @@ class SerialChain:
     def __repr__(self) -> str:
         return f"SerialChain({self.joint_names[0]} ... {self.joint_names[-1]})"
 
-    def forward(self, q: Float[Tensor, "*batch joints"]) -> Pose:
+    def joint_positions(self, q: ArrayLike) -> Float[Tensor, "*batch joints"]:
+        """Joint positions as a tensor, their number checked.
+
+        Args:
+            q: Joint positions [rad].
+
+        Raises:
+            ValueError: The last dimension differs from the number of joints.
+        """
+        q = as_tensor(q)
+        count = len(self.joint_names)
+        if q.ndim == 0 or q.shape[-1] != count:
+            raise ValueError(
+                f"{self!r} has {count} joints ({', '.join(self.joint_names)}), but the joint "
+                f"positions have shape {tuple(q.shape)}: the last dimension must be {count}."
+            )
+        return q
+
+    def forward(self, q: ArrayLike) -> Pose:
         """Pose of the tool centre point in the base frame.
 
         Args:
             q: Joint positions [rad].
         """
+        q = self.joint_positions(q)
         if torch.compiler.is_compiling():
             return Pose.from_matrix(self.transform_and_jacobian(q)[0])  # J is never computed
         return Pose.from_matrix(self._joint_frames(q)[-1] @ self._tip.like(q))
 
-    def link_poses(self, q: Float[Tensor, "*batch joints"]) -> Pose:
+    def link_poses(self, q: ArrayLike) -> Pose:
         """Poses of the joint frames, the flange and the tool centre point, in this order.
 
         Args:
@@ -210,50 +228,47 @@ class SerialChain:
         """
         return Pose.from_matrix(self.link_frames(q))
 
-    def link_frames(
-        self, q: Float[Tensor, "*batch joints"]
-    ) -> Float[Tensor, "*batch links 3 4"]:
+    def link_frames(self, q: ArrayLike) -> Float[Tensor, "*batch links 3 4"]:
         """`link_poses` left as matrices (R | p): no quaternion made.
 
         Args:
             q: Joint positions [rad].
         """
+        q = self.joint_positions(q)
         frames = self._joint_frames(q)
         tips = [frames[-1] @ self._flange.like(q), frames[-1] @ self._tip.like(q)]
         return torch.stack([*frames, *tips], dim=-3)
 
-    def joint_origins(
-        self, q: Float[Tensor, "*batch joints"]
-    ) -> Float[Tensor, "*batch joints 3"]:
+    def joint_origins(self, q: ArrayLike) -> Float[Tensor, "*batch joints 3"]:
         """Origins of the joint frames in the base frame [m]: `link_poses` without the turns.
 
         Args:
             q: Joint positions [rad].
         """
-        return torch.stack([frame[..., 3] for frame in self._joint_frames(q)], dim=-2)
+        frames = self._joint_frames(self.joint_positions(q))
+        return torch.stack([frame[..., 3] for frame in frames], dim=-2)
 
-    def joint_origin(
-        self, q: Float[Tensor, "*batch joints"], joint: int
-    ) -> Float[Tensor, "*batch 3"]:
+    def joint_origin(self, q: ArrayLike, joint: int) -> Float[Tensor, "*batch 3"]:
         """Origin of the frame of one joint in the base frame [m].
 
         Args:
             q: Joint positions [rad].
             joint: Number of the joint, from 1.
         """
-        return self._joint_frames(q, joint)[-1][..., 3]
+        return self._joint_frames(self.joint_positions(q), joint)[-1][..., 3]
 
     def joint_origins_and_jacobian(
-        self, q: Float[Tensor, "*batch joints"]
+        self, q: ArrayLike
     ) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch 6 joints"]]:
         """`joint_origins` and `jacobian` for little more than the price of one."""
+        q = self.joint_positions(q)
         frames = self._joint_frames(q)
         tip = frames[-1] @ self._tip.like(q)
         frames = torch.stack(frames, dim=-3)
         axis, origin = frames[..., 2], frames[..., 3]
         return origin, self._screw_jacobian(axis, origin, tip[..., None, :, 3])
 
-    def jacobian(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 6 joints"]:
+    def jacobian(self, q: ArrayLike) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the tool centre point.
 
         Args:
@@ -265,16 +280,17 @@ class SerialChain:
         return self.transform_and_jacobian(q)[1]
 
     def forward_and_jacobian(
-        self, q: Float[Tensor, "*batch joints"]
+        self, q: ArrayLike
     ) -> tuple[Pose, Float[Tensor, "*batch 6 joints"]]:
         """`forward` and `jacobian` for little more than the price of one."""
         tip, J = self.transform_and_jacobian(q)
         return Pose.from_matrix(tip), J
 
     def transform_and_jacobian(
-        self, q: Float[Tensor, "*batch joints"]
+        self, q: ArrayLike
     ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
         """`forward_and_jacobian` with the pose left as a matrix (R | p): no quaternion made."""
+        q = self.joint_positions(q)
         if torch.compiler.is_compiling():
             return transform_and_jacobian(
                 q, self._mount_entries, self._tip_entries, self._slides
@@ -284,9 +300,7 @@ class SerialChain:
         frames = torch.stack(frames, dim=-3)
         return tip, self._screw_jacobian(frames[..., 2], frames[..., 3], tip[..., None, :, 3])
 
-    def joint_jacobian(
-        self, q: Float[Tensor, "*batch joints"], joint: int
-    ) -> Float[Tensor, "*batch 6 joints"]:
+    def joint_jacobian(self, q: ArrayLike, joint: int) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the frame of one joint, to pull the arm there.
 
         Args:
@@ -299,7 +313,7 @@ class SerialChain:
         count = len(self.joint_names)
         if not 1 <= joint <= count:
             raise ValueError(f"joint must be 1 to {count}, counted from the base, not {joint}.")
-        frames = torch.stack(self._joint_frames(q, joint), dim=-3)
+        frames = torch.stack(self._joint_frames(self.joint_positions(q), joint), dim=-3)
         origin = frames[..., -1:, :, 3]
         J = self._screw_jacobian(frames[..., 2], frames[..., 3], origin)
         return torch.nn.functional.pad(J, (0, count - joint))

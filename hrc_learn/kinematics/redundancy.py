@@ -13,9 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry import Pose
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.franka import FrankaChain, UnreachableError
 
 # Smallest singular value of the 6 x n Jacobian (metres and radians mixed, as it stands) below
 # which inverting it exactly asks for joint speeds an arm does not have.
@@ -138,51 +136,6 @@ def arm_angle_and_motion(
     difference = torch.remainder(after - before + torch.pi, 2 * torch.pi) - torch.pi
     rate = (difference / (2 * _STEP)).unsqueeze(-1)
     return angle, direction * rate / (rate * rate + _DAMPING)
-
-
-def comfortable_posture(
-    chain: FrankaChain, pose: Pose, *, candidates: int = 29
-) -> Float[Tensor, "n"]:
-    """Inverse-kinematics solution furthest from singularities and joint limits.
-
-    An arm that servoes round a pose keeps its posture but for small motions, so the posture
-    it arrives in decides whether it meets a limit there.
-
-    Args:
-        chain: The arm.
-        pose: Of the tool, without batch dimensions.
-        candidates: Values tried for the last joint, the redundant parameter.
-
-    Returns:
-        Joint position [rad].
-
-    Raises:
-        UnreachableError: No candidate reaches the pose within the limits.
-    """
-    return comfortable_postures(chain, pose, candidates=candidates)[0]
-
-
-def comfortable_postures(
-    chain: FrankaChain, pose: Pose, *, candidates: int = 29
-) -> Float[Tensor, "postures n"]:
-    """Inverse-kinematics solutions that differ, the most comfortable one first.
-
-    Arguments and errors are those of `comfortable_posture`.
-    """
-    lower, upper = chain.limits.lower, chain.limits.upper
-    q7 = torch.linspace(float(lower[-1]), float(upper[-1]), candidates, dtype=torch.float64)
-    many = Pose(
-        pose.position.double().expand(candidates, 3),
-        pose.orientation.double().expand(candidates, 4),
-    )
-    solutions = chain.inverse_all(many, q7).flatten(0, 1)
-    solutions = solutions[solutions.isfinite().all(-1)]
-    if len(solutions) == 0:
-        raise UnreachableError(
-            f"no posture within the joint limits brings the tool to {pose.position.tolist()} m "
-            f"with orientation {pose.orientation.tolist()}; move the goal towards the arm"
-        )
-    return best_postures(chain, solutions).to(pose.position)
 
 
 def best_postures(

@@ -14,17 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.kinematics.arm import Arm, LimitsGiven
-from hrc_learn.kinematics.collision import CapsuleArm
-from hrc_learn.kinematics.franka import (
-    HAND_MASS,
-    LINK_MASSES,
-    FrankaChain,
-    fr3,
-    fr3_capsules,
-    panda,
-    panda_capsules,
-)
+from hrc_learn.kinematics.arm import Arm
+from hrc_learn.kinematics.described_arm import LimitsGiven, arm_from_file
+from hrc_learn.kinematics.franka import fr3, panda
 
 
 class MissingModelError(ModuleNotFoundError):
@@ -181,10 +173,7 @@ _SOURCES = {
         ready=(0.0, 0.0, 0.0, 1.4, 0.0),
     ),
 }
-_OWN: dict[str, tuple[FrankaChain, CapsuleArm]] = {
-    "panda": (panda, panda_capsules),
-    "fr3": (fr3, fr3_capsules),
-}
+_OWN = {"panda": panda, "fr3": fr3}
 
 
 def registered_arms() -> tuple[str, ...]:
@@ -227,11 +216,8 @@ def arm(
     if name in registered_arms():
         given = {key: value for key, value in choice.items() if value is not None}
         return _registered(name) if not given else _changed(name, **given)
-    suffix = path.suffix.lower()
-    if suffix == ".urdf":
-        return Arm.from_urdf(path, **choice)
-    if suffix in (".xml", ".mjcf"):
-        return Arm.from_mjcf(path, **choice)
+    if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
+        return arm_from_file(path, **choice)
     raise ValueError(
         f"no arm {name!r}: there are {', '.join(registered_arms())}, and files in URDF (.urdf) "
         "and MJCF (.xml, .mjcf)"
@@ -240,7 +226,7 @@ def arm(
 
 @cache
 def _registered(name: str) -> Arm:
-    return _franka(name) if name in _OWN else _changed(name)
+    return _OWN[name] if name in _OWN else _changed(name)
 
 
 def _changed(name: str, **choice: Any) -> Arm:
@@ -255,7 +241,6 @@ def _changed(name: str, **choice: Any) -> Arm:
         return found.with_tool(choice["tool"])
     source = _SOURCES[name]
     path = _locate(name, source)
-    read = Arm.from_mjcf if path.suffix == ".xml" else Arm.from_urdf
     settings: dict[str, Any] = {
         "name": name,
         "base": source.base,
@@ -264,7 +249,7 @@ def _changed(name: str, **choice: Any) -> Arm:
         "limits": source.limits or None,
         "ready": source.ready,
     }
-    return read(path, **{**settings, **choice})
+    return arm_from_file(path, **{**settings, **choice})
 
 
 def _locate(name: str, source: _Source) -> Path:
@@ -294,28 +279,27 @@ def _placed(origin: Sequence[float], approach: Sequence[float]) -> Tensor:
     return T
 
 
-def _franka(name: str) -> Arm:
-    """One of Franka's arms, whose numbers are this package's own.
+@dataclass(frozen=True)
+class ArmChoice:
+    """An arm by its name or file, as configurations keep it."""
 
-    Its real shape, and its fingers, are in example-robot-data; the two arms' meshes are alike
-    to 2 mm (docs/kinematics.md). Without that package it has none.
-    """
-    chain, body = _OWN[name]
-    own = {"name": name, "chain": chain, "own_body": body}
-    path = f"{_ROBOTS}/panda_description/urdf/panda.urdf"
-    try:
-        file = Path(str(distribution("example-robot-data").locate_file(path)))
-    except PackageNotFoundError:
-        return Arm(**own)
-    if not file.is_file():
-        return Arm(**own)
-    drawn = Arm.from_urdf(
-        file, base="panda_link0", tip="panda_link8", tool=chain.tcp, ready=chain.ready.tolist()
-    )
-    return Arm(
-        **own,
-        visuals=drawn.visuals,
-        gripper=drawn.gripper,
-        shapes=drawn.shapes,
-        told_masses=(None, *LINK_MASSES, 0.0, HAND_MASS),
-    )
+    name: str = "panda"
+    """Registered name, or a URDF or MJCF file."""
+    base: str = ""
+    """Base link of a file; empty: its root."""
+    tip: str = ""
+    """Flange link of a file; empty: its only end."""
+
+    def work_arm(self) -> Arm:
+        """The arm with the hand of our work cell: two parallel fingers, as the Franka hand.
+
+        Raises:
+            ValueError: There is no such arm, or it has fewer than six joints.
+        """
+        return _equipped(self)
+
+
+@cache
+def _equipped(choice: ArmChoice) -> Arm:
+    found = arm(choice.name, base=choice.base or None, tip=choice.tip or None)
+    return found if found.is_franka else found.with_hand()

@@ -20,7 +20,8 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import SerialChain, WorkArm, gripper_down
+from hrc_learn.kinematics import Arm as ArmModel
+from hrc_learn.kinematics import SerialChain, gripper_down
 from hrc_learn.lerobot.loop_watch import LoopWatch
 from hrc_learn.lerobot.person import Person, PersonConfig
 from hrc_learn.protocols import Arm, ArmState
@@ -274,7 +275,7 @@ class ArmRobot(Device, Robot):
 
     complement: ComplementaryMotion | None = None
 
-    def __init__(self, config: ArmRobotConfig, work_arm: WorkArm):
+    def __init__(self, config: ArmRobotConfig, work_arm: ArmModel):
         super().__init__(config)
         if config.person.kind != "none" and work_arm.null_space == "none":
             raise ValueError(

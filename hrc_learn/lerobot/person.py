@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hrc_learn.kinematics import SerialChain, WorkArm
+from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
 class Person(Human):
     """Reads the device of a person, shows them the arm, and gives the device back."""
 
-    def __init__(self, config: PersonConfig, work_arm: WorkArm):
+    def __init__(self, config: PersonConfig, work_arm: Arm):
         """Open the device.
 
         Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from hrc_learn.kinematics import WorkArm
+from hrc_learn.kinematics import Arm
 
 if TYPE_CHECKING:
     from hrc_learn.lerobot.arm_robot import ArmRobot
@@ -19,7 +19,7 @@ class RobotPage:
     """
 
     def __init__(
-        self, arm: WorkArm, host: str, port: int | None, note: str, *, guides: bool = True
+        self, arm: Arm, host: str, port: int | None, note: str, *, guides: bool = True
     ):
         """Serve it.
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import PANDA, CapsuleArm, LinkCapsule, WorkArm
+from hrc_learn.kinematics import Arm, CapsuleArm, LinkCapsule, panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections, Imperfections
 from hrc_learn.vision import Marker, marker_texture
@@ -116,7 +116,7 @@ def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
 class ArmModelConfig:
     """How the arm is built and driven."""
 
-    robot: WorkArm = PANDA
+    robot: Arm = panda
     """Which arm it is."""
     stiffness: tuple[float, ...] = ()
     """Position gain of the joint servos [N m/rad]; none given: by the torques of the joints."""
@@ -175,7 +175,7 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
         body = _add_body(body, f"link{i + 1}", np.linalg.inv(parent_frame) @ frames[i])
         parent_frame = frames[i]
         _add_joint(spec, body, name, i, config)
-        _add_capsules(body, robot, i + 1, mass=robot.masses[i])
+        _add_capsules(body, robot, i + 1, mass=robot.link_masses[i])
     # The end effector's frame: at the flange, turned as the tool.
     flange, tool = frames[n], frames[n + 1]
     hand_frame = np.linalg.inv(parent_frame) @ tool
@@ -231,7 +231,7 @@ def _add_body(parent, name: str, transform: np.ndarray):
     return body
 
 
-def _add_capsules(body, robot: WorkArm, link: int, mass: float | None) -> None:
+def _add_capsules(body, robot: Arm, link: int, mass: float | None) -> None:
     capsules = [capsule for capsule in robot.body.capsules if capsule.link == link]
     if not capsules and mass is not None:
         # A link without a shape still has its mass: a ball of 4 cm that touches nothing.
@@ -360,7 +360,7 @@ class MujocoArm:
         model: mujoco.MjModel,
         data: mujoco.MjData,
         imperfections: DrawnImperfections | None = None,
-        robot: WorkArm = PANDA,
+        robot: Arm = panda,
     ):
         """Find its joints and servos.
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import WorkArm, coarse_orientation
+from hrc_learn.kinematics import Arm, coarse_orientation
 from hrc_learn.kinematics.collision import segment_distance
 from hrc_learn.kinematics.inverse import follow_poses
 from hrc_learn.sim.arm_model import Plate
@@ -49,7 +49,7 @@ def clearance_quality(
 
 
 def _quality(
-    robot: WorkArm,
+    robot: Arm,
     clearances: Clearances,
     q: Float[Tensor, "steps *rows joints"],
     error: Float[Tensor, "steps *rows"],
@@ -64,7 +64,7 @@ def _quality(
 
 
 def way_quality(
-    robot: WorkArm,
+    robot: Arm,
     clearances: Clearances,
     points: Float[Tensor, "points 3"],
     level_at: float,
@@ -111,7 +111,7 @@ class MarkedTurns:
 
 
 def marked_turns(
-    robot: WorkArm,
+    robot: Arm,
     clearances: Clearances,
     camera: CameraModel,
     plate: Plate,
@@ -150,7 +150,7 @@ def marked_turns(
 
 
 def _turned_above_table(
-    robot: WorkArm, middle: Pose, reach: tuple[float, float], hover: Float[Tensor, " joints"]
+    robot: Arm, middle: Pose, reach: tuple[float, float], hover: Float[Tensor, " joints"]
 ) -> tuple[Float[Tensor, "turns places joints"], Float[Tensor, "turns places"]]:
     """Joint positions above five places, for all turns of the hand from -180 to 180 degrees."""
     chain, (a, b) = robot.chain, reach
@@ -190,7 +190,7 @@ def _other_side(plate: Plate) -> Plate:
 
 
 def marker_seen(
-    robot: WorkArm, camera: CameraModel, plate: Plate, q: Float[Tensor, "*batch joints"]
+    robot: Arm, camera: CameraModel, plate: Plate, q: Float[Tensor, "*batch joints"]
 ) -> Bool[Tensor, "*batch"]:
     """Whether a camera sees all of a plate on the hand: no link between, and in the image.
 

@@ -17,9 +17,8 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics import (
-    FrankaWorkArm,
+    Arm,
     UnreachableError,
-    WorkArm,
     coarse_orientation,
     gripper_down,
 )
@@ -105,7 +104,7 @@ class Workplace:
     """Distance in front of the boards from which the end effector moves straight in [m]."""
 
     @classmethod
-    def of(cls, robot: WorkArm, **options: Any) -> "Workplace":
+    def of(cls, robot: Arm, **options: Any) -> "Workplace":
         """The same place with another arm in it, laid out for its reach.
 
         Args:
@@ -115,14 +114,14 @@ class Workplace:
         Raises:
             UnreachableError: The arm cannot do the work in any layout.
         """
-        if not isinstance(robot, FrankaWorkArm):
+        if not robot.is_franka:
             return replace(layout_for(robot).workplace, **options)
         scene = SceneConfig()
         scene = replace(scene, arm=replace(scene.arm, robot=robot))
         return cls(scene=scene, **options)
 
     @property
-    def robot(self) -> WorkArm:
+    def robot(self) -> Arm:
         """The arm that works there."""
         return self.scene.arm.robot
 
@@ -151,11 +150,11 @@ class Workplace:
         home = self.home()
         if offset is not None:
             home = Pose(home.position + offset, home.orientation)
-        if isinstance(self.robot, FrankaWorkArm):
+        if self.robot.is_franka:
             return self.robot.chain.inverse(
                 home, self.home_q7 + q7_offset, near=_LEANING_FORWARD
             )
-        return self.robot.nearest(home, near=_vector(*self.home_posture))
+        return self.robot.inverse(home, near=_vector(*self.home_posture))
 
     def hover(self) -> Pose:
         """End effector above the middle of the table."""
@@ -174,9 +173,9 @@ class Workplace:
 
         Where it is upright, the axes of joints 1 and 3 coincide, and nobody can pull the elbow.
         """
-        if isinstance(self.robot, FrankaWorkArm):
+        if self.robot.is_franka:
             return self.robot.chain.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
-        return self.robot.nearest(self.hover(), near=_vector(*self.hover_posture))
+        return self.robot.inverse(self.hover(), near=_vector(*self.hover_posture))
 
     def hover_postures(self) -> list[Float[Tensor, " joints"]]:
         """Joint positions above the table, the preferred ones first."""
@@ -303,7 +302,7 @@ type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
 
 
 @cache
-def layout_for(robot: WorkArm) -> CellLayout:
+def layout_for(robot: Arm) -> CellLayout:
     """The best layout for an arm, the usual one if that is good enough.
 
     Raises:
@@ -324,7 +323,7 @@ def layout_for(robot: WorkArm) -> CellLayout:
     return best
 
 
-def _layouts(robot: WorkArm) -> Iterator[CellLayout]:
+def _layouts(robot: Arm) -> Iterator[CellLayout]:
     """Layouts in which an arm does the work, the likely ones first."""
     unlikely = []
     for reach in _REACHES:
@@ -359,7 +358,7 @@ def _worth(quality: float, seen: float) -> float:
     return min(quality, 1.0 - _UNSEEN * (1.0 - seen))
 
 
-def _workplaces(robot: WorkArm, scale: float) -> Iterator[Workplace]:
+def _workplaces(robot: Arm, scale: float) -> Iterator[Workplace]:
     """With the table at one distance, and the cabinet in several places."""
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))

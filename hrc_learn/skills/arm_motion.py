@@ -22,12 +22,14 @@ from hrc_learn.controller import (
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import (
-    PANDA,
     SINGULAR_BELOW,
     SerialChain,
-    WorkArm,
+    panda,
     pseudo_inverse,
     singularity_damping,
+)
+from hrc_learn.kinematics import (
+    Arm as ArmModel,
 )
 from hrc_learn.protocols import Arm, ArmState
 
@@ -295,7 +297,7 @@ def nearest_configuration(
     goal: Pose,
     near: Float[Tensor, "*#batch joints"],
     samples: int = 57,
-    robot: WorkArm = PANDA,
+    robot: ArmModel = panda,
 ) -> Float[Tensor, "*batch joints"]:
     """Joint positions that reach poses, as near as can be to given ones.
 
@@ -308,7 +310,7 @@ def nearest_configuration(
     Raises:
         UnreachableError: No joint positions within the limits reach a pose.
     """
-    return robot.nearest(goal, near, samples)
+    return robot.inverse(goal, near=near, samples=samples)
 
 
 def joints_near(

@@ -270,7 +270,7 @@ class Grasping:
         """
         here = self._cell.joints
         try:
-            posture = self._workplace.robot.nearest(pose, near=here, samples=_POSTURES)
+            posture = self._workplace.robot.inverse(pose, near=here, samples=_POSTURES)
         except UnreachableError:
             return "the arm does not reach there with this orientation"
         table = self._workplace.robot.whole.box_distance(

@@ -267,7 +267,7 @@ class PickAndPlace:
 
     def _new_job(self, item: GraspObject, shelf: str) -> PickPlaceJob:
         goal = self._workplace.shelf(shelf, item.half_size)
-        self._placing.robot.nearest(goal, near=self._placing.joint.goal)
+        self._placing.robot.inverse(goal, near=self._placing.joint.goal)
         return PickPlaceJob(item=item, shelf=shelf, goal=goal)
 
     def _deliver(self, job: PickPlaceJob) -> None:
@@ -284,7 +284,7 @@ class PickAndPlace:
         """Take the object from a person's hand, wherever they hand it over."""
         receiving, robot = self._receiving[job.item.name], self._workplace.robot
         job.receipt = receiving.receipt
-        posture = robot.nearest(receiving.wait, near=self._workplace.hover_joints())
+        posture = robot.inverse(receiving.wait, near=self._workplace.hover_joints())
         plan = joint_plan(self._cell, self._cell.joints, posture)
         self._check(plan)
         follow_path(self._cell, plan.path)

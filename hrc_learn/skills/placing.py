@@ -20,11 +20,10 @@ from torch import Tensor
 from hrc_learn.dmp import JointDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
-    PANDA,
+    Arm,
     SerialChain,
     TaskSpace,
     UnreachableError,
-    WorkArm,
     arm_angle,
     arm_angle_and_motion,
     panda,
@@ -105,11 +104,11 @@ class PlacingSkill:
     pose: PoseDMP
     """Motion of the end effector together with the arm angle, its null-space posture, of an arm
     that has one."""
-    robot: WorkArm = PANDA
+    robot: Arm = panda
     """The arm that they are of."""
 
     @classmethod
-    def load(cls, folder: Path, robot: WorkArm = PANDA) -> "PlacingSkill":
+    def load(cls, folder: Path, robot: Arm = panda) -> "PlacingSkill":
         """Read what `hrc fit` wrote.
 
         Args:
@@ -158,7 +157,7 @@ class PlacingSkill:
             UnreachableError: If no joint positions reach the goal.
         """
         # Of both spaces: a goal out of reach is refused before anything is planned.
-        end = self.robot.nearest(goal, near=self.joint.goal)
+        end = self.robot.inverse(goal, near=self.joint.goal)
         duration = float(self.joint.duration) / speed
         time = torch.arange(0.0, duration + dt / 2, dt, dtype=torch.float64)
         chain, has_angle = self.robot.chain, self.robot.null_space == "arm angle"

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import WorkArm
+from hrc_learn.kinematics import Arm
 from hrc_learn.vision import Marker
 
 
@@ -37,7 +37,7 @@ class Workplace(Protocol):
     """Poses of a task: table, home and shelves, known roughly, in the base frame."""
 
     @property
-    def robot(self) -> WorkArm:
+    def robot(self) -> Arm:
         """The arm that works there."""
         ...
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.controller import SafetyConfig
-from hrc_learn.kinematics import PANDA, WorkArm, gripper_down
+from hrc_learn.kinematics import Arm, gripper_down, panda
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections, World, open_camera
 from hrc_learn.sim.cameras import hidden_markers
@@ -131,7 +131,7 @@ class Grasping(Scenario):
         # On the table as it is, of an object as tall as it is.
         pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
         hover = self.workplace.hover()
-        joints = self.workplace.robot.nearest(hover, near=self.workplace.hover_joints())
+        joints = self.workplace.robot.inverse(hover, near=self.workplace.hover_joints())
         world.reset(joints.numpy(), {item.name: pose})
         grasp = pose[:3, 3]
         above, lifted = (grasp + np.array([0.0, 0.0, h]) for h in (0.08, self.height))
@@ -423,7 +423,7 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
         raise ValueError("placing begins with the object in the gripper, so it has no pixels.")
 
 
-def make_scenario(name: str, shelf: str, robot: WorkArm = PANDA) -> Scenario:
+def make_scenario(name: str, shelf: str, robot: Arm = panda) -> Scenario:
     """A scenario in the workplace of an arm.
 
     Raises:

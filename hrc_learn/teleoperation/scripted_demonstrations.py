@@ -14,13 +14,7 @@ from jaxtyping import Float
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import (
-    PANDA,
-    SerialChain,
-    WorkArm,
-    coarse_orientation,
-    gripper_down,
-)
+from hrc_learn.kinematics import Arm, SerialChain, coarse_orientation, gripper_down, panda
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
@@ -113,7 +107,7 @@ def write_demonstrations(
     features: Mapping[str, Sequence[str]] | None = None,
     details: Mapping[str, object] | None = None,
     overwrite: bool = False,
-    robot: WorkArm = PANDA,
+    robot: Arm = panda,
 ) -> None:
     """Write demonstrations of an arm as a LeRobot dataset, one episode each, as they come.
 
@@ -246,7 +240,7 @@ def demonstrate_servoing(
     expert = servo_expert(workplace, above, config, rng, _turn_for(pose, workplace))
     start = torch.from_numpy(expert.path.position(0.0))
     goal = Pose(start, expert.orientation(start, 0.0))
-    q = workplace.robot.nearest(goal, near=workplace.hover_joints())
+    q = workplace.robot.inverse(goal, near=workplace.hover_joints())
     world.reset(q.numpy(), {item.name: pose})
     last = np.zeros((4, 2))
 

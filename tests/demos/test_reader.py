@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError, UnitsWarning, load_demos
 
-PANDA = [f"panda_joint{i}" for i in range(1, 4)]
+panda = [f"panda_joint{i}" for i in range(1, 4)]
 STATE = "observation.state"
 
 
@@ -27,7 +27,7 @@ def test_versions_and_column_types_read_alike(tmp_path, version, ragged_lists, d
     root = write_folder(
         tmp_path / "set",
         episodes,
-        {STATE: [f"{j}.pos" for j in PANDA]},
+        {STATE: [f"{j}.pos" for j in panda]},
         version=version,
         ragged_lists=ragged_lists,
         dtype=dtype,
@@ -35,7 +35,7 @@ def test_versions_and_column_types_read_alike(tmp_path, version, ragged_lists, d
     )
     demos = load_demos(root)
     assert [demo.task for demo in demos] == ["reach", "place"]
-    assert demos.joint_names == tuple(PANDA)
+    assert demos.joint_names == tuple(panda)
     for demo, q in zip(demos, motions, strict=True):
         np.testing.assert_allclose(demo.joint_position, q, atol=1e-6)
         np.testing.assert_array_equal(demo.time, np.arange(len(q)) / FPS)
@@ -44,19 +44,19 @@ def test_versions_and_column_types_read_alike(tmp_path, version, ragged_lists, d
 @pytest.mark.parametrize(
     "names",
     [
-        PANDA,
-        {"axes": PANDA},
-        {"motors": PANDA},
-        {"joints": PANDA},
-        [PANDA],
-        [f"{j}.pos" for j in PANDA],
-        [f"{j}.obs_pos" for j in PANDA],
+        panda,
+        {"axes": panda},
+        {"motors": panda},
+        {"joints": panda},
+        [panda],
+        [f"{j}.pos" for j in panda],
+        [f"{j}.obs_pos" for j in panda],
     ],
 )
 def test_names_in_every_nesting(tmp_path, names):
     motions, episodes = two_episodes(**{STATE: lambda q: q})
     demos = load_demos(write_folder(tmp_path / "set", episodes, {STATE: names}))
-    assert demos.joint_names == tuple(PANDA)
+    assert demos.joint_names == tuple(panda)
     np.testing.assert_allclose(demos[1].joint_position, motions[1], atol=1e-6)
 
 
@@ -188,7 +188,7 @@ def test_orientations_turn_continuous_in_every_encoding(tmp_path, names, encode)
 def test_orientations_are_mapped_in_every_encoding(tmp_path, role, encode):
     turn = Rotation.from_rotvec(joint_path(50, seed=4))
     episode = {STATE: joint_path(50), "observation.tool": encode(turn)}
-    root = write_folder(tmp_path / "set", [episode], {STATE: PANDA}, dtype="float64")
+    root = write_folder(tmp_path / "set", [episode], {STATE: panda}, dtype="float64")
     demo = load_demos(root, mapping={role: "observation.tool"})[0]
     assert_same_rotation(demo.orientation, turn)
 
@@ -202,18 +202,18 @@ def test_columns_that_are_no_rotation_are_told(tmp_path):
 
 def test_the_persons_effort_is_found_by_name_and_by_key(tmp_path):
     q = joint_path()
-    names = [*(f"{j}.pos" for j in PANDA), *(f"{j}.human_torque" for j in PANDA)]
+    names = [*(f"{j}.pos" for j in panda), *(f"{j}.human_torque" for j in panda)]
     by_name = write_folder(tmp_path / "a", [{STATE: np.hstack([q, 2 * q])}], {STATE: names})
     np.testing.assert_allclose(load_demos(by_name)[0].human_effort, 2 * q, atol=1e-6)
     episode = {STATE: q, "observation.human_effort": 3 * q}
-    by_key = write_folder(tmp_path / "b", [episode], {STATE: PANDA})
+    by_key = write_folder(tmp_path / "b", [episode], {STATE: panda})
     np.testing.assert_allclose(load_demos(by_key)[0].human_effort, 3 * q, atol=1e-6)
 
 
 def test_true_stamps_are_preferred_and_begin_at_zero(tmp_path):
     stamps = 1.7e9 + np.cumsum(np.random.default_rng(0).uniform(0.018, 0.022, 60))
     episode = {STATE: joint_path(60), "observation.time": stamps[:, None]}
-    root = write_folder(tmp_path / "set", [episode], {STATE: PANDA}, dtype="float64")
+    root = write_folder(tmp_path / "set", [episode], {STATE: panda}, dtype="float64")
     demo = load_demos(root)[0]
     np.testing.assert_allclose(demo.time, stamps - stamps[0], atol=1e-6)
     assert demo.start_time == pytest.approx(stamps[0])
@@ -223,7 +223,7 @@ def test_true_stamps_are_preferred_and_begin_at_zero(tmp_path):
 def test_units_of_stamps_are_guessed_from_the_frame_rate(tmp_path, recwarn, unit, size):
     stamps = 5 + np.arange(60) / FPS * 1.2  # a recorder that fell behind
     episode = {STATE: joint_path(60), "time_stamp": stamps[:, None] / size}
-    root = write_folder(tmp_path / "set", [episode], {STATE: PANDA}, dtype="float64")
+    root = write_folder(tmp_path / "set", [episode], {STATE: panda}, dtype="float64")
     demos = load_demos(root)
     np.testing.assert_allclose(demos[0].time, stamps - 5, atol=1e-9)
     assert any(note.startswith("time: ") for note in demos.notes) == (unit != "s")
@@ -233,7 +233,7 @@ def test_units_of_stamps_are_guessed_from_the_frame_rate(tmp_path, recwarn, unit
 @pytest.mark.parametrize("without", ["timestamp", "frame_index", "index", "task_index"])
 def test_index_columns_may_be_missing(tmp_path, without):
     root = write_folder(
-        tmp_path / "set", [{STATE: joint_path()}], {STATE: PANDA}, without=[without]
+        tmp_path / "set", [{STATE: joint_path()}], {STATE: panda}, without=[without]
     )
     demo = load_demos(root)[0]
     assert demo.task == "reach"
@@ -244,7 +244,7 @@ def test_missing_videos_are_no_matter(tmp_path):
     root = write_folder(
         tmp_path / "set",
         [{STATE: joint_path()}],
-        {STATE: PANDA},
+        {STATE: panda},
         videos=["observation.images.a"],
     )
     assert len(load_demos(root)) == 1
@@ -252,7 +252,7 @@ def test_missing_videos_are_no_matter(tmp_path):
 
 def test_episodes_are_chosen_in_order_and_from_their_row_groups(tmp_path):
     motions = [joint_path(20 + i, seed=i) for i in range(5)]
-    root = write_folder(tmp_path / "set", [{STATE: q} for q in motions], {STATE: PANDA})
+    root = write_folder(tmp_path / "set", [{STATE: q} for q in motions], {STATE: panda})
     demos = load_demos(root, episodes=[3, 1])
     assert [demo.episode for demo in demos] == [3, 1]
     np.testing.assert_allclose(demos[0].joint_position, motions[3], atol=1e-6)
@@ -269,7 +269,7 @@ def test_episodes_are_chosen_in_order_and_from_their_row_groups(tmp_path):
 def test_units_of_joints_are_guessed_shown_and_overruled(tmp_path, recwarn, scale, unit):
     q = joint_path() + 2
     root = write_folder(
-        tmp_path / "set", [{STATE: scale * q, "action": scale * q}], {STATE: PANDA}
+        tmp_path / "set", [{STATE: scale * q, "action": scale * q}], {STATE: panda}
     )
     demos = load_demos(root)
     np.testing.assert_allclose(demos[0].joint_position, q, atol=1e-5)
@@ -293,13 +293,13 @@ def test_positions_in_centimetres_are_noticed(tmp_path):
 def test_units_stand_in_the_sidecar(tmp_path):
     q = joint_path()
     root = write_folder(
-        tmp_path / "set", [{STATE: np.rad2deg(q)}], {STATE: [f"{j}.pos" for j in PANDA]}
+        tmp_path / "set", [{STATE: np.rad2deg(q)}], {STATE: [f"{j}.pos" for j in panda]}
     )
     sidecar = {
         "format": 1,
         "units": {"joint_position": "deg"},
         "columns": {},
-        "joint_names": PANDA,
+        "joint_names": panda,
         "frames": {},
         "details": {},
     }
@@ -312,12 +312,12 @@ def test_units_stand_in_the_sidecar(tmp_path):
 def test_mapping_overrules_what_names_say(tmp_path):
     q = joint_path()
     episode = {STATE: np.hstack([q, q / 2]), "observation.qpos_raw": 2 * q}
-    root = write_folder(tmp_path / "set", [episode], {STATE: [*PANDA, "px", "py", "pz"]})
+    root = write_folder(tmp_path / "set", [episode], {STATE: [*panda, "px", "py", "pz"]})
     by_slice = load_demos(root, mapping={"joint_position": "observation.state[0:2]"})
-    assert by_slice.joint_names == tuple(PANDA[:2])
+    assert by_slice.joint_names == tuple(panda[:2])
     by_feature = load_demos(root, mapping={"joint_position": "observation.qpos_raw"})
     np.testing.assert_allclose(by_feature[0].joint_position, 2 * q, atol=1e-6)
-    by_names = load_demos(root, mapping={"joint_position": [PANDA[2], f"{STATE}/{PANDA[0]}"]})
+    by_names = load_demos(root, mapping={"joint_position": [panda[2], f"{STATE}/{panda[0]}"]})
     np.testing.assert_allclose(by_names[0].joint_position, q[:, [2, 0]], atol=1e-6)
     assert load_demos(root, mapping={"position": None})[0].position is None
 
@@ -341,7 +341,7 @@ def test_mapping_overrules_what_names_say(tmp_path):
     ],
 )
 def test_a_wrong_mapping_says_what_exists(tmp_path, mapping, message):
-    root = write_folder(tmp_path / "set", [{STATE: joint_path()}], {STATE: PANDA})
+    root = write_folder(tmp_path / "set", [{STATE: joint_path()}], {STATE: panda})
     with pytest.raises(DatasetError, match=message):
         load_demos(root, mapping=mapping)
 
@@ -351,10 +351,10 @@ def test_joints_are_selected_by_name(tmp_path):
     root = write_folder(
         tmp_path / "set",
         [{STATE: q, "action": q[:, ::-1]}],
-        {STATE: PANDA, "action": PANDA[::-1]},
+        {STATE: panda, "action": panda[::-1]},
     )
-    demo = load_demos(root, joint_names=[PANDA[2], PANDA[0]])[0]
-    assert demo.joint_names == (PANDA[2], PANDA[0])
+    demo = load_demos(root, joint_names=[panda[2], panda[0]])[0]
+    assert demo.joint_names == (panda[2], panda[0])
     np.testing.assert_allclose(demo.joint_position, q[:, [2, 0]], atol=1e-6)
     np.testing.assert_allclose(demo.command_position, q[:, [2, 0]], atol=1e-6)
     with pytest.raises(DatasetError, match=r"no joint named elbow.*panda_joint1"):
@@ -372,7 +372,7 @@ def test_actions_of_other_joints_are_kept_apart(tmp_path):
 
 def test_an_object_is_not_taken_for_the_end_effector(tmp_path):
     episode = {STATE: joint_path(), "observation.object_position": joint_path(seed=5)}
-    names = {STATE: PANDA, "observation.object_position": ["x", "y", "z"]}
+    names = {STATE: panda, "observation.object_position": ["x", "y", "z"]}
     demo = load_demos(write_folder(tmp_path / "set", [episode], names))[0]
     assert demo.position is None
     assert "observation.object_position" in demo.extra
@@ -380,7 +380,7 @@ def test_an_object_is_not_taken_for_the_end_effector(tmp_path):
 
 def test_shards_are_read_from_their_own_first_row(tmp_path):
     motions = [joint_path(30, seed=i) for i in range(3)]
-    root = write_folder(tmp_path / "set", [{STATE: q} for q in motions], {STATE: PANDA})
+    root = write_folder(tmp_path / "set", [{STATE: q} for q in motions], {STATE: panda})
     first = root / "data/chunk-000/file-000.parquet"
     second = root / "data/chunk-000/file-001.parquet"
     second.write_bytes(first.read_bytes())

@@ -18,7 +18,7 @@ from hrc_learn.experiments.collaboration.worker_room import (
     reach_rooms,
 )
 from hrc_learn.geometry import Box
-from hrc_learn.kinematics import CapsuleArm, panda, panda_capsules
+from hrc_learn.kinematics import CapsuleArm, panda
 from hrc_learn.log import StepLog
 from hrc_learn.sim import whole_arm
 from hrc_learn.sim.workplace import Workplace
@@ -41,8 +41,8 @@ def test_the_free_volume_of_an_empty_box_is_all_of_it():
 def test_what_an_arm_takes_is_the_volume_of_its_links_and_a_margin():
     """One capsule, by the formula for a capsule whose radius is larger by the margin."""
     # With the base's, which is far below the box.
-    forearm = panda_capsules.capsules[10]
-    one = CapsuleArm(panda, [panda_capsules.capsules[0], forearm])
+    forearm = panda.whole.capsules[10]
+    one = CapsuleArm(panda, [panda.whole.capsules[0], forearm])
     first, second = one.segments(WAITING)[1]
     r = forearm.radius
     middle = ((first + second) / 2).tolist()

@@ -146,7 +146,9 @@ def test_the_links_of_frankas_arms_weigh_what_their_description_says(name):
     assert ur5 is not None
     robots = next(folder for folder in ur5.parents if folder.name == "robots")
     described = arm(robots / "panda_description/urdf/panda.urdf", tip="panda_link8")
-    assert_close(ArmChoice(name).work_arm().masses, described.masses[1:8], rtol=0, atol=0.005)
+    assert_close(
+        ArmChoice(name).work_arm().link_masses, described.masses[1:8], rtol=0, atol=0.005
+    )
     # The description has the fingers apart.
     assert installed(name).masses[-1] == pytest.approx(described.masses[-1], abs=0.05)
 
@@ -189,7 +191,7 @@ def test_fingers_are_where_mujoco_has_them_from_closed_to_open(tmp_path):
             assert {finger.closed, finger.opened} == {lower, upper}
             assert abs(finger.opened) > abs(finger.closed)
             values = np.linspace(finger.closed, finger.opened, 5)
-            for value, shape in zip(values, a.shapes, strict=True):
+            for value, shape in zip(values, a.shape.shapes, strict=True):
                 assert shape.link == a.tool_link
                 data.joint("grip").qpos[0] = value
                 mujoco.mj_kinematics(model, data)
@@ -336,7 +338,7 @@ def test_hulls_are_parted_where_a_plane_fits_between(gap):
 def test_most_postures_of_an_arm_are_no_contact_with_itself(name):
     a = installed(name)
     q = random_positions(a.chain, 1000, seed=6)
-    assert float((a.body.self_distance(q) < 0).double().mean()) < 0.6
+    assert float((a.whole.self_distance(q) < 0).double().mean()) < 0.6
 
 
 def test_without_scipy_shapes_are_not_fitted_and_it_says_why(monkeypatch):

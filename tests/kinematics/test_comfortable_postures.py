@@ -40,5 +40,5 @@ def test_a_pose_out_of_reach_is_refused():
         torch.tensor([2.0, 0.0, 0.3], dtype=torch.float64),
         torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64),
     )
-    with pytest.raises(UnreachableError, match="move the goal"):
+    with pytest.raises(UnreachableError, match="move the pose"):
         comfortable_posture(panda, far)

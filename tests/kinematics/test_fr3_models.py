@@ -10,7 +10,7 @@ import torch
 from sampling import generator, within
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import LINK_CAPSULES, fr3, fr3_capsules
+from hrc_learn.kinematics import LINK_CAPSULES, fr3
 
 _SPEC = find_spec("franky_sim")
 pytestmark = pytest.mark.skipif(_SPEC is None, reason="franky-sim has models of the FR3")
@@ -88,7 +88,7 @@ def test_it_is_where_pinocchio_has_it(count):
 
 def test_its_meshes_stick_out_of_the_capsules_by_no_more_than_is_said(model):
     data = solve(model, fr3.ready)
-    ends = fr3_capsules.segments(fr3.ready)
+    ends = fr3.whole.segments(fr3.ready)
     start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
     furthest: dict[str, float] = {}
     for geom in range(model.ngeom):
@@ -101,10 +101,10 @@ def test_its_meshes_stick_out_of_the_capsules_by_no_more_than_is_said(model):
         p = torch.from_numpy(points).double()[:, None]
         share = ((p - start) * along).sum(-1) / along.square().sum(-1)
         nearest = start + share.clamp(0, 1)[..., None] * along
-        out = ((p - nearest).norm(dim=-1) - fr3_capsules.radius).amin(-1)
+        out = ((p - nearest).norm(dim=-1) - fr3.whole.radius).amin(-1)
         furthest[name] = max(furthest.get(name, -1.0), float(out.max()))
     assert len(furthest) == 9
     assert 0.04 < furthest.pop("fr3_link0") < 0.047
     assert furthest.pop("hand") < 0.0095
     assert 0.029 < max(furthest.values()) < 0.0305
-    assert len(fr3_capsules.capsules) == len(LINK_CAPSULES) + 2
+    assert len(fr3.whole.capsules) == len(LINK_CAPSULES) + 2

@@ -6,7 +6,7 @@ from sampling import generator, within
 from torch.testing import assert_close
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import UnreachableError, fr3, franka_chain, panda
+from hrc_learn.kinematics import UnreachableError, arm, fr3, panda
 
 
 def solvable_configurations(count, rng):
@@ -28,7 +28,7 @@ def test_recovers_the_configuration_it_starts_from():
 def test_every_branch_reaches_the_pose_within_limits():
     q = solvable_configurations(200, generator(2))
     pose = panda.forward(q)
-    branches = panda.inverse_all(pose, q[:, 6])
+    branches = panda.solutions(pose, q[:, 6])
     valid = ~branches.isnan().any(-1)
     assert bool(valid[:, 0].all())
     assert bool((valid[:, 1:] <= valid[:, :-1]).all()), "rows of NaN come last"
@@ -46,7 +46,7 @@ def test_finds_the_branches_of_the_library_itself():
             frankik.ik_full(flange.numpy(), q.numpy(), q[6].item(), False)
         )
         theirs = theirs[~theirs.isnan().any(-1)]
-        ours = panda.inverse_all(panda.forward(q), q[6])
+        ours = panda.solutions(panda.forward(q), q[6])
         ours = ours[~ours.isnan().any(-1)]
         distance = torch.cdist(theirs, ours).amin(-1)
         assert float(distance.max()) < 1e-6
@@ -57,7 +57,7 @@ def test_finds_the_branches_of_the_library_itself():
 def test_nearest_branch_is_chosen():
     q = solvable_configurations(200, generator(4))
     pose = panda.forward(q)
-    branches = panda.inverse_all(pose, q[:, 6])
+    branches = panda.solutions(pose, q[:, 6])
     count = (~branches.isnan().any(-1)).sum(-1)
     i = int(count.argmax())
     assert int(count[i]) >= 2
@@ -74,8 +74,8 @@ def test_without_near_the_branch_is_the_one_nearest_to_ready():
 def test_batches_and_broadcasts(batch):
     q = solvable_configurations(6, generator(5))[: torch.Size(batch).numel()].reshape(*batch, 7)
     pose = panda.forward(q)
-    assert panda.inverse_all(pose, q[..., 6]).shape == (*batch, 4, 7)
-    assert panda.inverse_all(pose, 0.3).shape == (*batch, 4, 7)
+    assert panda.solutions(pose, q[..., 6]).shape == (*batch, 4, 7)
+    assert panda.solutions(pose, 0.3).shape == (*batch, 4, 7)
     assert_close(panda.inverse(pose, q[..., 6], near=q), q, rtol=0, atol=1e-6)
 
 
@@ -106,7 +106,7 @@ def test_unreachable_pose_names_itself_and_says_what_to_do():
     both = Pose(torch.stack([ready.position, far.position]), ready.orientation.expand(2, 4))
     with pytest.raises(UnreachableError, match=r"pose \[1\] of \[2\]"):
         panda.inverse(both, torch.pi / 4)
-    assert bool(panda.inverse_all(far, torch.pi / 4).isnan().all())
+    assert bool(panda.solutions(far, torch.pi / 4).isnan().all())
 
 
 def test_joint_7_outside_its_limits_is_unreachable():
@@ -147,7 +147,7 @@ def test_the_research_3_has_the_inverse_within_limits_of_its_own():
     q = research_3_configurations(300)
     pose = fr3.forward(q)
     assert_close(fr3.inverse(pose, q[:, 6], near=q), q, rtol=0, atol=1e-6)
-    branches = fr3.inverse_all(pose, q[:, 6])
+    branches = fr3.solutions(pose, q[:, 6])
     valid = ~branches.isnan().any(-1)
     assert bool(fr3.limits.contain(branches[valid]).all())
     wanted = pose.matrix()[:, None].expand(-1, 4, 4, 4)[valid]
@@ -160,15 +160,13 @@ def test_its_wrist_bends_further_than_the_pandas():
     q[5], q[6] = 4.0, 0.3
     pose = fr3.forward(q)
     assert_close(fr3.inverse(pose, q[6], near=q), q, rtol=0, atol=1e-6)
-    found = panda.inverse_all(pose, q[6])
+    found = panda.solutions(pose, q[6])
     assert not bool(((found - q).abs().amax(-1) < 1e-3).any())
 
 
 def test_arms_by_their_name():
-    assert franka_chain("panda") is panda
-    assert franka_chain("fr3") is fr3
+    assert arm("panda") is panda
+    assert arm("fr3") is fr3
     assert fr3.joint_names[6] == "fr3_joint7"
     assert '<robot name="fr3">' in fr3.urdf()
     assert '<robot name="panda">' in panda.urdf()
-    with pytest.raises(ValueError, match=r"no arm 'ur5'; Franka's are panda, fr3"):
-        franka_chain("ur5")

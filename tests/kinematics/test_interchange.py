@@ -10,9 +10,9 @@ from sampling import generator
 from torch.testing import assert_close
 
 from hrc_learn.kinematics import (
-    Arm,
     JointLimits,
     SerialChain,
+    arm_from_file,
     from_pytorch_kinematics,
     panda,
     to_pytorch_kinematics,
@@ -131,7 +131,7 @@ def test_urdf_keeps_how_each_joint_moves(tmp_path):
     )
     file = tmp_path / "sliding.urdf"
     file.write_text(to_urdf(chain))
-    read = Arm.from_urdf(file, base="link0", tip="tcp").chain
+    read = arm_from_file(file, base="link0", tip="tcp").chain
     assert read.kinds == chain.kinds
     q = torch.tensor([[0.3, 0.2, -0.7], [-2.0, -0.1, 1.5]]).double()
     assert_close(read.forward(q).matrix(), chain.forward(q).matrix(), rtol=0, atol=1e-12)

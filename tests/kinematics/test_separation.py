@@ -6,17 +6,11 @@ import pytest
 import sampling
 import torch
 
-from hrc_learn.kinematics import (
-    TOOL_LINK,
-    GraspedBox,
-    panda,
-    panda_capsules,
-    separation,
-)
+from hrc_learn.kinematics import TOOL_LINK, GraspedBox, panda, separation
 from hrc_learn.kinematics.collision import nearest_on_segment_and_box
 
 BOX = GraspedBox(half_size=(0.04, 0.022, 0.03), centre=(0.0, 0.005, 0.01))
-ARM = panda_capsules
+ARM = panda.whole
 ROWS = len(ARM.capsules)
 NAMES = ("distance", "on_arm", "on_person", "direction", "fraction", "gradient")
 
@@ -181,7 +175,7 @@ def test_a_held_box_moves_with_all_joints():
     J = panda.jacobian(q)[:, :3]
     expected = -(found.direction[:, ROWS] @ J).squeeze(-2)
     torch.testing.assert_close(found.gradient[:, ROWS, 0], expected, atol=1e-6, rtol=0)
-    assert panda_capsules.links[-1] == TOOL_LINK
+    assert panda.whole.links[-1] == TOOL_LINK
 
 
 def test_points_of_a_box_nearest_to_a_segment_are_on_it():

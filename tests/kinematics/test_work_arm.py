@@ -6,14 +6,7 @@ import torch
 from bare_arm import bare
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import (
-    PANDA,
-    ArmChoice,
-    EquippedArm,
-    JointLimits,
-    UnreachableError,
-    panda,
-)
+from hrc_learn.kinematics import ArmChoice, JointLimits, UnreachableError, panda
 from hrc_learn.kinematics.inverse import follow_poses, solutions_from
 
 
@@ -27,7 +20,7 @@ def poses_of(chain, count, seed=0):
 
 @pytest.mark.parametrize("left_out", [(2,), ()])
 def test_solutions_reach_the_pose_within_the_limits(left_out):
-    arm = EquippedArm(bare(left_out))
+    arm = bare(left_out).with_hand()
     starts, poses = poses_of(arm.chain, 40)
     found_of_all = solutions_from(arm.chain, poses[:5], starts)
     for i in range(5):
@@ -40,10 +33,10 @@ def test_solutions_reach_the_pose_within_the_limits(left_out):
 
 
 def test_the_nearest_is_where_the_pose_came_from():
-    arm = EquippedArm(bare())
+    arm = bare().with_hand()
     q, poses = poses_of(arm.chain, 10, seed=1)
     for i in range(len(q)):
-        found = arm.nearest(poses[i], near=q[i] + 0.02)
+        found = arm.inverse(poses[i], near=q[i] + 0.02)
         # Six joints have finitely many solutions: the one beside is the same.
         torch.testing.assert_close(found, q[i], atol=1e-7, rtol=0)
 
@@ -54,12 +47,12 @@ def test_joints_that_turn_twice_around_stay_near():
     turning.chain.limits = JointLimits(
         **{**vars(limits), "lower": limits.lower - 6.0, "upper": limits.upper + 6.0}
     )
-    arm = EquippedArm(turning)
+    arm = turning.with_hand()
     q, _ = poses_of(bare().chain, 3, seed=2)
     pose = arm.chain.forward(q)
     for i in range(3):
         away = q[i] + torch.tensor([2 * math.pi, 0, 0, 0, 0, 0], dtype=torch.float64)
-        found = arm.nearest(pose[i], near=away)
+        found = arm.inverse(pose[i], near=away)
         torch.testing.assert_close(found, away, atol=1e-7, rtol=0)
 
 
@@ -70,19 +63,19 @@ def test_joints_that_slide_go_on_sliding_and_are_not_turned():
     far = limits.upper.clone()
     far[0] = 9.0
     described.chain.limits = JointLimits(**{**vars(limits), "upper": far})
-    arm = EquippedArm(described)
+    arm = described.with_hand()
     q, _ = poses_of(bare(()).chain, 3, seed=2)
     pose = described.with_tool(arm.chain.tcp).chain.forward(q)
     assert arm.chain.forward(q).twist_to(pose).abs().max() < 1e-12
     away = torch.zeros(7, dtype=torch.float64)
     away[0] = 2 * math.pi
     for i in range(3):
-        found = arm.nearest(pose[i], near=q[i] + away)
+        found = arm.inverse(pose[i], near=q[i] + away)
         assert arm.chain.forward(found).twist_to(pose[i]).abs().max() < 1e-6
 
 
 def test_postures_differ_and_the_first_is_the_most_comfortable():
-    arm = EquippedArm(bare())
+    arm = bare().with_hand()
     _, poses = poses_of(arm.chain, 10, seed=3)
     several = [found for found in (arm.postures(poses[i]) for i in range(10)) if len(found) > 1]
     assert several
@@ -98,25 +91,25 @@ def test_postures_differ_and_the_first_is_the_most_comfortable():
 
 
 def test_a_pose_out_of_reach_is_refused():
-    arm = EquippedArm(bare())
+    arm = bare().with_hand()
     far = Pose(torch.tensor([3.0, 0.0, 0.0]).double(), torch.tensor([1.0, 0, 0, 0]).double())
     with pytest.raises(UnreachableError, match=r"\(3\.000, 0\.000, 0\.000\) m"):
-        arm.nearest(far, near=arm.chain.ready)
+        arm.inverse(far, near=arm.chain.ready)
     with pytest.raises(UnreachableError):
         arm.postures(far)
 
 
 def test_it_carries_our_hand_in_place_of_its_own():
     described = bare()
-    arm = EquippedArm(described)
+    arm = described.with_hand()
     hand = arm.chain.forward(arm.chain.ready).position
     flange = described.chain.forward(described.chain.ready)
     along = torch.tensor([0.0, 0.0, 0.1034], dtype=torch.float64)
     torch.testing.assert_close(hand, flange.apply(along))
     assert max(arm.body.links) == 6
-    own = [c for c in PANDA.whole.capsules if c.link == 9]
+    own = [c for c in panda.whole.capsules if c.link == 9]
     assert [c.radius for c in arm.whole.capsules if c.link == 8] == [c.radius for c in own]
-    assert arm.masses == (2.0,) * 6
+    assert arm.link_masses == (2.0,) * 6
     assert {(0, 2), (5, 8), (6, 8)} == set(arm.whole.overlapping)
 
 
@@ -124,20 +117,20 @@ def test_it_carries_our_hand_in_place_of_its_own():
     ("left_out", "null_space"), [((2,), "none"), ((), "free")], ids=["6", "7"]
 )
 def test_what_null_space_is_left(left_out, null_space):
-    arm = EquippedArm(bare(left_out))
+    arm = bare(left_out).with_hand()
     rank = np.linalg.matrix_rank(arm.chain.jacobian(arm.chain.ready).numpy())
     assert arm.null_space == null_space
     assert (arm.joints - rank > 0) == (null_space == "free")
-    assert PANDA.null_space == "arm angle"
+    assert panda.null_space == "arm angle"
 
 
 def test_too_few_joints_are_refused():
     with pytest.raises(ValueError, match="cut has 5 joints"):
-        EquippedArm(bare((2, 4)))
+        bare((2, 4)).with_hand()
 
 
 def test_a_choice_opens_the_same_arm_each_time():
-    assert ArmChoice().work_arm() is PANDA
+    assert ArmChoice().work_arm() is panda
     fr3 = ArmChoice("fr3").work_arm()
     assert fr3.chain.joint_names[0] == "fr3_joint1"
     assert ArmChoice("fr3").work_arm() is fr3
@@ -153,7 +146,7 @@ def test_the_nearest_of_frankas_is_the_best_of_a_scan_of_joint_7():
     q, poses = poses_of(panda, 6, seed=4)
     for i in range(len(q)):
         near = (q[i] + 0.3).clamp(panda.limits.lower, panda.limits.upper)
-        found = PANDA.nearest(poses[i], near=near, samples=15)
+        found = panda.inverse(poses[i], near=near, samples=15)
         scanned = []
         for q7 in [float(near[6]), *torch.linspace(lower, upper, 15).tolist()]:
             try:
@@ -168,30 +161,30 @@ def test_the_nearest_of_frankas_is_the_best_of_a_scan_of_joint_7():
 @pytest.mark.parametrize("of", ["panda", "cut"])
 @pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 2)])
 def test_the_nearest_of_many_poses_are_those_of_each(batch, of):
-    arm = PANDA if of == "panda" else EquippedArm(bare())
+    arm = panda if of == "panda" else bare().with_hand()
     q, poses = poses_of(arm.chain, 4, seed=6)
     near = (q + 0.2).clamp(arm.chain.limits.lower, arm.chain.limits.upper)
     count = math.prod(batch)
     shaped = Pose(
         poses.position[:count].reshape(*batch, 3), poses.orientation[:count].reshape(*batch, 4)
     )
-    found = arm.nearest(shaped, near[:count].reshape(*batch, -1), samples=9)
+    found = arm.inverse(shaped, near=near[:count].reshape(*batch, -1), samples=9)
     assert found.shape == (*batch, arm.joints)
     for i, row in enumerate(found.reshape(count, -1)):
-        torch.testing.assert_close(row, arm.nearest(poses[i], near[i], samples=9))
+        torch.testing.assert_close(row, arm.inverse(poses[i], near=near[i], samples=9))
     # One wish for all of them.
-    same = arm.nearest(shaped, near[0], samples=9).reshape(count, -1)
-    torch.testing.assert_close(same[-1], arm.nearest(poses[count - 1], near[0], samples=9))
+    same = arm.inverse(shaped, near=near[0], samples=9).reshape(count, -1)
+    torch.testing.assert_close(same[-1], arm.inverse(poses[count - 1], near=near[0], samples=9))
 
 
 @pytest.mark.parametrize("of", ["panda", "cut"])
 def test_the_first_of_many_poses_out_of_reach_is_named(of):
-    arm = PANDA if of == "panda" else EquippedArm(bare())
+    arm = panda if of == "panda" else bare().with_hand()
     _, poses = poses_of(arm.chain, 3, seed=7)
     position = poses.position.clone()
     position[1, 0], position[2, 0] = 2.5, 3.5
     with pytest.raises(UnreachableError, match=r"position \(2\.500,"):
-        arm.nearest(Pose(position, poses.orientation), arm.chain.ready, samples=9)
+        arm.inverse(Pose(position, poses.orientation), near=arm.ready, samples=9)
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 2)])

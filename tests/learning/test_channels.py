@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
-from hrc_learn.kinematics import panda, panda_capsules
+from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.arm_shapes import panda_bodies
 from hrc_learn.learning.channels import Motions, demonstrations_recording
 
@@ -27,7 +27,7 @@ def test_the_arm_is_drawn_where_planning_takes_it_to_be(joints):
         for capsule in body.capsules
         for end in (capsule.start, capsule.end)
     ]
-    expected = panda_capsules.segments(torch.from_numpy(joints)).flatten(1, 2).numpy()
+    expected = panda.whole.segments(torch.from_numpy(joints)).flatten(1, 2).numpy()
     np.testing.assert_allclose(np.stack(drawn, axis=1), expected, atol=1e-12)
 
 

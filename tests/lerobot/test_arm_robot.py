@@ -7,7 +7,7 @@ from bare_arm import bare
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import EquippedArm, panda
+from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmRobot, ArmValues, robot_registry
 from hrc_learn.lerobot.expert_recording import observation_features
 from hrc_learn.lerobot.person import PersonConfig
@@ -48,7 +48,7 @@ def test_an_action_without_joints_is_refused():
 @pytest.fixture
 def six(monkeypatch):
     """Lets every simulated arm be one of six joints, a Panda's without the third."""
-    arm = EquippedArm(bare())
+    arm = bare().with_hand()
     monkeypatch.setattr(MujocoArmRobotConfig, "work_arm", lambda config: arm)
     return arm
 

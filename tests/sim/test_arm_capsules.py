@@ -7,7 +7,7 @@ import sampling
 import torch
 from grasp_trials import PEDESTAL, TABLE
 
-from hrc_learn.kinematics import LINK_CAPSULES, CapsuleArm, panda, panda_capsules
+from hrc_learn.kinematics import LINK_CAPSULES, CapsuleArm, panda
 from hrc_learn.kinematics.collision import segment_box_distance
 from hrc_learn.sim import FINGER_STROKE, SceneConfig, build_scene, whole_arm
 from hrc_learn.sim.world import body_geoms
@@ -44,11 +44,11 @@ def place(model: mujoco.MjModel, q: torch.Tensor) -> mujoco.MjData:
 
 def test_distances_of_links_are_those_of_the_simulator(model):
     ids = [model.geom(name).id for name in geom_names()]
-    pairs = [(k, pair) for k, pair in enumerate(panda_capsules.pairs) if max(pair) < len(ids)]
+    pairs = [(k, pair) for k, pair in enumerate(panda.whole.pairs) if max(pair) < len(ids)]
     assert len(pairs) > 40
     for q in postures(12):
         data = place(model, q)
-        ours = panda_capsules.pair_distances(q)
+        ours = panda.whole.pair_distances(q)
         for k, (a, b) in pairs:
             theirs = mujoco.mj_geomDistance(model, data, ids[a], ids[b], FAR, None)
             assert ours[k].item() == pytest.approx(theirs, abs=1e-6)
@@ -57,7 +57,7 @@ def test_distances_of_links_are_those_of_the_simulator(model):
 def test_the_distance_from_the_table_is_that_of_the_simulator(model):
     """The hand is a box there and a capsule round it here: links alone are compared."""
     table = SceneConfig().table
-    arm = type(panda_capsules)(panda, LINK_CAPSULES)
+    arm = type(panda.whole)(panda, LINK_CAPSULES)
     ids = [model.geom(name).id for name in geom_names() if name != "link0"]
     top = model.geom("table").id
     q = postures(40)
@@ -80,20 +80,20 @@ def test_no_box_that_is_left_out_is_the_nearest():
     centre = 1.6 * torch.rand(9, 3, generator=rng, dtype=torch.float64) - 0.8
     half_size = 0.02 + 0.3 * torch.rand(9, 3, generator=rng, dtype=torch.float64)
     q = postures(50)
-    ends = panda_capsules.segments(q)
+    ends = panda.whole.segments(q)
     each = torch.stack(
         [
-            segment_box_distance(ends[:, k], centre[b], half_size[b]) - panda_capsules.radius[k]
-            for k, link in enumerate(panda_capsules.links)
+            segment_box_distance(ends[:, k], centre[b], half_size[b]) - panda.whole.radius[k]
+            for k, link in enumerate(panda.whole.links)
             for b in range(9)
             if link > 0
         ]
     )
-    ours = panda_capsules.box_distance(q, centre, half_size)
+    ours = panda.whole.box_distance(q, centre, half_size)
     torch.testing.assert_close(ours, each.amin(0), atol=1e-12, rtol=0)
     # A posture that is not known is at no distance.
     q[7, 2] = torch.nan
-    unknown = panda_capsules.box_distance(q.reshape(5, 10, 7), centre, half_size).isnan()
+    unknown = panda.whole.box_distance(q.reshape(5, 10, 7), centre, half_size).isnan()
     assert unknown.nonzero().tolist() == [[0, 7]]
 
 
@@ -102,7 +102,7 @@ HAND = ("hand", *(f"finger_{side}{pad}" for side in ("left", "right") for pad in
 
 @pytest.mark.parametrize(
     ("arm", "geoms"),
-    [(panda_capsules, HAND), (whole_arm(SceneConfig().arm), (*HAND, "hand_marker_plate"))],
+    [(panda.whole, HAND), (whole_arm(SceneConfig().arm), (*HAND, "hand_marker_plate"))],
     ids=["hand", "hand and plate"],
 )
 @pytest.mark.parametrize("opening", [0.0, 0.02, FINGER_STROKE])
@@ -149,13 +149,13 @@ def test_links_touch_where_the_simulator_says_so(model):
     number = {model.geom(name).id: k for k, name in enumerate(names)}
     q = postures(600)
     found = 0
-    for posture, ours in zip(q, panda_capsules.pair_distances(q).tolist(), strict=True):
+    for posture, ours in zip(q, panda.whole.pair_distances(q).tolist(), strict=True):
         contacts = place(model, posture).contact.geom
         geoms = [tuple(sorted(number.get(int(g), -1) for g in pair)) for pair in contacts]
         theirs = {pair for pair in geoms if pair[0] >= 0}
         touching = {
             pair
-            for pair, distance in zip(panda_capsules.pairs, ours, strict=True)
+            for pair, distance in zip(panda.whole.pairs, ours, strict=True)
             if distance < 0 and max(pair) < len(names)
         }
         assert touching == theirs

@@ -9,17 +9,16 @@ import torch
 from bare_arm import bare
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import PANDA, ArmChoice, CapsuleArm, EquippedArm, LinkCapsule, panda
-from hrc_learn.kinematics.work_arm import FrankaWorkArm
+from hrc_learn.kinematics import Arm, ArmChoice, LinkCapsule, panda
 from hrc_learn.sim import ArmModelConfig, World
 from hrc_learn.sim.arm_model import add_arm, whole_arm
 from hrc_learn.sim.drawn_world import DrawnWorld
 from hrc_learn.sim.workplace import Workplace
 
 ARMS = {
-    "panda": lambda: PANDA,
+    "panda": lambda: panda,
     "fr3": ArmChoice("fr3").work_arm,
-    "six": cache(lambda: EquippedArm(bare())),
+    "six": cache(lambda: bare().with_hand()),
 }
 
 
@@ -41,7 +40,7 @@ def test_mujoco_has_the_tool_where_the_chain_has_it(robot):
 
 
 def test_a_joint_that_slides_slides_in_mujoco_too():
-    robot = EquippedArm(bare((), slides=(0, 2)))
+    robot = bare((), slides=(0, 2)).with_hand()
     spec = mujoco.MjSpec()
     add_arm(spec, ArmModelConfig(robot=robot))
     model = spec.compile()
@@ -79,7 +78,7 @@ def test_its_capsules_are_those_of_the_distances(robot):
     ]
     radii = sorted(float(geom.size[0]) for geom in world_capsules)
     assert radii == pytest.approx(sorted(c.radius for c in robot.body.capsules))
-    total = sum(robot.masses)
+    total = sum(robot.link_masses)
     links = [spec_world.model.body(f"link{i + 1}").mass[0] for i in range(robot.joints)]
     assert sum(links) == pytest.approx(total)
     assert whole_arm(ArmModelConfig(robot=robot)) is robot.whole
@@ -96,7 +95,7 @@ def test_the_workplace_is_within_reach(name):
     near = workplace.home_joints()
     for shelf in workplace.shelf_names():
         goal = workplace.shelf(shelf)
-        reached[shelf] = robot.nearest(goal, near=near), goal
+        reached[shelf] = robot.inverse(goal, near=near), goal
     for q, goal in reached.values():
         assert robot.chain.limits.contain(q)
         tool: Pose = robot.chain.forward(q)
@@ -105,7 +104,7 @@ def test_the_workplace_is_within_reach(name):
 
 
 def test_a_drawn_world_is_where_the_world_is_and_leaves_it_alone():
-    workplace = Workplace.of(PANDA)
+    workplace = Workplace.of(panda)
     world = World(workplace.scene)
     before = world.model.ngeom
     drawn = DrawnWorld(world)
@@ -125,7 +124,7 @@ def test_a_drawn_world_is_where_the_world_is_and_leaves_it_alone():
 
 
 def test_links_that_touch_stand_out_and_are_themselves_again():
-    world = World(Workplace.of(PANDA).scene)
+    world = World(Workplace.of(panda).scene)
     drawn = DrawnWorld(world)
     before = drawn.model.geom_rgba.copy()
     red = (1.0, 0.0, 0.0, 1.0)
@@ -138,10 +137,9 @@ def test_links_that_touch_stand_out_and_are_themselves_again():
 
 
 def test_a_capsule_without_a_length_is_a_ball_and_a_base_may_have_several():
-    robot = FrankaWorkArm(panda)
     point, radius = (0.0, 0.0, 0.1), 0.05
     balls = [LinkCapsule(link=i, start=point, end=point, radius=radius) for i in range(8)]
-    robot.body = CapsuleArm(panda, [balls[0], *balls])
+    robot = Arm(name="panda", chain=panda, capsules=[balls[0], *balls])
     spec = mujoco.MjSpec()
     add_arm(spec, ArmModelConfig(robot=robot))
     model = spec.compile()

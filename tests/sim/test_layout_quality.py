@@ -11,8 +11,8 @@ from bare_arm import bare
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
+    Arm,
     ArmChoice,
-    EquippedArm,
     SerialChain,
     UnreachableError,
     coarse_orientation,
@@ -30,7 +30,7 @@ from hrc_learn.sim.workplace import Workplace, layout_for
 
 @cache
 def six_joints():
-    return EquippedArm(bare())
+    return bare().with_hand()
 
 
 def described(name):
@@ -163,7 +163,7 @@ def test_an_arm_too_small_for_the_cell_is_refused():
         ready=chain.ready,
     )
     with pytest.raises(UnreachableError, match=r"cut .* too small"):
-        layout_for(EquippedArm(replace(small, chain=shrunk)))
+        layout_for(Arm(name="cut", chain=shrunk, capsules=small.whole.capsules).with_hand())
 
 
 def test_the_cell_of_frankas_is_the_usual_one():

@@ -30,7 +30,7 @@ from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.monte_carlo import Trial
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import panda, panda_capsules
+from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.sim import World
@@ -285,7 +285,7 @@ def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
     half_size = torch.tensor(item.half_size, dtype=torch.float64)
 
     def distance(path):
-        return float(panda_capsules.box_distance(path, lies, half_size).min())
+        return float(panda.whole.box_distance(path, lies, half_size).min())
 
     assert distance(joint_line(start, WORKPLACE.hover_joints(), 0.6, 0.05)) < 0
     with shapes_unchecked():

@@ -11,7 +11,7 @@ import torch
 
 from hrc_learn.controller import SafetyConfig, SeparationConfig
 from hrc_learn.experiments.collaboration.worker import somebody_comes
-from hrc_learn.kinematics import GraspedBox, panda, panda_capsules, separation
+from hrc_learn.kinematics import GraspedBox, panda, separation
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import Imperfections, WorkerDistance, WorkerSensor, World, whole_arm
 from hrc_learn.sim.worker import PARTS
@@ -145,13 +145,13 @@ def test_the_most_urgent_pairs_are_told_of_with_their_exact_distances(seed, load
         panda.limits.lower, panda.limits.upper, rng=sampling.generator(seed), margin=0.1
     )
     config = PersonWatchConfig(contact=-NOWHERE_NEAR)
-    watch = PersonWatch(SimpleNamespace(read=lambda: person), panda_capsules, config=config)
+    watch = PersonWatch(SimpleNamespace(read=lambda: person), panda.whole, config=config)
     told = watch.look(2.13, q, load)
 
     ends, radius, v = (
         torch.from_numpy(x) for x in (person.ends, person.radius, person.velocity)
     )
-    every = separation(panda_capsules, q, ends, radius, load)
+    every = separation(panda.whole, q, ends, radius, load)
     age = 2.13 - 2.0
     gain = PersonWatchConfig().acceleration * (age + SeparationConfig().reaction_time)
     pairs = []
@@ -205,7 +205,7 @@ def test_the_arm_rests_by_the_time_that_somebody_may_arrive(distance, speed):
     ends = np.full((1, 2, 3), tip - np.array([0.0, 0.0, distance + radius]))
     velocity = np.broadcast_to([0.0, 0.0, speed], (1, 2, 3)).copy()
     seen = PersonObservation(time=1.0, ends=ends, radius=np.array([radius]), velocity=velocity)
-    watch = PersonWatch(SimpleNamespace(read=lambda: seen), panda_capsules, SEPARATION, config)
+    watch = PersonWatch(SimpleNamespace(read=lambda: seen), panda.whole, SEPARATION, config)
     found = watch.look(1.0 + age, WORKPLACE.hover_joints())
 
     # Who goes away may turn round at once.
@@ -247,7 +247,7 @@ def test_a_hand_that_sets_off_meets_an_arm_at_rest(gap):
     separation = sizes.plant(SafetyConfig()).separation
     hand, now, rests = Hand(gap), 0.0, None
     sensor = WorkerSensor(hand, lambda: now, sizes, np.random.default_rng(0))
-    watch = PersonWatch(sensor, panda_capsules, separation)
+    watch = PersonWatch(sensor, panda.whole, separation)
     while hand.gap(now) > 0:
         found = watch.look(now, WORKPLACE.hover_joints())
         if now < hand.begin or found.share > 0:

@@ -10,7 +10,7 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import configuration, leads_real_arm, write_values
 from hrc_learn.cli.arguments.record import RecordExpert, RecordPlacing, RecordServoing
 from hrc_learn.experiments.arm_access import access_by
-from hrc_learn.kinematics import ArmChoice, WorkArm
+from hrc_learn.kinematics import Arm, ArmChoice
 from hrc_learn.sim import PhysicsError, World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.failures import TaskFailedError
@@ -114,7 +114,7 @@ def record_servoing(args: RecordServoing) -> None:
     write_values(args.json, {"episodes": args.episodes, "marker_seen_min": min(seen)})
 
 
-def _opening(args: RecordPlacing | RecordServoing, robot: WorkArm) -> OpenArm:
+def _opening(args: RecordPlacing | RecordServoing, robot: Arm) -> OpenArm:
     """How the scripted expert's arm is led.
 
     Raises:

@@ -33,7 +33,8 @@ from hrc_learn.experiments.on_arm import ArmSite, opened_arm
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import ArmChoice, SerialChain, WorkArm
+from hrc_learn.kinematics import Arm as ArmModel
+from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Arm, OpenedArm
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.closed_loop import PinholeCamera
@@ -148,7 +149,7 @@ class _LedArm:
     """What the safety filter is told of it."""
 
 
-def _led(args: Serve, dt: float, robot: WorkArm) -> _LedArm:
+def _led(args: Serve, dt: float, robot: ArmModel) -> _LedArm:
     """A real arm, or a simulated one that is ready."""
     if leads_real_arm(args):
         site: ArmSite = replace(resolved(args).site, driver=args.arm, ip=args.ip)

@@ -30,7 +30,7 @@ from hrc_learn.experiments.collaboration.worker_room import (
 )
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import PANDA, WorkArm
+from hrc_learn.kinematics import Arm, panda
 from hrc_learn.sim import (
     CameraChange,
     CameraKind,
@@ -424,7 +424,7 @@ def workplace_for(
     shelves: Sequence[str],
     shelf_x: float | None = None,
     shelf_depth: float | None = None,
-    robot: WorkArm = PANDA,
+    robot: Arm = panda,
 ) -> Workplace:
     """A workplace with an object for each shelf.
 

@@ -29,14 +29,7 @@ from hrc_learn.experiments.collaboration.job_cycle import JobCycle
 from hrc_learn.experiments.collaboration.worker import margin_to_stop
 from hrc_learn.experiments.collaboration.worker_tables import Workers, WorkerTables
 from hrc_learn.geometry.numerics import null_projection
-from hrc_learn.kinematics import (
-    CapsuleArm,
-    Separation,
-    panda,
-    panda_body,
-    panda_capsules,
-    separation,
-)
+from hrc_learn.kinematics import CapsuleArm, Separation, panda, separation
 from hrc_learn.sim import CommandChannel, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import (
@@ -648,7 +641,7 @@ class _Batch:
 
 def _capsule_speeds(q: Tensor, v: Tensor) -> Float[Tensor, "some capsules"]:
     """Of the faster end of each of the arm's own capsules [m/s]."""
-    now, then = panda_capsules.segments(torch.stack([q, q + _STEP * v]))
+    now, then = panda.whole.segments(torch.stack([q, q + _STEP * v]))
     return (then - now).norm(dim=-1).amax(-1) / _STEP
 
 
@@ -656,7 +649,7 @@ def _clear_bound(
     workplace: Workplace, q: Tensor, reach: Float[Tensor, "some capsules"]
 ) -> Float[Tensor, " some"]:
     """Lower bound of the arm's clearance while its capsules move by no more than so far [m]."""
-    own, body = panda_capsules, panda_body
+    own, body = panda.whole, panda.body
     first, second = torch.tensor(own.pairs).mT
     clear = (own.pair_distances(q) - reach[:, first] - reach[:, second]).amin(-1)
     # The body has the first of the capsules, all but the hand's.

@@ -45,7 +45,7 @@ from hrc_learn.experiments.placing.trial import (
     taught_correction,
 )
 from hrc_learn.experiments.run_recording import no_live_view
-from hrc_learn.kinematics import ArmChoice, FrankaWorkArm, UnreachableError
+from hrc_learn.kinematics import ArmChoice, UnreachableError
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import Imperfections, RenderingUnavailableError, World
 from hrc_learn.sim.workplace import Workplace
@@ -273,7 +273,7 @@ def _reached_with_joint7(workplace: Workplace, end: np.ndarray) -> tuple[str, ..
     """Shelves that need no other position of joint 7 than the demonstration ended with."""
     near = torch.from_numpy(end)
     reached: list[str] = []
-    if not isinstance(workplace.robot, FrankaWorkArm):
+    if not workplace.robot.is_franka:
         return ()
     for shelf in workplace.shelf_names():
         try:

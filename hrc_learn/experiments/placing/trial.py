@@ -180,7 +180,7 @@ def taught_correction(
     read = led
     for _ in range(_SHOWN_ITERATIONS):
         # Where the tool truly is, and by how much it misses.
-        joints = world.arm.robot.nearest(read, near=near).numpy()
+        joints = world.arm.robot.inverse(read, near=near).numpy()
         world.reset(joints - errors.encoder_offset)
         matrix = torch.from_numpy(world.arm.tcp_pose())
         tool = Pose(matrix[:3, 3], quaternion.from_matrix(matrix[:3, :3]))

@@ -25,7 +25,7 @@ from hrc_learn.hardware import (
     Load,
     Realtime,
 )
-from hrc_learn.kinematics import PANDA
+from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
 from hrc_learn.protocols import Arm
 from hrc_learn.watchdog import bring_to_rest
@@ -116,7 +116,7 @@ class FrankaPanda(ArmRobot):
     watchdog: Watchdog | ArmProcess
 
     def __init__(self, config: FrankaPandaConfig):
-        super().__init__(config, PANDA)
+        super().__init__(config, panda)
         self.config = config
         self.cameras = make_cameras_from_configs(config.cameras)
         self._arm: FrankyArm | ArmProcess
@@ -151,7 +151,7 @@ class FrankaPanda(ArmRobot):
             self.watchdog = Watchdog(config.timeout, self._arm.stop)
         safety = SafetyConfig(tcp_speed=config.tcp_speed, braking=config.dynamics, delay=_DELAY)
         self._servo = PositionServo(
-            PANDA.chain, self._arm, self.dt, PositionServoConfig(safety=safety)
+            panda.chain, self._arm, self.dt, PositionServoConfig(safety=safety)
         )
         for camera in self.cameras.values():
             camera.connect()

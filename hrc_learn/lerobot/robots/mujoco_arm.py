@@ -14,7 +14,8 @@ from lerobot.robots import RobotConfig
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import ArmChoice, WorkArm
+from hrc_learn.kinematics import Arm as ArmModel
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.lerobot.arm_robot import DOWN, MARKER, PIXELS, ArmRobot, ArmRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.protocols import Arm
@@ -100,7 +101,7 @@ class MujocoArmRobotConfig(ArmRobotConfig):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative.")
 
-    def work_arm(self) -> WorkArm:
+    def work_arm(self) -> ArmModel:
         """The arm with our hand on it.
 
         Raises:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from hrc_learn.kinematics import PANDA, WorkArm
+from hrc_learn.kinematics import Arm, panda
 from hrc_learn.lerobot.arm_robot import (
     DOWN,
     ArmRobot,
@@ -100,7 +100,7 @@ class ArmTeleoperator(Device, Teleoperator):
 
     @property
     def action_features(self) -> dict[str, type]:
-        names = ArmValues(PANDA.chain).action_names("joint")
+        names = ArmValues(panda.chain).action_names("joint")
         with suppress(DeviceNotConnectedError):  # LeRobot asks before it connects the robot
             names = tuple(self._find().action_features)
         return dict.fromkeys(names, float)
@@ -191,19 +191,19 @@ class ArmPage(ArmTeleoperator):
     name = "arm_page"
     page: Page
     _shown: RobotPage
-    _arm: WorkArm
+    _arm: Arm
 
     def __init__(self, config: ArmPageConfig):
         super().__init__(config)
         self.config = config
 
     def _open(self) -> None:
-        arm = PANDA
+        arm = panda
         with suppress(DeviceNotConnectedError):  # which LeRobot may connect later
             arm = self._find().work_arm
         self._serve(arm)
 
-    def _serve(self, arm: WorkArm) -> None:
+    def _serve(self, arm: Arm) -> None:
         note = "LeRobot records: its own keys begin and end episodes"
         self._shown = RobotPage(arm, self.config.host, self.config.port, note)
         self._arm, self.page = arm, self._shown.page
