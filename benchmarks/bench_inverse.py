@@ -51,7 +51,7 @@ def main(args: Args) -> None:
         pose = chain.forward(ready)
         timings = time_calls(
             {
-                "batched": partial(robot.nearest, pose, ready, _SAMPLES),
+                "batched": partial(robot.inverse, pose, near=ready, samples=_SAMPLES),
                 "loop": partial(_one_by_one, robot, pose, ready),
             },
             args.repeats,
