@@ -1,9 +1,9 @@
 """Evaluate fitted movement primitives on demonstrations, such as those held out.
 
-The same as `hrc evaluate primitives`.
+The same as `hrc evaluate`.
 """
 
 from hrc_learn import cli
 
 if __name__ == "__main__":
-    cli.main("evaluate", "primitives")
+    cli.main("evaluate")

@@ -1,4 +1,4 @@
-"""`python -m hrc_learn.cli`: the command where its script is not installed."""
+"""`python -m hrc_learn.cli`: the command `hrc` if its script is not installed."""
 
 from hrc_learn.cli import main
 

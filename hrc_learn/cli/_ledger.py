@@ -1,4 +1,4 @@
-"""Which steps of a job need not be done again, as what they made is there and unchanged."""
+"""Record of finished steps of a job, so that steps whose results are up to date are skipped."""
 
 import hashlib
 import json
@@ -10,19 +10,18 @@ from hrc_learn.viz.report import software_versions
 
 
 class Ledger:
-    """Remembers what each folder was made of and what it held then.
+    """Digests of the inputs and the contents of each result folder.
 
-    A step is done again when its options, the contents of the folders that it reads, the code
-    of this package or the versions of the libraries are others, or when its result was changed
-    by somebody else.
+    A step is repeated when its options, the folders that it reads, the code of this package,
+    the versions of the libraries or the contents of its result have changed.
     """
 
     def __init__(self, path: Path):
         """Open a ledger.
 
         Args:
-            path: File that keeps it; one that cannot be read counts as empty, so that all is
-                done again.
+            path: JSON file. One that cannot be read counts as empty, so that every step is
+                repeated.
         """
         self._path = path
         try:
@@ -34,19 +33,19 @@ class Ledger:
         self._software = [*software_versions().items(), code]
 
     def holds(self, folder: Path, options: Mapping[str, object], *reads: Path) -> bool:
-        """Whether a folder is there as a step with these options would make it.
+        """True if a result folder is up to date.
 
         Args:
             folder: Result of the step.
-            options: Of the step; paths and the like count by their text.
-            reads: Folders that it reads.
+            options: Options of the step, compared by their text.
+            reads: Folders that the step reads.
         """
         return folder.is_dir() and self._entries.get(folder.name) == self._entry(
             folder, options, reads
         )
 
     def enter(self, folder: Path, options: Mapping[str, object], *reads: Path) -> None:
-        """Note that a step has just made a folder; arguments as in `holds`."""
+        """Record that a step has just made a folder, with arguments as in `holds`."""
         self._entries[folder.name] = self._entry(folder, options, reads)
         write_text(self._path, json.dumps(self._entries, indent=2) + "\n")
 

@@ -1,9 +1,10 @@
-"""A command run: its command line, its exit status, and what it writes and prints.
+"""Frame of a command: command line, exit status, error messages, JSON values.
 
 Exit status: 0 done, 1 the work failed, 2 bad input, 143 ended by SIGTERM. Bad input ends in one
 line on stderr.
 """
 
+import inspect
 import io
 import json
 import os
@@ -16,13 +17,11 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from hrc_learn.cli._options import complete, mentions_details, short_help
-from hrc_learn.cli.arguments import Led
 from hrc_learn.store import write_json
 
 EXTRAS = {
@@ -48,31 +47,28 @@ EXTRAS = {
     "huggingface_hub": "hub",
     "httpx": "hub",
 }
-"""Extra of the package that brings a library."""
+"""Extra of the package that installs a library."""
 
 
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
     """Parse the command line into the dataclass `args`, call `main` with it, and exit.
 
     `main` returns the exit status, None for 0. A ValueError or a file that is missing, exists
-    or may not be used is the user's doing and ends with status 2 and one line; a library that
-    is not installed ends with status 1 and the extra that brings it; anything else is ours and
-    shows its traceback with status 1.
+    or may not be used is the caller's mistake: status 2 and one line. A library that is not
+    installed: status 1 and the extra that installs it. Other exceptions show their traceback.
     """
     words, program = sys.argv[1:], Path(sys.argv[0]).name
-    # The program's own docstring says what it does.
     description = (sys.modules[main.__module__].__doc__ or main.__doc__ or "").strip() or None
     sys.exit(status_of(lambda: main(parse(args, words, program, description)) or 0))
 
 
 def status_of(work: Callable[[], int]) -> int:
-    """Do the work; its exit status, what went wrong told in one line on stderr.
+    """Run the work and return its exit status; errors are one line on stderr.
 
-    SIGTERM ends it as an exception, so that arms are stopped and files are closed on the way
-    out, with status 143. Whoever reads the output may leave, as `head` does: nothing is said
-    then, and the status is 1.
+    SIGTERM is raised as an exception, so that arms are stopped and files closed, with status
+    143. A closed output, as with `hrc ... | head`, ends quietly with status 1.
     """
-    # As a user reads it: without the place in our code that warned.
+    # Users need no line number of ours in a warning.
     warnings.formatwarning = lambda message, *_place, **_line: f"warning: {message}\n"
     try:
         with _ended_by_sigterm():
@@ -88,13 +84,13 @@ def status_of(work: Callable[[], int]) -> int:
             extra = f"pip install 'hrc-learn[{EXTRAS[library]}]'"
             missing = f"{library} is not installed, which this needs: {extra}"
         elif not str(error).startswith("No module named"):
-            missing = one_line(error)  # of a package without an extra: says itself what to do
+            missing = one_line(error)  # our own message, which says what to do
         else:
             raise
         print(f"error: {missing}", file=sys.stderr)
         return 1
     except BrokenPipeError:
-        if not _reader_left():
+        if not _output_closed():
             raise
         return 1
     except OSError as error:
@@ -107,28 +103,28 @@ def status_of(work: Callable[[], int]) -> int:
         return 1
 
 
-def _reader_left() -> bool:
-    """Whether nobody reads the output any more; what is left of it then goes nowhere."""
+def _output_closed() -> bool:
+    """True if the reader of stdout is gone; the rest of the output is then discarded."""
     try:
         print(flush=True)
     except BrokenPipeError:
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)
         return True
     return False
 
 
 @contextmanager
 def _ended_by_sigterm() -> Iterator[None]:
-    """SIGTERM becomes `SystemExit` where it would have killed the process."""
-    mine = threading.current_thread() is threading.main_thread()
-    if not mine or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+    """Raise `SystemExit` on SIGTERM, unless another handler is installed."""
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
 
     def end(number: int, frame: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_DFL)  # a second one does not wait for what follows
+        signal.signal(number, signal.SIG_DFL)  # a second SIGTERM kills at once
         raise SystemExit(128 + number)
 
     signal.signal(signal.SIGTERM, end)
@@ -141,35 +137,27 @@ def _ended_by_sigterm() -> Iterator[None]:
 def parse[Args](
     arguments: type[Args], words: Sequence[str], program: str, description: str | None = None
 ) -> Args:
-    """The command line as an instance of its dataclass.
+    """Parse a command line into its dataclass.
 
     Args:
-        arguments: The dataclass.
-        words: What was typed after the command.
-        program: The command.
-        description: What it does; the docstring of the dataclass when None.
+        arguments: Dataclass of the command line.
+        words: Words typed after the command.
+        program: Name of the command.
+        description: Text above the options. Default: the docstring of the dataclass.
 
     Raises:
-        SystemExit: After help, with status 0; of bad input, told in one line, with status 2.
+        SystemExit: After help, with status 0; after one line about bad input, with status 2.
     """
-    if description is None and ("-h" in words or "--help" in words):
-        print(short_help(program, arguments))
-        sys.exit(0)
+    import tyro  # a tenth of a second, which a mistyped command does not need
 
-    import tyro  # a tenth of a second, which the short help does not need
-
-    everything = "--help-all" in words
-    words = ["--help" if word == "--help-all" else word for word in words]
     said = io.StringIO()
     try:
         with redirect_stderr(said):
             return tyro.cli(
-                complete(arguments)
-                if everything or mentions_details(arguments, words)
-                else arguments,
+                arguments,
                 args=words,
                 prog=program,
-                description=description or (arguments.__doc__ or "").strip(),
+                description=description or inspect.getdoc(arguments),
             )
     except SystemExit:
         if text := said.getvalue():
@@ -178,10 +166,9 @@ def parse[Args](
 
 
 def _complaint(box: str) -> str:
-    """What tyro says in a box of many lines, in one."""
+    """One line of the box in which tyro reports an error."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)  # colours
-    # A frame, of blanks on a terminal without its characters; first the title, then sections
-    # with rules between them.
+    # Inside the frame: a title, then sections separated by rules.
     rows = [re.sub("[│╭╮╰╯]", " ", row).rstrip() for row in plain.splitlines()]
     _, *rows = [row[2:] for row in rows if row.strip()]
     sections = re.split(r"^ *[─-]{3,}$", "\n".join(rows), flags=re.MULTILINE)
@@ -191,26 +178,22 @@ def _complaint(box: str) -> str:
             names = " ".join(part.split("Unrecognized options:")[1].replace(",", " ").split())
             meant = next((other for other in others if "Perhaps" in other), "")
             similar = " or ".join(re.findall(r"^ {4}(--[\w.-]+)", meant, re.MULTILINE))
-            return f"unknown options: {names}" + (f"; perhaps {similar}" if similar else "")
+            hint = f"; did you mean {similar}?" if similar else ""
+            return f"unknown options: {names}{hint}"
     if missing := re.findall(r"^ {4}(\S+)", said, re.MULTILINE):
         return f"missing: {', '.join(missing)}"
-    # Why each of several types did not fit is for programmers.
-    text = " ".join(said.split()).split(" Got errors")[0].rstrip(".")
-    # A configuration names its field, and who typed the command an option.
-    if refused := re.match(r"Error parsing ([\w.-]+): (\w+) must be ", text):
-        option = f"--{refused[1]}.{refused[2].replace('_', '-')}"
-        return f"{option} must be {text[refused.end() :]}"
-    return text
+    # The reasons why each member of a union failed help programmers only.
+    return " ".join(said.split()).split(" Got errors")[0].rstrip(".")
 
 
 def write_values(path: Path | None, values: Mapping[str, float | int]) -> None:
-    """Write measured values as one flat object, where a file is asked for."""
+    """Write measured values as one flat JSON object if a file is given."""
     if path is not None:
         write_json(path, values)
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says, with the notes added to it, on one line."""
+    """Message of an exception with its notes, on one line."""
     if isinstance(error, OSError) and error.strerror and error.filename:
         text = f"{error.filename}: {error.strerror}"
     else:
@@ -219,63 +202,41 @@ def one_line(error: BaseException) -> str:
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Say before any work that its result would find something in its place.
+    """Refuse an existing result before any work is done.
 
     Raises:
-        FileExistsError: If there is something that may not be replaced.
+        FileExistsError: The path exists and may not be replaced.
     """
     if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists: give another --out, or --overwrite it")
+        raise FileExistsError(f"{path} exists: give another --out, or --overwrite")
 
 
 def refuse_repeats(episodes: Sequence[int]) -> None:
-    """Say that an episode is named twice, which would count it twice.
+    """Refuse an episode that is named twice, as it would count twice.
 
     Raises:
-        ValueError: It is; says which.
+        ValueError: An episode is repeated.
     """
     repeated = [episode for episode, count in Counter(episodes).items() if count > 1]
     if repeated:
         raise ValueError(f"--episodes names {repeated[0]} more than once: name each once")
 
 
-def leads_real_arm(args: Led, simulated_only: Sequence[str] = ()) -> bool:
-    """Whether a command leads a real arm, not a simulated one.
-
-    Args:
-        args: Of the command.
-        simulated_only: Names of its options that only the simulated work cell has.
-
-    Raises:
-        ValueError: An address without a driver, a driver without an address, or an option of
-            the simulated work cell.
-    """
-    if args.arm == "sim":
-        if args.ip:
-            raise ValueError(f"--ip {args.ip} needs a driver: --arm franky or --arm franka.")
-        return False
-    if args.ip == "sim":
-        return False
-    if not args.ip:
-        raise ValueError(
-            f"--arm {args.arm} needs --ip with the address of the arm's control box; --ip sim "
-            "serves the simulated arm there."
-        )
-    given = {field.name: getattr(args, field.name) != field.default for field in fields(args)}
-    if simulated := [name for name in simulated_only if given.get(name)]:
-        option = simulated[0].replace("_", "-")
-        raise ValueError(f"--{option} is for simulated arms, not for a real one (--ip).")
-    return True
+def has_screen() -> bool:
+    """True if this machine can open windows."""
+    return not sys.platform.startswith("linux") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
 
 
 def configuration(args: Any) -> dict[str, Any]:
-    """The arguments of a command as they are kept with its results: plain JSON."""
+    """Arguments of a command as plain JSON, to be stored with its results."""
     return json.loads(json.dumps(asdict(args), default=str))
 
 
 def command_line() -> str:
-    """What was typed to start this process, to be typed again."""
+    """Command line of this process."""
     program, *arguments = sys.argv
-    # The installed command is found by its name; a program needs Python before it.
+    # The installed command is on the path; a program needs Python.
     start = ["python", program] if program.endswith(".py") else [Path(program).name]
     return shlex.join([*start, *arguments])

@@ -1,4 +1,4 @@
-"""Tables that commands print: at most a screen of rows, each with its unit and a verdict."""
+"""Tables that commands print: at most a screen of rows with value, unit and target."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,17 +6,16 @@ from hrc_learn.viz.report import Measurement, show_measurements
 
 _PER_CENT = 100.0
 _FINEST = 0.01
-"""Of NRMSE [%] and of rotation errors [deg]: an encoder's 1e-4 rad is 0.006 deg."""
+"""Resolution of NRMSE [%] and of rotation errors [deg]: an encoder resolves 1e-4 rad."""
 
 REPRESENTED = 2.0
-"""NRMSE up to which a primitive represents its demonstration [%]: a centimetre of a motion of
-half a metre, which noise of encoders and 30 frames a second leave room for."""
+"""Largest NRMSE at which a primitive represents its demonstration [%]: a centimetre in a motion
+of half a metre, well above the noise of encoders at 30 frames a second."""
 PREDICTED = 10.0
-"""Error of an image Jacobian, of the image motion that it predicts [%]. Noise of the images
-alone makes half of it, and the controller adapts from far worse (docs/controller.md)."""
+"""Largest error of an image Jacobian relative to the image motion [%]. Half of it is image
+noise, and the controller converges from far larger errors."""
 MARKER_RESOLUTION = 0.1
-"""Mean distance of a detected marker from its true pixel [px] (docs/vision.md): what is said of
-a target in the image is no finer."""
+"""Mean error of a detected marker [px], the resolution of a target in the image."""
 
 _OF_CHANNEL = {
     "joint": "joints",
@@ -36,24 +35,20 @@ def show_values(
     title: str,
     values: Mapping[str, float],
     rows: Sequence[Measurement],
-    everything: bool = False,
 ) -> None:
-    """Print what a fit came to.
+    """Print the main results of a fit.
 
     Args:
-        title: Of the table.
-        values: All that was measured, by the names that --json gives them.
-        rows: What matters of it, in words.
-        everything: All values rather than those rows.
+        title: Title of the table.
+        values: All measured values, by their names in JSON.
+        rows: The main ones, with titles.
     """
-    every = [named(name, value) for name, value in values.items()]
-    table, more = (every, 0) if everything else (rows, len(every) - len(rows))
-    elsewhere = "--verbose, or metrics.json"
-    show_measurements(table, everything, title=title, more=more, elsewhere=elsewhere)
+    more = len(values) - len(rows)
+    show_measurements(rows, title=title, more=more, elsewhere="metrics.json")
 
 
 def named(name: str, value: float) -> Measurement:
-    """A measured value under its name in JSON, whose last word is the unit if it is one."""
+    """Measured value by its name in JSON, whose last word is the unit if it is one."""
     stem, _, unit = name.rpartition("_")
     known = stem and unit in _UNITS
     words = (stem if known else name).replace("_", " ")
@@ -61,14 +56,14 @@ def named(name: str, value: float) -> Measurement:
 
 
 def primitive_rows(values: Mapping[str, float]) -> list[Measurement]:
-    """What matters of `FittedPrimitives.metrics`, NRMSE relative to the range of the motion."""
+    """Main rows of `FittedPrimitives.metrics`, NRMSE relative to the range of motion."""
     rows = []
     if "demonstrations" in values:
         rows.append(Measurement(name="demonstrations", value=round(values["demonstrations"])))
     if "left_out_error" in values:
         rows.append(
             Measurement(
-                name="error of demonstrations left out, of the spread of actions",
+                name="held-out error, relative to the spread of actions",
                 value=_PER_CENT * values["left_out_error"],
                 unit="%",
             )
@@ -81,9 +76,9 @@ def primitive_rows(values: Mapping[str, float]) -> list[Measurement]:
         }
         best = min(held_out, key=lambda said: values[held_out[said]], default="")
         shown = (
-            # The worst of them: one demonstration that is not represented must not hide.
+            # The maximum, so that one demonstration that is not represented shows.
             (f"{channel}_nrmse_max", "worst NRMSE of a demonstration", "%", REPRESENTED),
-            (f"mean_{channel}_nrmse_median", "median NRMSE, one for all", "%", None),
+            (f"mean_{channel}_nrmse_median", "median NRMSE of the common model", "%", None),
             (held_out.get(best, ""), f"held out, {best}", "%", None),
             (f"{channel}_turn_rmse_max", "worst rotation error", "deg", None),
         )
@@ -102,19 +97,19 @@ def primitive_rows(values: Mapping[str, float]) -> list[Measurement]:
 
 
 def image_jacobian_rows(values: Mapping[str, float]) -> list[Measurement]:
-    """What matters of `VisualServoSkill.metrics`."""
+    """Main rows of `VisualServoSkill.metrics`."""
     rows = [
         Measurement(name="pairs of images", value=round(values["pairs"])),
         Measurement(name="neurons", value=round(values["neurons"])),
         Measurement(name="image motion in a pair", value=values["motion_px"], unit="px"),
         Measurement(
-            name="held-out error, of that motion",
+            name="held-out error, relative to that motion",
             value=_PER_CENT * values["held_out_relative"],
             unit="%",
             target=PREDICTED,
         ),
         Measurement(
-            name="the same, worst part of the workspace",
+            name="held-out error, worst part of the workspace",
             value=_PER_CENT * values["held_out_relative_worst_cell"],
             unit="%",
         ),

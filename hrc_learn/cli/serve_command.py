@@ -1,22 +1,23 @@
-"""`hrc serve`: the controller in a paced loop, and its latency."""
+"""`hrc serve`: the controller at a fixed rate, and its latency."""
 
 import os
 
+# More threads would only wait for each other within a control step.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 import torch
 from rich.console import Console
 
-from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import leads_real_arm, write_values
-from hrc_learn.cli.arguments.run import Serve
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli.arm_arguments import Serve
 from hrc_learn.controller import (
     GRIPPER_DOWN,
     INITIAL_IMAGE_JACOBIAN,
@@ -40,43 +41,46 @@ from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.closed_loop import PinholeCamera
 
 FRAME_TIME = 0.032
-"""From one image to the next [s]."""
+"""Time between images [s]."""
 CENTRE = (0.35, 0.35, 0.35)
-"""Of the box [m]."""
+"""Centre of the box that the tool moves in [m]."""
 PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Latencies:
-    """One entry a step [s]."""
+    """Latencies of each control step."""
 
     step: np.ndarray
-    """From reading the joints to the command."""
+    """Time from reading the joints to the command [s]."""
     late: np.ndarray
-    """How long ago the tick was due, or the first of those that were missed before it."""
+    """Delay of the tick, or of the first one missed before it [s]."""
     missed: int
-    """Ticks that never came."""
+    """Number of missed ticks."""
 
 
 def serve(args: Serve) -> None:
+    """Run the loop and print its latencies."""
     if not (args.duration > 0 and args.rate > 0):
-        raise ValueError("duration and rate must be positive")
+        raise ValueError("--duration and --rate must be positive")
     if args.rate < (slowest := SafetyConfig().rate):
-        raise ValueError(f"rate must be at least {slowest:g}, as the safety filter asks")
+        raise ValueError(
+            f"--rate must be at least {slowest:g}, the minimum of the safety filter"
+        )
     torch.set_num_threads(1)
     dt = 1 / args.rate
-    camera, robot = _camera(), ArmChoice(args.robot, args.base, args.tip).work_arm()
-    led = _led(args, dt, robot)
-    controller, observation = _controller(robot.chain, camera, dt, led.safety)
+    camera, robot = _camera(), ArmChoice(args.robot, *args.links()).work_arm()
+    access = _access(args, dt, robot)
+    controller, observation = _controller(robot.chain, camera, dt, access.safety)
     began = time.perf_counter()
     if args.step == "eager":
         runner = EagerRunner(controller, observation)
     else:
-        runner = open_step(controller, observation, args.packages)
+        runner = open_step(controller, observation)
     opened = time.perf_counter() - began
-    with led.opened() as arm:
+    with access.open() as arm:
         steps = round(args.duration * args.rate)
-        latencies, error = _serve(runner, arm, robot.chain, camera, dt, steps)
+        latencies, error = _run_loop(runner, arm, robot.chain, camera, dt, steps)
     figures = {"open_s": opened} | _figures(latencies) | {"pixel_error": error}
     counts = runner.state("safety.counts")
     figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
@@ -113,7 +117,7 @@ def _camera() -> PinholeCamera:
 def _controller(
     chain: SerialChain, camera: PinholeCamera, dt: float, safety: SafetyConfig
 ) -> tuple[AdaptiveController, Observation]:
-    """The controller, and an observation with all that the loop will tell it."""
+    """The controller, and an observation with every field that the loop sets."""
     centre = torch.tensor(CENTRE, dtype=torch.float64)
     down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
     target, _ = camera.project(Pose(centre + centre.new_tensor((0.03, -0.02, 0.0)), down))
@@ -133,42 +137,50 @@ def _controller(
         feature_new=torch.tensor(False),
         image_joint_position=q,
         nullspace_input=torch.zeros_like(q),
-        # A tensor, so that one package serves all rates.
+        # A tensor, so that one compiled step serves all rates.
         dt=torch.tensor(dt, dtype=torch.float64),
     )
     return controller, observation
 
 
 @dataclass(frozen=True, kw_only=True)
-class _LedArm:
-    """The arm that is led."""
+class _Access:
+    """Access to the arm of the loop."""
 
-    opened: Callable[[], AbstractContextManager[OpenedArm]]
-    """Connects to it."""
+    open: Callable[[], AbstractContextManager[OpenedArm]]
+    """Connects to the arm."""
     safety: SafetyConfig
-    """What the safety filter is told of it."""
+    """Configuration of the safety filter for this arm."""
 
 
-def _led(args: Serve, dt: float, robot: ArmModel) -> _LedArm:
-    """A real arm, or a simulated one that is ready."""
-    if leads_real_arm(args):
-        site: ArmSite = replace(resolved(args).site, driver=args.arm, ip=args.ip)
+@dataclass(frozen=True, kw_only=True)
+class _Settings:
+    """Settings of a real arm."""
+
+    site: ArmSite = field(default_factory=ArmSite)
+
+
+def _access(args: Serve, dt: float, robot: ArmModel) -> _Access:
+    """Access to a real arm, or to a simulated one in its ready posture."""
+    settings = with_settings(args.config, _Settings())
+    if args.drives_real_arm():
+        site = replace(settings.site, driver=args.arm, ip=args.ip)
 
         @contextmanager
         def open_arm() -> Iterator[OpenedArm]:
             with opened_arm(site) as arm:
                 yield OpenedArm(arm=arm, gripper=arm, advance=lambda _time: None)
 
-        return _LedArm(opened=open_arm, safety=site.cell_config().safety)
+        return _Access(open=open_arm, safety=site.cell_config().safety)
     scene = SceneConfig(timestep=dt)
     world = World(replace(scene, arm=replace(scene.arm, robot=robot)))
     world.reset(robot.chain.ready.numpy())
     access = access_by(args.arm, robot)
     safety = SafetyConfig(delay=access.delay, braking=access.dynamics)
-    return _LedArm(opened=partial(access.open, world), safety=safety)
+    return _Access(open=partial(access.open, world), safety=safety)
 
 
-def _serve(
+def _run_loop(
     runner: StepRunner,
     opened: OpenedArm,
     chain: SerialChain,
@@ -176,13 +188,13 @@ def _serve(
     dt: float,
     steps: int,
 ) -> tuple[Latencies, float]:
-    """Run the loop; returns latencies and the last pixel error [px]."""
+    """Run the loop and return its latencies and the last image error [px]."""
     arm = opened.arm
     target = runner.observation["feature"].copy()
     frame_steps = max(1, round(FRAME_TIME / dt))
     took, late = np.empty(steps), np.empty(steps)
     runner.observation["joint_position"][:] = arm.read().joint_position
-    runner.step()  # the first one is slower than any other
+    runner.step()  # the first step is slower than all others
     runner.start(arm.read().joint_position)
     rate = Rate(dt)
     with ending_at_rest(lambda: arm.command(np.zeros(len(chain.joint_names)))):
@@ -200,7 +212,7 @@ def _serve(
 
 
 def _answer(runner: StepRunner, arm: Arm) -> None:
-    """All that lies between a measurement and a command."""
+    """Read the joints, step the controller, send the command."""
     runner.observation["joint_position"][:] = arm.read().joint_position
     arm.command(runner.step())
 
@@ -208,7 +220,7 @@ def _answer(runner: StepRunner, arm: Arm) -> None:
 def _look(
     arrays: dict[str, np.ndarray], chain: SerialChain, camera: PinholeCamera, arm: Arm
 ) -> None:
-    """Image of the marker, with the joints when it was taken."""
+    """Take an image of the marker, stamped with the joints."""
     q = arm.read().joint_position
     feature, visible = camera.project(chain.forward(torch.from_numpy(q)))
     arrays["feature"][:] = feature.numpy()

@@ -1,4 +1,4 @@
-"""`hrc smooth`: limits on what any LeRobot policy asks for."""
+"""`hrc smooth`: limits on the motion that a LeRobot policy commands."""
 
 from dataclasses import asdict
 
@@ -7,30 +7,31 @@ from rich.console import Console
 from rich.table import Table
 
 from hrc_learn.cli._run import write_values
-from hrc_learn.cli.arguments.learn import Smooth
+from hrc_learn.cli.arguments import Smooth
 from hrc_learn.kinematics import panda
 
 
 def smooth(args: Smooth) -> None:
+    """Add limits to a checkpoint or a file, or remove them."""
     if args.checkpoint is not None and not args.checkpoint.is_dir():
         raise FileNotFoundError(f"there is no folder {args.checkpoint}")
     if args.checkpoint is None and (args.remove or args.limits is None):
-        raise ValueError("--checkpoint is needed, or --limits to write them to a file alone.")
+        raise ValueError("give --checkpoint, or --limits to write only a file.")
     # LeRobot takes seconds to import.
     from hrc_learn.lerobot.arm_robot import ArmValues
     from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
 
     if args.remove and args.checkpoint is not None:
         remove_smoothing(args.checkpoint)
-        print(f"{args.checkpoint} is as it was trained")
+        print(f"limits removed from {args.checkpoint}")
         return
     if args.dataset is None:
-        raise ValueError("--dataset is needed: limits are those of its demonstrators.")
-    if not args.share > 0:
-        raise ValueError(f"--share must be positive, but is {args.share}.")
+        raise ValueError("give --dataset: the limits are those of its demonstrators.")
+    if not args.scale > 0:
+        raise ValueError(f"--scale must be positive, got {args.scale}")
     limits = gathered_limits(
         args.dataset,
-        share=args.share,
+        share=args.scale,
         urdf=args.urdf,
         calibration=args.calibration,
         degrees=args.degrees,
@@ -49,7 +50,7 @@ def smooth(args: Smooth) -> None:
         table.add_row(name, *(f"{values[kind][i]:.3g}" for kind in kinds))
     Console().print(table)
     if args.checkpoint is not None:
-        print(f"actions of {args.checkpoint} are kept within these limits")
+        print(f"{args.checkpoint} keeps its actions within these limits")
     figures = {
         f"{kind}_{name}": float(v)
         for kind in kinds

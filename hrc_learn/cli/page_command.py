@@ -1,20 +1,21 @@
-"""`hrc page`: a page in the browser from which a person leads the arm."""
+"""`hrc page`: a page in the browser to guide the arm and record demonstrations."""
 
 import os
 
+# More threads would only wait for each other within a control step.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from rich.console import Console
 
-from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import configuration, leads_real_arm, write_values
-from hrc_learn.cli.arguments.run import ServePage
+from hrc_learn.cli._run import configuration, write_values
+from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli.arm_arguments import ServePage
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
@@ -29,47 +30,64 @@ from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
 from hrc_learn.teleoperation.gate import qr_code
 from hrc_learn.teleoperation.haptic_device import HapticDevice
-from hrc_learn.teleoperation.page import Page
+from hrc_learn.teleoperation.page import Page, PageConfig
 from hrc_learn.teleoperation.page.headset_scene import BUILD
 from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,
+    PageSessionConfig,
     counted,
     place_targets,
 )
 
 SWITCH_INTERVAL = 0.0005
-"""Longest that the page's threads keep the interpreter from the control loop [s]."""
+"""Longest time for which a thread of the page holds the interpreter [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Settings:
+    """Settings of the page, the recording session and a real arm."""
+
+    page: PageConfig
+    session: PageSessionConfig = field(default_factory=PageSessionConfig)
+    site: ArmSite = field(default_factory=ArmSite)
 
 
 def page(args: ServePage) -> None:
-    args = resolved(args)
-    if args.port is not None:
-        args = replace(args, page=replace(args.page, port=args.port))
+    """Serve the page and run the control loop until the person finishes."""
+    settings = _Settings(page=PageConfig(host=args.host, port=args.port))
+    settings = with_settings(args.config, settings)
+    guiding = settings.session.guiding
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    robot, console = ArmChoice(args.robot, args.base, args.tip).work_arm(), Console()
+    robot, console = ArmChoice(args.robot, *args.links()).work_arm(), Console()
     workplace = Workplace.of(robot)
     writer = DatasetWriter(
         args.out,
-        fps=args.session.fps,
+        fps=settings.session.fps,
         robot_type=robot.name,
         joint_names=robot.chain.joint_names,
         features=FEATURES,
         frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
-        details={"taught by": "a person at the page", "recorded with": configuration(args)},
+        details={
+            "demonstrated by": "a person at the page",
+            "recorded with": configuration(args),
+        },
     )
     recorder = DemonstrationRecorder(writer, lambda: page.task, chain=robot.chain)
     stands = [*workplace.scene.boxes(), *place_targets(workplace)]
     try:
-        # The recorder ends last: whatever ends the rest, what is open is kept.
-        with recorder, _opened(args, workplace) as (world, opened, safety):
+        # The recorder is closed last, so that an open demonstration is kept in any case.
+        with (
+            recorder,
+            _opened(args, settings.site, guiding.safety, workplace) as (world, opened, safety),
+        ):
             bodies = MovingBodies(world)
             drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-            config = replace(args.session, guiding=replace(args.session.guiding, safety=safety))
+            config = replace(settings.session, guiding=replace(guiding, safety=safety))
             with (
-                _beside(args.beside, robot.chain) as beside,
-                Page(robot.chain, drawn, stands, args.page, task=args.task) as page,
+                _opened_device(args.device, robot.chain) as devices,
+                Page(robot.chain, drawn, stands, settings.page, task=args.task) as page,
             ):
                 session = PageSession(
                     workplace,
@@ -77,27 +95,26 @@ def page(args: ServePage) -> None:
                     recorder,
                     world,
                     opened=opened,
-                    beside=beside,
+                    beside=devices,
                     config=config,
                 )
                 _announce(console, page)
-                figures = _serve(session, page, config.guiding.dt, args.duration)
+                figures = _run_loop(session, page, guiding.dt, args.duration)
     finally:
         if saved := recorder.status.saved:
             console.print(f"{args.out}: {counted(saved)}", soft_wrap=True)
     if not saved:
-        console.print("Nothing saved, so there is no dataset")
+        console.print("No demonstration was saved, so there is no dataset")
     write_values(args.json, {**figures, "episodes": saved})
 
 
 @contextmanager
 def _opened(
-    args: ServePage, workplace: Workplace
+    args: ServePage, site: ArmSite, safety: SafetyConfig, workplace: Workplace
 ) -> Iterator[tuple[World, OpenedArm | None, SafetyConfig]]:
-    """The world, its arm unless no driver leads it, and what the filter is told of it."""
-    safety: SafetyConfig = args.session.guiding.safety
-    if leads_real_arm(args):
-        site: ArmSite = replace(args.site, driver=args.arm, ip=args.ip)
+    """World, arm (None without a driver), and the safety filter's configuration for it."""
+    if args.drives_real_arm():
+        site = replace(site, driver=args.arm, ip=args.ip)
         with opened_site(site, workplace) as (world, opened):
             yield world, opened, site.cell_config().safety
         return
@@ -108,25 +125,25 @@ def _opened(
     access = access_by(args.arm, workplace.robot)
     world.hold(workplace.scene.objects[0].name, workplace.home_joints().numpy())
     with access.open(world) as opened:
-        told = replace(safety, delay=safety.delay + access.delay, braking=access.dynamics)
-        yield world, opened, told
+        delay = safety.delay + access.delay
+        yield world, opened, replace(safety, delay=delay, braking=access.dynamics)
 
 
 def _announce(console: Console, page: Page) -> None:
-    """Say where the page is, with the secret that opens it."""
+    """Print the addresses of the page, with the secret that opens it."""
     console.print(f"Page at [bold]{page.url}[/]", soft_wrap=True)
     if page.headset_url:
         console.print(f"For headsets and phones: [bold]{page.headset_url}[/]", soft_wrap=True)
     else:
-        console.print(f"No client for headsets: [bold]{BUILD}[/] in a checkout builds it")
+        console.print(f"No client for headsets: build it with [bold]{BUILD}[/] in a checkout")
     if page.address.scheme == "https":
-        console.print("Whoever has this address can move the arm:")
+        console.print("Anyone with this address can move the arm:")
         console.print(qr_code(page.url))
 
 
 @contextmanager
-def _beside(device: str, chain: SerialChain) -> Iterator[tuple[Human, ...]]:
-    """The device for the other hand, if any."""
+def _opened_device(device: str, chain: SerialChain) -> Iterator[tuple[Human, ...]]:
+    """The additional input device, if any."""
     if device == "haptic":
         with HapticDevice.open(chain) as haptic:
             yield (haptic,)
@@ -136,10 +153,10 @@ def _beside(device: str, chain: SerialChain) -> Iterator[tuple[Human, ...]]:
         yield (TerminalKeyboard.open(chain),) if device == "keyboard" else ()
 
 
-def _serve(
+def _run_loop(
     session: PageSession, page: Page, dt: float, duration: float | None
 ) -> dict[str, float | int]:
-    """Run the loop in the arm's own time; what was measured of it."""
+    """Run the loop at the rate of the arm and return its figures."""
     rate, steps = Rate(dt), 0
     try:
         with ending_at_rest(session.arm.stop):

@@ -1,27 +1,25 @@
-"""`hrc show`, `hrc report`: dashboards in Rerun, and runs on a page."""
+"""`hrc show` and `hrc report`: dashboards in Rerun, and one page of several runs."""
 
-import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from hrc_learn.cli._run import write_values
-from hrc_learn.cli.arguments.dataset import Show
-from hrc_learn.cli.arguments.run import Report
+from hrc_learn.cli._run import has_screen, write_values
+from hrc_learn.cli.arguments import Report, Show
 from hrc_learn.store import write_text
 from hrc_learn.viz.report import read_report, reports_page
 
 
 def show(args: Show) -> int:
-    """Open recordings, or make one of the demonstrations of a dataset."""
-    if not args.path.exists():
-        raise FileNotFoundError(f"{args.path} is not there.")
-    if recordings := recordings_in(args.path):
+    """Open the recordings of a folder, or record the demonstrations of a dataset."""
+    if not args.dataset.exists():
+        raise FileNotFoundError(f"there is nothing at {args.dataset}")
+    if recordings := recordings_in(args.dataset):
         if args.out is not None:
             raise ValueError(
-                f"--out is for a dataset, but {args.path} is recorded already: "
+                f"--out records a dataset, but {args.dataset} holds recordings: "
                 f"{', '.join(map(str, recordings))}."
             )
         return _open(recordings, args.web)
@@ -37,30 +35,28 @@ def show(args: Show) -> int:
 
 
 def recordings_in(path: Path) -> list[Path]:
-    """The recording that a path is, or those in a folder; that of the run itself first."""
+    """Recordings at a path: the file itself, or those in a folder, `run.rrd` first."""
     if path.is_file():
         return [path]
     return sorted(path.glob("*.rrd"), key=lambda file: (file.stem != "run", file.name))
 
 
 def viewer_command(recordings: Sequence[Path], web: bool) -> list[str]:
-    """The command line of the viewer, by the Python that this is: no path has to hold it.
+    """Command line of Rerun's viewer, run by this Python so that it need not be on the path.
 
     Args:
-        recordings: To open.
-        web: In the browser.
+        recordings: Files to open.
+        web: Open them in the browser.
     """
-    # On this machine alone: the viewer would listen to all networks by default.
+    # Bound to this machine, as the viewer would listen on all networks by default.
     serving = ["--serve-web", "--bind", "127.0.0.1"] if web else []
     return [sys.executable, "-m", "rerun", *serving, *map(str, recordings)]
 
 
 def _open(recordings: Sequence[Path], web: bool) -> int:
-    screen = not sys.platform.startswith("linux") or any(
-        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
-    )
+    screen = has_screen()
     if not screen and not web:
-        print("no screen here: the dashboard is served to the browser (Ctrl-C ends it)")
+        print("no screen: the dashboard is served to the browser (Ctrl-C ends it)")
     try:
         return subprocess.run(
             viewer_command(recordings, web or not screen), check=False
@@ -70,44 +66,42 @@ def _open(recordings: Sequence[Path], web: bool) -> int:
 
 
 _SHOWN, _SHOWN_FRAMES = 200, 1_000_000
-"""Demonstrations shown of a dataset, unless they are named, and their frames: more are neither
-told apart by eye nor held by a viewer."""
-
-
-_ALONE = 8
-"""Demonstrations with a tab of their own, and with images in it."""
+"""Largest number of demonstrations and frames shown by default, limited by the viewer."""
+_WITH_TAB = 8
+"""Demonstrations with a tab and images of their own."""
 
 
 def _record_demonstrations(args: Show, out: Path) -> None:
-    # Rerun and PyTorch, which a report does without.
+    # Rerun and PyTorch, which a report does not need.
     from hrc_learn.demos import open_demos, thumbnails
     from hrc_learn.learning.channels import demonstrations_recording
     from hrc_learn.viz.learning_dashboards import record_demonstrations
 
-    source = open_demos(args.path, episodes=args.episodes or None, units=args.units or None)
+    source = open_demos(args.dataset, episodes=args.episodes or None)
     shown = source
     if not args.episodes:
         usual = sorted(source.lengths)[len(source) // 2]
         shown = source.spread(min(_SHOWN, max(1, _SHOWN_FRAMES // usual)))
     demos = shown.load()
-    title = f"Demonstrations in {args.path.resolve().name}"
-    images, missing = thumbnails(args.path, demos[:_ALONE])
-    record_demonstrations(out, demonstrations_recording(demos, title, images), most=_ALONE)
-    for said in missing:
-        print(f"left out: {said}")
+    title = f"Demonstrations in {args.dataset.resolve().name}"
+    images, missing = thumbnails(args.dataset, demos[:_WITH_TAB])
+    record_demonstrations(out, demonstrations_recording(demos, title, images), most=_WITH_TAB)
+    for image in missing:
+        print(f"left out: {image}")
     if len(demos) < len(source):
-        print(f"of {len(source)}, spread over them (--episodes names others): ", end="")
-    print(f"{len(demos)} demonstrations")
+        print(f"{len(demos)} of {len(source)} demonstrations (--episodes names others)")
+    else:
+        print(f"{len(demos)} demonstrations")
     seconds = sum(demo.duration for demo in demos)
     write_values(args.json, {"episodes": len(demos), "seconds": seconds})
 
 
 def report(args: Report) -> None:
-    """One page from the folders of several runs."""
+    """Write one page of the reports of several runs."""
     if not args.runs:
-        raise ValueError("no run: name at least one folder with a report.json")
+        raise ValueError("name at least one folder with a report.json")
     reports = [read_report(run) for run in args.runs]
-    title = reports[0].title if len(reports) == 1 else args.title
+    title = reports[0].title if len(reports) == 1 else "Runs"
     write_text(args.out, reports_page(title, reports))
     print(f"{args.out}: {', '.join(report.title for report in reports)}")
     values = {

@@ -1,7 +1,7 @@
-"""`hrc fit`: movement primitives and image Jacobian from demonstrations."""
+"""`hrc fit`: movement primitives and image Jacobians from demonstrations."""
 
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,19 @@ import torch
 from rich.console import Console
 
 from hrc_learn import distributed
-from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import command_line, configuration, refuse_repeats, write_values
+from hrc_learn.cli._settings import with_settings
 from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
-from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
-from hrc_learn.cli.commands.check import columns
+from hrc_learn.cli.arguments import FitImageJacobian, FitPrimitives
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos, thumbnails
 from hrc_learn.demos.read.opened_dataset import open_dataset
-from hrc_learn.jacobian import CellErrors, RBFCenters, grid
+from hrc_learn.jacobian import (
+    CellErrors,
+    EvidenceConfig,
+    ImageJacobianFitConfig,
+    RBFCenters,
+    paper_grid,
+)
 from hrc_learn.learning.fit_report import fit_report
 from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import (
@@ -39,12 +44,12 @@ from hrc_learn.viz.report import PAGE, show_command, write_report
 
 
 def fit_primitives(args: FitPrimitives) -> None:
-    """Movement primitives of joints and end effector.
+    """Fit movement primitives of joints and end effector.
 
     Raises:
-        ValueError: Options that contradict each other, or an episode named twice.
+        ValueError: Options contradict each other, or an episode is named twice.
     """
-    torch.manual_seed(args.seed)
+    torch.manual_seed(0)
     console = Console()
     refuse_repeats(args.episodes)
     if args.as_lerobot_policy:
@@ -59,26 +64,26 @@ def fit_primitives(args: FitPrimitives) -> None:
     for note in demos.notes:
         console.print(f"note: {note}", soft_wrap=True)
     if _is_sample(demos, source):
-        console.print(f"note: {_OF_A_SAMPLE}", soft_wrap=True)
+        console.print(f"note: {_SAMPLE_NOTE}", soft_wrap=True)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(source)} demonstrations"):
             fitted, metrics = _learn(args, source, demos, folder)
         missing = _draw(fitted, args, demos, metrics, folder)
         _finish(args, metrics, folder)
-    for said in missing:
-        print(f"left out: {said}")
+    for image in missing:
+        print(f"left out: {image}")
     if (args.folder / PAGE).is_file():
         print(f"Report: {shlex.quote(str(args.folder / PAGE))}")
         print(f"Dashboard: {show_command(args.folder)}")
 
 
 def fit_silently(args: FitPrimitives) -> None:
-    """The models of `fit_primitives` alone: no contract, no report, and nothing is said.
+    """Fit the models of `fit_primitives` without contract, report or messages.
 
     Raises:
-        ValueError: The demonstrations hold no motion, or not what a channel needs.
+        ValueError: The demonstrations hold no motion, or lack a column that a channel needs.
     """
-    torch.manual_seed(args.seed)
+    torch.manual_seed(0)
     source = open_demos(args.dataset, **_wanted(args))
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         _learn(args, source, sampled(source), folder)
@@ -87,15 +92,18 @@ def fit_silently(args: FitPrimitives) -> None:
 def _learn(
     args: FitPrimitives, source: DemonstrationSource, demos: DemonstrationSet, folder: Path
 ) -> tuple[FittedPrimitives, dict[str, float]]:
-    """Fit, and save the models into the folder; the fit and what was measured of it."""
-    # Not every channel takes a scaling.
+    """Fit and save the models.
+
+    Returns:
+        The fit and its measured values.
+    """
+    # Only some channels take a scaling.
     scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
     fitted = fit_demonstrations(
         demos,
         args.n_basis,
         args.method,
         channels=args.channels,
-        robust=args.robust,
         **scaled,
     )
     if _is_sample(demos, source):
@@ -103,7 +111,7 @@ def _learn(
     metrics = fitted.metrics()
     if args.several == "contextual":
         metrics |= fit_contextual(fitted, demos, args.context, folder)
-    # Scaled motions are linear neither in their mean nor in a context.
+    # Scaled motions are linear neither in the mean nor in a context.
     if args.several == "best" and args.scaling == "none":
         metrics |= keep_best(fitted, demos, args.context, folder)
     fitted.save(folder, each=args.several == "distribution")
@@ -117,43 +125,43 @@ def _is_sample(demos: DemonstrationSet, source: DemonstrationSource) -> bool:
 
 
 def _refuse_unused_context(args: FitPrimitives) -> None:
-    """Raise ValueError where a context is given that no model would be a function of."""
+    """Refuse --context with models that are no function of it."""
     if not args.context:
         return
     if args.several not in ("best", "contextual"):
         raise ValueError(
-            f"--several {args.several} has no use for --context: leave it out, or learn a "
-            f"function of it by --several contextual"
+            f"--several {args.several} does not use --context: leave it out, or learn a "
+            f"function of it with --several contextual"
         )
     if args.several == "best" and args.scaling != "none":
         raise ValueError(
-            f"--scaling {args.scaling} has no use for --context: leave one of them out, or "
-            f"give --several contextual"
+            f"--scaling {args.scaling} does not use --context: leave one of them out, or give "
+            f"--several contextual"
         )
 
 
-_OF_A_SAMPLE = (
-    "every demonstration is fitted, and the mean is that of all; the sample tells how far the "
-    "mean is off and which model predicts best, and models other than the mean are made of it"
+_SAMPLE_NOTE = (
+    "the mean is fitted to all demonstrations; its error, the comparison of models and all "
+    "other models use a sample of them"
 )
 
 
 def _wanted(args: FitPrimitives) -> dict[str, Any]:
-    """What to read of the dataset, and how."""
+    """Arguments of `open_demos`."""
     return {
         "episodes": args.episodes or None,
         "joint_names": args.joint_names or None,
-        "mapping": columns(args.mapping),
+        "mapping": args.columns(),
         "units": args.units,
     }
 
 
 def _fit_streamed(args: FitPrimitives, console: Console) -> None:
-    given = (args.context, args.robust, args.method != "trajectory", args.scaling != "none")
+    given = (args.context, args.method != "trajectory", args.scaling != "none")
     if any(given):
         raise ValueError(
-            "--several streamed fits unscaled least squares to all demonstrations: it takes "
-            "neither --method nor --robust nor --scaling nor --context"
+            "--several streamed is an unscaled least-squares fit: it takes neither --method "
+            "nor --scaling nor --context"
         )
     if args.n_basis is None:
         raise ValueError("--several streamed needs a number of basis functions: --n-basis 60")
@@ -174,16 +182,15 @@ def _fit_policy(args: FitPrimitives, console: Console) -> None:
     # LeRobot takes ten seconds to import.
     from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
 
-    given = (args.channels, args.context, args.joint_names, args.robust)
-    given += (args.units, args.mapping)
+    given = (args.channels, args.context, args.joint_names, args.units, args.mapping)
     if any(given) or (args.several, args.method, args.scaling) != (
         "best",
         "trajectory",
         "none",
     ):
         raise ValueError(
-            "--as-lerobot-policy learns the dataset's actions from its observations: of what "
-            "to learn and how, it takes --n-basis and --episodes alone"
+            "--as-lerobot-policy learns the dataset's actions from its observations: it takes "
+            "--n-basis and --episodes only"
         )
     if args.n_basis is None:
         raise ValueError("--as-lerobot-policy needs a number of basis functions: --n-basis 50")
@@ -206,16 +213,15 @@ def _made_by(args: FitPrimitives) -> dict:
 
 
 def _spread(fitted: FittedPrimitives, channel: str) -> float:
-    """Standard deviation of the motion over demonstrations, root mean square [rad or m]."""
+    """Standard deviation over demonstrations, root mean square along the motion [rad or m]."""
     distribution = fitted.distribution(channel)
     durations = fitted.demonstrations.time.amax(dim=1)
     time = torch.linspace(0, float(durations.mean()), 100, dtype=torch.float64)
     return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
 
 
-_SEEN, _IMAGES = 3, 30
-"""Demonstrations with images, and images of each camera: few, as finding them means to decode
-all that is between."""
+_IMAGED_DEMOS, _IMAGES = 3, 30
+"""Demonstrations with images, and images per camera. Few, as a video is decoded up to each."""
 
 
 def _draw(
@@ -225,14 +231,14 @@ def _draw(
     metrics: dict[str, float],
     folder: Path,
 ) -> list[str]:
-    """A report and a recording of the fit, where there is more than an orientation to show.
+    """Write report and recording of the fit, unless only orientations were learned.
 
     Returns:
-        Images that could not be read, a line each.
+        One line for each image that could not be read.
     """
     if set(fitted.each) == {"orientation"}:
         return []
-    images, missing = thumbnails(args.dataset, demos[:_SEEN], _IMAGES)
+    images, missing = thumbnails(args.dataset, demos[:_IMAGED_DEMOS], _IMAGES)
     episodes = [demo.episode for demo in demos]
     shown = fit_recording(fitted, f"Fit of {args.dataset.name}", episodes, images)
     record_fit(folder / "fit.rrd", shown)
@@ -243,13 +249,13 @@ def _draw(
 
 def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:
     write_json(folder / "metrics.json", metrics)
-    show_values(f"Fit of {args.dataset}", metrics, primitive_rows(metrics), args.verbose)
+    show_values(f"Fit of {args.dataset}", metrics, primitive_rows(metrics))
     for channel, better in best_models(folder).items():
         error = 100 * metrics[f"held_out_{channel}_{better}_nrmse_median"]
         mean = 100 * metrics[f"held_out_{channel}_mean_nrmse_median"]
         print(
             f"{channel}: {_MODELS[better]} predicts held-out demonstrations best, NRMSE "
-            f"{error:.1f} % against {mean:.1f} % of the mean; hrc evaluate takes it"
+            f"{error:.1f} %, mean {mean:.1f} %; hrc evaluate uses it"
         )
     print(f"Model in {shlex.quote(str(args.folder))}")
     write_values(args.json, metrics)
@@ -261,40 +267,50 @@ _MODELS = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class _JacobianSettings:
+    """Settings of the fit of an image Jacobian."""
+
+    learning: EvidenceConfig = field(default_factory=EvidenceConfig)
+    fit: ImageJacobianFitConfig = field(default_factory=ImageJacobianFitConfig)
+
+
+_PAPER_NEURONS = RBFCenters(centers=paper_grid(), width=0.1)
+
+
 def fit_image_jacobian(args: FitImageJacobian) -> None:
-    """Image Jacobian, and the visual target.
+    """Fit the image Jacobian and the target in the image.
 
     Raises:
         ValueError: An episode is named twice.
     """
-    args = resolved(args)
+    settings = with_settings(args.config, _JacobianSettings())
+    learning = settings.learning
     refuse_repeats(args.episodes)
     with distributed.processes() as rank:
         console = Console(quiet=rank != 0)
         demos = open_demos(args.dataset, episodes=args.episodes or None)
         for note in demos.notes:
             console.print(f"note: {note}")
-        if args.learn and len(demos) < args.learning.hold_out:
+        if args.learn and len(demos) < learning.hold_out:
             console.print(
-                f"note: {len(demos)} demonstrations are too few to learn the neurons from; "
-                f"fitted as they are (--learning.hold-out {args.learning.hold_out})"
+                f"note: {len(demos)} demonstrations are too few to learn the neurons; they "
+                f"stay as they are (--config learning.hold_out={learning.hold_out})"
             )
         with console.status(f"Fitting {len(demos)} demonstrations") as status:
             skill = fit_visual_servo(
                 demos,
-                None if args.neurons == "around" else _grid(args),
-                args.fit,
-                args.learning if args.learn else None,
+                None
+                if args.neurons == "around"
+                else RBFCenters(centers=paper_grid(), width=0.1),
+                settings.fit,
+                learning if args.learn else None,
                 lambda number, state: status.update(
                     f"Learning, round {number}: held-out error {state.held_out_error:.3f} px"
                 ),
             )
         if rank == 0:
             _write(args, skill, demos, console)
-
-
-def _grid(args: FitImageJacobian) -> RBFCenters:
-    return RBFCenters(centers=grid(args.x, args.y), width=args.width)
 
 
 def _write(
@@ -314,7 +330,7 @@ def _write(
             figure = learning_figure(held_out, skill.learned.best, "px")
             figure.savefig(folder / "learning.png", dpi=120)
         title = f"Image Jacobian from {args.dataset.name}"
-        seen, missing = thumbnails(args.dataset, islice(demos, _SEEN), 2)
+        seen, missing = thumbnails(args.dataset, islice(demos, _IMAGED_DEMOS), 2)
         ends = {
             f"End of episode {episode}, {camera}": files[-1]
             for episode, cameras in seen.items()
@@ -324,7 +340,7 @@ def _write(
     for line in missing:
         console.print(f"note: {line}")
     rows = image_jacobian_rows(metrics)
-    show_values(f"Image Jacobian from {args.dataset}", metrics, rows, args.verbose)
+    show_values(f"Image Jacobian from {args.dataset}", metrics, rows)
     print(f"Model in {shlex.quote(str(args.folder))}")
     print(f"Dashboard: {show_command(args.folder)}")
     write_values(args.json, metrics)

@@ -1,4 +1,4 @@
-"""`hrc import`, `hrc extract`: datasets from arrays, and image features from videos."""
+"""`hrc import` and `hrc extract`: datasets of plain arrays, and markers in videos."""
 
 import time
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import numpy as np
 from rich.progress import track
 
 from hrc_learn.cli._run import write_values
-from hrc_learn.cli.arguments.dataset import Extract, ImportArrays
+from hrc_learn.cli.arguments import Extract, Import
 from hrc_learn.demos import DatasetWriter, Demonstration, Detector, extract_features
 from hrc_learn.demos.arrays import (
     ArrayOptions,
@@ -21,19 +21,18 @@ from hrc_learn.demos.write.episode import rotation_vectors
 from hrc_learn.vision import MarkerDetector, centre
 
 
-def import_arrays(args: ImportArrays) -> None:
-    """Import the recordings."""
+def import_arrays(args: Import) -> None:
+    """Convert the recordings."""
     if not args.files:
         raise ValueError("name at least one recording to import")
     read = [(path, demo) for path in args.files for demo in _read(args, path)]
-    _refuse_unlike(read)
+    _refuse_mixture(read)
     demos = [demo for _, demo in read]
     fps, features = demos[0].fps, {}
     if args.actions:
         demos, features = with_actions(demos)
-    with DatasetWriter(
-        args.out, fps, args.robot_type, demos[0].joint_names, features, dtype=args.dtype
-    ) as writer:
+    writer = DatasetWriter(args.out, fps, args.robot_type, demos[0].joint_names, features)
+    with writer:
         for demo in demos:
             writer.add_episode(demo)
     summary = {
@@ -49,14 +48,14 @@ def import_arrays(args: ImportArrays) -> None:
     write_values(args.json, summary)
 
 
-def _refuse_unlike(demos: Sequence[tuple[Path, Demonstration]]) -> None:
-    """Refuse demonstrations, each with its file, that cannot share a dataset."""
+def _refuse_mixture(demos: Sequence[tuple[Path, Demonstration]]) -> None:
+    """Refuse demonstrations, each with its file, that do not fit into one dataset."""
     first_path, first = demos[0]
     for path, demo in demos[1:]:
         for what, one, two, advice in (
-            ("joints", len(first.joint_names), len(demo.joint_names), "import them apart"),
+            ("joints", len(first.joint_names), len(demo.joint_names), "import them separately"),
             ("joints", first.joint_names, demo.joint_names, "give --joint-names"),
-            ("arrays", first.recorded, demo.recorded, "import them apart"),
+            ("arrays", first.recorded, demo.recorded, "import them separately"),
             ("frame rate", first.fps, demo.fps, "give --fps; stamps are kept"),
         ):
             if one != two:
@@ -70,6 +69,7 @@ def _in_words(value: float | int | tuple[str, ...]) -> str:
     return ", ".join(value) if isinstance(value, tuple) else f"{value:g}"
 
 
+_IMPORTED_UNITS = ("joint_position", "position", "time")
 _POSE_ACTION = {
     "position": ("ee.x", "ee.y", "ee.z"),
     "orientation": ("ee.wx", "ee.wy", "ee.wz"),
@@ -79,13 +79,13 @@ _POSE_ACTION = {
 def with_actions(
     demos: Sequence[Demonstration],
 ) -> tuple[list[Demonstration], dict[str, tuple[str, ...]]]:
-    """Demonstrations whose action is where the next frame is; the last one's is to stay.
+    """Add actions: the joints, or else the pose, of the next frame. The last one repeats.
 
     Args:
-        demos: All of the same columns.
+        demos: Demonstrations with the same columns.
 
     Returns:
-        Those, and the features of their own that a `DatasetWriter` is to be told of.
+        Demonstrations with actions, and the additional features for a `DatasetWriter`.
     """
     if demos[0].joint_position is not None:
         return [replace(d, command_position=_next(d.joint_position)) for d in demos], {}
@@ -104,65 +104,70 @@ def _next(values: np.ndarray | None) -> np.ndarray:
     return np.concatenate([values[1:], values[-1:]])
 
 
-def _read(args: ImportArrays, path: Path) -> list[Demonstration]:
-    """Demonstrations of one file."""
+def _read(args: Import, path: Path) -> list[Demonstration]:
+    """Read the demonstrations of one file."""
+    if unknown := args.units.keys() - _IMPORTED_UNITS:
+        raise ValueError(
+            f"--units {min(unknown)}: no such quantity; there are {', '.join(_IMPORTED_UNITS)}"
+        )
     sources = ArraySources(
-        joints=args.joints,
-        position=args.position,
-        orientation=args.orientation,
+        joints=",".join(args.joints) or None,
+        position=",".join(args.position) or None,
+        orientation=",".join(args.orientation) or None,
         time=args.time,
     )
     options = ArrayOptions(
-        units={
-            "joint_position": args.joint_unit,
-            "position": args.position_unit,
-            "time": args.time_unit,
-        },
+        units=args.units,
         quaternion_order=args.quaternion_order,
-        joint_names=args.joint_names,
+        joint_names=_words(args.joint_names),
         duration=args.duration,
         fps=args.fps,
         task=path.stem if args.task is None else args.task,
     )
-    table = read_arrays(path, [name for name in args.columns.split(",") if name])
-    return demonstrations_from_arrays(table, sources, options, path=path)
+    arrays = read_arrays(path, _words(args.columns))
+    return demonstrations_from_arrays(arrays, sources, options, path=path)
+
+
+def _words(values: Sequence[str]) -> list[str]:
+    """Words that are separated by spaces or commas."""
+    return [word for value in values for word in value.split(",") if word]
 
 
 def extract(args: Extract) -> int:
-    """Look at every image that was not looked at before; status 1 where some could not be."""
+    """Search every new image for the marker; status 1 if some could not be read."""
     if not 0 <= args.marker < 50:
         raise ValueError(f"--marker must be from 0 to 49, got {args.marker}")
     start = time.perf_counter()
     done = extract_features(
         args.dataset,
         f"marker_{args.marker}",
-        lambda: _follow(args.marker),
+        lambda: _detector(args.marker),
         camera=args.camera,
-        progress=lambda episodes: track(episodes, description="Looking at episodes"),
+        progress=lambda episodes: track(episodes, description="Searching episodes"),
     )
     rate = done.frames / max(time.perf_counter() - start, 1e-9)
-    share = done.seen / done.frames if done.frames else 1.0
+    seen = done.seen / done.frames if done.frames else 1.0
     print(
-        f"{done.name}: {done.episodes} episodes looked at, {done.known} known before; seen in "
-        f"{100 * share:.1f} % of {done.frames} frames, {done.without_image} without an image"
+        f"{done.name}: {done.episodes} episodes searched, {done.known} known before; marker in "
+        f"{100 * seen:.1f} % of {done.frames} frames, {done.without_image} without an image"
     )
     values = {
         "episodes": done.episodes,
         "episodes_known_before": done.known,
         "frames": done.frames,
-        "seen_share": share,
+        "seen_fraction": seen,
         "frames_without_image": done.without_image,
         "frames_per_s": rate,
         "episodes_left_out": len(done.left_out),
     }
-    for said in done.left_out.values():
-        print(f"left out: {said}")
+    for reason in done.left_out.values():
+        print(f"left out: {reason}")
     write_values(args.json, values)
     return int(bool(done.left_out))
 
 
-def _follow(marker: int) -> Detector:
-    """A detector that follows one marker."""
+def _detector(marker: int) -> Detector:
+    """Detector of one marker's centre [px]."""
     markers = MarkerDetector([marker])
 
     def detect(image: np.ndarray) -> np.ndarray | None:

@@ -1,0 +1,124 @@
+"""Settings beyond the options of a command: fields of configuration dataclasses, given as TOML.
+
+`--config site.speed=0.1 cell.toml` sets a field and reads a file; the last value counts.
+"""
+
+import dataclasses
+import sys
+import tomllib
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal
+
+
+def with_settings[Settings](texts: Sequence[str], default: Settings) -> Settings:
+    """Settings with the given values in place of their defaults.
+
+    Args:
+        texts: `NAME.FIELD=VALUE`, the value as in TOML or a plain word, or paths of TOML files.
+            "help" prints all settings and exits.
+        default: Dataclass of configuration dataclasses.
+
+    Raises:
+        ValueError: A setting is unknown or has a value of another type.
+        FileNotFoundError: There is no such file.
+    """
+    if "help" in texts:
+        print("\n".join(_listed("", default)))
+        sys.exit(0)
+    for text in texts:
+        default = _updated(default, _parsed(text), "--config ")
+    return default
+
+
+def _parsed(text: str) -> dict[str, Any]:
+    name, assigned, value = text.partition("=")
+    if not assigned:
+        try:
+            return tomllib.loads(Path(text).read_text(encoding="utf-8"))
+        except tomllib.TOMLDecodeError as error:
+            raise ValueError(f"{text}: not valid TOML ({error})") from None
+    name = name.strip().replace("-", "_")
+    try:
+        return tomllib.loads(f"{name} = {value}")
+    except tomllib.TOMLDecodeError:
+        quoted = value.replace("\\", "\\\\").replace('"', '\\"')
+    try:
+        return tomllib.loads(f'{name} = "{quoted}"')
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"--config {text}: not NAME=VALUE ({error})") from None
+
+
+def _unknown(place: str, name: str, known: typing.Iterable[str]) -> str:
+    close = get_close_matches(name, known, 1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    return f"{place}{name}: no such setting; {hint}"
+
+
+def _updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
+    """Dataclass with the given fields replaced. `place` precedes their names in errors."""
+    hints = typing.get_type_hints(type(config))
+    known = [field.name for field in dataclasses.fields(config)]
+    values = {}
+    for name, value in given.items():
+        if name not in known:
+            raise ValueError(_unknown(place, name, known))
+        current = getattr(config, name)
+        if dataclasses.is_dataclass(current) and isinstance(value, Mapping):
+            values[name] = _updated(current, value, f"{place}{name}.")
+        else:
+            values[name] = _converted(value, hints[name], f"{place}{name}")
+    try:
+        return dataclasses.replace(config, **values)
+    except ValueError as error:
+        error.add_note(f"({place}{', '.join(values)})")
+        raise
+
+
+def _converted(value: Any, hint: Any, place: str) -> Any:
+    """A TOML value as its annotated type: a scalar, path, tuple, mapping or dataclass."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if isinstance(hint, typing.TypeAliasType):
+        return _converted(value, hint.__value__, place)
+    if origin in (types.UnionType, typing.Union):
+        for part in parts:
+            try:
+                return _converted(value, part, place)
+            except ValueError:
+                continue
+    elif origin is Literal and value in parts:
+        return value
+    elif origin is tuple and isinstance(value, list):
+        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        if len(kinds) == len(value):
+            return tuple(_converted(v, k, place) for v, k in zip(value, kinds, strict=True))
+    elif origin in (dict, Mapping) and isinstance(value, dict):
+        return {key: _converted(v, parts[1], place) for key, v in value.items()}
+    elif dataclasses.is_dataclass(hint) and isinstance(value, dict):
+        hints = typing.get_type_hints(hint)
+        if unknown := value.keys() - hints.keys():
+            raise ValueError(_unknown(f"{place}.", min(unknown), hints))
+        fields = {k: _converted(v, hints[k], f"{place}.{k}") for k, v in value.items()}
+        return typing.cast("type[Any]", hint)(**fields)
+    elif hint is float and type(value) is int:
+        return float(value)
+    elif hint is Path and isinstance(value, str):
+        return Path(value)
+    elif hint is type(None) and value in ("none", "None"):
+        return None
+    elif isinstance(hint, type) and type(value) is hint:
+        return value
+    expected = getattr(hint, "__name__", str(hint))
+    raise ValueError(f"{place} must be {expected}, got {value!r}")
+
+
+def _listed(name: str, value: Any) -> Iterator[str]:
+    """Every setting below a name with its value, one a line."""
+    if not dataclasses.is_dataclass(value):
+        yield f"{name} = {value}"
+        return
+    for field in dataclasses.fields(value):
+        yield from _listed(f"{name}.{field.name}".lstrip("."), getattr(value, field.name))

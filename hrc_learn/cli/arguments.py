@@ -1,0 +1,393 @@
+"""Command lines of the commands that work on datasets and models.
+
+A command line is a frozen dataclass: each field is an option, its docstring the help. Nothing
+here imports a library, so that a mistyped option is found before any work; tests compare the
+choices with the definitions they repeat.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+Channel = Literal["joint", "position", "orientation", "pose"]
+"""Keys of `hrc_learn.learning.channels.CHANNELS`."""
+Scaling = Literal["none", "paper", "amplitude", "rotation"]
+"""Keys of `hrc_learn.dmp.forcing_scale.SCALINGS`."""
+
+
+def sibling(dataset: Path, suffix: str) -> Path:
+    """Folder DATASET_suffix next to a dataset, which may be given as "." or ".."."""
+    named = dataset if dataset.name not in ("", "..") else dataset.resolve()
+    return named.with_name(f"{named.name}_{suffix}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A command that measures something."""
+
+    json: Path | None = None
+    """File for the measured values, one flat JSON object of numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written(Measured):
+    """A command that writes a folder of results."""
+
+    overwrite: bool = False
+    """Replace an older result in that folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnDataset(Measured):
+    """A command that reads a LeRobot dataset."""
+
+    dataset: Path
+    """Folder of a LeRobot dataset, version 2.0, 2.1 or 3.0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """Meaning of a dataset's columns, where the reader does not find it."""
+
+    units: dict[str, str] = field(default_factory=dict)
+    """Units on disk by quantity, such as: joint_position deg position mm."""
+    mapping: dict[str, str] = field(default_factory=dict)
+    """Columns by quantity, such as: joint_position "observation.state[0:7]"."""
+
+    def columns(self) -> dict[str, str | list[str]]:
+        """`mapping` as the reader takes it."""
+        return columns(self.mapping)
+
+
+def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str]]:
+    """Columns by quantity: a feature, a range of it, or a list of names from "a,b"."""
+    return {role: text.split(",") if "," in text else text for role, text in mapping.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(Columns, OnDataset, Written):
+    """Check a dataset and list its errors and oddities.
+
+    Every finding names file, episode, frame and column. A table shows the meaning and unit of
+    each column. Exit status: 0 no errors, 1 errors in the data, 2 no dataset.
+    """
+
+    out: Path | None = None
+    """Folder for findings.json, contract.json and metrics.json."""
+    speed_limits: dict[str, float] = field(default_factory=dict)
+    """Maximum joint speeds [rad/s], such as: joint1 2.1 joint2 2.1."""
+    strict: bool = False
+    """Count warnings as errors in the exit status."""
+    full: bool = False
+    """Print each finding on a line of its own, not one line per kind."""
+    keep_contract: bool = False
+    """Store the meaning of the columns in DATASET/meta/hrc_learn.json."""
+    camera: bool = False
+    """Also find the episodes between which the camera was moved, by the tool's marker."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repair(Columns, OnDataset):
+    """Repair a dataset into a new copy and list the changes by episode.
+
+    By default the copy is trimmed, measured angles are unwrapped and the signs of quaternions
+    are made continuous. Commands, grippers and discrete columns stay as they are. The original
+    dataset is not changed.
+
+        hrc repair broken repaired
+        hrc repair broken repaired --fps 50 --drop bad-episodes --no-videos
+    """
+
+    out: Path | None = None
+    """Folder of the new dataset, which must not exist. Default: DATASET_repaired."""
+    skip: tuple[Literal["trim", "unwrap", "signs", "late"], ...] = ()
+    """Default repairs to leave out: rest at both ends, full turns of angles, quaternion signs,
+    frames whose time stamp does not increase."""
+    drop: tuple[Literal["bad-frames", "bad-episodes", "repeats"], ...] = ()
+    """Additional repairs: frames with values that are not finite, episodes that cannot be
+    repaired, frames that repeat the one before for up to 0.1 s."""
+    fps: float | None = None
+    """Resample to this frame rate [1/s]. Default: keep the frames."""
+    videos: bool = True
+    """Keep the videos. Dropping inner frames or resampling needs --no-videos."""
+    dry_run: bool = False
+    """List the changes without writing them."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the repaired copy."""
+        return self.out or sibling(self.dataset, "repaired")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curate(OnDataset):
+    """Review the episodes of a dataset, the most doubtful first, and keep the good ones.
+
+    Opens a page in the browser with videos and curves. Decisions are stored in
+    DATASET.curation.json. The cleaned dataset goes to a new folder. In the terminal:
+
+        hrc curate pour --no-browser
+        hrc curate pour --no-browser --reject 3 7 --cut 12 30:410 --write
+    """
+
+    out: Path | None = None
+    """Folder of the cleaned dataset, which must not exist. Default: DATASET_curated."""
+    browser: bool = True
+    """Open the page in the browser."""
+    port: int | None = None
+    """Port of the page. Default: the first free one from 8080."""
+    reject: tuple[int, ...] = ()
+    """Episodes to leave out."""
+    accept: tuple[int, ...] = ()
+    """Episodes to keep as they are."""
+    cut: dict[int, str] = field(default_factory=dict)
+    """Frames to keep of an episode, such as: 12 30:410."""
+    write: bool = False
+    """Write the cleaned dataset from the stored decisions, without a page."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the cleaned dataset."""
+        return self.out or sibling(self.dataset, "curated")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import(Measured):
+    """Convert recordings kept as plain arrays (.npz, .npy, .csv) to a LeRobot dataset.
+
+    Each file is one demonstration. An array with three axes (demonstrations, frames,
+    components) holds several. Time stamps are kept in `observation.time`.
+
+        hrc import pour.npz --out pour --joints q --time t
+        hrc import shelf.npy --out shelf --columns px py pz qw qx qy qz --duration 5
+        hrc import run1.csv run2.csv --out runs --joints j1 j2 j3 j4 j5 j6 --time stamp
+    """
+
+    files: tuple[Path, ...]
+    """Recordings to import."""
+    out: Path
+    """Folder of the new dataset, which must not exist."""
+    joints: tuple[str, ...] = ()
+    """Array of joint positions, or its columns."""
+    position: tuple[str, ...] = ()
+    """Array of the end effector's position, or its columns."""
+    orientation: tuple[str, ...] = ()
+    """Array of its orientation (quaternion or rotation vector), or its columns."""
+    time: str | None = None
+    """Array or column of time stamps."""
+    columns: tuple[str, ...] = ()
+    """Column names of a .npy file or a .csv without a header: px py pz and qw qx qy qz are
+    poses, t is time, all others joints."""
+    joint_names: tuple[str, ...] = ()
+    """Joint names. Default: joint1, joint2, ..."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units by quantity, such as: joint_position deg position cm time ms."""
+    quaternion_order: Literal["wxyz", "xyzw"] = "wxyz"
+    """Order of a quaternion's components."""
+    duration: float | None = None
+    """Duration of each demonstration [s] if there are no time stamps."""
+    fps: float | None = None
+    """Frame rate [1/s] if there are no time stamps."""
+    actions: bool = True
+    """Take the joints (or else the pose) of the next frame as action, as LeRobot's policies
+    need them."""
+    robot_type: str = "unknown"
+    """Robot type stored in the dataset."""
+    task: str | None = None
+    """Task in words. Default: the file's name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Show(Measured):
+    """Open a run, a fit or the demonstrations of a dataset in Rerun.
+
+    A dataset is recorded first: paths in 3D with the arm, the joints of all demonstrations,
+    and for each one image feature, human effort, gripper and camera images.
+    """
+
+    dataset: Path
+    """Folder of a run, a fit or a dataset, or a recording (.rrd)."""
+    out: Path | None = None
+    """File for the recording (.rrd) of a dataset. It is not opened."""
+    web: bool = False
+    """Open it in the browser, as on machines without a screen. Ctrl-C ends it."""
+    episodes: tuple[int, ...] = ()
+    """Episodes to show. Default: all, or 200 of a larger dataset."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extract(OnDataset):
+    """Find a marker in a dataset's videos and store its pixels next to the dataset.
+
+    The pixels go to NAME.features, where `load_demos` finds them. An interrupted run is
+    resumed.
+
+        hrc extract grasping --marker 3 --camera front
+    """
+
+    marker: int
+    """Marker number in OpenCV's ArUco dictionary 4x4_50."""
+    camera: str | None = None
+    """Camera name. May be left out if there is only one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Push(OnDataset):
+    """Check a dataset and upload it to the Hugging Face Hub with a dataset card.
+
+    Creates the repository if needed. Log in with `hf auth login` first.
+
+        hrc push pour alice/pour --license cc-by-4.0
+        hrc push pour alice/pour --dry-run
+    """
+
+    repo: str
+    """OWNER/NAME on the Hub."""
+    private: bool = True
+    """Make a new repository private."""
+    license: str | None = None
+    """Licence identifier, such as cc-by-4.0. Without one, others may not use the data."""
+    tags: tuple[str, ...] = ()
+    """Tags in addition to LeRobot and the robot type."""
+    unsound: bool = False
+    """Upload a dataset that has errors."""
+    dry_run: bool = False
+    """Show the card and the files without uploading them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recover(Measured):
+    """Recover or remove what a killed process left unfinished in a folder and below it.
+
+    Interrupted recordings become datasets of their saved episodes. Interrupted replacements are
+    completed. Files that a running process writes are not touched.
+    """
+
+    path: Path
+    """Dataset, model or folder of results, or a folder of several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(OnDataset, Written):
+    """A command that learns a model from demonstrations."""
+
+    out: Path | None = None
+    """Folder for the model. Default: DATASET_model."""
+    episodes: tuple[int, ...] = ()
+    """Episodes to learn from. Default: all."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the model."""
+        return self.out or sibling(self.dataset, "model")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitPrimitives(Columns, Fit):
+    """Fit movement primitives of joints and end effector to a dataset.
+
+    Each demonstration is fitted, and one common model predicts new motions from start, goal and
+    duration. The folder holds the primitives, the errors, figures and a Rerun recording.
+    """
+
+    channels: tuple[Channel, ...] = ()
+    """Channels to learn. Default: joint and pose, if the dataset has them."""
+    several: Literal["best", "mean", "distribution", "contextual", "streamed"] = "best"
+    """Common model of several demonstrations: the best of mean, contextual and nearest on
+    held-out ones; their mean; their mean and all of them (for a DMPDistribution); a function of
+    the context; or one primitive fitted in a single pass over the data."""
+    context: tuple[str, ...] = ()
+    """Columns whose first row is the context. Default: start and goal."""
+    n_basis: int | None = 60
+    """Number of basis functions. None: chosen by the error on held-out samples."""
+    method: Literal["trajectory", "ridge", "lwr"] = "trajectory"
+    """Least squares on the motion, ridge regression on the forcing term, or the paper's locally
+    weighted regression."""
+    scaling: Scaling = "none"
+    """Scaling of the forcing term with start and goal."""
+    joint_names: tuple[str, ...] = ()
+    """Joints to learn, in this order. Default: all."""
+    keep_contract: bool = True
+    """Store the meaning of the columns in DATASET/meta/hrc_learn.json if it is not there."""
+    as_lerobot_policy: bool = False
+    """Write a trained LeRobot policy of type dmp instead, from observations to actions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitImageJacobian(Fit):
+    """Fit the image Jacobian of an uncalibrated camera to a dataset.
+
+    Learns the motion of the marker's image as a function of the end effector's motion, with its
+    uncertainty, and the target in the image if an object was observed. Under torchrun each
+    process reads a part of the demonstrations.
+    """
+
+    neurons: Literal["around", "grid"] = "around"
+    """Thirteen neurons around the demonstrated poses, or the paper's grid over x and y."""
+    learn: bool = True
+    """Learn neurons, noise and prior by the gradient of the evidence."""
+    config: tuple[str, ...] = ()
+    """Settings of `learning` (EvidenceConfig) and `fit` (ImageJacobianFitConfig), as NAME=VALUE
+    or TOML files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(OnDataset, Written):
+    """Evaluate a model of `hrc fit` on demonstrations that it has not seen.
+
+    Primitives predict each demonstration from start, goal and duration. Without a model,
+    primitives are fitted to four of five demonstrations first. An image Jacobian is compared
+    with the simulator's true one. Exit status 1 if a target was missed.
+    """
+
+    model: Path | None = None
+    """Folder of `hrc fit`."""
+    out: Path | None = None
+    """Folder for figures and measured values of primitives."""
+    episodes: tuple[int, ...] = ()
+    """Episodes to evaluate on. Default: those not learned from, or all."""
+    most_nrmse: float | None = None
+    """Largest median error of primitives that passes."""
+    closed_loop: bool = True
+    """Also run closed loops with an image Jacobian, which takes a minute."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Smooth(Measured):
+    """Limit velocity, acceleration and jerk of a trained LeRobot policy's actions.
+
+    Adds two steps to the processors of a checkpoint, which also blend the seams between chunks.
+    The limits are those of the demonstrators. The weights stay as they are.
+    """
+
+    checkpoint: Path | None = None
+    """Folder `pretrained_model` of the checkpoint. None: only write --limits."""
+    dataset: Path | None = None
+    """LeRobot dataset that the policy was trained on."""
+    scale: float = 1.0
+    """Allowed fraction of the demonstrators' velocity, acceleration and jerk."""
+    urdf: Path | None = None
+    """Description of the robot with position and velocity limits of its joints."""
+    calibration: Path | None = None
+    """LeRobot's calibration of the robot with the position limits of its motors."""
+    degrees: bool = False
+    """Actions are in degrees. Default: radians with --urdf, percent with --calibration."""
+    limits: Path | None = None
+    """File for the limits, for --robot.limits of a robot of type `smooth`."""
+    remove: bool = False
+    """Remove the two steps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report(Measured):
+    """Make one HTML page of the reports of several runs.
+
+    The page holds figures, measured values with their targets, configurations and commands. It
+    needs no network.
+    """
+
+    runs: tuple[Path, ...]
+    """Folders of runs, in the order of the page. Each holds a report.json."""
+    out: Path
+    """HTML file to write. Replaces an older one."""

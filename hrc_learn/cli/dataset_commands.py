@@ -1,0 +1,301 @@
+"""`hrc check`, `repair`, `recover`, `curate`, `push`: quality of a dataset, and its upload."""
+
+import json
+import sys
+import webbrowser
+from collections.abc import Mapping
+from itertools import combinations
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+
+from hrc_learn.cli._run import configuration, has_screen, one_line, write_values
+from hrc_learn.cli.arguments import Check, Curate, Push, Recover, Repair
+from hrc_learn.demos import (
+    RepairOptions,
+    check_dataset,
+    load_demos,
+    push_dataset,
+    recover_all,
+    repair_dataset,
+)
+from hrc_learn.demos.format.dataset_folder import open_folder
+from hrc_learn.demos.format.metadata import SIDECAR_PATH
+from hrc_learn.demos.issues import ValidationReport
+from hrc_learn.demos.quality.decisions import (
+    Decisions,
+    decide,
+    decisions_path,
+    keep_decisions,
+    read_decisions,
+    write_curated,
+)
+from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
+from hrc_learn.demos.read.contract import Contract, keep_contract
+from hrc_learn.jacobian import camera_placements
+from hrc_learn.learning.visual_servo_fitting import feature_trajectories
+from hrc_learn.store import new_folder, write_json, write_text
+from hrc_learn.vision.camera_model import IMAGE_SIZE
+
+_RANKED_LINES = 20
+"""Episodes of a ranking that fit on a screen."""
+
+
+def check(args: Check) -> int:
+    """Check the dataset and print the findings.
+
+    Raises:
+        FileNotFoundError: There is no dataset.
+        ValueError: Options name what does not exist, there are no columns to store a contract
+            of, or no marker to find camera motion by. The findings are written before.
+    """
+    _require_dataset(args.dataset)
+    report = check_dataset(
+        args.dataset, args.columns(), units=args.units, speed_limits=args.speed_limits
+    )
+    if report.contract is not None:
+        print(*report.contract.lines(), "", sep="\n")
+    print(*report.lines(full=args.full), sep="\n")
+    counts = {
+        "errors": len(report.errors),
+        "warnings": len(report.warnings),
+        "episodes": report.episodes,
+        "frames": report.frames,
+    }
+    moved = False
+    try:
+        if args.keep_contract:
+            _store_contract(args.dataset, report.contract)
+        if args.camera:
+            moved = _camera_moved(args)
+            counts["camera_moved"] = int(moved)
+    finally:
+        _write_findings(args, report, counts)
+    return int(bool(report.errors or (args.strict and (report.warnings or moved))))
+
+
+def _require_dataset(dataset: Path) -> None:
+    if not dataset.is_dir():
+        raise FileNotFoundError(f"there is no dataset at {dataset}")
+
+
+def _store_contract(dataset: Path, contract: Contract | None) -> None:
+    if contract is None:
+        raise ValueError(f"{dataset}: no columns could be read to store a contract of")
+    contract.selections(open_folder(dataset).features)  # refuses an unreadable contract
+    keep_contract(dataset, contract)
+    print(f"contract stored in {dataset / SIDECAR_PATH}: edit it there")
+
+
+def _write_findings(args: Check, report: ValidationReport, counts: Mapping[str, int]) -> None:
+    if args.out is not None:
+        with new_folder(args.out, configuration(args), args.overwrite) as folder:
+            findings = json.dumps(report.records(), indent=2) + "\n"
+            write_text(folder / "findings.json", findings)
+            write_json(folder / "metrics.json", counts)
+            if report.contract is not None:
+                text = json.dumps(report.contract.content(), indent=2) + "\n"
+                write_text(folder / "contract.json", text)
+    write_values(args.json, counts)
+
+
+def _camera_moved(args: Check) -> bool:
+    """True if the camera was moved between episodes; prints its places."""
+    demos = load_demos(args.dataset, mapping=args.columns(), units=args.units)
+    placements = camera_placements(list(feature_trajectories(demos)), IMAGE_SIZE)
+    if not placements:
+        print("camera: the marker is visible in fewer than two episodes, nothing to compare")
+    for number, placement in enumerate(placements):
+        episodes = ", ".join(str(demos[index].episode) for index in placement.episodes)
+        found = placement.motion if number else "camera stood still"
+        print(f"{found} in episodes {episodes}")
+    return len(placements) > 1
+
+
+def repair(args: Repair) -> None:
+    """Repair the dataset and print the changes."""
+    options = RepairOptions(
+        trim="trim" not in args.skip,
+        unwrap="unwrap" not in args.skip,
+        fix_signs="signs" not in args.skip,
+        drop_late="late" not in args.skip,
+        drop_repeats="repeats" in args.drop,
+        drop_bad_frames="bad-frames" in args.drop,
+        drop_bad_episodes="bad-episodes" in args.drop,
+        fps=args.fps,
+        videos=args.videos,
+        dry_run=args.dry_run,
+    )
+    report = repair_dataset(
+        args.dataset,
+        args.folder,
+        options,
+        mapping=args.columns(),
+        units=args.units,
+        progress=lambda episodes: track(episodes, description="Repairing"),
+    )
+    print(report)
+    counts = {
+        "episodes": len(report.changes),
+        "episodes_changed": report.changed,
+        "episodes_left_out": len(report.left_out),
+        "frames_before": report.frames_before,
+        "frames": report.frames,
+    }
+    write_values(args.json, counts)
+
+
+def recover(args: Recover) -> None:
+    """Finish or remove what a killed process left unfinished."""
+    done = recover_all(args.path)
+    if not done and not args.path.exists():
+        raise FileNotFoundError(f"there is nothing at {args.path}, finished or unfinished")
+    for mended in done:
+        print(mended)
+    if not done:
+        print(f"{args.path}: nothing to recover")
+    write_values(args.json, {"mended": len(done)})
+
+
+def curate(args: Curate) -> None:
+    """Rank the episodes and decide which of them stay, in the browser or the terminal.
+
+    Raises:
+        FileNotFoundError: There is no dataset.
+        ValueError: An episode is named twice or does not exist, or a cut leaves nothing.
+    """
+    _refuse_contradictions(args)
+    _require_dataset(args.dataset)
+    ranking = rank_episodes(
+        args.dataset,
+        progress=lambda episodes: track(episodes, description="Ranking", transient=True),
+    )
+    decisions = _typed_decisions(args, ranking)
+    if args.browser and not args.write:
+        decisions = _browser_decisions(args, ranking)
+    else:
+        print(*ranking.lines(_RANKED_LINES), sep="\n")
+    values = {
+        "episodes": len(ranking.episodes),
+        "episodes_in_doubt": sum(q.score > 0 for q in ranking.episodes),
+        "episodes_broken": sum(q.broken for q in ranking.episodes),
+        "groups": sum(number >= 0 for number in ranking.clusters),
+        "episodes_rejected": sum(d.verdict == "reject" for d in decisions.values()),
+        "episodes_cut": sum(d.verdict == "cut" for d in decisions.values()),
+    }
+    if args.write:
+        report = write_curated(
+            args.dataset,
+            args.folder,
+            decisions,
+            progress=lambda episodes: track(episodes, description="Writing", transient=True),
+        )
+        values["frames"] = report.frames
+        print(
+            f"{args.folder}: {len(report.changes)} episodes, {report.frames} of "
+            f"{report.frames_before} frames"
+        )
+    elif decisions:
+        print(
+            f"decisions stored in {decisions_path(args.dataset)}; hrc curate {args.dataset} "
+            f"--write makes the cleaned dataset"
+        )
+    write_values(args.json, values)
+
+
+def _refuse_contradictions(args: Curate) -> None:
+    options = {"accept": {*args.accept}, "cut": {*args.cut}, "reject": {*args.reject}}
+    for (one, first), (other, second) in combinations(options.items(), 2):
+        if first & second:
+            raise ValueError(
+                f"--{one} and --{other} both name episode {min(first & second)}: decide on one"
+            )
+
+
+def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:
+    """Stored decisions, updated and stored again with those of the command line."""
+    decisions = read_decisions(args.dataset)
+    lengths = {quality.episode: quality.length for quality in ranking.episodes}
+    unknown = sorted({*args.reject, *args.accept, *args.cut} - {*lengths})
+    if unknown:
+        raise ValueError(
+            f"there is no episode {unknown[0]}; the dataset has {min(lengths)} to "
+            f"{max(lengths)}"
+        )
+    for episode in args.accept:
+        decisions[episode] = decide("accept", lengths[episode])
+    for episode, text in args.cut.items():
+        try:
+            start, stop = (int(part) for part in text.split(":"))
+            decisions[episode] = decide("cut", lengths[episode], start, stop)
+        except ValueError as error:
+            raise ValueError(
+                f"--cut {episode} {text}: give the first frame to keep and the one after the "
+                f"last, such as 30:410, of {lengths[episode]} ({error})"
+            ) from error
+    for episode in args.reject:
+        decisions[episode] = decide("reject", lengths[episode])
+    if args.accept or args.cut or args.reject:
+        keep_decisions(args.dataset, decisions)
+    return decisions
+
+
+def _browser_decisions(args: Curate, ranking: Ranking) -> Decisions:
+    """Serve the page until Ctrl-C and return the decisions made there."""
+    # The page's server, which the terminal does not need.
+    from hrc_learn.teleoperation.curation_page import CurationPage
+    from hrc_learn.teleoperation.gate.address import AddressConfig
+
+    console = Console()
+    page = CurationPage(ranking, args.folder, AddressConfig(port=args.port))
+    with page:
+        console.print(f"Page at [bold]{page.url}[/] (Ctrl-C ends it)", soft_wrap=True)
+        if has_screen():
+            webbrowser.open(page.url)
+        try:
+            page.wait()
+        except KeyboardInterrupt:
+            print()
+        return dict(page.decisions)
+
+
+def push(args: Push) -> int:
+    """Check the dataset, upload it, and print its address."""
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError
+
+    try:
+        pushed = push_dataset(
+            args.dataset,
+            args.repo,
+            private=args.private,
+            license=args.license,
+            tags=args.tags,
+            unsound=args.unsound,
+            dry_run=args.dry_run,
+        )
+    except HfHubHTTPError as error:
+        status = getattr(error.response, "status_code", None)
+        login = " (`hf auth login` with a token that may write)" if status in (401, 403) else ""
+        print(f"error: refused by the Hub: {one_line(error)}{login}", file=sys.stderr)
+        return 1
+    except httpx.TransportError as error:
+        print(f"error: the Hub cannot be reached: {one_line(error)}", file=sys.stderr)
+        return 1
+    if args.dry_run:
+        print(pushed.card)
+        print(*(f"{size:12d}  {file}" for file, size in pushed.files.items()), sep="\n")
+    size = f"{len(pushed.files)} files, {pushed.bytes / 1e6:.1f} MB"
+    place = pushed.url or f"{pushed.repo}, nothing sent"
+    print(f"{size}, tag {pushed.tag}: {place}")
+    if args.license is None and "license:" not in pushed.card:
+        print("no licence: --license names the one under which others may use the data")
+    values = {
+        "files": len(pushed.files),
+        "bytes": pushed.bytes,
+        "errors": len(pushed.report.errors),
+        "warnings": len(pushed.report.warnings),
+    }
+    write_values(args.json, values)
+    return 0

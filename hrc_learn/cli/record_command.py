@@ -1,0 +1,176 @@
+"""`hrc record`: demonstrations by a scripted expert, in simulation."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from rich.progress import Progress, track
+
+from hrc_learn.cli._run import configuration, write_values
+from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli.arm_arguments import Record
+from hrc_learn.experiments.arm_access import SIMULATED
+from hrc_learn.kinematics import ArmChoice
+from hrc_learn.sim import PhysicsError, World, open_camera
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.failures import TaskFailedError
+from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.visual_skill import (
+    ANGLE_FEATURE,
+    ANGLE_FEATURE_NAMES,
+    OBJECT_FEATURE,
+    OBJECT_FEATURE_NAMES,
+)
+from hrc_learn.teleoperation.hand_guiding import Frame
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    PlacingDemonstrationConfig,
+    ServoDemonstrationConfig,
+    demonstrate_placing_without_contact,
+    demonstrate_servoing,
+    write_demonstrations,
+)
+
+_DEFAULTS = {"placing": (3, 0), "servoing": (8, 1), "expert": (10, 0)}
+"""Number of episodes and seed by scenario."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PlacingSettings:
+    demonstration: PlacingDemonstrationConfig = field(
+        default_factory=PlacingDemonstrationConfig
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ServoingSettings:
+    demonstration: ServoDemonstrationConfig = field(default_factory=ServoDemonstrationConfig)
+
+
+def record(args: Record) -> int:
+    """Record the demonstrations of a scenario; exit status 1 if the expert fails."""
+    usual_episodes, usual_seed = _DEFAULTS[args.scenario]
+    episodes = usual_episodes if args.episodes is None else args.episodes
+    seed = usual_seed if args.seed is None else args.seed
+    if episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, but is {episodes}.")
+    args = replace(args, episodes=episodes, seed=seed)
+    recorders = {
+        "placing": _record_placing,
+        "servoing": _record_servoing,
+        "expert": _record_expert,
+    }
+    try:
+        recorders[args.scenario](args, episodes, seed)
+    except (TaskFailedError, PhysicsError, RuntimeError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _record_placing(args: Record, episodes: int, seed: int) -> None:
+    """Placing on a shelf: end effector and null-space posture at once."""
+    config = with_settings(args.config, _PlacingSettings()).demonstration
+    robot = ArmChoice(args.robot, *args.links()).work_arm()
+    workplace = Workplace.of(robot)
+    goal = workplace.shelf(args.shelf).position.numpy()
+    world = World(workplace.scene)
+    rng = np.random.default_rng(seed)
+    discarded, errors = [], []
+
+    def demonstrations() -> Iterator[list[Frame]]:
+        for _ in track(range(episodes), description="Placing demonstrations"):
+            frames, contacts = demonstrate_placing_without_contact(
+                world, workplace, args.shelf, config, rng, SIMULATED.open
+            )
+            discarded.append(contacts)
+            errors.append(float(np.linalg.norm(frames[-1]["position"] - goal)))
+            yield frames
+
+    write_demonstrations(
+        args.out,
+        demonstrations(),
+        f"place the box on the {args.shelf} shelf",
+        config.fps,
+        details={
+            "shelf": args.shelf,
+            "scene": "hrc_learn workplace",
+            "recorded with": configuration(args),
+        },
+        overwrite=args.overwrite,
+        robot=robot,
+    )
+    print(f"{episodes} demonstrations in {args.out} ({sum(discarded)} discarded)")
+    values = {
+        "episodes": episodes,
+        "discarded": sum(discarded),
+        "final_error_mm_max": 1e3 * max(errors),
+    }
+    write_values(args.json, values)
+
+
+def _record_servoing(args: Record, episodes: int, seed: int) -> None:
+    """Visual servoing to an object with an uncalibrated camera."""
+    config = with_settings(args.config, _ServoingSettings()).demonstration
+    robot = ArmChoice(args.robot, *args.links()).work_arm()
+    workplace = Workplace.of(robot)
+    world = World(workplace.scene)
+    rng = np.random.default_rng(seed)
+    sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
+    visible = []
+
+    def demonstrations() -> Iterator[list[Frame]]:
+        for _ in track(range(episodes), description="Servoing demonstrations"):
+            frames = demonstrate_servoing(world, workplace, sensor, config, rng, SIMULATED.open)
+            visible.append(float(np.mean([bool(f["feature_visible"]) for f in frames])))
+            yield frames
+
+    write_demonstrations(
+        args.out,
+        demonstrations(),
+        "servo to the box",
+        config.fps,
+        features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES, ANGLE_FEATURE: ANGLE_FEATURE_NAMES},
+        details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
+        overwrite=args.overwrite,
+        robot=robot,
+    )
+    seen = 100 * min(visible)
+    print(f"{episodes} demonstrations in {args.out}, marker visible in {seen:.0f} %")
+    write_values(args.json, {"episodes": episodes, "marker_seen_min": min(visible)})
+
+
+def _record_expert(args: Record, episodes: int, seed: int) -> None:
+    """The columns of lerobot-record with mujoco_arm and arm_expert, in simulated time."""
+    from hrc_learn.lerobot.expert_recording import record_expert
+    from hrc_learn.lerobot.robots import MujocoArmRobotConfig
+
+    if args.out.exists():
+        raise FileExistsError(f"{args.out} exists: give another --out")
+    base, tip = args.links()
+
+    @dataclass(frozen=True, kw_only=True)
+    class Settings:
+        robot: MujocoArmRobotConfig
+
+    default = MujocoArmRobotConfig(
+        arm=args.robot,
+        base=base,
+        tip=tip,
+        scenario=args.task,
+        shelf=args.shelf,
+        fps=20.0,
+        pixels=args.task == "grasping",
+        seed=seed,
+    )
+    config = with_settings(args.config, Settings(robot=default)).robot
+    # The camera's motion is found from pose and marker of the tool: one needs the other.
+    config = replace(config, hand=config.hand or config.marker)
+    failed = 0
+    with Progress(transient=True) as progress:
+        task = progress.add_task(f"Demonstrations of {args.task}", total=episodes)
+        for written, succeeded in record_expert(args.out, config, episodes):
+            failed += not succeeded
+            progress.update(task, completed=written)
+    print(f"{episodes} demonstrations in {args.out} ({failed} discarded)")
+    write_values(args.json, {"episodes": episodes, "discarded": failed})
