@@ -17,7 +17,7 @@ def teach(folder: Path) -> tuple[VisualServoSkill, PlacingSkill]:
     done("record", "placing", "--out", placing, "--episodes", 1)
     done(
         *("record", "servoing", "--out", servoing, "--episodes", 4),
-        *("--demonstration.duration", 5, "--json", folder / "servoing.json"),
+        *("--config", "demonstration.duration=5", "--json", folder / "servoing.json"),
     )
     assert json.loads((folder / "servoing.json").read_text())["episodes"] == 4
     done("fit", "--dataset", placing, "--out", folder / "placing")

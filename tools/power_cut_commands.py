@@ -19,7 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
@@ -56,17 +56,18 @@ class Case:
 CASES = {
     "record placing": Case("--out out --episodes 2 --json j.json", datasets=("out",)),
     "record servoing": Case(
-        "--out out --episodes 3 --demonstration.duration 2 --json j.json", datasets=("out",)
+        "--out out --episodes 3 --config demonstration.duration=2 --json j.json",
+        datasets=("out",),
     ),
     "record expert": Case(
-        "--out out --episodes 2 --scenario grasping --json j.json", datasets=("out",)
+        "--out out --episodes 2 --task grasping --json j.json", datasets=("out",)
     ),
     "import": Case(
         "{inputs}/x.npz {inputs}/x.npz --out out --joints q --time t --json j.json",
         datasets=("out",),
     ),
     "show": Case("{inputs}/placing_demos --out demos.rrd --json j.json"),
-    "check": Case("{inputs}/placing_demos --out out --findings f.json --json j.json"),
+    "check": Case("{inputs}/placing_demos --out out --json j.json"),
     "repair": Case("{inputs}/placing_demos --out out --json j.json"),
     "recover": Case(
         ". --json j.json", copies=("set.recording", ".fit.writing"), datasets=("set",)
@@ -75,20 +76,16 @@ CASES = {
         "marked --marker 7 --json j.json", copies=("marked",), grows=("marked.features",)
     ),
     "push": Case("{inputs}/placing_demos me/set --dry-run --json j.json"),
-    "fit primitives": Case("--dataset {inputs}/placing_demos --out out --json j.json"),
+    "fit": Case("--dataset {inputs}/placing_demos --out out --json j.json"),
     "fit image-jacobian": Case("--dataset {inputs}/aiming_demos --out out --json j.json"),
-    "evaluate primitives": Case(
-        "{inputs}/placing {inputs}/placing_demos --out out --json j.json"
-    ),
-    "evaluate image-jacobian": Case("{inputs}/aiming {inputs}/aiming_demos --json j.json"),
+    "evaluate": Case("{inputs}/placing {inputs}/placing_demos --out out --json j.json"),
     "smooth": Case(
         "--checkpoint checkpoint --dataset {inputs}/placing_demos --json j.json",
         copies=("checkpoint",),
         grows=("checkpoint",),
     ),
     "run grasping": Case(
-        "--aiming {inputs}/aiming --out out --camera synthetic --variants none --trials 2 "
-        "--json j.json",
+        "--aiming {inputs}/aiming --out out --camera synthetic --trials 2 --json j.json",
         resumed=("out.*.jsonl",),
     ),
     "report": Case("{inputs}/run --out page.html --json j.json"),
@@ -157,11 +154,12 @@ class Run(NamedTuple):
 
 def watch_command(name: str, inputs: Path, folder: Path, rng: random.Random) -> Count:
     """Watch a command of `CASES`, first with nothing there, then with an older result."""
-    from hrc_learn.cli._commands import COMMANDS
+    from hrc_learn import cli
 
     count, root, case = Count(), folder / "here", CASES[name]
     words = [*name.split(), *case.words.format(inputs=inputs.resolve()).split()]
-    known = {field.name for field in fields(COMMANDS[name].arguments_type())}
+    options = cli.commands()
+    known = options.get(name) or options[name.split()[0]]
     root.mkdir(parents=True)
     for copied in case.copies:
         shutil.copytree(inputs / copied, root / copied)
@@ -434,10 +432,10 @@ def make_inputs(inputs: Path) -> None:
     hrc = [sys.executable, "-m", "hrc_learn.cli"]
     for name, words in {
         "placing_demos": "record placing --episodes 1",
-        "aiming_demos": "record servoing --episodes 4 --demonstration.duration 5",
+        "aiming_demos": "record servoing --episodes 4 --config demonstration.duration=5",
         "placing": "fit --dataset placing_demos",
         "aiming": "fit image-jacobian --dataset aiming_demos",
-        "run": "run grasping --aiming aiming --camera synthetic --variants none",
+        "run": "run grasping --aiming aiming --camera synthetic",
     }.items():
         if not (inputs / name).exists():
             subprocess.run([*hrc, *words.split(), "--out", name], cwd=inputs, check=True)

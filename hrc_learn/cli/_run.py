@@ -43,7 +43,6 @@ EXTRAS = {
     "pylibfranka": "hardware",
     "franky_sim": "hardware",
     "example_robot_data": "meshes",
-    "ray": "sweep",
     "huggingface_hub": "hub",
     "httpx": "hub",
 }

@@ -8,7 +8,7 @@ import sys
 import tomllib
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
@@ -52,7 +52,7 @@ def _parsed(text: str) -> dict[str, Any]:
         raise ValueError(f"--config {text}: not NAME=VALUE ({error})") from None
 
 
-def _unknown(place: str, name: str, known: typing.Iterable[str]) -> str:
+def _unknown(place: str, name: str, known: Iterable[str]) -> str:
     close = get_close_matches(name, known, 1)
     hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
     return f"{place}{name}: no such setting; {hint}"
@@ -84,6 +84,8 @@ def _converted(value: Any, hint: Any, place: str) -> Any:
     if isinstance(hint, typing.TypeAliasType):
         return _converted(value, hint.__value__, place)
     if origin in (types.UnionType, typing.Union):
+        if value in ("none", "None") and type(None) in parts:  # TOML has no null
+            return None
         for part in parts:
             try:
                 return _converted(value, part, place)
@@ -107,8 +109,6 @@ def _converted(value: Any, hint: Any, place: str) -> Any:
         return float(value)
     elif hint is Path and isinstance(value, str):
         return Path(value)
-    elif hint is type(None) and value in ("none", "None"):
-        return None
     elif isinstance(hint, type) and type(value) is hint:
         return value
     expected = getattr(hint, "__name__", str(hint))

@@ -93,9 +93,7 @@ def run(args: Run) -> int:
         overwrite=args.overwrite,
         json=args.json,
     )
-    return conduct(
-        settings.experiment, options, configuration=asdict(args), command=command_line()
-    )
+    return conduct(settings.experiment, options, command=command_line())
 
 
 def _folder(args: Run) -> Path:

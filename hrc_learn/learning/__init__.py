@@ -1,4 +1,4 @@
-"""From datasets to models: movement primitives, image Jacobians, metrics, tuning."""
+"""From datasets to models: movement primitives, image Jacobians, errors."""
 
 from hrc_learn.learning.channels import CHANNELS as CHANNELS
 from hrc_learn.learning.channels import Motions as Motions
@@ -12,6 +12,4 @@ from hrc_learn.learning.primitive_fitting import FittedPrimitives as FittedPrimi
 from hrc_learn.learning.primitive_fitting import fit_contextual as fit_contextual
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit_primitives
 from hrc_learn.learning.primitive_fitting import fit_streamed as fit_streamed
-from hrc_learn.learning.tuning import TuningState as TuningState
-from hrc_learn.learning.tuning import with_gains as with_gains
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo as fit_visual_servo

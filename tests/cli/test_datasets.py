@@ -11,7 +11,7 @@ from commands import hrc
 from lerobot_folders import joint_path, write_folder
 from rrd_reading import Rrd
 
-from hrc_learn.cli.commands import check, show
+from hrc_learn.cli import dashboard_commands, dataset_commands
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.demos.format.videos import decode_image
 
@@ -61,7 +61,7 @@ def test_poses_are_imported_in_centimetres(tmp_path):
     np.save(tmp_path / "poses.npy", np.stack([pose, pose + 1e-9]))
     status, *_ = hrc(
         *("import", tmp_path / "poses.npy", "--out", tmp_path / "set"),
-        *("--columns", "px,py,pz,qw,qx,qy,qz", "--position-unit", "cm", "--duration", "5"),
+        *("--columns", "px,py,pz,qw,qx,qy,qz", "--units", "position", "cm", "--duration", "5"),
     )
     assert status == 0
     demos = load_demos(tmp_path / "set")
@@ -149,8 +149,8 @@ def test_check_of_nothing(tmp_path):
 def test_findings_are_written_for_other_programs(recording, tmp_path):
     hrc("import", recording, "--out", tmp_path / "set", "--joints", "q")
     (tmp_path / "set/meta/stats.json").unlink()
-    hrc("check", tmp_path / "set", "--findings", tmp_path / "findings.json")
-    (finding,) = json.loads((tmp_path / "findings.json").read_text())
+    hrc("check", tmp_path / "set", "--out", tmp_path / "found")
+    (finding,) = json.loads((tmp_path / "found" / "findings.json").read_text())
     assert finding["level"] == "warning"
     assert "no statistics" in finding["message"]
     assert finding["file"] == "meta/stats.json"
@@ -161,11 +161,11 @@ def test_what_was_found_is_written_even_where_the_camera_cannot_be_told(tmp_path
     def refuse(demos):
         raise ValueError(f"no marker was seen in {len(demos)} episodes")
 
-    monkeypatch.setattr(check, "feature_trajectories", refuse)
+    monkeypatch.setattr(dataset_commands, "feature_trajectories", refuse)
     # Told by their size, the first is in degrees and the second in radians.
     episodes = [{"observation.state": scale * joint_path(60, 2)} for scale in (60, 1)]
     root = write_folder(tmp_path / "set", episodes, {"observation.state": ["a.pos", "b.pos"]})
-    written = {name: tmp_path / name for name in ("findings", "json", "out")}
+    written = {name: tmp_path / name for name in ("json", "out")}
     places = [word for name, path in written.items() for word in (f"--{name}", path)]
     status, _, error = hrc(
         "check", root, "--camera", "--units", "joint_position", "rad", *places
@@ -186,7 +186,7 @@ def test_a_broken_dataset_is_repaired_checked_and_read(tmp_path):
     assert (status, error.count("\n")) == (2, 1)
     assert "drop_bad_frames" in error
     status, text, _ = hrc(
-        *("repair", root, tmp_path / "new", "--drop-bad-frames", "--fps", 40),
+        *("repair", root, tmp_path / "new", "--drop", "bad-frames", "--fps", 40),
         *("--units", "joint_position", "rad", "--json", tmp_path / "values.json"),
     )
     assert status == 0
@@ -215,8 +215,8 @@ def test_markers_are_found_in_the_videos_of_a_dataset(tmp_path):
     arguments = ("extract", root, "--marker", 7, "--json", tmp_path / "values.json")
     status, text, _ = hrc(*arguments)
     assert status == 0
-    assert "front.marker_7: 1 episodes looked at" in text
-    assert json.loads((tmp_path / "values.json").read_text())["seen_share"] == 1
+    assert "front.marker_7: 1 episodes searched" in text
+    assert json.loads((tmp_path / "values.json").read_text())["seen_fraction"] == 1
     (demo,) = load_demos(root)
     # A square of pixels 50 to 109 has its middle at 79.5.
     truth = np.stack([79.5 + 4 * np.arange(10), np.full(10, 69.5)], axis=1)
@@ -283,7 +283,7 @@ def test_images_are_shown_and_a_bad_video_is_listed(tmp_path):
 
 
 def test_of_many_demonstrations_some_are_shown(tmp_path, monkeypatch):
-    monkeypatch.setattr(show, "_SHOWN", 2)
+    monkeypatch.setattr(dashboard_commands, "_SHOWN", 2)
     array = np.linspace(0, 1, 180).reshape(3, 20, 3)
     np.save(tmp_path / "three.npy", array)
     columns = ("--columns", "px,py,pz", "--duration", 2)
@@ -292,7 +292,7 @@ def test_of_many_demonstrations_some_are_shown(tmp_path, monkeypatch):
     figures = tmp_path / "figures.json"
     arguments = ("show", tmp_path / "set", "--out", tmp_path / "d.rrd", "--json", figures)
     said = hrc(*arguments)
-    assert (said.status, "of 3, spread over them" in said.output) == (0, True)
+    assert (said.status, "2 of 3 demonstrations" in said.output) == (0, True)
     assert json.loads(figures.read_text())["episodes"] == 2
     hrc(*arguments, "--episodes", 0, 1, 2)
     assert json.loads(figures.read_text())["episodes"] == 3
@@ -308,7 +308,7 @@ def viewer(monkeypatch):
         opened.append(command)
         return subprocess.CompletedProcess(command, 0)
 
-    monkeypatch.setattr(show.subprocess, "run", start)
+    monkeypatch.setattr(dashboard_commands.subprocess, "run", start)
     return opened
 
 
@@ -345,8 +345,8 @@ def test_demonstrations_are_opened_from_a_recording_that_does_not_stay(
 def test_what_cannot_be_shown_is_said(viewer, tmp_path):
     (tmp_path / "run.rrd").touch()
     refused = hrc("show", tmp_path, "--out", tmp_path / "demos.rrd")
-    assert (refused.status, "recorded already" in refused.error) == (2, True)
-    assert "is not there" in hrc("show", tmp_path / "nowhere").error
+    assert (refused.status, "holds recordings" in refused.error) == (2, True)
+    assert "there is nothing at" in hrc("show", tmp_path / "nowhere").error
     assert not viewer
 
 

@@ -63,7 +63,7 @@ def test_a_driver_of_another_arm_is_bad_input(tmp_path):
 
 @pytest.mark.parametrize(
     ("rate", "why"),
-    [("0", "duration and rate must be positive"), ("4", "rate must be at least 5")],
+    [("0", "--duration and --rate must be positive"), ("4", "--rate must be at least 5")],
 )
 def test_a_rate_too_low_is_bad_input(rate, why):
     outcome = hrc("serve", "--rate", rate)
@@ -75,13 +75,13 @@ def test_a_rate_too_low_is_bad_input(rate, why):
 def test_it_runs_a_package_and_starts_again_in_no_time(tmp_path):
     # In a process of its own: what is compiled must not be checked for shapes.
     program = [sys.executable, Path(__file__).parents[2] / "control" / "serve_controller.py"]
-    arguments = ("--packages", tmp_path, "--rate", "500", "--duration", "8", "--json")
+    arguments = ("--rate", "500", "--duration", "8", "--json")
     for attempt in ("first", "second"):
         outcome = subprocess.run(
             [*program, *arguments, tmp_path / attempt],
             capture_output=True,
             text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            env={**os.environ, "OMP_NUM_THREADS": "1", "XDG_CACHE_HOME": str(tmp_path)},
         )
         assert outcome.returncode == 0, outcome.stderr
     figures = json.loads((tmp_path / "second").read_text())

@@ -11,7 +11,7 @@ from clean_sets import CAMERA, FPS, demonstration, write_set
 from commands import done
 from lerobot_folders import write_folder
 
-from hrc_learn.cli.commands import curate
+from hrc_learn.cli import dataset_commands
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.images import load_images
 from hrc_learn.demos.quality.decisions import (
@@ -214,8 +214,8 @@ def test_what_is_typed_is_decided_before_the_page_opens(tmp_path, monkeypatch):
     root = write_set(tmp_path / "set", "v3.0")
     opened = []
     monkeypatch.setattr(CurationPage, "wait", lambda page: opened.append(dict(page.decisions)))
-    monkeypatch.setattr(curate, "_has_screen", lambda: False)
-    command = ("curate", root, "--page.port", 0)
+    monkeypatch.setattr(dataset_commands, "has_screen", lambda: False)
+    command = ("curate", root, "--port", 0)
     done(*command, "--reject", 3, "--accept", 1, "--cut", 2, "5:20")
     (decisions,) = opened
     assert {k: d.verdict for k, d in decisions.items()} == {1: "accept", 2: "cut", 3: "reject"}

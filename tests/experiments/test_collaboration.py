@@ -124,8 +124,10 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
     outcome = done(
         *("run", "collaboration", "--placing", models / "placing"),
         *("--aiming", models / "aiming", "--out", out, "--shelf", "upper"),
-        *("--camera", "synthetic", "--seed", 3, "--json", figures, "--occlusion", 0, 3),
-        *("--config.interaction", 2.5, "--latency", 0.04, "--frame-loss", 0.1),
+        *("--camera", "synthetic", "--seed", 3, "--json", figures),
+        *("--config", "experiment.config.interaction=2.5"),
+        "experiment.disturbances.occlusions=[{start=0, duration=3}]",
+        "experiment.cell.latency={delay=0.04, frame_loss=0.1}",
         *("--imperfections", 0.5, "--worker"),
     )
     ((shelves, options),) = asked
@@ -184,7 +186,7 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
     ("arguments", "reason"),
     [
         (("--shelf", "attic"), "'lower', 'middle', 'upper'"),
-        (("--shelves", "lower", "lower"), "a shelf of its own"),
+        (("--shelf", "lower", "lower"), "a shelf of its own"),
         (("--placing", "nowhere"), "nowhere"),
         (("--imperfections", -1), "--imperfections"),
     ],

@@ -1,14 +1,11 @@
 """Fits, evaluations and searches, on data small enough to know the answer."""
 
-import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from hrc_learn.controller import ControllerConfig
 from hrc_learn.demos import DatasetWriter, Demonstration, DemonstrationSet, open_demos
 from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
@@ -28,7 +25,6 @@ from hrc_learn.learning.primitive_fitting import (
     fit_primitives,
     sampled,
 )
-from hrc_learn.learning.tuning import TuningState, with_gains
 
 
 def demonstration(episode, frames=120):
@@ -148,53 +144,6 @@ def test_dimensionless_jerk_of_a_minimum_jerk_motion():
         jerk = dimensionless_jerk(duration * s, way[:, None])
         # Differences are of first order at both ends, where the jerk is largest.
         assert float(jerk) == pytest.approx(720, rel=0.01)
-
-
-def bowl(numbers):
-    """Least, 0.1, at (3, 0.5)."""
-    a, b = math.log(numbers["a"] / 3), math.log(numbers["b"] / 0.5)
-    return 0.1 + a**2 + 3 * (a + b) ** 2
-
-
-def test_a_search_finds_the_bottom_of_a_bowl():
-    search = TuningState.around({"a": 1.0, "b": 1.0}, seed=3)
-    for _ in range(40):
-        tried = search.ask(10)
-        search = search.tell(tried, [bowl(one) for one in tried])
-    best = dict(zip(search.names, search.best, strict=True))
-    assert search.best_cost == pytest.approx(0.1, abs=1e-3)
-    assert best["a"] == pytest.approx(3, rel=0.05)
-
-
-def test_an_interrupted_search_goes_on_as_if_it_had_not_been():
-    def run(search, generations):
-        for _ in range(generations):
-            tried = search.ask(6)
-            search = search.tell(tried, [bowl(one) for one in tried])
-        return search
-
-    start = TuningState.around({"a": 1.0, "b": 1.0})
-    saved = json.loads(json.dumps(run(start, 2).to_json()))
-    assert run(TuningState.from_json(saved), 3) == run(start, 5)
-
-
-def test_bad_starts_and_states_of_a_search_are_refused():
-    with pytest.raises(ValueError, match="b must be positive"):
-        TuningState.around({"a": 1.0, "b": math.inf})
-    with pytest.raises(ValueError, match="not the state of a search"):
-        TuningState.from_json({"names": []})
-
-
-def test_gains_of_a_file_take_the_place_of_defaults(tmp_path):
-    path = tmp_path / "gains.json"
-    path.write_text('{"vision_rate": 5.5}')
-    config = ControllerConfig()
-    assert with_gains(config, path) == replace(config, vision_rate=5.5)
-    assert with_gains(config, None) is config
-    for content in ('{"speed": 1}', '{"vision_rate": "fast"}', "[]", "{"):
-        path.write_text(content)
-        with pytest.raises(ValueError, match=r"gains\.json"):
-            with_gains(config, path)
 
 
 def big_set(root, monkeypatch, episodes=11):

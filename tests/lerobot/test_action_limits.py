@@ -268,8 +268,8 @@ def test_both_copies_get_on_in_one_process(tmp_path):
 
 
 def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
-    from hrc_learn.cli.arguments.learn import Smooth
-    from hrc_learn.cli.commands.smooth import smooth
+    from hrc_learn.cli.arguments import Smooth
+    from hrc_learn.cli.smooth_command import smooth
 
     dataset = write(tmp_path / "set", paths(7), panda.joint_names)
     file = tmp_path / "limits.json"
@@ -285,7 +285,7 @@ def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
     assert limits.lower == [-1.5, *[None] * 6]
     assert limits.velocity[0] == 0.25
     for arguments in ({"dataset": dataset}, {"limits": file, "remove": True}):
-        with pytest.raises(ValueError, match="--checkpoint is needed"):
+        with pytest.raises(ValueError, match="give --checkpoint"):
             smooth(Smooth(**arguments))
-    with pytest.raises(ValueError, match="--share must be positive"):
-        smooth(Smooth(dataset=dataset, limits=file, share=0.0))
+    with pytest.raises(ValueError, match="--scale must be positive"):
+        smooth(Smooth(dataset=dataset, limits=file, scale=0.0))

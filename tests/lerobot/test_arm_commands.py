@@ -69,9 +69,9 @@ def shown(recorded):
         recorded,
         program,
         *("--out", recorded / "shown"),
-        *("--scenario", "grasping"),
+        *("--task", "grasping"),
         *("--episodes", 2),
-        *("--fps", 10),
+        *("--config", "robot.fps=10"),
         *("--json", recorded / "shown.json"),
     )
     assert json.loads((recorded / "shown.json").read_text())["episodes"] == 2

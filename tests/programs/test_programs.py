@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hrc_learn.cli._commands import COMMANDS
-from hrc_learn.cli._options import docstrings
+from hrc_learn import cli
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = sorted(
@@ -58,42 +57,31 @@ def words(text: str) -> str:
 
 @pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
 def test_a_program_is_a_command(program, run_here):
-    """The same help, to its name, from a few lines."""
-    command = COMMANDS[command_of(program)]
+    """The same help, from a few lines."""
+    command = command_of(program)
+    name = command if command in cli.commands() else command.split()[0]
     status, output, error = run_here(program, "--help")
     assert (status, error) == (0, "")
-    assert output.startswith(f"usage: hrc {command_of(program)}")
+    assert output.startswith(f"usage: hrc {name}")
     summary = ast.get_docstring(ast.parse(program.read_text()))
-    about = command.arguments_type().__doc__
     assert summary is not None
-    assert about is not None
-    assert f"`hrc {command_of(program)}`" in summary
+    assert f"`hrc {command}`" in summary
     assert len(program.read_text().splitlines()) < 15
 
 
-def test_every_command_but_those_of_the_package_alone_is_a_program():
-    assert COMMANDS.keys() - {command_of(program) for program in PROGRAMS} == {
-        "demo",
-        "recover",
-    }
+def test_every_command_but_demo_and_recover_is_a_program():
+    found = {command_of(program) for program in PROGRAMS}
+    found |= {name.split()[0] for name in found}
+    assert cli.commands().keys() - found == {"demo", "recover"}
 
 
 @every_benchmark
-def test_help_explains_every_option(program, run_here):
+def test_help_explains_a_benchmark(program, run_here):
     status, output, error = run_here(program, "--help")
-    assert status == 0
-    assert error == ""
-    shown, arguments = words(output), arguments_of(program)
+    assert (status, error) == (0, "")
     summary = ast.get_docstring(ast.parse(program.read_text()))
     assert summary is not None
-    assert words(summary.splitlines()[0]) in shown
-    texts = docstrings(arguments)
-    unexplained = [
-        field.name
-        for field in dataclasses.fields(arguments)
-        if not (text := texts.get(field.name)) or words(text) not in shown
-    ]
-    assert not unexplained
+    assert words(summary.splitlines()[0]) in words(output)
 
 
 @every_benchmark

@@ -230,11 +230,9 @@ def test_the_program_grasps_and_compares(skill, tmp_path):
     # This skill knows nothing of directions: objects lie as they were demonstrated.
     command += [
         "--ideal",
-        "--camera-roll",
-        "100",
-        "--variants",
-        "learned",
-        "fixed",
+        "--config",
+        "experiment.scene.camera_roll=1.745",
+        'experiment.variants=["learned", "fixed"]',
         "--trials",
         "1",
     ]

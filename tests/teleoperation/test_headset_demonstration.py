@@ -132,13 +132,13 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
     # Nobody has placed the arm: it stands ahead of who enters, and faces them.
     room = lambda points: placed(points, -np.pi / 2, (0.0, 0.72, -1.1))  # noqa: E731
     demos, log = tmp_path / "demos", tmp_path / "log"
-    options = ("--out", demos, "--page.timeout", "12", "--page.silence", "12")
+    options = ("--out", demos, "--config", "page.timeout=12", "page.silence=12")
     with (
         log.open("w") as output,
         chromium(tmp_path / "headset", (320, 200), ("--disable-blink-features=WebXR",)) as tab,
     ):
         served = subprocess.Popen(
-            [sys.executable, "control/serve_page.py", *map(str, options), "--page.no-meshes"],
+            [sys.executable, "control/serve_page.py", *map(str, options), "page.meshes=false"],
             cwd=ROOT,
             env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
             stdout=output,
@@ -184,7 +184,7 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
     program("datasets/check_dataset.py", demos)
     program("training/fit_dmp.py", "--dataset", demos, "--out", tmp_path / "model")
     outcome = tmp_path / "measured"
-    run = ("--placing", tmp_path / "model", "--out", tmp_path / "run", "--no-pictures")
+    run = ("--placing", tmp_path / "model", "--out", tmp_path / "run", "--no-film")
     run += ("--trials", PLACINGS)
     program("control/run_placing.py", *run, "--json", outcome, status=(0, 1))
     measured = json.loads(outcome.read_text("utf-8"))

@@ -73,7 +73,7 @@ def show(tab) -> None:
 def test_ones_own_demonstration_is_recorded_learned_and_run(tmp_path):
     demos, model, log = tmp_path / "demos", tmp_path / "model", tmp_path / "log"
     with log.open("w") as output, chromium(tmp_path / "chromium", (900, 600)) as tab:
-        options = ["--page.timeout", "12", "--page.forces.speed", "0.1"]
+        options = ["--config", "page.timeout=12", "page.forces.speed=0.1"]
         options += ["--out", str(demos), "--json", str(tmp_path / "figures")]
         program = subprocess.Popen(
             [sys.executable, "control/serve_page.py", *options],
@@ -112,7 +112,7 @@ def test_ones_own_demonstration_is_recorded_learned_and_run(tmp_path):
     assert np.sqrt(np.square(error).mean()) < 0.02
     assert np.abs(error[-1]).max() < 0.01
     # Nobody shaped the body, so that other shelves may be missed.
-    options = ("--out", tmp_path / "run", "--no-pictures", "--json", tmp_path / "measured")
+    options = ("--out", tmp_path / "run", "--no-film", "--json", tmp_path / "measured")
     run("control/run_placing.py", "--placing", model, *options, status=(0, 1))
     measured = json.loads((tmp_path / "measured").read_text())
     assert measured["joint_space_middle_shelf_placed"] == 1

@@ -63,7 +63,7 @@ def hearing_interrupts():
 def test_what_is_recorded_survives_the_end_of_the_program(tmp_path, ended_by):
     demos, log = tmp_path / "demos", tmp_path / "log"
     command = [sys.executable, "-m", "hrc_learn.cli", "page", "--out", str(demos)]
-    command += ["--page.silence", "5", "--page.timeout", "5"]
+    command += ["--config", "page.silence=5", "page.timeout=5"]
     draft = tmp_path / "demos.recording" / "episode_000000.parquet"
     with log.open("w") as output:
         program = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)

@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import done
 
-from hrc_learn.cli.arguments.run import RunCollaboration
 from hrc_learn.experiments.collaboration.experiment import CollaborationExperiment
 from hrc_learn.experiments.collaboration.trial import simulate_collaboration
 from hrc_learn.kinematics import panda
@@ -40,7 +38,6 @@ def test_every_part_has_the_same_default():
     assert default_of(force_to_nullspace_input, "mapping") == DEFAULT_MAPPING
     assert default_of(simulate_collaboration, "mapping") == DEFAULT_MAPPING
     assert field_default(CollaborationExperiment, "mapping") == DEFAULT_MAPPING
-    assert field_default(RunCollaboration, "mapping") == DEFAULT_MAPPING
     for forces in (InteractionForceConfig(), PageConfig().forces, GamepadConfig().forces):
         assert forces.mapping == DEFAULT_MAPPING
 
@@ -56,20 +53,6 @@ def test_the_docs_tell_that_default():
     assert {row[1], DEFAULT_MAPPING} == {"transpose", "pinv"}
     page = (DOCS / "teleoperation.md").read_text(encoding="utf-8")
     assert f'`mapping="{DEFAULT_MAPPING}"` by default' in page
-
-
-@pytest.mark.parametrize(
-    ("command", "option"),
-    [
-        (("run", "collaboration"), "--mapping"),
-        (("page",), "--page.forces.mapping"),
-    ],
-)
-def test_the_help_tells_that_default(command, option):
-    text = " ".join(done(*command, "--help-all").output.replace("│", " ").split())
-    assert re.search(rf"{re.escape(option)} {{[a-z,]+}}.*?\(default: (\w+)\)", text)[1] == (
-        DEFAULT_MAPPING
-    )
 
 
 @pytest.mark.parametrize("mapping", ["transpose", "pinv"])

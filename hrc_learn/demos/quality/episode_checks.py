@@ -53,7 +53,7 @@ def finite_values(
             name = features[key].component(component)
             yield Issue(
                 message=f"{name} is {values[frame, component]} ({len(bad)} values are not "
-                f"finite); hrc repair --drop-bad-frames (or --drop-bad-episodes) makes a copy "
+                f"finite); hrc repair --drop bad-frames (or bad-episodes) makes a copy "
                 f"without",
                 **entry.location,
                 frame=frame,

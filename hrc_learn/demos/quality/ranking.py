@@ -124,7 +124,7 @@ class Ranking:
             cells = (f"{cell:>{w}}" for cell, w in zip(row, widths, strict=False))
             yield f"{'  '.join(cells)}  {row[-1]}".rstrip()
         if len(rows) > len(shown) - 1:
-            yield f"and {len(rows) - len(shown) + 1} less doubtful episodes (--full)"
+            yield f"and {len(rows) - len(shown) + 1} less doubtful episodes"
         groups = {k: v for k, v in self.clusters.items() if k >= 0}
         alone = len(self.clusters.get(-1, ()))
         sizes = ", ".join(str(len(v)) for v in groups.values())

@@ -94,7 +94,7 @@ class PlacingExperiment:
     def __post_init__(self) -> None:
         if self.speed <= 0 or self.noise < 0:
             raise ValueError(
-                "--speed must be positive and --noise not negative, but they are "
+                "speed must be positive and noise not negative, but they are "
                 f"{self.speed:g} and {self.noise:g}."
             )
 

@@ -148,7 +148,7 @@ def _own_certificate(name: str) -> tuple[Path, Path]:
     if openssl is None:
         raise ValueError(
             "a page on the network needs TLS: install openssl, which makes a certificate, or "
-            "give --page.certificate and --page.key."
+            "give page.certificate and page.key."
         )
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     try:
