@@ -78,7 +78,7 @@ def serve(args: Serve) -> None:
     else:
         runner = open_step(controller, observation)
     opened = time.perf_counter() - began
-    with access.open() as arm:
+    with access.connect() as arm:
         steps = round(args.duration * args.rate)
         latencies, error = _run_loop(runner, arm, robot.chain, camera, dt, steps)
     figures = {"open_s": opened} | _figures(latencies) | {"pixel_error": error}
@@ -147,7 +147,7 @@ def _controller(
 class _Access:
     """Access to the arm of the loop."""
 
-    open: Callable[[], AbstractContextManager[OpenedArm]]
+    connect: Callable[[], AbstractContextManager[OpenedArm]]
     """Connects to the arm."""
     safety: SafetyConfig
     """Configuration of the safety filter for this arm."""
@@ -171,13 +171,13 @@ def _access(args: Serve, dt: float, robot: ArmModel) -> _Access:
             with opened_arm(site) as arm:
                 yield OpenedArm(arm=arm, gripper=arm, advance=lambda _time: None)
 
-        return _Access(open=open_arm, safety=site.cell_config().safety)
+        return _Access(connect=open_arm, safety=site.cell_config().safety)
     scene = SceneConfig(timestep=dt)
     world = World(replace(scene, arm=replace(scene.arm, robot=robot)))
     world.reset(robot.chain.ready.numpy())
     access = access_by(args.arm, robot)
     safety = SafetyConfig(delay=access.delay, braking=access.dynamics)
-    return _Access(open=partial(access.open, world), safety=safety)
+    return _Access(connect=partial(access.open, world), safety=safety)
 
 
 def _run_loop(

@@ -144,7 +144,7 @@ class ValidationReport:
         self.attempt(collect)
 
     def lines(self, full: bool = False) -> Iterator[str]:
-        """The report as text; issues of one kind are grouped in a line that names the worst place.
+        """Lines of the report; issues of one kind share a line that names the worst place.
 
         Args:
             full: Give every issue a line of its own.
