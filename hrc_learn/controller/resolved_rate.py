@@ -91,8 +91,17 @@ def resolved_rate(
     Returns:
         Joint velocity of the task, and that of the null space [rad/s].
     """
-    task = matmul(J.mT, solve_positive(_damped_gram(J), twist.unsqueeze(-1))).squeeze(-1)
-    return task, null_projection(J, null_velocity)
+    return task_rate(J, twist), null_projection(J, null_velocity)
+
+
+def task_rate(
+    J: Float[Tensor, "*batch rows n"], twist: Float[Tensor, "*batch rows"]
+) -> Float[Tensor, "*batch n"]:
+    """J^+ twist, the smallest joint velocity for a twist, damped near singularities [rad/s].
+
+    Arguments are those of `resolved_rate`.
+    """
+    return matmul(J.mT, solve_positive(_damped_gram(J), twist.unsqueeze(-1))).squeeze(-1)
 
 
 def _damped_gram(J: Float[Tensor, "*batch rows n"]) -> Float[Tensor, "*batch rows rows"]:

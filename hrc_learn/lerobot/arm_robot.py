@@ -415,8 +415,8 @@ class ArmRobot(Device, Robot):
 
     def _invite(self, config: PersonConfig) -> None:
         """Let a person lead the body."""
+        from hrc_learn.controller.null_space_motion import YieldingConfig
         from hrc_learn.skills.complementary_motion import ComplementaryMotion
-        from hrc_learn.skills.null_space_yielding import YieldingConfig
 
         self._person = Person(config, self.work_arm)
         self.complement = ComplementaryMotion(

@@ -5,7 +5,6 @@ from hrc_learn.skills.arm_motion import PositionServoConfig as PositionServoConf
 from hrc_learn.skills.arm_motion import StraightLine as StraightLine
 from hrc_learn.skills.arm_motion import joint_line as joint_line
 from hrc_learn.skills.arm_motion import nearest_configuration as nearest_configuration
-from hrc_learn.skills.arm_motion import resolved_rate as resolved_rate
 from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
 from hrc_learn.skills.failures import BlockedPathError as BlockedPathError
 from hrc_learn.skills.failures import MissedGraspError as MissedGraspError
@@ -18,7 +17,6 @@ from hrc_learn.skills.marker_sensor import DelayedChannel as DelayedChannel
 from hrc_learn.skills.marker_sensor import LatencyConfig as LatencyConfig
 from hrc_learn.skills.marker_sensor import MarkerObservation as MarkerObservation
 from hrc_learn.skills.marker_sensor import MarkerSensor as MarkerSensor
-from hrc_learn.skills.null_space_yielding import YieldingConfig as YieldingConfig
 from hrc_learn.skills.path_following import follow_path as follow_path
 from hrc_learn.skills.pick_and_place import Phase as Phase
 from hrc_learn.skills.pick_and_place import PickAndPlace as PickAndPlace

@@ -1,4 +1,4 @@
-"""How far every part of an arm is from the people beside it, as far as a tracker tells."""
+"""Distances of every part of an arm from the people near it, as seen by a tracker."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
 
 _NAN = math.nan
-# In which an arm comes to rest [s]: a joint of a Panda from 0.8 rad/s with 0.7 of its
-# acceleration, as drivers plan. Without this rule up to 7 of 60 jobs beside a worker came too
-# near.
+# Time in which an arm comes to rest [s]: a joint of a Panda from 0.8 rad/s with 0.7 of its
+# acceleration, as drivers plan. Without this rule up to 7 of 60 jobs near a worker came too
+# close.
 _COMING_TO_REST = 0.15
 
-BESIDE_PEOPLE = ConstraintConfig(early_exit=True, distance_weight=0.1)
-"""Of the constraint layer of an arm that watches people. Before them an arm may always rest, so
-it never has to leave its path: that comes before the distance, and the arm brakes on it within
-the reaction time that the protective distance allows for. Off it, an elbow that a person had to
-stop for took the end effector along by 6 mm, on it by 0.5 mm. Steps run one by one."""
+NEAR_PEOPLE = ConstraintConfig(early_exit=True, distance_weight=0.1)
+"""Constraint layer of an arm near people. An arm may always come to rest before them, so it
+need not leave its path: the path comes before the distance, and the arm brakes on it within the
+reaction time that the protective distance allows for. The end effector then leaves its path by
+0.5 mm, and by 6 mm if the distance comes first. The solver may stop early, as steps are not
+compiled."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PersonWatchConfig:
-    """What is assumed of people between two observations, and how much is told of them."""
+    """Assumptions about people between two observations."""
 
     acceleration: float = 5.0
-    """At which a person may get faster than they were seen to be [m/s^2]. People begin a step
-    with 1 to 2 m/s^2, but a hand that sets off at what lies beside the arm does so with up to
-    9 m/s^2: taken for 3 m/s^2, 3 of 1000 jobs beside such hands came too near."""
+    """Highest acceleration of a person between two observations [m/s^2]. People begin a step
+    with 1 to 2 m/s^2; a hand that reaches for an object near the arm accelerates with up to
+    9 m/s^2. With 3 m/s^2, 3 of 1000 jobs near such hands came too close."""
     pairs: int = 8
-    """Of parts of the arm and of a person, the most urgent ones, that are kept apart: others
-    are told of once they are among them."""
-
+    """Number of pairs of a part of the arm and a part of a person that are kept apart: the most
+    urgent ones."""
     contact: float = 0.03
-    """Distance seen below which people may touch the arm [m], three deviations of a tracker's
-    noise: it stops, as which way leads away from them is not known."""
+    """Observed distance below which a person may touch the arm [m], three standard deviations
+    of a tracker's noise. The arm stops, as the direction away from the person is not known."""
 
     def __post_init__(self) -> None:
         if self.acceleration < 0:
@@ -51,22 +51,22 @@ class PersonWatchConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class WatchedPeople:
-    """Where people may be by now, seen from the arm."""
+    """People near the arm, as far as they may have moved since they were observed."""
 
     distances: Distances
-    """Of the most urgent pairs, smaller than seen by as much as people may have come nearer
-    since. NaN, for which the arm brakes, as long as nothing is known, and where people may
-    touch it."""
+    """Distances of the most urgent pairs, reduced by the distance that people may have moved
+    since the observation. NaN, for which the arm brakes, while there is no observation and
+    where people may touch the arm."""
     nearest: float = _NAN
-    """Smallest distance when they were seen, from the arm as it is now [m]."""
+    """Smallest distance between people as observed and the arm as it is now [m]."""
     age: float = _NAN
-    """Of the observation [s]."""
-    share: float = 1.0
-    """Of its speed that is left to the arm, whichever way it moves: see `share_of_speed`."""
+    """Age of the observation [s]."""
+    speed_scale: float = 1.0
+    """Speed scale of the arm in every direction, 0 to 1: see `person_speed_scale`."""
 
 
 class PersonWatch:
-    """Turns what a tracker sees into distances that a safety filter keeps."""
+    """Distances that a safety filter keeps, from the observations of a tracker."""
 
     def __init__(
         self,
@@ -75,13 +75,13 @@ class PersonWatch:
         separation: SeparationConfig | None = None,
         config: PersonWatchConfig | None = None,
     ):
-        """Begin to watch.
+        """Begin without an observation.
 
         Args:
-            tracker: Sees the people.
+            tracker: Tracker of the people.
             arm: Capsules of arm and tool.
-            separation: Of the protective distance: by it pairs are the more or less urgent.
-            config: What is assumed of people.
+            separation: Protective distance, by which the urgency of pairs is judged.
+            config: Assumptions about people.
         """
         self._tracker, self._arm = tracker, arm
         self._separation = separation or SeparationConfig()
@@ -90,12 +90,12 @@ class PersonWatch:
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
     ) -> WatchedPeople:
-        """Where they may be now.
+        """People near the arm now.
 
         Args:
-            time: Now [s].
-            joints: Joint positions now [rad].
-            load: What the arm holds; None: nothing.
+            time: Reading of the clock [s].
+            joints: Joint positions [rad].
+            load: Object in the gripper; None: none.
         """
         seen, number = self._tracker.read(), self._config.pairs
         if seen is None:
@@ -112,12 +112,12 @@ class PersonWatch:
             torch.from_numpy(x).to(joints) for x in (seen.ends, seen.radius, seen.velocity)
         )
         found, age = separation(self._arm, joints, ends, radius, load), time - seen.time
-        what_is_seen = found, velocity, joints.new_tensor(age), self._separation, self._config
+        observed = found, velocity, joints.new_tensor(age), self._separation, self._config
         return WatchedPeople(
-            distances=urgent_distances(*what_is_seen),
+            distances=urgent_distances(*observed),
             nearest=float(found.distance.min()),
             age=age,
-            share=float(share_of_speed(*what_is_seen)),
+            speed_scale=float(person_speed_scale(*observed)),
         )
 
 
@@ -128,25 +128,25 @@ def urgent_distances(
     separation: SeparationConfig,
     config: PersonWatchConfig,
 ) -> Distances:
-    """The most urgent distances from people who were seen some time ago.
+    """Distances of the most urgent pairs, for people observed some time ago.
 
     Args:
-        found: Distances of the arm as it is now from people as they were seen.
-        velocity: Of the ends of their capsules, as seen [m/s].
-        age: Of the observation [s].
-        separation: Of the protective distance: by it pairs are the more or less urgent.
-        config: What is assumed of people.
+        found: Distances of the arm as it is now from people as they were observed.
+        velocity: Velocities of the ends of their capsules [m/s].
+        age: Age of the observation [s].
+        separation: Protective distance, by which the urgency of pairs is judged.
+        config: Assumptions about people.
 
     Returns:
-        The distances, smaller than seen by as much as people may have come nearer since. NaN
-        where they may touch the arm.
+        The distances, reduced by the distance that people may have moved since. NaN where they
+        may touch the arm.
     """
-    # What they may have gained since, and gain until the arm reacts.
+    # Speed that people may have gained since, and gain until the arm reacts.
     gain = (config.acceleration * (age + separation.reaction_time))[..., None, None]
     towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten(-2)
     distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
     allowed = separation.highest_speed(distance, towards)
-    # Of pairs that allow nothing the nearest ones: they may open again.
+    # Among pairs that allow no approach the nearest are the most urgent.
     number = min(config.pairs, distance.shape[-1])
     _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
     touching = found.distance.flatten(-2).amin(-1, keepdim=True) < config.contact
@@ -158,26 +158,27 @@ def urgent_distances(
     )
 
 
-def share_of_speed(
+def person_speed_scale(
     found: Separation,
     velocity: Float[Tensor, "*batch H 2 3"],
     age: Float[Tensor, "*batch"],
     separation: SeparationConfig,
     config: PersonWatchConfig,
 ) -> Float[Tensor, "*batch"]:
-    """Share of its speed that people who come towards an arm leave it, 0 to 1.
+    """Speed scale imposed on the arm by approaching people, 0 to 1.
 
-    Distances limit how fast the arm comes nearer. One that moves past people, or makes way,
-    closes in on them as soon as they are beside it; so it rests by the time that they may touch
-    any part of it, getting faster all the while. Who goes away counts as at rest: a hand turns
-    round faster than a tracker, which averages over some images, tells.
+    The protective distance limits the speed towards people only. An arm that moves past them,
+    or makes way, approaches them as soon as they have come near; so it comes to rest by the
+    time at which they may touch any part of it, if they accelerate all the while. People who
+    recede count as at rest: a hand turns round faster than a tracker, which averages over some
+    images, can show.
 
     Args:
-        found: Distances of the arm as it is now from people as they were seen.
-        velocity: Of the ends of their capsules, as seen [m/s].
-        age: Of the observation [s].
-        separation: Of the protective distance, for the time until the arm reacts.
-        config: What is assumed of people.
+        found: Distances of the arm as it is now from people as they were observed.
+        velocity: Velocities of the ends of their capsules [m/s].
+        age: Age of the observation [s].
+        separation: Protective distance, for the reaction time of the arm.
+        config: Assumptions about people.
     """
     coming = (-found.person_rate(velocity)).clamp(min=0)
     # The root t of  coming t + a t^2/2 = distance.

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.dmp import JointDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
@@ -32,7 +33,7 @@ from hrc_learn.kinematics import (
     task_rank,
 )
 from hrc_learn.regions import JointRegion
-from hrc_learn.skills.arm_motion import joint_line, resolved_rate
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.workplace import CollisionChecker, Workplace
 
@@ -227,7 +228,8 @@ def follow_pose(
         if task != "pose":
             basis = task_basis(J, pose.orientation, task, rank)
             J, desired = basis @ J, basis @ desired
-        q = q + dt * resolved_rate(J, desired, null_velocity)
+        task_velocity, null = resolved_rate(J, desired, null_velocity)
+        q = q + dt * (task_velocity + null)
         path.append(q)
     return torch.stack(path)
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Observation
+from hrc_learn.controller.joint_path import changed_rate
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import Measurement
 from hrc_learn.regions import OrientationRegion
@@ -21,7 +22,6 @@ from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsConfig
 from hrc_learn.skills.failures import MissedGraspError
 from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
 from hrc_learn.skills.marker_sensor import HeldMarker
-from hrc_learn.skills.null_space_yielding import changed_rate
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
@@ -406,7 +406,7 @@ class VisualServo:
         if new and self._held is None:
             self._find_turn(target)
         self._turn_on(target, feature.numpy())
-        asked, clock = self._cell.human_input, self._cell.pace.time
+        asked, clock = self._cell.human_input, self._cell.task_time
         self._drawn.turn_on(asked.turn, self._config.turn_rate * self._cell.config.dt)
         self._above = target.above.orientation
         target = self._turned_by_person(target, self._turning)
@@ -450,7 +450,7 @@ class VisualServo:
             turn=quaternion.log(self._drawn.turn).numpy(),
         )
         if self._drawn.away:
-            self._led += self._cell.pace.time - clock
+            self._led += self._cell.task_time - clock
             if self._held is not None:  # the marker goes with an end effector that is led
                 self._held = HeldMarker(self._config.half_hidden)
 
@@ -527,7 +527,7 @@ class VisualServo:
     @property
     def _clock(self) -> float:
         """Time of the task without that in which a person led the end effector away [s]."""
-        return self._cell.pace.time - self._led
+        return self._cell.task_time - self._led
 
     def _image_jacobian(self) -> Float[np.ndarray, "2 6"]:
         """Estimate at the pose of the newest image [px/m, px/rad], computed once an image."""

@@ -1,69 +1,45 @@
-"""A work cell: the place skills work in; arm, gripper, camera and person under one clock."""
+"""A work cell: arm, gripper, camera and person, driven by one control loop."""
 
 import math
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hrc_learn.controller import (
-    INTERVENTIONS,
-    Command,
-    Distances,
-    SafetyConfig,
-    SafetyFilter,
-    SafetyReport,
-    WayMakingConfig,
-    scale_null_space,
-    way_making_velocity,
+from hrc_learn.controller import INTERVENTIONS, Command, Distances, SafetyConfig
+from hrc_learn.controller.arm_loop import (
+    ArmLoop,
+    ArmLoopConfig,
+    ArmLoopState,
+    ArmReading,
+    ArmReport,
+    ArmRequest,
+    FollowPath,
+    MoveJoints,
+    SendCommand,
+    TrackPose,
 )
+from hrc_learn.controller.joint_path import JointPaths, changed_rate, deviation_ratio
+from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import GraspedBox, SerialChain
-from hrc_learn.log import Event, StepLog
-from hrc_learn.protocols import (
-    HINDRANCES,
-    Arm,
-    ArmState,
-    Feedback,
-    Gripper,
-    Human,
-    HumanInput,
-)
+from hrc_learn.protocols import HINDRANCES, Arm, ArmState, Feedback, Gripper, Human, HumanInput
 from hrc_learn.regions import PositionRegion
-from hrc_learn.skills.arm_motion import (
-    StraightLine,
-    kept_clear,
-    null_space_giving_way,
-    null_space_slowdown,
-    task_rate,
-)
-from hrc_learn.skills.failures import StoppedByPersonError, TaskFailedError
+from hrc_learn.skills.arm_motion import StraightLine
+from hrc_learn.skills.failures import BlockedPathError, StoppedByPersonError, TaskFailedError
 from hrc_learn.skills.marker_sensor import (
     DelayedDetection,
     LatencyConfig,
     MarkerObservation,
     MarkerSensor,
 )
-from hrc_learn.skills.null_space_yielding import (
-    NullSpaceYielding,
-    YieldingConfig,
-    share_of_motion,
-)
-from hrc_learn.skills.pace import TaskPace, at_people, people_bind
-from hrc_learn.skills.person_feedback import (
-    Hindrances,
-    PersonFeedback,
-    contact_force,
-    filter_hindrance,
-    share_kept,
-)
-from hrc_learn.skills.person_watch import BESIDE_PEOPLE, PersonWatch
+from hrc_learn.skills.person_feedback import PersonFeedback, contact_force
+from hrc_learn.skills.person_watch import NEAR_PEOPLE, PersonWatch, WatchedPeople
+from hrc_learn.log import Event, StepLog
 
 HINDRANCE_COLUMNS = HINDRANCES
 """Names of the components of the log's column "hindered"."""
@@ -71,20 +47,23 @@ HINDRANCE_COLUMNS = HINDRANCES
 SAFETY_COLUMNS = INTERVENTIONS
 """Names of the components of the log's column "safety"."""
 
-# At the end of a straight line, for the pose error to decay by pose_gain [s].
+# Time for joints to return at the end of a path [s].
+_LONGEST_RETURN = 5.0
+# Time at the end of a straight line for the pose error to decay by pose_gain [s].
 _SETTLING_TIME = 0.4
-# Readings of the torque that are averaged, and steps in which an arm gets under way: friction
-# keeps it back at first.
-_FELT, _GETTING_UNDER_WAY = 5, 25
-# For which what was felt may still be met: the fingers open, the hand leaves it. And in which
-# an arm that is stopped comes to rest [s].
-_LEAVING, _COMES_TO_REST = 1.0, 1.0
+# Time for which a straight line waits for an end effector that lags behind [s]. A goal out of
+# reach must not be waited for without end.
+_LONGEST_LAG = 5.0
+# Torque readings that are averaged, and steps in which an arm gets under way against friction.
+_AVERAGED, _GETTING_UNDER_WAY = 5, 25
+# Time after feeling for a contact in which one is still expected: the fingers open and the
+# gripper leaves. Time in which an arm that is stopped comes to rest [s].
+_LEAVING, _COMING_TO_REST = 1.0, 1.0
 _NAN = float("nan")
-# Logged as the goal of steps without a path.
-_NOWHERE = np.full(3, _NAN)
-# Logged while the arm follows whoever leads it, or nobody does.
+_NO_POSITION = np.full(3, _NAN)
 _UNHINDERED = np.zeros(len(HINDRANCE_COLUMNS), dtype=bool)
-# Logged by steps in which no camera is in the loop.
+_STILL = torch.zeros(6, dtype=torch.float64)
+# Columns of steps without a camera in the loop.
 _NO_VISION = {
     "feature": np.full(2, _NAN),
     "target": np.full(2, _NAN),
@@ -101,39 +80,15 @@ _NO_VISION = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkCellConfig(YieldingConfig):
-    """How the loop runs."""
+class WorkCellConfig(ArmLoopConfig):
+    """Settings of the control loop, and of the camera in it."""
 
-    dt: float = 0.01
-    """Control step [s]."""
     detect_every: int = 4
-    """Control steps from one detection to the next, while markers are tracked."""
+    """Control steps between two detections while markers are tracked."""
     keep_image_every: int = 40
-    """Control steps from one image kept for the recording to the next; 0: none is kept."""
+    """Control steps between two images kept for the recording; 0: none is kept."""
     latency: LatencyConfig = field(default_factory=LatencyConfig)
     """Delay and loss of the camera's images."""
-    command_delay: float = 0.01
-    """From a command until the arm follows it, its servos' lag included [s]: velocities along a
-    path are those of then. By default that of the simulated servos; real arms are later, by a
-    network and a kernel's scheduler."""
-    limit_room: float = 0.1
-    """Distance from the margin of the joints' limits beyond which nobody can push the arm
-    [rad]: of some centimetres of the end effector, which the task may need."""
-    speed: float = 1.0
-    """Share of its speed that the task is done with, as for a first run on a real arm, above 0
-    to 1. Beside paths the null space is as fast as ever."""
-    longest_wait: float = 300.0
-    """For which the arm stands still before somebody until the task is given up [s]; of people
-    who share a table, who go away some time."""
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-    """Of the safety filter, which is told what the arm's driver can do."""
-    way_making: WayMakingConfig | None = None
-    """Whether the null space makes way by itself for people who are watched for, follows the
-    person who pushes it, or both; None: it follows the person."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.speed <= 1:
-            raise ValueError(f"speed must be in (0, 1], but is {self.speed}.")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,63 +96,45 @@ class KeptImage:
     """An image kept for the recording."""
 
     time: float
-    """[s]"""
+    """Time at which it was taken [s]."""
     image: UInt8[np.ndarray, "height width 3"]
 
 
-class _Reading:
-    """Kinematics of one reading of the arm, computed when they are first asked for."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Sensed:
+    """All that was read at the beginning of a control step."""
 
-    def __init__(self, chain: SerialChain, limits: SafetyFilter, state: ArmState):
-        self._chain, self._limits, self.state = chain, limits, state
-        self.joints = torch.from_numpy(state.joint_position)
-
-    @cached_property
-    def _transform_and_jacobian(self) -> tuple[Tensor, Tensor]:
-        return self._chain.transform_and_jacobian(self.joints)
-
-    @cached_property
-    def pose(self) -> Pose:
-        """Of the end effector."""
-        return Pose.from_matrix(self._transform_and_jacobian[0])
-
-    @property
-    def jacobian(self) -> Float[Tensor, "6 joints"]:
-        """Of the end effector."""
-        return self._transform_and_jacobian[1]
-
-    @cached_property
-    def room(self) -> tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]]:
-        """Lowest and highest velocities that leave the task its room [rad/s]."""
-        return self._limits.velocity_bounds(self.joints)
+    arm: ArmState
+    reading: ArmReading
+    watched: WatchedPeople | None
+    pushing: bool
+    """True while a person asks for a motion of the null space."""
 
 
 class WorkCell:
-    """Runs the control loop: read the human input, command, let time pass, detect, log.
+    """Control loop of a work cell: read, command, let time pass, detect, log.
 
-    Skills act through this class and know protocols only. Time passes by a callable that is
-    passed in: a simulator's physics, or a clock that waits for real hardware.
+    The law is `ArmLoop`; this class connects it to drivers, a clock, a camera, a person and a
+    log. Skills act through it and know protocols only. Time passes by a callable: a simulator's
+    physics, or a clock that waits for real hardware.
 
     Attributes:
         chain: Kinematics of the arm.
-        gripper: Its gripper's driver.
-        human: The person beside the arm; may be another from the next step on.
+        config: Settings of the loop.
+        gripper: Driver of the gripper.
+        human: Person near the arm; may be replaced between two steps.
+        human_input: Newest input of that person, its null-space part smoothed.
         observation: Newest detection of markers that has arrived.
-        watched: Where people beside the arm may be; None: nobody watches for them.
-        load: What the arm holds, which people must not be hit with either.
-        pace: How fast people let the task go on.
-        yielding: How the null space yields to the person, and goes back.
-        clearance: Distance of an arm at given joint positions from itself and from what stands
-            around [m]; None: people can push it anywhere within its limits.
-        human_input: What the person asks for now.
-        tracked_markers: Markers detected every `detect_every` steps; empty: no image is taken.
+        load: Object in the gripper, which must keep its distance from people as well.
+        tracked_markers: Markers detected every `detect_every` steps; empty: none.
+        region: Position region of the last controller command; None: there was none.
+        plan: Joint path being followed [rad]; None: none.
         log: Columns of every step so far, and the phases of the task.
-        remarks: What was said to the person beside the arm, and when [s].
-        region: To which the last command of a controller led the end effector; None: the last
-            command was of no controller.
-        plan: Path that the joints follow [rad]; None: they follow none.
+        remarks: Messages to the person, with their times [s].
         images: Images kept for the recording.
     """
+
+    load: GraspedBox | None
 
     def __init__(
         self,
@@ -219,101 +156,102 @@ class WorkCell:
 
         Args:
             chain: Kinematics of the arm.
-            arm: Its driver.
-            gripper: Its gripper's driver.
-            sensor: The fixed camera with its marker detector; None where a task needs none.
-            human: The person beside the arm.
+            arm: Driver of the arm.
+            gripper: Driver of its gripper.
+            sensor: Fixed camera with its marker detector; None where a task needs none.
+            human: Person near the arm.
             advance: Lets a given time pass [s].
-            config: How the loop runs.
+            config: Settings of the loop.
             on_phase: Called with the name of each phase of the task and its start time [s].
-            rng: Decides which images are lost.
-            clearance: Distance of an arm at given joint positions from itself and from what
-                stands around [m]; None: people can push it anywhere within its limits.
-            watch: For people, before whom the arm slows down, waits, and goes on where it
-                was; None: nobody does.
+            rng: Source of lost images.
+            clearance: Distance of the arm at given joint positions from itself and its
+                surroundings [m]; None: a push can move it anywhere within its limits.
+            watch: Tracks people, before whom the arm slows down, waits, and goes on where it
+                was; None: people are not tracked.
         """
         self.config = config or WorkCellConfig()
-        self.chain = chain
-        self.gripper = gripper
-        self.tracked_markers: Collection[int] = ()
-        self.log = StepLog()
-        # Logged as the joints of the path by steps without one.
-        self._no_path = np.full(len(chain.joint_names), _NAN)
-        self.images: list[KeptImage] = []
-        self.remarks: list[Event] = []
-        self.region: PositionRegion | None = None
-        self.plan: Float[np.ndarray, "steps joints"] | None = None
-        self._arm = arm
-        self.human = human
-        self._advance, self._on_phase = advance, on_phase
-        self.clearance = clearance
-        safety = self.config.safety
+        self.chain, self.gripper, self.human = chain, gripper, human
+        self._arm, self._advance, self._on_phase = arm, advance, on_phase
         self._watch, self.load = watch, None
-        self._safety = SafetyFilter(chain.limits, self.watchful(safety))
-        self._room = SafetyFilter(
-            chain.limits, replace(safety, margin=safety.margin + self.config.limit_room)
-        )
-        self._ticks = 0
-        self._reading = _Reading(chain, self._room, arm.read())
-        self._feedback, self._pushing = PersonFeedback(chain), False
-        self.yielding = NullSpaceYielding(
-            chain, self.config.dt, self.config, self._feedback.hindrances
-        )
-        asked = human.read(self.state)
-        self.human_input = replace(asked, nullspace_input=self.yielding.nullspace_input)
-        self.observation = MarkerObservation()
+        loop_config = replace(self.config, safety=self.watchful(self.config.safety))
+        self._loop = ArmLoop(chain, loop_config, clearance)
+        self._feedback = PersonFeedback(chain)
         self._markers = DelayedDetection(
             sensor, self.config.latency, self.config.dt, rng or np.random.default_rng(0)
         )
-        self._guard = self._safety.initial_state(self.joints)
-        self.pace = TaskPace(
-            time=self.time,
-            dt=self.config.dt,
-            speed=self.config.speed,
-            longest_wait=self.config.longest_wait,
-        )
-        # Whether a person has stopped the task, and the arm is coming to rest.
+        self.observation = MarkerObservation()
+        self.tracked_markers: Collection[int] = ()
+        self.region: PositionRegion | None = None
+        self.plan: Float[np.ndarray, "steps joints"] | None = None
+        self.log = StepLog()
+        self.images: list[KeptImage] = []
+        self.remarks: list[Event] = []
         self._stopping = False
-        # Until when something may be met that the task has felt for [s].
+        # Time until which the task may meet something that it has felt for [s].
         self._contact_expected = -math.inf
-        self._look()
+        state = arm.read()
+        asked = human.read(state)
+        self._no_joints = np.full(len(chain.joint_names), _NAN)
+        self.human_input = replace(asked, nullspace_input=np.zeros(len(chain.joint_names)))
+        self._sensed = self._sense(state, self.human_input)
+        self._state = self._loop.initial_state(self.joints, state.time)
 
-    load: GraspedBox | None
-
-    @property
-    def joints(self) -> Float[Tensor, " joints"]:
-        """Measured joint positions [rad]."""
-        return self._reading.joints
-
-    @property
-    def pose(self) -> Pose:
-        """Pose of the end effector, from the measured joints."""
-        return self._reading.pose
-
-    @property
-    def jacobian(self) -> Float[Tensor, "6 joints"]:
-        """Geometric Jacobian of the end effector, at the measured joints."""
-        return self._reading.jacobian
+    # Readings.
 
     @property
     def state(self) -> ArmState:
         """Newest reading of the arm."""
-        return self._reading.state
-
-    @property
-    def hindrances(self) -> Hindrances:
-        """What keeps the arm from following the person in this step."""
-        return self._feedback.hindrances
-
-    @property
-    def commanded_velocity(self) -> Float[Tensor, " joints"]:
-        """Of the last step [rad/s]."""
-        return self._guard.velocity
+        return self._sensed.arm
 
     @property
     def time(self) -> float:
         """Clock of the arm [s]."""
         return self.state.time
+
+    @property
+    def joints(self) -> Float[Tensor, " joints"]:
+        """Measured joint positions [rad]."""
+        return self._sensed.reading.joint_position
+
+    @property
+    def pose(self) -> Pose:
+        """Pose of the end effector, from the measured joints."""
+        return self._sensed.reading.pose
+
+    @property
+    def jacobian(self) -> Float[Tensor, "6 joints"]:
+        """Geometric Jacobian of the end effector, at the measured joints."""
+        return self._sensed.reading.jacobian
+
+    @property
+    def distances(self) -> Distances | None:
+        """Distances from people, for a safety filter to keep; None: people are not tracked."""
+        return self._sensed.reading.distances
+
+    @property
+    def loop_state(self) -> ArmLoopState:
+        """State of the control loop: safety filter, pace of the task, null space, path."""
+        return self._state
+
+    @property
+    def pace(self) -> TaskPace:
+        """Speed of the task, as people near the arm and pauses allow."""
+        return self._state.pace
+
+    @property
+    def task_time(self) -> float:
+        """Clock without the time lost to people near the arm and to pauses [s]."""
+        return float(self.pace.time)
+
+    def watchful(self, safety: SafetyConfig) -> SafetyConfig:
+        """Settings of a safety filter that keeps its distance from the people tracked here."""
+        if self._watch is None:
+            return safety
+        constraints = safety.constraints or NEAR_PEOPLE
+        separation = self.config.safety.separation
+        return replace(safety, constraints=constraints, separation=separation)
+
+    # Messages and images.
 
     def begin_phase(self, phase: str) -> None:
         """Begin another phase of the task: an event of the log."""
@@ -321,16 +259,16 @@ class WorkCell:
         self._on_phase(phase, self.time)
 
     def tell(self, words: str) -> None:
-        """Say something to the person beside the arm."""
+        """Show a message to the person near the arm."""
         self.remarks.append(Event(self.time, words))
 
     def detect(self, ids: Collection[int] | None = None) -> None:
         """Take an image and detect markers in it, all by default; it may be late, or lost."""
         self._markers.detect(self.time, self.joints, ids)
-        self._receive()
+        self.observation = self._markers.newest(self.time) or self.observation
 
     def wait_for_detection(self) -> MarkerObservation:
-        """Hold still until an image taken from now on has arrived; what was detected in it."""
+        """Hold still until an image taken from now on has arrived, and return its markers."""
         now = self.time
         self.detect()
         while self.observation.time < now:
@@ -338,39 +276,11 @@ class WorkCell:
             self.detect()
         return self.observation
 
-    def step(
-        self,
-        joint_velocity: Float[Tensor, " joints"],
-        goal: Pose | None = None,
-        *,
-        path_joints: Float[Tensor, " joints"] | None = None,
-    ) -> None:
-        """Send a command through the safety filter, and let one step pass.
+    # Motions.
 
-        Args:
-            joint_velocity: The command [rad/s].
-            goal: Where the end effector should be now, for the log.
-            path_joints: Where the joints should be on a path of theirs [rad], for the log.
-        """
-        safe, self._guard, report = self._safety.step(
-            self._guard,
-            self.joints,
-            self._share * joint_velocity,
-            self.config.dt,
-            jacobian=self.jacobian,
-            distances=self.distances,
-        )
-        self._keep_pace(self.jacobian @ joint_velocity, safe, report)
-        self._note_filter(joint_velocity, safe, report)
-        position = _NOWHERE if goal is None else goal.position.numpy()
-        self.region = None
-        self._send(
-            safe,
-            safety=report.flags.numpy(),
-            goal_position=position,
-            path_joints=self._no_path if path_joints is None else path_joints.numpy(),
-            **_NO_VISION,
-        )
+    def step(self, joint_velocity: Float[Tensor, " joints"]) -> None:
+        """Send a joint velocity [rad/s] through the safety filter, and let one step pass."""
+        self._act(MoveJoints(joint_velocity=joint_velocity))
 
     def execute(
         self,
@@ -383,290 +293,301 @@ class WorkCell:
         drawn: bool = False,
         turn: Float[np.ndarray, "3"] | None = None,
     ) -> None:
-        """Execute one command of the adaptive controller, which has its own safety filter.
+        """Send a command of the adaptive controller, which has its own safety filter.
 
         Args:
-            command: Of the controller.
-            target: Where the feature should be [px].
-            feature: Where it is; NaN if it is not detected [px].
+            command: Command of the controller.
+            target: Pixel that the feature should have [px].
+            feature: Pixel that it has; NaN if it is not detected [px].
             approach: Fraction of a joint-space approach in the command, 0 to 1.
-            region: Of the end effector's position.
-            drawn: Whether a person has drawn that region, or a target in it.
-            turn: What a person has added to the planned orientation, as a rotation vector
-                [rad]; None: nothing.
+            region: Region of the end effector's position.
+            drawn: True if a person has drawn that region, or a target in it.
+            turn: Rotation that a person has added to the planned orientation, as a rotation
+                vector [rad]; None: none.
         """
-        velocity = self.pace.led * command.joint_velocity
-        self._guard = self._safety.initial_state(self.joints, velocity)
-        self.region = region
-        self._keep_pace(command.twist, command.joint_velocity, command.safety)
-        self._note_controller(command, approach)
-        self._send(
-            velocity,
-            safety=command.safety.flags.numpy(),
-            feature=feature,
-            target=target,
-            image_jacobian=command.image_jacobian.numpy(),
-            weight_norm=float(command.weight_norm),
-            potential=float(command.potential),
-            potential_rate=float(command.potential_rate),
-            vision_activation=float(command.vision_level),
-            approach=approach,
-            goal_position=_NOWHERE,
-            path_joints=self._no_path,
-            region=torch.cat([region.centre, region.half_size]).numpy(),
-            drawn=drawn,
-            turn=np.zeros(3) if turn is None else turn,
+        self._act(
+            SendCommand(command),
+            explained=approach == 0,
+            region=region,
+            columns={
+                "feature": feature,
+                "target": target,
+                "image_jacobian": command.image_jacobian.numpy(),
+                "weight_norm": float(command.weight_norm),
+                "potential": float(command.potential),
+                "potential_rate": float(command.potential_rate),
+                "vision_activation": float(command.vision_level),
+                "approach": approach,
+                "region": torch.cat([region.centre, region.half_size]).numpy(),
+                "drawn": drawn,
+                "turn": np.zeros(3) if turn is None else turn,
+            },
         )
 
-    def track_pose(
-        self,
-        goal: Pose,
-        twist: Float[Tensor, "6"],
-        drift: Float[Tensor, " joints"] | None = None,
-        *,
-        push_share: float = 1.0,
-        path_joints: Float[Tensor, " joints"] | None = None,
-    ) -> bool:
+    def track_pose(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
         """One step of tracking a moving pose; the null space yields to the person.
 
         Args:
-            goal: Where the end effector should be.
-            twist: Its velocity (linear [m/s], angular [rad/s]).
-            drift: Joint velocity whose null-space part is wanted besides [rad/s].
-            push_share: What is left of the person's own, 0 to 1.
-            path_joints: Where the joints should be on a path of theirs [rad], for the log.
-
-        Returns:
-            Whether the arm, pushed aside, would meet something if the pose went on.
+            goal: Pose that the end effector should have.
+            twist: Velocity of that pose (linear [m/s], angular [rad/s]).
         """
-        joints = self.joints
-        # Where the arm will be when it follows: the null space is that of then.
-        J = self.chain.jacobian(joints + self.config.command_delay * self._guard.velocity)
-        correction = self.config.pose_gain * self.pose.twist_to(goal)
-        null_velocity = push_share * self.yielding.null_velocity
-        if drift is not None:
-            null_velocity = null_velocity + drift
-        task = task_rate(J, twist + correction)
-        null = null_projection(J, null_velocity)
-        if drift is not None:
-            # A person may push the way that the path leads: both together bend the null space.
-            slowdown = null_space_slowdown(self.chain, joints, null)
-            self.hindrances.note("speed", float(slowdown))
-            null = null * slowdown
-        waits = False
-        if self.clearance is not None and bool(null.any()):
-            clear = kept_clear(joints, task, null, self.clearance, self.config.clearance)
-            distance, kept = 100 * float(clear.distance), share_kept(null, clear.null)
-            self.hindrances.note("obstacle", kept, distance=distance)
-            null, waits = clear.null, bool(clear.waits)
-        null = self._within_limits(J, task, null)
-        self.step(task + null, goal, path_joints=path_joints)
-        return waits
-
-    def _within_limits(
-        self,
-        J: Float[Tensor, "6 joints"],
-        task: Float[Tensor, " joints"],
-        null: Float[Tensor, " joints"],
-    ) -> Float[Tensor, " joints"]:
-        """The null-space velocity with which the task has room before the joints' limits."""
-        gives_way = null_space_giving_way(J, task, null, *self._reading.room)
-        if not torch.equal(gives_way, null):
-            gives_way = gives_way * null_space_slowdown(self.chain, self.joints, gives_way)
-        kept = gives_way
-        if bool(gives_way.any()):
-            bounds = self._safety.velocity_bounds(self.joints)
-            kept = scale_null_space(task, gives_way, *bounds)
-        if self._pushing:
-            room = self._reading.room
-            self.hindrances.note_limits(null, kept, task + null, room)
-        return kept
+        self._act(TrackPose(pose=goal, twist=twist))
 
     def hold_pose(self, duration: float) -> None:
-        """Keep the end effector where it is for a while [s], yielding to the person."""
+        """Keep the end effector where it is for a while [s]; the null space yields."""
         self._settle(self.pose, duration)
 
     def move_straight(self, goal: Pose, speed: float = 0.15) -> None:
         """Move the end effector to a pose on a straight line, and let it settle.
 
+        The line slows down where the end effector falls behind, as at a joint limit to which
+        the arm was pushed, for 5 s at most.
+
         Args:
-            goal: Where to.
+            goal: Pose at the end.
             speed: Mean speed [m/s].
         """
-        line, begun = StraightLine(self.pose, goal, speed), self.pace.time
-        while (passed := self.pace.time - begun) < line.duration:
-            self._track_line(line, passed)
+        line, passed, lag, rate = StraightLine(self.pose, goal, speed), 0.0, 0.0, 1.0
+        while passed < line.duration:
+            before = self.task_time
+            pose, twist = self._track_line(line, passed, rate)
+            behind = float(deviation_ratio(self.pose.twist_to(pose), twist))
+            wanted = 2.0 - behind if lag < _LONGEST_LAG else 1.0
+            passed += rate * (self.task_time - before)
+            lag += (1.0 - rate) * self.config.dt
+            rate = float(changed_rate(rate, wanted, self.config.dt))
         self._settle(goal, _SETTLING_TIME)
-
-    def _track_line(self, line: StraightLine, passed: float) -> None:
-        """One step along a line of which so much time has passed [s]."""
-        now = min(passed + self.config.dt, line.duration)
-        pose, _ = line.at(now)
-        _, twist = line.at(min(now + self.config.command_delay, line.duration))
-        self.track_pose(pose, self.pace.led * twist)
 
     def move_until_contact(
         self, goal: Pose, speed: float = 0.02, force: float = 12.0
     ) -> Pose | None:
-        """Move on a straight line, and stop where something is met; where that was.
+        """Move on a straight line until the end effector meets something.
 
-        It waits while a person pushes the null space: friction turns with the joints, and that
-        feels like a contact.
+        The motion waits while a person pushes the null space: friction turns with the joints,
+        and that feels like a contact.
 
         Args:
-            goal: Where to, if nothing is met.
-            speed: Mean speed [m/s]: what is met gives way by as much as it takes to stop.
-            force: Of the contact against the motion [N]. Friction and an unknown load are felt
-                too, so what counts is the change since the motion began.
+            goal: Pose at the end, if nothing is met.
+            speed: Mean speed [m/s]: an object gives way by as much as the stop takes.
+            force: Contact force against the motion [N]. Friction and an unknown load are
+                measured too, so the change since the start of the motion counts.
 
         Returns:
-            Pose of the end effector when it met something; None if it met nothing, also for an
-            arm that does not tell external torques.
+            Pose of the end effector at the contact; None without one, and for an arm without
+            an estimate of external torques.
 
         Raises:
-            TaskFailedError: Somebody has pushed the null space for too long (`longest_wait`).
+            TaskFailedError: The null space was pushed for longer than `longest_wait`.
         """
         along = goal.position - self.pose.position
         along = (along / along.norm().clamp(min=1e-9)).numpy()
-        felt: deque[float] = deque(maxlen=_FELT)
-        before: deque[Pose] = deque(maxlen=_FELT)
-        still = torch.zeros(6, dtype=torch.float64)
+        felt: deque[float] = deque(maxlen=_AVERAGED)
+        before: deque[Pose] = deque(maxlen=_AVERAGED)
         free, moving, waited = None, 0, 0.0
-        line, begun = StraightLine(self.pose, goal, speed), self.pace.time
-        while (passed := self.pace.time - begun) < line.duration:
+        line, begun = StraightLine(self.pose, goal, speed), self.task_time
+        while (passed := self.task_time - begun) < line.duration:
             self._contact_expected = self.time + _LEAVING
-            if self.yielding.pushed:
-                self.hindrances.mention("task_waits")
-                self.track_pose(line.at(passed)[0], still)
-                begun, moving = self.pace.time - passed, 0
+            if self._state.pushed:
+                self._feedback.hindrances.mention("task_waits")
+                self.track_pose(line.at(passed)[0], _STILL)
+                begun, moving = self.task_time - passed, 0
                 waited += self.config.dt
                 if waited > self.config.longest_wait:
                     raise TaskFailedError(
-                        f"the null space was pushed for {waited:.0f} s while the hand felt for "
-                        "a contact: let it go, or let the arm wait longer (longest_wait)."
+                        f"the null space was pushed for {waited:.0f} s while the gripper felt "
+                        "for a contact: let it go, or raise longest_wait."
                     )
                 continue
             self._track_line(line, passed)
             felt.append(-float(self._contact_force() @ along))
             before.append(self.pose)
-            # An arm that waits for somebody gets under way anew.
-            moving = moving + 1 if self.pace.undisturbed else 0
-            if moving <= _FELT + _GETTING_UNDER_WAY:
+            # An arm that waits for people gets under way again.
+            moving = moving + 1 if self.pace.at_full_speed else 0
+            if moving <= _AVERAGED + _GETTING_UNDER_WAY:
                 free = None
                 continue
-            # Friction turns with the motion: what is felt under way is the reference.
+            # Friction turns with the motion: the force while under way is the reference.
             now = float(np.mean(felt))
             free = now if free is None else free
             if now - free > force:
-                # As long as it took to be sure, the arm has gone on and pushed.
-                self.hold_pose(_FELT * self.config.dt)
+                # The arm has gone on and pushed for as long as the average takes.
+                self.hold_pose(_AVERAGED * self.config.dt)
                 return before[0]
         return None
 
+    def follow(self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool]) -> int:
+        """Follow a joint path; see `follow_path`."""
+        paths = JointPaths.of(self.chain, [path], self.config.dt)
+        request = FollowPath(paths=paths, path=torch.tensor(0))
+        self._state = self._loop.begin_path(self._state, self.joints, request)
+        while not self._state.path.finished:
+            if until():
+                return int(self._state.path.progress)
+            self._act(request)
+        if self.config.after_push == "return":
+            deadline = self.time + _LONGEST_RETURN
+            while self._state.aside and not self._state.pushed and self.time < deadline:
+                self._act(request)
+        return len(path)
+
+    def _track_line(
+        self, line: StraightLine, passed: float, rate: float = 1.0
+    ) -> tuple[Pose, Float[Tensor, "6"]]:
+        """One step along a line of which so much time has passed [s]; its pose and twist."""
+        now = min(passed + self.config.dt, line.duration)
+        pose, _ = line.at(now)
+        _, twist = line.at(min(now + self.config.command_delay, line.duration))
+        twist = rate * self.pace.speed_override * twist
+        self.track_pose(pose, twist)
+        return pose, twist
+
+    def _settle(self, goal: Pose, duration: float) -> None:
+        for _ in range(round(duration / self.config.dt)):
+            self.track_pose(goal, _STILL)
+
     def _contact_force(self) -> Float[np.ndarray, "3"]:
-        """Estimate of the force on the end effector [N]; zero if the arm tells none."""
+        """Estimate of the force on the end effector [N]; zero if the arm has none."""
         force = contact_force(self.jacobian, self.state)
         return np.zeros(3) if force is None else force
 
-    def _settle(self, goal: Pose, duration: float) -> None:
-        still = torch.zeros(6, dtype=torch.float64)
-        for _ in range(round(duration / self.config.dt)):
-            self.track_pose(goal, still)
+    # One step.
 
-    def watchful(self, safety: SafetyConfig) -> SafetyConfig:
-        """Settings of a safety filter that keeps its distance from the people watched for."""
-        if self._watch is None:
-            return safety
-        constraints = safety.constraints or BESIDE_PEOPLE
-        separation = self.config.safety.separation
-        return replace(safety, constraints=constraints, separation=separation)
-
-    @property
-    def distances(self) -> Distances | None:
-        """From people, for a safety filter to keep; None: nobody watches for them."""
-        return None if self.watched is None else self.watched.distances
-
-    @property
-    def _share(self) -> float:
-        """Of its speed that people who come towards the arm leave it."""
-        return 1.0 if self.watched is None else self.watched.share
-
-    def _look(self) -> None:
-        """Where people may be now."""
-        if self._watch is None:
-            self.watched = None
-        else:
-            self.watched = self._watch.look(self.time, self.joints, self.load)
-
-    def _keep_pace(
+    def _act(
         self,
-        asked: Float[Tensor, "6"],
-        sent: Float[Tensor, " joints"],
-        report: SafetyReport,
+        request: ArmRequest,
+        *,
+        explained: bool = True,
+        region: PositionRegion | None = None,
+        columns: dict[str, object] = _NO_VISION,
     ) -> None:
-        """Note how much of its twist people beside the arm left the task.
+        """Send what the loop makes of a request, let one step pass, and read again.
 
-        Raises:
-            TaskFailedError: Somebody has been in the way for too long.
+        Args:
+            request: Motion to make.
+            explained: Tell the person what the safety filter takes from a push.
+            region: Region of the controller's command.
+            columns: For the log.
         """
-        distances, kept, pace = self.distances, report.constraints, 1.0
-        if self._share < 1 or (
-            distances is not None
-            and kept is not None
-            and bool(people_bind(distances, sent, kept, self._safety.config))
-        ):
-            pace = float(share_of_motion(asked, self.jacobian @ sent))
-        self.pace.beside(pace)
+        reading = self._sensed.reading
+        velocity, self._state, report = self._loop.act(self._state, reading, request)
+        self._give_up_if_blocked()
+        self.region = region
+        self._feedback.note(report, filtered=explained)
+        told = self._told()
+        self._log(velocity, report, told, columns)
+        self._arm.command(velocity.numpy())
+        self.human.tell(told)
+        self._advance(self.config.dt)
+        self._read()
 
-    def _at_people(self, sent: Float[Tensor, " joints"]) -> bool:
-        """Whether a velocity takes the arm towards people as fast as it may [rad/s]."""
-        config, distances = self._safety.config, self.distances
-        if distances is None or config.constraints is None:
-            return False
-        return bool(at_people(distances, sent, config))
-
-    def _note_filter(
-        self,
-        wanted: Float[Tensor, " joints"],
-        sent: Float[Tensor, " joints"],
-        report: SafetyReport,
-    ) -> None:
-        """Note what the safety filter takes from the null-space part of a velocity [rad/s]."""
-        if not self._pushing:
+    def _read(self) -> None:
+        """Read arm, people and person, take images, and obey a stop."""
+        state = self._arm.read()
+        self._markers.remember(state.time, state.joint_position)
+        asked = self.human.read(state)
+        self._sensed = self._sense(state, asked)
+        before = self.pace.speed_override
+        self._state, limitations = self._loop.observe(self._state, self._sensed.reading)
+        self._feedback.note_limitations(limitations)
+        smooth = self.config.damping * self._state.null_velocity
+        self.human_input = replace(asked, nullspace_input=smooth.numpy())
+        self.observation = self._markers.newest(self.time) or self.observation
+        self._take_images()
+        if self._stopping:
             return
-        slowed = self._share < 1 or self._at_people(sent)
-        cause = "person" if slowed else filter_hindrance(report)
-        if cause is not None:
-            J = self.jacobian
-            kept = share_kept(null_projection(J, wanted), null_projection(J, sent))
-            self.hindrances.note(cause, kept)
+        if asked.stop:
+            self._come_to_rest()
+            raise StoppedByPersonError(f"stopped: {asked.stop}")
+        self._tell_of_pause(asked.pause, before)
+        if float(self._state.path.held) > self.config.longest_wait:
+            raise TaskFailedError(
+                f"the arm was held aside for {float(self._state.path.held):.0f} s while its "
+                "path waited: let it go, or raise longest_wait."
+            )
 
-    def _note_controller(self, command: Command, approach: float) -> None:
-        """Note what the adaptive controller takes from a push, beside its own gradient."""
-        if not self._pushing:
-            return
-        wanted = self.yielding.null_velocity - command.xi_q / self.config.damping
-        wanted = null_projection(self.jacobian, wanted)
-        bounds = self._safety.velocity_bounds(self.joints)
-        self.hindrances.note_limits(wanted, command.null_velocity, wanted, bounds)
-        # A joint-space approach moves the null space as well, by an unknown part of it.
-        if approach == 0:
-            self._note_filter(command.null_velocity, command.joint_velocity, command.safety)
+    def _sense(self, state: ArmState, asked: HumanInput) -> _Sensed:
+        """Kinematics of a reading, and the people near the arm."""
+        joints = torch.from_numpy(state.joint_position)
+        watched = None
+        if self._watch is not None:
+            watched = self._watch.look(state.time, joints, self.load)
+        push, way = asked.nullspace_input, self.config.way_making
+        pushing = bool(push.any()) and (way is None or way.expert)
+        pose, jacobian = self.chain.forward_and_jacobian(joints)
+        scale = None if watched is None else joints.new_tensor(watched.speed_scale)
+        reading = ArmReading(
+            joint_position=joints,
+            pose=pose,
+            jacobian=jacobian,
+            nullspace_input=torch.from_numpy(push),
+            pause=torch.tensor(asked.pause),
+            distances=None if watched is None else watched.distances,
+            person_speed_scale=scale,
+            explain=pushing,
+        )
+        return _Sensed(arm=state, reading=reading, watched=watched, pushing=pushing)
+
+    def _take_images(self) -> None:
+        """Detect markers and keep images in the steps meant for it."""
+        step = len(self.log)
+        if self.tracked_markers and step % self.config.detect_every == 0:
+            self.detect(self.tracked_markers)
+        every = self.config.keep_image_every
+        if every and step % every == 0 and (image := self._markers.image()) is not None:
+            self.images.append(KeptImage(time=self.time, image=image))
+
+    def _give_up_if_blocked(self) -> None:
+        """Raise where people block the arm for too long, or obstacles its way back."""
+        blocked_for = float(self.pace.blocked_for)
+        if blocked_for > self.config.longest_wait:
+            raise TaskFailedError(
+                f"a person has been in the way of the arm for {blocked_for:.0f} s: clear its "
+                "path, or raise longest_wait."
+            )
+        if self._state.path.direct_return.blocked:
+            raise BlockedPathError(
+                "path: the arm was pushed aside and finds no way back that is clear of its "
+                "surroundings."
+            )
+
+    def _come_to_rest(self) -> None:
+        """Brake until the arm is at rest, whatever the person asks for meanwhile."""
+        self._stopping, deadline = True, self.time + _COMING_TO_REST
+        self.step(torch.zeros_like(self.joints))
+        while self._state.safety.velocity.any() and self.time < deadline:
+            self.step(torch.zeros_like(self.joints))
+        self._stopping = False
+
+    def _tell_of_pause(self, pause: bool, before: Tensor) -> None:
+        """Tell the person that the task waits or goes on."""
+        full, now = self.config.speed, self.pace.speed_override
+        if pause and before == full:
+            self.tell("The task waits.")
+        if now == full and before < full:
+            self.tell("The task goes on.")
 
     def _told(self) -> Feedback:
-        """What the person is told of this step."""
+        """Feedback to the person in this step."""
+        watched = self._sensed.watched
         return self._feedback.told(
             self.state,
             self.jacobian,
-            pushed=self._pushing,
-            person_distance=None if self.watched is None else self.watched.nearest,
-            pace=self.pace.share,
+            pushed=self._sensed.pushing,
+            person_distance=None if watched is None else watched.nearest,
+            pace=float(self.pace.scale),
             load=self.load,
             contact_expected=self.time < self._contact_expected,
         )
 
-    def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
-        told = self._told()
+    def _log(
+        self,
+        velocity: Float[Tensor, " joints"],
+        report: ArmReport,
+        told: Feedback,
+        columns: dict[str, object],
+    ) -> None:
+        """Append a row to the log."""
+        goal, joints = report.goal, report.path_joints
         self.log.append(
             time=self.time,
             joint_position=self.state.joint_position,
@@ -676,82 +597,34 @@ class WorkCell:
             gripper=self.state.gripper_width,
             followed=told.followed if told.pushed else _NAN,
             hindered=_hindered(told),
-            **self._watched_columns(velocity),
+            safety=report.safety.flags.numpy(),
+            goal_position=_NO_POSITION if goal is None else goal.position.numpy(),
+            path_joints=self._no_joints if joints is None else joints.numpy(),
+            **self._separation_columns(velocity),
             **columns,
         )
-        self._arm.command(velocity.numpy())
-        self.human.tell(told)
-        self._advance(self.config.dt)
-        self._ticks += 1
-        self._markers.remember(self.time, self.state.joint_position)
-        self._reading = _Reading(self.chain, self._room, self._arm.read())
-        self._look()
-        asked = self.human.read(self.state)
-        way = self.config.way_making
-        self._pushing = bool(asked.nullspace_input.any()) and (way is None or way.expert)
-        push = smooth = self._nullspace_input(asked)
-        if push.any() or self.yielding.pushed:
-            smooth = self.yielding.feel(push, self.joints, self._reading.room, self.jacobian)
-        self.human_input = replace(asked, nullspace_input=smooth)
-        self._receive()
-        if self.tracked_markers and self._ticks % self.config.detect_every == 0:
-            self.detect(self.tracked_markers)
-        every = self.config.keep_image_every
-        if every and self._ticks % every == 0 and (image := self._markers.image()) is not None:
-            self.images.append(KeptImage(time=self.time, image=image))
-        self._wait_or_stop(asked)
 
-    def _wait_or_stop(self, asked: HumanInput) -> None:
-        """Do what a person asks of the task as a whole.
-
-        Raises:
-            StoppedByPersonError: They stop it; the arm is at rest by then.
-        """
-        if self._stopping:
-            return
-        if asked.stop:
-            self._stopping, still = True, torch.zeros_like(self.joints)
-            deadline = self.time + _COMES_TO_REST
-            self.step(still)
-            while self._guard.velocity.any() and self.time < deadline:
-                self.step(still)
-            self._stopping = False
-            raise StoppedByPersonError(f"stopped: {asked.stop}")
-        self.pace.lead(asked.pause, self.tell)
-
-    def _nullspace_input(self, asked: HumanInput) -> Float[np.ndarray, " joints"]:
-        """Of the person who pushes, and by which the arm makes way by itself [N m]."""
-        way, distances = self.config.way_making, self.distances
-        if way is None:
-            return self._share * asked.nullspace_input
-        push = asked.nullspace_input if way.expert else np.zeros_like(asked.nullspace_input)
-        if way.automatic and distances is not None:
-            push = push + self.config.damping * way_making_velocity(distances, way).numpy()
-        return self._share * push
-
-    def _watched_columns(self, velocity: Float[Tensor, " joints"]) -> dict[str, float]:
-        """For the log: the sensed distance of people, and the protective one at this speed."""
-        if self.watched is None:
+    def _separation_columns(self, velocity: Float[Tensor, " joints"]) -> dict[str, float]:
+        """Columns of the distance from people, and of the protective one at this speed."""
+        watched = self._sensed.watched
+        if watched is None:
             return {}
-        near, separation = self.watched.distances, self.config.safety.separation
+        near, separation = watched.distances, self.config.safety.separation
         needed = separation.protective_distance(
             -(near.gradient @ velocity), near.approach_speed
         )
         tightest = (near.distance - needed).argmin()
         return {
-            "person_distance": self.watched.nearest,
-            "person_age": self.watched.age,
+            "person_distance": watched.nearest,
+            "person_age": watched.age,
             "protective_distance": float(needed[tightest]),
             "separation_margin": float((near.distance - needed)[tightest]),
-            "pace": self.pace.beside_people,
+            "pace": float(self.pace.people_scale),
         }
-
-    def _receive(self) -> None:
-        self.observation = self._markers.newest(self.time) or self.observation
 
 
 def _hindered(told: Feedback) -> Bool[np.ndarray, " hindrances"]:
-    """What keeps the arm from following the person, in the order of `HINDRANCE_COLUMNS`."""
+    """Hindrances told to the person, in the order of `HINDRANCE_COLUMNS`."""
     if not told.reasons:
         return _UNHINDERED
     reasons = {reason.hindrance for reason in told.reasons}

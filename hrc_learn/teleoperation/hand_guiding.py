@@ -15,13 +15,14 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
+from hrc_learn.controller.null_space_motion import fraction_kept
+from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import Arm, ArmState, Human, HumanInput
 from hrc_learn.regions import PositionRegion
-from hrc_learn.skills.arm_motion import resolved_rate
-from hrc_learn.skills.person_feedback import PersonFeedback, filter_hindrance, share_kept
+from hrc_learn.skills.person_feedback import PersonFeedback, filter_hindrance
 
 ForceMapping = Literal["transpose", "pinv"]
 DEFAULT_MAPPING: ForceMapping = "transpose"
@@ -344,7 +345,8 @@ class HandGuidedArm:
         if not human_input.twist.any():
             twist[:3] = self._attraction(human_input, pose.position)
         null_velocity = torch.from_numpy(human_input.nullspace_input / self.config.damping)
-        desired = resolved_rate(J, twist, null_velocity)
+        task, null = resolved_rate(J, twist, null_velocity)
+        desired = task + null
         if (way := self._way_to_posture(q, human_input)) is not None:
             desired = way
         velocity, self.safety, report = self._filter.step(
@@ -357,7 +359,7 @@ class HandGuidedArm:
             pushed = True
             hindrances.note_across(null_velocity, null_projection(J, null_velocity))
         if (cause := filter_hindrance(report)) is not None:
-            hindrances.note(cause, share_kept(desired, velocity))
+            hindrances.note(cause, float(fraction_kept(desired, velocity)))
         self._human.tell(self._feedback.told(state, J, pushed=pushed))
         return GuidedStep(state=state, human_input=human_input, pose=pose, command=command)
 

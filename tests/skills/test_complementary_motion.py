@@ -8,11 +8,12 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
+from hrc_learn.controller.joint_path import FAR_ASIDE, POORLY_ALIGNED
+from hrc_learn.controller.null_space_motion import YieldingConfig
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
-from hrc_learn.skills import ComplementaryMotion, YieldingConfig, joint_line
-from hrc_learn.skills.null_space_yielding import FAR_ASIDE, LEADS_BACK
+from hrc_learn.skills import ComplementaryMotion, joint_line
 
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
@@ -267,6 +268,6 @@ def test_where_the_null_space_may_lead_elsewhere_people_have_less_of_a_say_and_a
     error = postures[-1] - joints[-1]
     away = null_projection(panda.jacobian(joints[-1]), error)
     straight = float(away.norm() / error.norm())  # the cosine, by its definition
-    assert LEADS_BACK < straight < 0.8  # from which on less and less is left
+    assert POORLY_ALIGNED < straight < 0.8  # from which on less and less is left
     kept = {reason.hindrance: reason.kept for reason in human.told[-1].reasons}
-    assert kept["too_far"] == pytest.approx((straight - LEADS_BACK) / 0.15, abs=0.02)
+    assert kept["too_far"] == pytest.approx((straight - POORLY_ALIGNED) / 0.15, abs=0.02)

@@ -1,0 +1,402 @@
+"""Joint paths that the null space may leave: when they slow down, wait, and are gone back.
+
+While a person pushes the joints off their path, the end effector keeps to the poses of the
+path. The rules here decide whether the joints are off the path, how far a push may take them,
+when the path waits for them, and how they return. All of them are batched and stateless.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hrc_learn.controller.null_space_motion import (
+    Clearance,
+    YieldingConfig,
+    smallest_singular_value,
+)
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.pytree import pytree
+
+CHANGE_OF_RATE = 0.2
+"""Time in which a path comes to rest, or to its full speed [s]."""
+FAR_ASIDE = 1.8
+"""Distance of the joints from a path that still goes on [rad]. From 1.4 rad, an elbow aside by
+some 0.2 m, all joints found back to their path; from 2 rad some did not."""
+WELL_ALIGNED, POORLY_ALIGNED = 0.8, 0.65
+"""Alignment (`return_alignment`) from which on a push counts in full, and below which the null
+space may lead to another posture than that of the path. An elbow that has gone a quarter of its
+circle has 0.7, after half of the circle it has none."""
+NARROW = 0.07
+"""Smallest singular value of the Jacobian along a path below which the joints cannot leave it.
+Damping begins at 0.05."""
+
+# Distance from the path at which joints that were pushed count as aside when a path begins, and
+# at which they count as back [rad]. Servos lag by 0.03 rad at the speed of transfers.
+_ASIDE, _BACK = 0.1, 0.03
+# Distance at which a path that has waited goes on [rad].
+_NEAR_AGAIN = 1.4
+# Distances from the path [rad]: joints nearer than the first find back whatever the alignment,
+# which counts in full from the second on.
+_NEARBY = 0.3, 0.5
+# Distance by which joints must come nearer not to be stuck [rad]: 1 s of the slowest returns.
+_NEARER = 0.05
+# Tolerated distance of the end effector from its path [m], and the time by which servos lag
+# [s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
+_ON_PATH, _SERVO_LAG = 0.001, 0.06
+# Length that converts a rotation of the end effector: the size of gripper and object [m/rad].
+_METRES_PER_RADIAN = 0.1
+# Samples of a path that a direct return may lead to, and postures checked on the way.
+_RETURN_GOALS, _CHECKED = 20, 50
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class JointPaths:
+    """Joint paths, sampled at the control step and padded by their last sample."""
+
+    position: Float[Tensor, "paths samples n"]
+    """Joint positions [rad]."""
+    velocity: Float[Tensor, "paths samples n"]
+    """Joint velocities [rad/s]."""
+    narrow: Bool[Tensor, "paths samples"]
+    """True near a singularity, where the joints cannot leave the path."""
+    narrow_ahead: Bool[Tensor, "paths samples"]
+    """True where the path is narrow within the distance in which it stops."""
+    last: Int[Tensor, " paths"]
+    """Index of the last sample of each path."""
+
+    @classmethod
+    def of(
+        cls, chain: SerialChain, paths: Sequence[Float[np.ndarray, "samples n"]], dt: float
+    ) -> JointPaths:
+        """Tabulate paths.
+
+        Args:
+            chain: Kinematics of the arm.
+            paths: Joint positions of each path [rad].
+            dt: Time between samples [s].
+        """
+        longest, rows = max(len(path) for path in paths), []
+        for path in paths:
+            velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
+            position = torch.from_numpy(path.copy())
+            narrow = smallest_singular_value(chain, position) < NARROW
+            ahead = narrow.clone()
+            for k in range(1, int(CHANGE_OF_RATE / dt) + 1):
+                ahead[:-k] |= narrow[k:]
+            index = torch.arange(longest).clamp(max=len(path) - 1)
+            columns = position, torch.from_numpy(velocity), narrow, ahead
+            rows.append([column[index] for column in columns])
+        position, velocity, narrow, ahead = (torch.stack(x) for x in zip(*rows, strict=True))
+        last = torch.tensor([len(path) - 1 for path in paths])
+        return cls(
+            position=position, velocity=velocity, narrow=narrow, narrow_ahead=ahead, last=last
+        )
+
+    def interpolated(
+        self, samples: Tensor, path: Int[Tensor, "*batch"], progress: Float[Tensor, "*batch"]
+    ) -> Float[Tensor, "*batch n"]:
+        """Samples of some paths, interpolated linearly.
+
+        Args:
+            samples: `position` or `velocity`.
+            path: Index of each path.
+            progress: Sample number, not negative. Beyond the last one the last one counts.
+        """
+        last = self.last[path]
+        k = torch.minimum(progress.long(), last)
+        first, following = samples[path, k], samples[path, torch.minimum(k + 1, last)]
+        return first + (progress - k).clamp(max=1.0).unsqueeze(-1) * (following - first)
+
+
+def begins_aside(error: Float[Tensor, "*batch n"]) -> Bool[Tensor, "*batch"]:
+    """True where joints are so far from the start of a path [rad] that a push moved them."""
+    return error.norm(dim=-1) > _ASIDE
+
+
+def stays_aside(
+    pushed: Bool[Tensor, "*batch"],
+    aside: Bool[Tensor, "*batch"],
+    error: Float[Tensor, "*batch n"],
+) -> Bool[Tensor, "*batch"]:
+    """True where the joints are off their path because they are, or were, pushed.
+
+    Joints that lag behind without a push have met something: they go on along the path.
+
+    Args:
+        pushed: True while the null space is pushed.
+        aside: True if the joints were off their path in the last step.
+        error: Path minus joint positions [rad].
+    """
+    return pushed | (aside & (error.norm(dim=-1) > _BACK))
+
+
+def return_alignment(
+    null_error: Float[Tensor, "*batch n"], error: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch"]:
+    """Cosine between the path error and its null-space part; 1 for small errors.
+
+    Args:
+        null_error: Null-space part of the error [rad].
+        error: Path minus joint positions [rad].
+    """
+    size, (near, far) = error.norm(dim=-1), _NEARBY
+    cosine = null_error.norm(dim=-1) / size.clamp(min=near)
+    return torch.lerp(torch.ones_like(size), cosine, ((size - near) / (far - near)).clamp(0, 1))
+
+
+def may_not_return(
+    error: Float[Tensor, "*batch n"],
+    alignment: Float[Tensor, "*batch"],
+    waited: Bool[Tensor, "*batch"] | bool = False,
+) -> Bool[Tensor, "*batch"]:
+    """True where the null space might lead to another posture than that of a path that goes on.
+
+    Args:
+        error: Path minus joint positions [rad].
+        alignment: `return_alignment` of that error.
+        waited: True if the path has waited for the joints, which are pushed no more. It goes on
+            only once they are well on their way: otherwise it would lead them astray again.
+    """
+    waited = torch.as_tensor(waited)
+    farthest = torch.where(waited, _NEAR_AGAIN, FAR_ASIDE)
+    least = torch.where(waited, WELL_ALIGNED, POORLY_ALIGNED)
+    return (error.norm(dim=-1) > farthest) | (alignment < least)
+
+
+def push_fraction(
+    push: Float[Tensor, "*batch n"],
+    null_error: Float[Tensor, "*batch n"],
+    alignment: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch"]:
+    """Fraction of a push that is followed, 0 to 1: it fades where joints might not find back.
+
+    Args:
+        push: Null-space velocity that is asked for [rad/s]. One towards the path counts fully.
+        null_error: Null-space part of the path error [rad].
+        alignment: `return_alignment` of the error.
+    """
+    fade = (alignment - POORLY_ALIGNED) / (WELL_ALIGNED - POORLY_ALIGNED)
+    return torch.where(torch.linalg.vecdot(push, null_error) > 0, 1.0, fade.clamp(0.0, 1.0))
+
+
+def eased_return(
+    previous: Float[Tensor, "*batch n"],
+    null_error: Float[Tensor, "*batch n"],
+    dt: float,
+    config: YieldingConfig,
+) -> Float[Tensor, "*batch n"]:
+    """Null-space velocity back to a path [rad/s], without jumps.
+
+    Args:
+        previous: That of the last step [rad/s].
+        null_error: Null-space part of the path error [rad]; zero for joints that stay aside.
+        dt: Control step [s].
+        config: Gain and highest speed of the return.
+    """
+    fastest = config.return_speed / null_error.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+    back = fastest.clamp(max=config.pose_gain) * null_error
+    return previous + min(dt / config.nullspace_rise, 1.0) * (back - previous)
+
+
+def waiting_time(
+    waited: Float[Tensor, "*batch"],
+    nearest: Float[Tensor, "*batch"],
+    distance: Float[Tensor, "*batch"],
+    rate: Float[Tensor, "*batch"],
+    counts: Bool[Tensor, "*batch"],
+    stuck_after: float,
+    dt: float,
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Time for which a path has waited for joints that come no nearer, one step later.
+
+    Time in which the path goes on is subtracted: a path that stops and starts under repeated
+    pushes is stuck only if it rests for more than half of the time.
+
+    Args:
+        waited: Waiting time one step before [s].
+        nearest: Distance of the joints from the path when they last had come nearer [rad].
+        distance: Distance now [rad].
+        rate: Rate of the path, -1 to 1.
+        counts: False for steps in which the arm is pushed or slowed down by people.
+        stuck_after: Waiting time from which on coming nearer does not count any more [s].
+        dt: Control step [s].
+
+    Returns:
+        `waited` and `nearest`, one step later.
+    """
+    nearer = counts & (distance < nearest - _NEARER) & (waited <= stuck_after)
+    longer = (waited + (1.0 - 2.0 * rate.clamp(min=0)) * dt).clamp(min=0)
+    waited = torch.where(nearer, 0.0, torch.where(counts, longer, waited))
+    return waited, torch.where(nearer | ~counts, distance, nearest)
+
+
+def nears_singularity(
+    chain: SerialChain,
+    joint_position: Float[Tensor, "*batch n"],
+    joint_velocity: Float[Tensor, "*batch n"],
+) -> Bool[Tensor, "*batch"]:
+    """True if joints off their path are near a singularity, or will be before the path stops.
+
+    There the end effector could not be kept on the path.
+
+    Args:
+        chain: Kinematics of the arm.
+        joint_position: Joint positions [rad].
+        joint_velocity: Joint velocities [rad/s].
+    """
+    ahead = joint_position + CHANGE_OF_RATE * joint_velocity
+    postures = torch.stack([joint_position, ahead])
+    return (smallest_singular_value(chain, postures) < NARROW).any(0)
+
+
+def changed_rate(
+    rate: float | Float[Tensor, "*batch"],
+    wanted: float | Float[Tensor, "*batch"],
+    dt: float,
+    direction: int | Int[Tensor, "*batch"] = 1,
+) -> Float[Tensor, "*batch"]:
+    """Rate of a path one step later, without jumps.
+
+    Args:
+        rate: Fraction of the path's own speed, -1 to 1.
+        wanted: Magnitude to approach; values beyond 0 and 1 are clipped.
+        dt: Control step [s].
+        direction: 1 for forward, -1 for back.
+    """
+    change, goal = dt / CHANGE_OF_RATE, direction * torch.as_tensor(wanted).clamp(0.0, 1.0)
+    return rate + (goal - rate).clamp(-change, change)
+
+
+def deviation_ratio(
+    error: Float[Tensor, "*batch 6"], twist: Float[Tensor, "*batch 6"]
+) -> Float[Tensor, "*batch"]:
+    """Distance of the end effector from its path, relative to the tolerated one.
+
+    Args:
+        error: Motion to where it should be (linear [m], angular [rad]).
+        twist: Velocity of the path there (linear [m/s], angular [rad/s]).
+    """
+    return _length(error) / (_ON_PATH + _SERVO_LAG * _length(twist))
+
+
+def _length(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
+    """Length of a motion, its rotation converted to metres [m]."""
+    return twist[..., :3].norm(dim=-1) + _METRES_PER_RADIAN * twist[..., 3:].norm(dim=-1)
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class DirectReturn:
+    """A straight motion of the joints back to a path, where no null-space motion leads there.
+
+    Another posture for the same pose may lie in between, so the end effector leaves its path.
+    """
+
+    start: Float[Tensor, "*batch n"]
+    """Joint positions at the start [rad]."""
+    goal: Float[Tensor, "*batch n"]
+    """Joint positions on the path [rad]."""
+    progress: Float[Tensor, "*batch"]
+    """Sample of the path at which the return ends."""
+    duration: Float[Tensor, "*batch"]
+    """Duration [s]."""
+    time: Float[Tensor, "*batch"]
+    """Time since the start [s]."""
+    active: Bool[Tensor, "*batch"]
+    """True while the joints return directly."""
+    blocked: Bool[Tensor, "*batch"]
+    """True where the arm would meet something on the way to each sample."""
+
+    @classmethod
+    def none(cls, joint_position: Float[Tensor, "*batch n"]) -> DirectReturn:
+        """No return under way."""
+        zero = torch.zeros_like(joint_position[..., 0])
+        never = torch.zeros_like(zero, dtype=torch.bool)
+        return cls(
+            start=joint_position,
+            goal=joint_position,
+            progress=zero,
+            duration=zero,
+            time=zero,
+            active=never,
+            blocked=never,
+        )
+
+    @classmethod
+    def planned(
+        cls,
+        paths: JointPaths,
+        path: Int[Tensor, "*batch"],
+        progress: Float[Tensor, "*batch"],
+        joint_position: Float[Tensor, "*batch n"],
+        config: YieldingConfig,
+        clearance: Clearance | None,
+    ) -> DirectReturn:
+        """Plan a return to the sample where a path waits, or the nearest that is clear.
+
+        Args:
+            paths: Table of paths.
+            path: Index of the path.
+            progress: Sample at which it waits.
+            joint_position: Joint positions now [rad].
+            config: Highest speed, and the clearance that need not be exceeded.
+            clearance: Distance of the arm from obstacles; None: every way is clear.
+        """
+        goals, order = _return_goals(paths, path, progress, joint_position)
+        start = joint_position.unsqueeze(0).expand_as(goals)
+        if clearance is None:
+            clear = torch.ones_like(order, dtype=torch.bool)
+        else:
+            fraction = torch.linspace(0, 1, _CHECKED + 1, dtype=goals.dtype)
+            fraction = fraction.reshape(-1, *(1 for _ in goals.shape))
+            distance = clearance(torch.lerp(start, goals, fraction))
+            ends = distance[[0, -1]].amin(0)
+            clear = (distance >= ends.clamp(max=config.clearance)).all(0)
+        # The first candidate that is clear.
+        chosen = clear.to(torch.int64).argmax(0, keepdim=True)
+        goal = goals.gather(0, chosen.unsqueeze(-1).expand_as(goals[:1])).squeeze(0)
+        # A minimum-jerk motion peaks at 1.875 times its mean speed.
+        far = (goal - joint_position).abs().amax(-1)
+        return cls(
+            start=joint_position,
+            goal=goal,
+            progress=order.gather(0, chosen).squeeze(0),
+            duration=1.875 * far / config.return_speed,
+            time=torch.zeros_like(far),
+            active=clear.any(0),
+            blocked=~clear.any(0),
+        )
+
+    def joint_position(self) -> Float[Tensor, "*batch n"]:
+        """Joint positions to track now [rad]."""
+        s = (self.time / self.duration.clamp(min=1e-9)).clamp(0, 1)
+        s = s**3 * (10 - 15 * s + 6 * s**2)
+        return torch.lerp(self.start, self.goal, s.unsqueeze(-1))
+
+
+def _return_goals(
+    paths: JointPaths,
+    path: Int[Tensor, "*batch"],
+    progress: Float[Tensor, "*batch"],
+    joint_position: Float[Tensor, "*batch n"],
+) -> tuple[Float[Tensor, "goals *batch n"], Float[Tensor, "goals *batch"]]:
+    """Goals of a direct return and their samples: the one that waits, others by distance."""
+    last = paths.last[path]
+    stride = ((last + 1) // _RETURN_GOALS).clamp(min=1)
+    k = torch.arange(2 * _RETURN_GOALS).reshape(-1, *(1 for _ in last.shape)) * stride
+    # Short lists are padded by the first sample.
+    k = torch.where(k <= last, k, 0)
+    others = paths.position[path.expand_as(k), k]
+    far = (others - joint_position).norm(dim=-1)
+    order = far.argsort(dim=0, stable=True)
+    others = others.gather(0, order.unsqueeze(-1).expand_as(others))
+    samples = k.gather(0, order).to(progress.dtype)
+    here = paths.interpolated(paths.position, path, progress)
+    return torch.cat([here[None], others]), torch.cat([progress[None], samples])

@@ -1,0 +1,333 @@
+"""Null-space motions that an arm can follow without moving its end effector.
+
+A person, or a repulsion from what is near, asks for a motion of the null space. The functions
+here reduce it to what the arm can do: slow enough for the end effector to be kept in place,
+away from singularities, within the joint limits, clear of obstacles, and without jumps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hrc_learn.controller.resolved_rate import scale_null_space
+from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain
+
+LOOK_AHEAD = 0.15
+"""Horizon over which a null-space motion is checked [s]; an elbow at 1 m/s stops in 0.1 s."""
+
+# Largest acceleration of the end effector that the joints may have to compensate [m/s^2], where
+# 1 rad counts as 0.1 m. Servos that lag 10 ms more than assumed, corrected with 4 1/s, leave
+# an error of 0.5 mm.
+_BENDING, _METRES_PER_RADIAN = 0.2, 0.1
+_DIFFERENCE_STEP = 1e-4  # [s]
+# Highest speed of the elbow under guidance [m/s], the reduced speed of ISO 10218-1:2011, 3.23,
+# and of a joint [rad/s]: it stops within 0.2 rad by the acceleration reserved for pushes.
+_GUIDED_SPEED, _GUIDED_JOINT_SPEED = 0.25, 1.0
+# Fractions of a motion, or of the time ahead, at which it is checked.
+_FRACTIONS = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
+# Smallest singular values between which a motion towards a singularity fades out: below the
+# lower one the task itself is damped.
+_SINGULAR, _REGULAR = SINGULAR_BELOW, 1.6 * SINGULAR_BELOW
+# Fractions of the joint acceleration that a push and its end may use. The task needs the rest,
+# and is slowed down as well where both together exceed the limits.
+_PUSH_EFFORT, _STOP_EFFORT = 0.3, 0.6
+# Lowest speed for which singularities are looked for ahead of the arm [rad/s].
+_SLOW = 0.2
+# Null-space part of a correction below which the correction is not in the null space [rad/s].
+_NEGLIGIBLE = 1e-6
+# Closing speed that remains allowed at the clearance margin [m/s], and depth within the margin
+# at which it reaches zero [m]. An arm that slides along a surface would otherwise stop and
+# start with every reading, and its task with it.
+_SLIDING_SPEED, _DEEPEST = 0.002, 0.005
+# Fraction of a push in the null space below which it asks for a motion of the end effector.
+_ACROSS = 0.1
+
+type Clearance = Callable[[Float[Tensor, "*batch n"]], Float[Tensor, "*batch"]]
+"""Distance of the arm at given joint positions from itself and its surroundings [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class YieldingConfig:
+    """Response of the null space to a push, and return of the joints afterwards."""
+
+    damping: float = 3.0
+    """c_d: null-space input per unit of joint velocity (paper, Table I) [N m s/rad]."""
+    nullspace_rise: float = 0.15
+    """Time constant with which the null-space input is smoothed [s]."""
+    pose_gain: float = 4.0
+    """Decay rate of the pose error on prescribed motions [1/s]."""
+    after_push: Literal["return", "stay"] = "return"
+    """Behaviour after a push: the joints return to their planned path, and a servoed arm to its
+    posture, or they stay off it."""
+    return_speed: float = 0.4
+    """Highest speed of the return, norm over all joints [rad/s]."""
+    clearance: float = 0.03
+    """Distance from obstacles that a push cannot reduce further [m]: three times the
+    calibration errors of base and table."""
+
+
+def smallest_singular_value(
+    chain: SerialChain, joint_position: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch"]:
+    """Smallest singular value of the end effector's Jacobian, metres and radians mixed.
+
+    Args:
+        chain: Kinematics of the arm.
+        joint_position: Joint positions [rad].
+    """
+    return torch.linalg.svdvals(chain.jacobian(joint_position))[..., -1]
+
+
+def null_space_slowdown(
+    chain: SerialChain,
+    joint_position: Float[Tensor, "*batch n"],
+    null_velocity: Float[Tensor, "*batch n"],
+) -> Float[Tensor, "*batch"]:
+    """Fraction of a null-space velocity at which the end effector can be kept in place.
+
+    The null space is curved. A motion along it at speed s accelerates the end effector by
+    s^2 c, where c is the derivative of J along the motion times the motion; late servos
+    compensate for it only in part. The speeds of elbow and joints are limited as well: near a
+    singularity a joint could turn far before it stops.
+
+    Args:
+        chain: Kinematics of the arm.
+        joint_position: Joint positions [rad].
+        null_velocity: Velocity in the null space of the Jacobian there [rad/s].
+
+    Returns:
+        Factor of at most 1.
+    """
+    # At the joints now, and where the arm will be once it could have slowed down.
+    times = null_velocity.new_tensor([0.0, LOOK_AHEAD])
+    times = torch.stack([times, times + _DIFFERENCE_STEP])
+    steps = times.reshape(2, 2, *(1 for _ in null_velocity.shape)) * null_velocity
+    origins, (J, beyond) = chain.joint_origins_and_jacobian(joint_position + steps)
+    bending = ((beyond - J) @ null_velocity.unsqueeze(-1)).squeeze(-1) / _DIFFERENCE_STEP
+    scale = bending.new_tensor([1.0] * 3 + [_METRES_PER_RADIAN] * 3)
+    excess = torch.linalg.vector_norm(scale * bending, dim=-1).amax(0) / _BENDING
+    moved = torch.linalg.vector_norm(origins[1, 0] - origins[0, 0], dim=-1)
+    fastest = moved.amax(-1) / _DIFFERENCE_STEP / _GUIDED_SPEED
+    fastest = torch.maximum(fastest, null_velocity.abs().amax(-1) / _GUIDED_JOINT_SPEED)
+    return torch.minimum(excess.clamp(min=1.0) ** -0.5, 1 / fastest).clamp(max=1.0)
+
+
+def singularity_fade(
+    chain: SerialChain,
+    joint_position: Float[Tensor, "*batch n"],
+    null_velocity: Float[Tensor, "*batch n"],
+) -> Float[Tensor, "*batch"]:
+    """Fraction of a null-space velocity that does not lead into a singularity.
+
+    Args:
+        chain: Kinematics of the arm.
+        joint_position: Joint positions [rad].
+        null_velocity: Velocity in the null space of the Jacobian there [rad/s].
+
+    Returns:
+        1 away from singularities and on the way out of one, 0 on the way into one.
+    """
+    # Intermediate postures count too: beyond a singularity the arm is regular again.
+    ahead = joint_position + 2 * LOOK_AHEAD * _fractions_of(null_velocity)
+    now, *later = torch.linalg.svdvals(chain.jacobian(ahead))[..., -1]
+    least = torch.stack(later).amin(0)
+    fade = ((least - _SINGULAR) / (_REGULAR - _SINGULAR)).clamp(0, 1)
+    return torch.where(least >= now, 1.0, fade)
+
+
+def _fractions_of(velocity: Float[Tensor, "*batch n"]) -> Tensor:
+    """Fractions of a motion from none to all of it, shape (fractions, *batch, n)."""
+    return _FRACTIONS.to(velocity).reshape(-1, *(1 for _ in velocity.shape)) * velocity
+
+
+class EasedVelocity(NamedTuple):
+    """Null-space velocity of one step, and what limited it."""
+
+    velocity: Float[Tensor, "*batch n"]
+    """Velocity to command [rad/s]."""
+    projected: Float[Tensor, "*batch n"]
+    """Null-space part of the requested velocity [rad/s]."""
+    slowdown: Float[Tensor, "*batch"]
+    """Fraction left by `null_space_slowdown`."""
+    fade: Float[Tensor, "*batch"]
+    """Fraction left by `singularity_fade`."""
+    unbounded: Float[Tensor, "*batch n"]
+    """Velocity after both fractions [rad/s]."""
+    bounded: Float[Tensor, "*batch n"]
+    """The same velocity within the joint bounds [rad/s]."""
+
+
+def eased_null_velocity(
+    chain: SerialChain,
+    joint_position: Float[Tensor, "*batch n"],
+    jacobian: Float[Tensor, "*batch 6 n"],
+    previous: Float[Tensor, "*batch n"],
+    requested: Float[Tensor, "*batch n"],
+    bounds: tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]],
+    dt: float,
+    config: YieldingConfig,
+) -> EasedVelocity:
+    """Null-space velocity of the next step towards a requested one.
+
+    Arms follow late and with limited acceleration, so a velocity that jumps or is too fast
+    would move the end effector.
+
+    Args:
+        chain: Kinematics of the arm.
+        joint_position: Joint positions [rad].
+        jacobian: Jacobian of the end effector there.
+        previous: Null-space velocity of the last step [rad/s].
+        requested: Joint velocity whose null-space part is requested [rad/s].
+        bounds: Lowest and highest joint velocities that leave the task its margin [rad/s].
+        dt: Control step [s].
+        config: Response to pushes.
+    """
+    previous = null_projection(jacobian, previous)
+    projected = null_projection(jacobian, requested)
+    slowdown = null_space_slowdown(chain, joint_position, projected)
+    unbounded = projected * slowdown.unsqueeze(-1)
+    # Singularities are looked for as far ahead as the arm gets while it slows down.
+    last, size = previous.norm(dim=-1, keepdim=True), unbounded.norm(dim=-1, keepdim=True)
+    speed = last.clamp(min=_SLOW) / size.clamp(min=1e-9)
+    fade = singularity_fade(chain, joint_position, speed * unbounded)
+    unbounded = unbounded * fade.unsqueeze(-1)
+    bounded = scale_null_space(torch.zeros_like(unbounded), unbounded, *bounds)
+    slows = bounded.norm(dim=-1, keepdim=True) < last
+    rise = torch.where(slows, 1.0, min(dt / config.nullspace_rise, 1.0))
+    change = rise * (bounded - previous)
+    effort = torch.where(slows, _STOP_EFFORT, _PUSH_EFFORT)
+    reach = effort * dt * chain.limits.acceleration
+    velocity = previous + change / (change.abs() / reach).amax(-1, keepdim=True).clamp(min=1.0)
+    return EasedVelocity(velocity, projected, slowdown, fade, unbounded, bounded)
+
+
+def null_space_giving_way(
+    jacobian: Float[Tensor, "*batch 6 n"],
+    task: Float[Tensor, "*batch n"],
+    null: Float[Tensor, "*batch n"],
+    lower: Float[Tensor, "*batch n"],
+    upper: Float[Tensor, "*batch n"],
+) -> Float[Tensor, "*batch n"]:
+    """The null-space velocity nearest to a given one that keeps task plus null space in bounds.
+
+    At a limit to which a person has pushed the arm, the null space thus gives way to the task.
+    The correction runs along one direction of the null space, which for seven joints is all of
+    it. Where none fits, the bounds are exceeded by as little as possible.
+
+    Args:
+        jacobian: Jacobian of the end effector.
+        task: Joint velocity of the task, which is not changed [rad/s].
+        null: Requested null-space velocity [rad/s].
+        lower: Lowest joint velocity [rad/s].
+        upper: Highest joint velocity [rad/s].
+    """
+    velocity = task + null
+    missing = velocity.clamp(lower, upper) - velocity
+    if not bool(missing.any()):
+        return null
+    along = null_projection(jacobian, missing)
+    size = along.abs()
+    moving = size > _NEGLIGIBLE * size.amax(-1, keepdim=True)
+    slope = torch.where(moving, along, 1.0)
+    at_lower, at_upper = (lower - velocity) / slope, (upper - velocity) / slope
+    least = torch.where(moving, torch.minimum(at_lower, at_upper), -math.inf).amax(-1)
+    most = torch.where(moving, torch.maximum(at_lower, at_upper), math.inf).amin(-1)
+    factor = torch.where(least <= most, least, (least + most) / 2)
+    factor = torch.where(along.norm(dim=-1) < _NEGLIGIBLE, 0.0, factor)
+    return null + factor.unsqueeze(-1) * along
+
+
+class ClearMotion(NamedTuple):
+    """A null-space velocity that keeps the arm clear of its surroundings."""
+
+    null: Float[Tensor, "*batch n"]
+    """Null-space velocity [rad/s]."""
+    blocked: Bool[Tensor, "*batch"]
+    """True where the task alone takes the arm below the margin: the task has to wait."""
+    distance: Float[Tensor, "*batch"]
+    """Clearance of the arm now [m]."""
+
+
+def kept_clear(
+    joint_position: Float[Tensor, "*batch n"],
+    task: Float[Tensor, "*batch n"],
+    null: Float[Tensor, "*batch n"],
+    clearance: Clearance,
+    margin: float,
+    look_ahead: float = LOOK_AHEAD,
+) -> ClearMotion:
+    """Reduce a null-space velocity until the arm keeps its clearance.
+
+    Args:
+        joint_position: Joint positions [rad].
+        task: Joint velocity of the task, which is not changed [rad/s].
+        null: Null-space velocity [rad/s].
+        clearance: Distance from obstacles. Called once, with a leading axis of the postures
+            that are compared.
+        margin: Clearance to keep [m]. Where the task alone leaves less, the null space does
+            not reduce it further.
+        look_ahead: Time constant with which the motion comes to rest at the margin [s].
+    """
+    ahead = joint_position + look_ahead * (task + _fractions_of(null))
+    now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
+    blocked = without < torch.clamp(now, max=margin)
+    if bool((every >= margin).all()):
+        return ClearMotion(null, blocked, now)
+    closing = without - every[2:]
+    spare = without - margin
+    sliding = look_ahead * _SLIDING_SPEED * (1.0 + spare / _DEEPEST).clamp(0.0, 1.0)
+    allowed = spare.clamp(min=0.0) + sliding
+    # Closing grows with the fraction of the motion: scale it down in proportion.
+    fractions = _FRACTIONS[1:].to(closing).reshape(-1, *(1 for _ in now.shape))
+    factor = torch.where(closing > allowed, fractions * allowed / closing, 1.0).amin(0)
+    return ClearMotion(factor.unsqueeze(-1) * null, blocked, now)
+
+
+def fraction_kept(
+    before: Float[Tensor, "*batch n"], after: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch"]:
+    """Fraction of a velocity that is left along its direction, 0 to 1; 1 for no velocity."""
+    square = torch.linalg.vecdot(before, before)
+    moving = square >= 1e-12  # a microradian a second
+    along = torch.linalg.vecdot(before, after) / torch.where(moving, square, 1.0)
+    return torch.where(moving, along, 1.0).clamp(0.0, 1.0)
+
+
+def fraction_in_null_space(
+    requested: Float[Tensor, "*batch n"], projected: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch"]:
+    """Fraction of a push in the null space if it is below a tenth; 1 otherwise.
+
+    Args:
+        requested: Joint velocity that is asked for [rad/s].
+        projected: Its null-space part [rad/s].
+    """
+    square = torch.linalg.vecdot(requested, requested)
+    # For an orthogonal projection N, |N w|^2 = w^T N w.
+    inside = torch.linalg.vecdot(requested, projected).clamp(min=0)
+    fraction = (inside / torch.where(square > 0, square, 1.0)).sqrt()
+    return torch.where((square > 0) & (fraction < _ACROSS), fraction, 1.0)
+
+
+def limiting_joint(
+    velocity: Float[Tensor, "*batch n"],
+    lower: Float[Tensor, "*batch n"],
+    upper: Float[Tensor, "*batch n"],
+) -> Int[Tensor, "*batch"]:
+    """Joint, from 0, whose bounds allow the smallest fraction of a velocity.
+
+    Args:
+        velocity: Joint velocity [rad/s].
+        lower: Lowest velocity [rad/s].
+        upper: Highest velocity [rad/s].
+    """
+    bound = torch.where(velocity > 0, upper, lower)
+    return torch.where(velocity == 0, math.inf, bound / velocity).argmin(-1)

@@ -1,0 +1,121 @@
+"""The pace of a task: people near the arm slow it down, and a person may pause it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.controller.constraint_layer import Distances
+from hrc_learn.controller.joint_path import CHANGE_OF_RATE, changed_rate
+from hrc_learn.controller.safety_filter import ConstraintReport, SafetyConfig
+from hrc_learn.pytree import pytree, static
+
+# Twist below which a fraction of it is not computed (metres and radians mixed) [1/s].
+_AT_REST = 1e-3
+# Fraction of the task given up by the constraint layer that exceeds rounding.
+_SLOWED = 1e-3
+# Margin of the closing speed below which a distance counts as binding [m/s]: what the solver
+# leaves unused is rounding. And the scale below which the arm counts as blocked.
+_BINDING, _BLOCKED = 1e-3, 0.01
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class TaskPace:
+    """Speed of the task relative to its planned speed, and the clock that runs with it."""
+
+    time: Float[Tensor, "*batch"]
+    """Task time: the clock without the time lost to people near the arm and to pauses [s]."""
+    people_scale: Float[Tensor, "*batch"]
+    """Speed scale imposed by people near the arm, 0 to 1."""
+    speed_override: Float[Tensor, "*batch"]
+    """Speed scale set by the operator: `full_speed`, or less during a pause."""
+    blocked_for: Float[Tensor, "*batch"]
+    """Time for which people have blocked the arm without interruption [s]."""
+    full_speed: float = static(1.0)
+    """Speed scale of a task that is not paused."""
+
+    @property
+    def scale(self) -> Float[Tensor, "*batch"]:
+        """Speed scale of the task now, 0 to 1."""
+        return self.people_scale * self.speed_override
+
+    @property
+    def at_full_speed(self) -> Bool[Tensor, "*batch"]:
+        """True where neither people nor a pause slow the task down."""
+        return (self.people_scale == 1) & (self.speed_override == self.full_speed)
+
+    def limited(self, people_scale: Float[Tensor, "*batch"], dt: float) -> TaskPace:
+        """Pace one step later, after people have left a fraction of the requested motion.
+
+        Args:
+            people_scale: That fraction. The scale may drop at once; it rises as paths do.
+            dt: Control step [s].
+        """
+        scale = torch.minimum(people_scale, self.people_scale + dt / CHANGE_OF_RATE)
+        pace = replace(self, people_scale=scale)
+        blocked_for = torch.where(scale < _BLOCKED, self.blocked_for + dt, 0.0)
+        return replace(pace, time=self.time + pace.scale * dt, blocked_for=blocked_for)
+
+    def overridden(self, pause: Bool[Tensor, "*batch"], dt: float) -> TaskPace:
+        """Pace one step later.
+
+        Args:
+            pause: True while a person pauses the task.
+            dt: Control step [s].
+        """
+        rate = changed_rate(self.speed_override, (~pause).to(self.speed_override), dt)
+        return replace(self, speed_override=rate.clamp(max=self.full_speed))
+
+
+def fraction_of_motion(
+    requested: Float[Tensor, "*batch 6"], done: Float[Tensor, "*batch 6"]
+) -> Float[Tensor, "*batch"]:
+    """Fraction of a requested motion that is done, 0 to 1; 1 at rest.
+
+    Args:
+        requested: Twist of the end effector (linear [m/s], angular [rad/s]).
+        done: Twist that is left of it.
+    """
+    square, along = (requested * requested).sum(-1), (requested * done).sum(-1)
+    moves = square > _AT_REST**2
+    return torch.where(moves, along / torch.where(moves, square, 1.0), 1.0).clamp(0, 1)
+
+
+def people_bind(
+    distances: Distances,
+    sent: Float[Tensor, "*batch n"],
+    report: ConstraintReport,
+    safety: SafetyConfig,
+) -> Bool[Tensor, "*batch"]:
+    """True where the arm is slowed down by people, or because their distance is not known.
+
+    Limits of the arm itself do not count: a path that waited for them would wait for ever.
+
+    Args:
+        distances: Distances from people.
+        sent: Joint velocity sent to the arm [rad/s].
+        report: Result of the constraint layer.
+        safety: Settings of the safety filter, with constraints.
+    """
+    near = closes_in(distances, sent, safety)
+    return ~distances.known() | ~report.solved | ((report.slowed > _SLOWED) & near)
+
+
+def closes_in(
+    distances: Distances, sent: Float[Tensor, "*batch n"], safety: SafetyConfig
+) -> Bool[Tensor, "*batch"]:
+    """True where the arm approaches people as fast as the protective distance allows.
+
+    Args:
+        distances: Distances from people.
+        sent: Joint velocity sent to the arm [rad/s].
+        safety: Settings of the safety filter, with constraints.
+    """
+    assert safety.constraints is not None  # without them no distance is kept
+    allowed = distances.closing_speed(safety.constraints, safety.separation)
+    opening = torch.linalg.vecdot(distances.gradient, sent.unsqueeze(-2))
+    return (allowed + opening <= _BINDING).any(-1)
