@@ -24,7 +24,7 @@ from rich.table import Table
 from timing import time_calls
 
 from hrc_learn import cli
-from hrc_learn.experiments.collaboration.worker import move_worker, somebody_comes
+from hrc_learn.experiments.collaboration.worker import draw_visit, move_worker
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, MotionLog, WorkerSensor, World, whole_arm
 from hrc_learn.sim.workplace import Workplace
@@ -96,7 +96,7 @@ def work_cell_step(seed: int, *parts: str) -> Callable[[], None]:
     """
     workplace, sizes = Workplace(), Imperfections.nominal()
     rng = np.random.default_rng([seed, 2])
-    visit = somebody_comes(workplace, rng) if "worker" in parts else None
+    visit = draw_visit(workplace, rng) if "worker" in parts else None
     if visit is not None:
         person = visit.worker.config
         workplace = replace(workplace, scene=replace(workplace.scene, worker=person))

@@ -27,6 +27,7 @@ from hrc_learn.controller.joint_path import JointPaths, changed_rate, deviation_
 from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import GraspedBox, SerialChain
+from hrc_learn.log import Event, StepLog
 from hrc_learn.protocols import HINDRANCES, Arm, ArmState, Feedback, Gripper, Human, HumanInput
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import StraightLine
@@ -39,7 +40,6 @@ from hrc_learn.skills.marker_sensor import (
 )
 from hrc_learn.skills.person_feedback import PersonFeedback, contact_force
 from hrc_learn.skills.person_watch import NEAR_PEOPLE, PersonWatch, WatchedPeople
-from hrc_learn.log import Event, StepLog
 
 HINDRANCE_COLUMNS = HINDRANCES
 """Names of the components of the log's column "hindered"."""

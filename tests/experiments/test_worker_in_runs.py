@@ -8,9 +8,9 @@ import torch
 
 from hrc_learn.controller import SeparationConfig
 from hrc_learn.experiments.collaboration.worker import (
+    draw_visit,
     move_worker,
     separation_margin,
-    somebody_comes,
     worker_contacts,
 )
 from hrc_learn.kinematics import panda, separation
@@ -21,7 +21,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
 
 WORKPLACE = Workplace()
-VISIT = somebody_comes(WORKPLACE, np.random.default_rng(5))
+VISIT = draw_visit(WORKPLACE, np.random.default_rng(5))
 SCENE = replace(WORKPLACE.scene, worker=VISIT.worker.config)
 HAND = PARTS.index("hand_right")
 
@@ -122,7 +122,7 @@ def test_a_world_without_a_worker_keeps_no_distances():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_beside_the_elbow_nobody_leans_into_the_arm_that_waits(seed):
-    visit = somebody_comes(WORKPLACE, np.random.default_rng(seed), beside_elbow=True)
+    visit = draw_visit(WORKPLACE, np.random.default_rng(seed), beside_elbow=True)
     waiting, world = WORKPLACE.hover_joints().numpy(), World(SCENE)
     world.reset(waiting)
     distance = WorkerDistance(world)

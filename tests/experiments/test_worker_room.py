@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.experiments.collaboration.worker import somebody_comes
+from hrc_learn.experiments.collaboration.worker import draw_visit
 from hrc_learn.experiments.collaboration.worker_room import (
     CLEAR,
     bench_places,
@@ -28,7 +28,7 @@ from hrc_learn.sim.workplace import Workplace
 WORKPLACE = Workplace()
 ARM = whole_arm(WORKPLACE.scene.arm)
 WAITING = WORKPLACE.hover_joints()
-VISIT = somebody_comes(WORKPLACE, np.random.default_rng(3), beside_elbow=True)
+VISIT = draw_visit(WORKPLACE, np.random.default_rng(3), beside_elbow=True)
 FAR = torch.tensor([-1.5, -0.8, 0.0, -2.4, 0.0, 1.6, 0.8], dtype=torch.float64)
 """Turned to the other side, away from the bench."""
 

@@ -6,18 +6,13 @@ import torch
 from obedient_arm import ObedientArm, cell_with, hindered
 from unchecked import shapes_unchecked
 
+from hrc_learn.controller.joint_path import FAR_ASIDE
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput
-from hrc_learn.skills import (
-    BlockedPathError,
-    TaskFailedError,
-    WorkCellConfig,
-    joint_line,
-)
-from hrc_learn.skills.null_space_yielding import FAR_ASIDE, STUCK
-from hrc_learn.skills.path_following import PathFollower, _Patience, follow_path
+from hrc_learn.skills import TaskFailedError, WorkCellConfig, joint_line
+from hrc_learn.skills.path_following import follow_path
 
 PUSH = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
 
@@ -126,7 +121,7 @@ def test_nobody_pushes_joints_so_far_that_they_do_not_find_back(
     config = WorkCellConfig(after_push=after_push, pose_gain=1e-3)
     cell = cell_with(ObedientArm(panda.ready.numpy()), Person(), config=config)
     cell.hold_pose(0.5)
-    push = cell.yielding.null_velocity
+    push = cell.loop_state.null_velocity
     assert push.norm() > 0.05
     error = straight * null + np.sqrt(1 - straight**2) * first
     path = cell.joints.numpy()[None] + error
@@ -160,21 +155,6 @@ def test_who_pushes_is_told_that_a_path_which_waits_leads_the_joints_back():
     assert hindered(cell, "too_far")[-1]
 
 
-def test_a_path_gone_back_to_where_the_joints_are_on_it_goes_on():
-    cell = cell_with(ObedientArm(panda.ready.numpy()))
-    patience, off = _Patience(cell.config), torch.full((7,), 0.5, dtype=torch.float64)
-    cell.yielding.begin(off)
-    for _ in range(205):
-        patience.step(cell.yielding, off, 0.0, True)
-    assert patience.is_stuck
-    for _ in range(100):
-        patience.step(cell.yielding, off * 0.5, -1.0, True)
-    assert patience.is_stuck
-    cell.yielding.begin(torch.zeros_like(off))
-    patience.step(cell.yielding, off * 0, -1.0, True)
-    assert not patience.is_stuck
-
-
 def test_a_path_that_waits_is_not_gone_back_while_the_joints_come_nearer():
     """However slowly: here for longer than it takes to give up."""
     path = transfer()
@@ -186,7 +166,7 @@ def test_a_path_that_waits_is_not_gone_back_while_the_joints_come_nearer():
     assert np.diff(along).min() > -1e-6
     rests = np.abs(np.diff(planned, axis=0)).max(axis=1) < 1e-6
     released = cell.log["time"][1:] > 4.0
-    assert 0.01 * (rests & released).sum() > 2.0 + STUCK
+    assert 0.01 * (rests & released).sum() > 2.0 + cell.config.back_after
     # Until the joints are well on their way back.
     assert off[1:][released & ~rests][0] < 1.45
 
@@ -272,52 +252,6 @@ def test_joints_that_stay_beside_a_path_come_back_to_it_before_its_singularity()
     config = WorkCellConfig(after_push="stay")
     cell = pushed_along(path, 0.5 * PUSH, (0.2, 1.0), config=config)
     np.testing.assert_allclose(cell.joints, path[-1], atol=0.03)
-
-
-@pytest.mark.parametrize("distance", [0.5, -0.5])
-def test_an_arm_that_finds_no_way_back_goes_straight_or_says_so(distance):
-    goal = panda.ready
-    away = goal + torch.tensor([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
-    arm = ObedientArm(away.numpy())
-
-    def clearance(q):
-        # Clear at both ends; in between as given.
-        ends = torch.stack([goal, away])
-        near = (q[..., None, :] - ends).norm(dim=-1).amin(-1)
-        return torch.where(near < 0.05, 0.5, distance)
-
-    cell = cell_with(arm, clearance=clearance)
-    path = goal[None].numpy()
-    with shapes_unchecked():
-        if distance < 0:
-            with pytest.raises(BlockedPathError, match="pushed aside"):
-                PathFollower(cell, path).go_straight_back(0.0)
-        else:
-            assert PathFollower(cell, path).go_straight_back(0.0) == 0.0
-            np.testing.assert_allclose(cell.joints, goal, atol=0.03)
-            speed = np.linalg.norm(cell.log["joint_velocity"], axis=1).max()
-            assert speed < 2 * cell.config.return_speed
-
-
-def test_where_the_way_back_is_blocked_another_sample_of_the_path_is_as_good():
-    """A wall between the arm and where the path waits, but not where it began."""
-    start = panda.ready
-    waits = start + torch.tensor([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
-    arm = ObedientArm((start + torch.tensor([0.2] + 6 * [0.0]).double()).numpy())
-
-    def clearance(q):
-        # A post halfway to the sample at which it waits.
-        middle = (torch.from_numpy(arm_began) + waits) / 2
-        return (q - middle).norm(dim=-1) - 0.15
-
-    arm_began = arm.q.copy()
-    cell = cell_with(arm, clearance=clearance)
-    path = joint_line(start, waits, speed=0.5, dt=0.01).numpy()
-    with shapes_unchecked():
-        sample = PathFollower(cell, path).go_straight_back(float(len(path) - 1))
-    assert sample < len(path) / 2
-    np.testing.assert_allclose(cell.joints, path[int(sample)], atol=0.05)
-    assert clearance(torch.from_numpy(cell.log["joint_position"])).min() > 0
 
 
 def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():

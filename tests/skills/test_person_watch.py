@@ -10,7 +10,7 @@ import sampling
 import torch
 
 from hrc_learn.controller import SafetyConfig, SeparationConfig
-from hrc_learn.experiments.collaboration.worker import somebody_comes
+from hrc_learn.experiments.collaboration.worker import draw_visit
 from hrc_learn.kinematics import GraspedBox, panda, separation
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import Imperfections, WorkerDistance, WorkerSensor, World, whole_arm
@@ -20,7 +20,7 @@ from hrc_learn.skills.grasping import as_load
 from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
 
 WORKPLACE = Workplace()
-VISIT = somebody_comes(WORKPLACE, np.random.default_rng(5))
+VISIT = draw_visit(WORKPLACE, np.random.default_rng(5))
 SCENE = replace(WORKPLACE.scene, worker=VISIT.worker.config)
 ARM = whole_arm(SCENE.arm)
 HAND = PARTS.index("hand_right")
@@ -216,7 +216,7 @@ def test_the_arm_rests_by_the_time_that_somebody_may_arrive(distance, speed):
         arrival += dt
     # Late by the age and the reaction, and with 0.15 s to come to rest.
     expected = np.clip((arrival - age - SEPARATION.reaction_time) / 0.15, 0.0, 1.0)
-    assert found.share == pytest.approx(expected, abs=2e-3)
+    assert found.speed_scale == pytest.approx(expected, abs=2e-3)
 
 
 class Hand:
@@ -250,7 +250,7 @@ def test_a_hand_that_sets_off_meets_an_arm_at_rest(gap):
     watch = PersonWatch(sensor, panda.whole, separation)
     while hand.gap(now) > 0:
         found = watch.look(now, WORKPLACE.hover_joints())
-        if now < hand.begin or found.share > 0:
+        if now < hand.begin or found.speed_scale > 0:
             rests = None
         elif rests is None:
             rests = now
@@ -262,7 +262,7 @@ def test_a_hand_that_sets_off_meets_an_arm_at_rest(gap):
 def test_nobody_who_stays_away_slows_the_arm_down():
     found = watch(observed(), acceleration=3.0).look(1.0, WORKPLACE.home_joints())
     assert found.nearest > 0.4
-    assert found.share == 1.0
+    assert found.speed_scale == 1.0
 
 
 @pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"pairs": 0}])

@@ -291,23 +291,3 @@ def test_however_hard_and_long_a_person_pushes_the_task_keeps_its_place_and_room
 def self_motion(q):
     q = torch.as_tensor(q, dtype=torch.float64)
     return np.linalg.svd(panda.jacobian(q).numpy())[2][6]
-
-
-def test_the_null_space_gives_way_to_a_task_that_needs_the_room():
-    """A joint at the edge of the room left to the task, which a push had moved it to."""
-    q = panda.ready.clone()
-    arm = ObedientArm(q.numpy())
-    cell = cell_with(arm)
-    lower, upper = cell._room.velocity_bounds(q)
-    direction = self_motion(q)
-    k = int(np.abs(direction).argmax())
-    task = torch.zeros(7, dtype=torch.float64)
-    task[k] = 0.2
-    cell._room.velocity_bounds = lambda joints: (
-        lower,
-        upper.clone().index_fill(0, torch.tensor(k), 0.0),
-    )
-    J, still = panda.jacobian(q), torch.zeros(7, dtype=torch.float64)
-    null = cell._within_limits(J, task, still)
-    assert float((J @ null).norm()) < 1e-9
-    assert float((task + null)[k]) == pytest.approx(0.0, abs=1e-9)

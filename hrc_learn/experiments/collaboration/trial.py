@@ -19,9 +19,9 @@ from hrc_learn.experiments.collaboration.hand_over import (
 )
 from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
 from hrc_learn.experiments.collaboration.worker import (
+    draw_visit,
     move_worker,
     separation_margin,
-    somebody_comes,
 )
 from hrc_learn.experiments.collaboration.worker_room import (
     ReachRoom,
@@ -293,7 +293,7 @@ def simulate_collaboration(
         raise ValueError("one person comes: give --worker or --handover")
     # Drawn apart, so that runs with and without the worker are alike but for him.
     chance = np.random.default_rng([seed, 2])
-    visit = somebody_comes(workplace, chance, beside_elbow=True) if worker else None
+    visit = draw_visit(workplace, chance, beside_elbow=True) if worker else None
     scene = replace(workplace.scene, worker=None if visit is None else visit.worker.config)
     if handover:
         scene = replace(scene, worker=giver(seed).config)

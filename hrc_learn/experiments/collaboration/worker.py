@@ -1,4 +1,4 @@
-"""A worker beside the robot in a run: who comes, and whom he touches."""
+"""A worker near the robot in a run: the visit, its contacts, and the distance left to stop."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -24,33 +24,41 @@ from hrc_learn.sim import (
 from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace
 
-# When he comes beside the elbow [s] and how often he reaches: a robot waits above the first
-# object 11 s after it began, and he is to reach under it then.
-_COMES, _REACHES = (4.0, 9.0), (3, 5)
-# Distance that people keep from an arm at rest which they see, as far as a sleeve stands out
-# [m]; how often that is looked at [s]; and how many are drawn until one can reach like that.
-_KEPT_CLEAR, _LOOKED_AT, _DRAWS = 0.03, 0.05, 200
+# Arrival at the elbow [s] and number of reaches: a robot waits above its first object 11 s
+# after the start, and the worker is to reach under it then.
+_ARRIVES, _REACHES = (4.0, 9.0), (3, 5)
+# Distance that people keep from a resting arm in their view, the thickness of a sleeve [m];
+# time between checks of it [s]; and workers drawn until one can reach like that.
+_KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 200
 # Joints at the ends of the forearm, from 0.
 _FOREARM = slice(3, 5)
+# Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
+# push creep.
+_AT_REST = 0.01
+# Steps that are computed together: some 100 MB.
+_BLOCK = 250
 
 
-def somebody_comes(
+def draw_visit(
     workplace: Workplace, rng: np.random.Generator, *, beside_elbow: bool = False
 ) -> WorkerVisit:
-    """A visit of somebody to the table.
+    """Draw a visit of a worker to the table.
 
     Args:
-        workplace: Whose table, and where the arm works.
-        rng: Source of chance: who, when, and what they do.
-        beside_elbow: Whether they come to the side of the table where the elbow is, while the
-            robot waits above its first object, and reach under the forearm, as in the paper's
-            Experiment 3. Else they come to the far side, and reach beside the end effector.
+        workplace: Table and arm.
+        rng: Source of the worker's body, times and motions.
+        beside_elbow: True: the worker comes to the side of the table where the elbow is, while
+            the robot waits above its first object, and reaches under the forearm, as in the
+            paper's Experiment 3. False: to the far side, reaching past the end effector.
+
+    Raises:
+        ValueError: No worker can reach under the arm that waits.
     """
     table = workplace.scene.table
     if not beside_elbow:
         worker = Worker(WorkerConfig.draw(rng))
         return random_visit(worker, rng, bench=table, under=workplace.table_centre)
-    # Visits are to the side of +y: drawn as if the side of -x were there.
+    # Visits are drawn to the side of +y, as if the side of -x were there, and turned.
     arm, waiting = whole_arm(workplace.scene.arm), workplace.hover_joints()
     elbow, wrist = panda.joint_origins(waiting)[_FOREARM].tolist()
     x, y = (elbow[0] + wrist[0]) / 2, (elbow[1] + wrist[1]) / 2
@@ -61,7 +69,7 @@ def somebody_comes(
         radius = torch.from_numpy(worker.radius)
 
         def is_clear(ends: Float[np.ndarray, "time parts 2 3"], radius=radius) -> bool:
-            """Of the arm that waits: nobody leans into steel, however awkward it gets."""
+            """True if the body stays clear of the arm that waits, as people do."""
             there = torch.from_numpy(turned_about_base(ends, np.pi / 2))
             found = separation(arm, waiting, there, radius)
             return bool((found.distance >= _KEPT_CLEAR).all())
@@ -72,13 +80,13 @@ def somebody_comes(
                 rng,
                 bench=bench,
                 under=(y, -x),
-                begin=_COMES,
+                begin=_ARRIVES,
                 reaches=_REACHES,
                 is_clear=is_clear,
             )
         except ValueError:
             continue  # a small person who stands where the arm hinders them
-        on_the_way = np.arange(visit.begin, visit.end, _LOOKED_AT)
+        on_the_way = np.arange(visit.begin, visit.end, _CHECKED_EVERY)
         if is_clear(visit.capsules_at(on_the_way).ends):
             return visit.turned(np.pi / 2)
     raise ValueError(
@@ -89,18 +97,18 @@ def somebody_comes(
 
 
 def move_worker(world: World, visit: WorkerVisit) -> None:
-    """Put the worker where he is now."""
+    """Move the simulated worker to the posture of the visit at this time."""
     ends = visit.ends_at(world.time)
     world.move_worker(ends, visit.item_at(world.time, ends))
 
 
 def worker_contacts(world: World, log: LoggedSteps, motion: MotionLog) -> tuple[Touch, ...]:
-    """Touches of the worker and the robot, or what it held then.
+    """Contacts of the worker with the robot, or with the object in its gripper.
 
     Args:
-        world: As the run left it.
-        log: The run's.
-        motion: Of everything in it.
+        world: Simulation at the end of the run.
+        log: Log of the run.
+        motion: Motion of everything in it.
     """
     objects = {item.name for item in world.config.objects}
     time = log["time"] if len(log) else np.empty(0)
@@ -109,18 +117,11 @@ def worker_contacts(world: World, log: LoggedSteps, motion: MotionLog) -> tuple[
         if touch.first not in objects:
             return True
         during = (time >= touch.start) & (time <= touch.end)
-        # A touch may be shorter than a step: the one that it began in counts as well.
+        # A contact may be shorter than a step: the step in which it began counts as well.
         during[max(int(np.searchsorted(time, touch.start, side="right")) - 1, 0)] = True
         return bool((during & motion.held(touch.first)[: len(time)]).any())
 
     return tuple(touch for touch in world.worker_contacts.touches if counts(touch))
-
-
-# Speed up to which a part of the arm is at rest: servos that hold a pose against a push creep
-# [m/s].
-_AT_REST = 0.01
-# Steps that are computed at once: some 100 MB.
-_AT_ONCE = 250
 
 
 def margin_to_stop(
@@ -129,16 +130,17 @@ def margin_to_stop(
     person_velocity: Float[Tensor, "*batch H 2 3"],
     config: SeparationConfig,
 ) -> tuple[Float[Tensor, "*batch C H"], Bool[Tensor, "*batch C H"]]:
-    """What distances exceed the one by which the arm can stop before a person [m].
+    """Margin of each distance over the one within which the arm can stop before a person [m].
 
     Args:
         found: True distances.
-        joint_velocity: Of the arm [rad/s].
-        person_velocity: Of both ends of the person's capsules [m/s].
-        config: With the deceleration of the arm.
+        joint_velocity: Joint velocity of the arm [rad/s].
+        person_velocity: Velocity of both ends of the person's capsules [m/s].
+        config: Protective distance, with the deceleration of the arm.
 
     Returns:
-        d - v_h v/a - v^2/(2 a), infinite where the arm does not close in; and whether it does.
+        d - v_h v/a - v^2/(2 a), infinite where the arm does not approach; and True where it
+        does.
     """
     stop = replace(config, reaction_time=0.0, clearance=0.0)
     closing = -found.rate(joint_velocity, torch.zeros_like(person_velocity))
@@ -157,19 +159,20 @@ def separation_margin(
     encoder_offset: Float[np.ndarray, " joints"],
     loads: Mapping[str, tuple[GraspedBox, Bool[np.ndarray, " steps"]]],
 ) -> Float[np.ndarray, " steps"]:
-    """By how much the worker truly was further away than the arm needed to stop before him [m].
+    """Margin of the true distance from the worker over the stopping distance, at each step [m].
 
-    That is the protective distance of what is true, with nothing unknown and nothing to wait
-    for: v_h v/a + v^2/(2 a), for each part of the arm that closes in on one of his with the
-    speed v while he comes with v_h. The least over all of them; infinite while none closes in.
+    The stopping distance is v_h v/a + v^2/(2 a), for a part of the arm that approaches a part
+    of the worker at speed v while that comes at v_h: the protective distance without reaction
+    time and uncertainty. The result is the smallest margin over all parts, infinite while the
+    arm approaches none.
 
     Args:
-        log: Of the run.
-        visit: Where he was.
+        log: Log of the run.
+        visit: Motion of the worker.
         arm: Capsules of arm and tool.
-        config: With the deceleration of the arm.
-        encoder_offset: What the joint positions of the log are too large by [rad].
-        loads: What the arm held at times, and when.
+        config: Protective distance, with the deceleration of the arm.
+        encoder_offset: Offset of the logged joint positions: measured minus true [rad].
+        loads: Objects in the gripper, and the steps in which they were.
     """
     time = log["time"]
     q = torch.from_numpy(log["joint_position"] - encoder_offset)
@@ -188,6 +191,6 @@ def separation_margin(
     for load, held in [*loads.values(), (None, rest)]:
         steps = np.flatnonzero(held & rest)
         rest[steps] = False
-        for k in range(0, len(steps), _AT_ONCE):
-            measure(steps[k : k + _AT_ONCE], load)
+        for k in range(0, len(steps), _BLOCK):
+            measure(steps[k : k + _BLOCK], load)
     return margin

@@ -1,0 +1,389 @@
+"""A thousand jobs near a worker: the cost of keeping the protective distance, and what making
+way saves, compared with arms that stop and wait.
+
+Another worker comes in each run, puts something on the table, reaches for markers under the arm
+and walks away. The arms keep the protective distance of ISO/TS 15066 from what a tracker sees,
+and their null space makes way or not; others stop and wait while the worker is nearer than a
+fixed distance. The exit status is 1 if an arm that keeps the distance violated it.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress
+from rich.table import Table
+from torch import Tensor
+from worker_job import JobCycle, random_cycles
+from worker_runs import Job, Reaction, WorkerRuns, run_near_workers
+from worker_tables import WorkerTables
+
+from hrc_learn import cli
+from hrc_learn.controller import WayMakingConfig
+from hrc_learn.controller.arm_loop import ArmLoopConfig
+from hrc_learn.experiments.collaboration.worker import draw_visit
+from hrc_learn.sim import Imperfections, WorkerVisit, whole_arm
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.store import new_file, new_folder, write_json
+from hrc_learn.teleoperation import ScriptedForce
+from hrc_learn.viz.figures import cycle_time_figure
+
+Mode = Literal["none", "expert", "automatic", "both"]
+MODES: tuple[Mode, ...] = ("none", "expert", "automatic", "both")
+"""Sources of null-space motion: `WayMakingConfig.mode`."""
+
+# Runs at once: their tables of visits take some 2 GB.
+_BATCH = 250
+# Readings of the encoders after which their noise repeats.
+_READINGS = 1000
+# Reaction time of the expert to the worker's reaching [s]: as in bench_constraints.py.
+_REACTION = 0.4
+# Force with which the expert draws the elbow away [N], and distance of the point that it is
+# drawn towards, so far that the direction stays [m]: `random_pulls`.
+_FORCE, _FAR_AWAY = 60.0, 10.0
+# Largest distance of the object from the middle of the table, along x and y [m].
+_REACH = (0.10, 0.08)
+_COLUMNS = (
+    ("viol.\nruns", "violated_runs", "{:.0f}"),
+    ("least\nmargin", "margin_least_mm", "{:.0f}"),
+    ("closing\n least", "closing_least_mm", "{:.0f}"),
+    ("p5", "closing_p5_mm", "{:.0f}"),
+    ("median", "closing_median_mm", "{:.0f}"),
+    ("elbow\np5", "elbow_p5_mm", "{:.0f}"),
+    ("free\n[%]", "roomy", "{:.1%}"),
+    ("cycle\n[s]", "cycle_s", "{:.1f}"),
+    ("p95", "cycle_p95_s", "{:.1f}"),
+    ("x undis-\nturbed", "over_undisturbed", "{:.2f}"),
+    ("waited\n[s]", "waited_s", "{:.1f}"),
+    ("off path\np95", "off_path_p95_mm", "{:.1f}"),
+    ("less, same\ndistance", "shorter_at_same_distance", "{:.1%}"),
+    ("less,\nsafe stop", "shorter_than_safe_stop", "{:.1%}"),
+)
+# Width of the table: a log file has none of its own.
+_WIDTH = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    placing: Path
+    """Folder of the placing skill."""
+    aiming: Path
+    """Folder of the visual-servoing skill, whose orientation above the table is taken."""
+    runs: int = 1000
+    """Runs of each reaction, with the same workers in all of them."""
+    seed: int = 0
+    """Seed of workers, trackers, encoders and objects."""
+    modes: tuple[Mode, ...] = MODES
+    """Sources of null-space motion to compare."""
+    stop_distances: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.8)
+    """Distances within which arms stop and wait [m]."""
+    cycles: int = 24
+    """Different cycles of the job, to one shelf after the other; several arms do each."""
+    imperfections: float = 1.0
+    """Size of the imperfections, relative to the nominal ones; 0: none."""
+    out: Path | None = None
+    """Folder for the figures and the picture."""
+    overwrite: bool = False
+    """Replace that folder."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> int:
+    """Run the study, print its table, write the figures."""
+    if args.cycles < 1 or any(not distance > 0 for distance in args.stop_distances):
+        raise ValueError("--cycles and --stop-distances must be positive.")
+    torch.set_num_threads(1)
+    sizes = Imperfections.nominal().scaled(args.imperfections)
+    config = WorkerStudyConfig(runs=args.runs, seed=args.seed, imperfections=sizes)
+    workplace = Workplace().approached(VisualServoSkill.load(args.aiming).approach)
+    placing = PlacingSkill.load(args.placing)
+    with Progress() as progress, torch.inference_mode():
+        # A seed of another length than those of the runs.
+        rng = np.random.default_rng([args.seed, 0, 1])
+        drawn = random_cycles(workplace, placing, args.cycles, _REACH, rng, config.cell.dt)
+        cycles = list(progress.track(drawn, args.cycles, description="planning"))
+        tasks = {}
+
+        def report(name: str, done: float) -> None:
+            if name not in tasks:
+                tasks[name] = progress.add_task(name, total=args.runs)
+            progress.update(tasks[name], completed=done)
+
+        study = run_study(
+            workplace,
+            cycles,
+            config,
+            modes=args.modes,
+            stop_distances=args.stop_distances,
+            report=report,
+        )
+    figures = study.figures()
+    show(study, figures)
+    if args.out is not None:
+        with new_folder(args.out, asdict(args), args.overwrite) as folder:
+            write_json(folder / "metrics.json", figures)
+            draw(folder / "worker.png", study)
+    if args.json is not None:
+        cli.write_json(args.json, figures)
+    return int(any(bool(runs.violations.any()) for runs in study.making_way.values()))
+
+
+def show(study: WorkerStudy, figures: dict[str, float]) -> None:
+    """Print the table."""
+    console = Console()
+    console = Console(width=max(console.width, _WIDTH))
+    table = Table(
+        title=f"{next(iter(figures.values())):.0f} jobs near a worker; true distances in mm, "
+        "`closing` between parts that approached each other"
+    )
+    table.add_column("arm", no_wrap=True)
+    for title, *_ in _COLUMNS:
+        table.add_column(escape(title), justify="right", no_wrap=True)
+    names = [(mode, f"null space: {mode}") for mode in study.making_way]
+    names += [(f"stop_{round(1e3 * d)}_mm", f"stops within {d:g} m") for d in study.stopping]
+    for key, name in names:
+        found = (figures.get(f"{key}_{column}") for _, column, _ in _COLUMNS)
+        shown = (
+            "" if value is None else form.format(value)
+            for value, (*_, form) in zip(found, _COLUMNS, strict=True)
+        )
+        table.add_row(name, *shown)
+    console.print(table)
+
+
+def draw(path: Path, study: WorkerStudy) -> None:
+    """Draw cycle times over smallest distances."""
+
+    def point(runs: WorkerRuns) -> tuple[float, float]:
+        return smallest_distance(runs), float(runs.cycle_time.median())
+
+    first = next(iter([*study.making_way.values(), *study.stopping.values()]))
+    figure = cycle_time_figure(
+        {mode: point(runs) for mode, runs in study.making_way.items()},
+        {distance: point(runs) for distance, runs in study.stopping.items()},
+        undisturbed=float(first.undisturbed.median()),
+    )
+    with new_file(path) as part:
+        figure.savefig(part, dpi=150)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerStudyConfig:
+    """Settings of the runs."""
+
+    runs: int = 1000
+    seed: int = 0
+    """Seed of workers, visits, trackers and encoders; the same for all reactions."""
+    limit: float = 180.0
+    """Longest time of a run [s]: five cycles."""
+    imperfections: Imperfections = field(default_factory=Imperfections.nominal)
+    """Imperfections of encoders, commands, servos, drivers and trackers."""
+    cell: ArmLoopConfig = field(default_factory=ArmLoopConfig)
+
+    def __post_init__(self) -> None:
+        if self.runs < 1:
+            raise ValueError(f"runs must be at least 1, but is {self.runs}.")
+
+
+def draw_job(
+    workplace: Workplace,
+    cycles: Sequence[JobCycle],
+    runs: Sequence[int],
+    config: WorkerStudyConfig,
+) -> Job:
+    """Workers near arms that do their cycles; each run is the same in any batch.
+
+    Args:
+        workplace: Table, shelves and arm.
+        cycles: Cycles of the job, done in turn.
+        runs: Numbers of the runs.
+        config: Settings of the runs.
+    """
+    sizes, dt, visits, chances = config.imperfections, config.cell.dt, [], []
+    offset, noise = [], []
+    for run in runs:
+        rng = np.random.default_rng([config.seed, run])
+        visits.append(draw_visit(workplace, rng))
+        drawn = sizes.draw(rng)
+        offset.append(drawn.encoder_offset)
+        noise.append(sizes.encoder_noise * rng.standard_normal((_READINGS, 7)))
+        chances.append(rng)
+    return Job(
+        workplace=workplace,
+        arm=whole_arm(workplace.scene.arm),
+        cycles=cycles,
+        cycle=torch.tensor([run % len(cycles) for run in runs]),
+        workers=WorkerTables.of(visits, sizes, chances, dt),
+        pulls=[expert_pull(visit) for visit in visits],
+        encoder_offset=torch.from_numpy(np.stack(offset)),
+        encoder_noise=torch.from_numpy(np.stack(noise)),
+        sizes=sizes,
+    )
+
+
+def expert_pull(visit: WorkerVisit) -> ScriptedForce:
+    """Pull of an expert who draws joint 4 away from the worker while he reaches under the arm.
+
+    As in Experiment 3 of the paper.
+    """
+    # The last three motions of a visit: hands down, turn, walk away.
+    begin, end = visit.released + _REACTION, float(visit.time[-4]) + _REACTION
+    k = int(np.searchsorted(visit.time, visit.released))
+    place, heading = visit.poses[k, :2], visit.poses[k, 2]
+    x, y = place + _FAR_AWAY * np.array([np.cos(heading), np.sin(heading)])
+    return ScriptedForce(
+        start=begin, duration=end - begin, towards=(float(x), float(y), 0.5), max_force=_FORCE
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkerStudy:
+    """Runs with each reaction."""
+
+    making_way: Mapping[Mode, WorkerRuns]
+    """Runs by the source of null-space motion; all of them keep the protective distance."""
+    stopping: Mapping[float, WorkerRuns]
+    """Runs of arms that stop and wait, by the distance within which they rest [m]."""
+
+    def figures(self) -> dict[str, float]:
+        """All figures by name; lengths in mm, times in s."""
+        figures: dict[str, float] = {}
+        for mode, runs in self.making_way.items():
+            own = summary(runs) | self._compared(runs)
+            figures |= {f"{mode}_{key}": value for key, value in own.items()}
+        for distance, runs in self.stopping.items():
+            name = f"stop_{round(1e3 * distance)}_mm"
+            figures |= {f"{name}_{key}": value for key, value in summary(runs).items()}
+        return figures
+
+    def stop_and_wait(self, smallest: float) -> float:
+        """Median cycle time of stop-and-wait at a smallest distance [s].
+
+        Interpolated between the distances that were tried; NaN beyond them.
+
+        Args:
+            smallest: 5 % quantile over the runs, see `smallest_distance` [m].
+        """
+        if not self.stopping:
+            return np.nan
+        kept = [smallest_distance(runs) for runs in self.stopping.values()]
+        times = [float(runs.cycle_time.median()) for runs in self.stopping.values()]
+        # Arms that rest sooner keep more distance, but for chance.
+        order = np.argsort(kept)
+        return float(
+            np.interp(
+                smallest, np.take(kept, order), np.take(times, order), left=np.nan, right=np.nan
+            )
+        )
+
+    def _compared(self, runs: WorkerRuns) -> dict[str, float]:
+        """Reduction of the cycle time relative to arms that stop and wait."""
+        ours = float(runs.cycle_time.median())
+        figures = {
+            "shorter_at_same_distance": 1 - ours / self.stop_and_wait(smallest_distance(runs))
+        }
+        safe = [stop for stop in self.stopping.values() if not bool(stop.violations.any())]
+        if safe:
+            shortest = min(float(stop.cycle_time.median()) for stop in safe)
+            figures["shorter_than_safe_stop"] = 1 - ours / shortest
+        return {key: value for key, value in figures.items() if np.isfinite(value)}
+
+
+def smallest_distance(runs: WorkerRuns) -> float:
+    """5 % quantile over the runs of the distance that was closed in on [m]."""
+    return float(runs.closing.quantile(0.05))
+
+
+def summary(runs: WorkerRuns) -> dict[str, float]:
+    """Counts, medians and quantiles over the runs; lengths in mm, times in s."""
+
+    def quantile(values: Float[Tensor, " runs"], q: float) -> float:
+        return float(values.quantile(q, interpolation="nearest"))
+
+    present = runs.present.clamp(min=1e-9)
+    return {
+        "runs": float(len(runs.cycle_time)),
+        "violated_runs": float((runs.violations > 0).sum()),
+        "violated_steps": float(runs.violations.sum()),
+        "margin_least_mm": 1e3 * float(runs.margin.amin()),
+        "closing_least_mm": 1e3 * float(runs.closing.amin()),
+        "closing_p5_mm": 1e3 * smallest_distance(runs),
+        "closing_median_mm": 1e3 * quantile(runs.closing, 0.5),
+        "least_median_mm": 1e3 * quantile(runs.least, 0.5),
+        "elbow_p5_mm": 1e3 * quantile(runs.elbow, 0.05),
+        "elbow_median_mm": 1e3 * quantile(runs.elbow, 0.5),
+        "roomy": float((1 - runs.crowded / present).mean()),
+        "cycle_s": quantile(runs.cycle_time, 0.5),
+        "cycle_p95_s": quantile(runs.cycle_time, 0.95),
+        "over_undisturbed": quantile(runs.cycle_time / runs.undisturbed, 0.5),
+        "waited_s": quantile(runs.waited, 0.5),
+        "waited_p95_s": quantile(runs.waited, 0.95),
+        "off_path_median_mm": 1e3 * quantile(runs.off_path, 0.5),
+        "off_path_p95_mm": 1e3 * quantile(runs.off_path, 0.95),
+        "unfinished": float(runs.cycle_time.isinf().sum()),
+        "unsolved_steps": float(runs.unsolved.sum()),
+    }
+
+
+def run_study(
+    workplace: Workplace,
+    cycles: Sequence[JobCycle],
+    config: WorkerStudyConfig,
+    *,
+    modes: Sequence[Mode] = MODES,
+    stop_distances: Sequence[float] = (),
+    report: Callable[[str, float], None] = lambda name, done: None,
+) -> WorkerStudy:
+    """Let arms do their cycles near workers, with one reaction after the other.
+
+    Args:
+        workplace: Table, shelves and arm.
+        cycles: Cycles of the job, done in turn.
+        config: Settings of the runs.
+        modes: Sources of null-space motion.
+        stop_distances: Distances of stop-and-wait [m].
+        report: Called with a reaction and the number of its runs that have ended.
+    """
+    reactions: dict[str, Reaction] = {
+        mode: Reaction(way_making=WayMakingConfig(mode=mode)) for mode in modes
+    }
+    stops = {f"stop at {d:g} m": d for d in sorted(stop_distances)}
+    still = WayMakingConfig(mode="none")
+    for name, distance in stops.items():
+        reactions[name] = Reaction(way_making=still, stop_distance=distance)
+    parts: dict[str, list[WorkerRuns]] = {name: [] for name in reactions}
+    for first in range(0, config.runs, _BATCH):
+        batch = range(first, min(first + _BATCH, config.runs))
+        job = draw_job(workplace, cycles, batch, config)
+        for name, reaction in reactions.items():
+
+            def ended(fraction: float, name: str = name, batch: range = batch) -> None:
+                report(name, batch.start + fraction * len(batch))
+
+            parts[name].append(
+                run_near_workers(job, reaction, config.cell, config.limit, ended)
+            )
+    joined = {name: WorkerRuns.joined(part) for name, part in parts.items()}
+    return WorkerStudy(
+        making_way={mode: joined[mode] for mode in modes},
+        stopping={distance: joined[name] for name, distance in stops.items()},
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

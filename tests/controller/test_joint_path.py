@@ -1,0 +1,150 @@
+"""Rules for joints that a push has taken off their path."""
+
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.controller.joint_path import (
+    DirectReturn,
+    JointPaths,
+    may_not_return,
+    nears_singularity,
+    push_fraction,
+    return_alignment,
+    waiting_time,
+)
+from hrc_learn.controller.null_space_motion import YieldingConfig
+from hrc_learn.kinematics import panda
+
+Q = torch.tensor([0.4, 0.2, -0.3, -2.2, 0.1, 2.4, 0.6], dtype=torch.float64)
+
+
+def aside(size, straight):
+    """An error of that size [rad] and its null-space part, of that cosine."""
+    first, *_, null = torch.from_numpy(np.linalg.svd(panda.jacobian(Q).numpy())[2])
+    return size * (straight * null + np.sqrt(1 - straight**2) * first), size * straight * null
+
+
+@pytest.mark.parametrize(
+    ("size", "straight", "lost"),
+    [
+        (1.7, 0.9, False),
+        (1.9, 0.9, True),
+        (1.0, 0.7, False),
+        (1.0, 0.6, True),
+        # So near they do find back; in between there is no jump.
+        (0.29, 0.1, False),
+        (0.36, 0.6, False),
+        (0.45, 0.5, True),
+    ],
+)
+def test_joints_far_aside_or_poorly_aligned_may_not_return(size, straight, lost):
+    error, null = aside(size, straight)
+    assert bool(may_not_return(error, return_alignment(null, error))) == lost
+
+
+@pytest.mark.parametrize(
+    ("size", "straight", "lost"),
+    [(1.45, 0.9, True), (1.0, 0.77, True), (1.35, 0.82, False), (0.01, 1.0, False)],
+)
+def test_a_path_that_has_waited_goes_on_once_the_joints_are_well_on_their_way(
+    size, straight, lost
+):
+    error, null = aside(size, straight)
+    assert bool(may_not_return(error, return_alignment(null, error), True)) == lost
+
+
+@pytest.mark.parametrize(("straight", "fraction"), [(0.6, 0.0), (0.725, 0.5), (0.9, 1.0)])
+def test_a_push_fades_where_the_joints_might_not_find_back(straight, fraction):
+    error, null = aside(1.0, straight)
+    alignment = return_alignment(null, error)
+    assert float(push_fraction(-null, null, alignment)) == pytest.approx(fraction)
+    assert float(push_fraction(null, null, alignment)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("smallest", "towards", "nears"),
+    [(0.09, 1.0, True), (0.09, -1.0, False), (0.09, 0.0, False), (0.06, -1.0, True)],
+)
+def test_an_arm_nears_a_singularity_by_the_time_that_its_path_has_stopped(
+    smallest, towards, nears
+):
+    """The second joint takes the shoulder to where its axes are in a plane."""
+    postures = torch.tensor([-0.3, 0.0, 1.5, -1.9, -0.1, 2.0, -0.3], dtype=torch.float64)
+    postures = postures.repeat(700, 1)
+    postures[:, 1] = torch.linspace(0.1, 0.8, 700, dtype=torch.float64)
+    values = np.linalg.svd(panda.jacobian(postures).numpy())[1][:, -1]
+    assert (np.diff(values) > 0).all()
+    q = postures[np.abs(values - smallest).argmin()]
+    velocity = torch.zeros(7, dtype=torch.float64)
+    velocity[1] = -towards
+    assert bool(nears_singularity(panda, q, velocity)) == nears
+
+
+def test_a_path_waits_for_joints_as_long_as_they_come_nearer():
+    """2 s without 0.05 rad of way; half as long again after time in which it went on."""
+    one, dt = torch.ones((), dtype=torch.float64), 0.01
+
+    def steps(offs, waited=0.0, nearest=torch.inf, rate=0.0, counts=True):
+        waited, nearest = waited * one, nearest * one
+        for off in offs:
+            waited, nearest = waiting_time(
+                waited, nearest, off * one, rate * one, torch.tensor(counts), 2.0, dt
+            )
+        return float(waited)
+
+    slowly, stuck = np.linspace(2.0, 1.0, 600), np.full(100, 1.5)
+    assert steps(slowly) < 0.5
+    assert steps(stuck) == pytest.approx(0.99)
+    assert steps(np.linspace(1.5, 1.46, 100)) == pytest.approx(0.99)
+    assert steps(stuck, rate=1.0, waited=1.5, nearest=1.5) == pytest.approx(0.5)
+    assert steps(stuck[:50], waited=1.0, nearest=1.5, rate=-1.0) == pytest.approx(1.5)
+    # Not while somebody pushes, who may push it farther: that is where it comes back from.
+    assert steps(stuck, waited=1.0, counts=False) == pytest.approx(1.0)
+    _, nearest = waiting_time(one, 0.5 * one, 2.5 * one, one, torch.tensor(False), 2.0, dt)
+    assert steps(np.linspace(2.5, 1.0, 600), nearest=float(nearest)) < 0.5
+    # A path that is gone back is gone back to where the joints are on it again.
+    assert steps(slowly, waited=2.5, nearest=2.0) > 8.0
+
+
+START = panda.ready
+AWAY = START + torch.tensor([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
+
+
+def planned(samples, progress, joints, clearance):
+    paths = JointPaths.of(panda, [samples.numpy()], 0.01)
+    zero = torch.tensor(0)
+    progress = torch.tensor(progress, dtype=torch.float64)
+    config = YieldingConfig()
+    return DirectReturn.planned(paths, zero, progress, joints, config, clearance)
+
+
+@pytest.mark.parametrize("distance", [0.5, -0.5])
+def test_a_direct_return_is_blocked_where_the_arm_would_meet_something(distance):
+    def clearance(q):
+        # Clear at both ends; in between as given.
+        near = (q[..., None, :] - torch.stack([START, AWAY])).norm(dim=-1).amin(-1)
+        return torch.where(near < 0.05, 0.5, distance)
+
+    direct = planned(START[None], 0.0, AWAY, clearance)
+    assert bool(direct.blocked) == (distance < 0)
+    assert bool(direct.active) == (distance > 0)
+    torch.testing.assert_close(direct.joint_position(), AWAY)
+    if distance > 0:
+        # A minimum-jerk motion of 0.3 rad whose peak is 0.4 rad/s.
+        assert float(direct.duration) == pytest.approx(1.875 * 0.3 / 0.4)
+
+
+def test_a_direct_return_leads_to_another_sample_if_the_way_is_blocked():
+    joints = START + torch.tensor([0.2] + 6 * [0.0], dtype=torch.float64)
+    post = (joints + AWAY) / 2
+
+    def clearance(q):
+        return (q - post).norm(dim=-1) - 0.15
+
+    fraction = torch.linspace(0, 1, 101, dtype=torch.float64)[:, None]
+    direct = planned(torch.lerp(START, AWAY, fraction), 100.0, joints, clearance)
+    assert bool(direct.active)
+    assert float(direct.progress) < 50
+    way = torch.lerp(direct.start, direct.goal, fraction)
+    assert clearance(way).min() > 0
