@@ -144,7 +144,7 @@ class ValidationReport:
         self.attempt(collect)
 
     def lines(self, full: bool = False) -> Iterator[str]:
-        """Lines of the report; issues of one kind share a line that names the worst place.
+        """The report as text; issues of one kind become one line that names the worst place.
 
         Args:
             full: Give every issue a line of its own.
