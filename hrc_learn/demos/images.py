@@ -164,9 +164,8 @@ class ImageReader:
                 key=camera,
             )
         if len(wanted) and not (wanted[0] >= 0 and wanted[-1] < entry.length):
-            raise DatasetError(
-                f"has no frames {wanted[0]} to {wanted[-1]}: it has {entry.length}",
-                **entry.location,
+            raise entry.error(
+                f"has no frames {wanted[0]} to {wanted[-1]}: it has {entry.length}"
             )
         if self._folder.features[camera].dtype == "image":
             yield from self._from_column(entry, camera, wanted, size)
@@ -241,11 +240,8 @@ class ImageReader:
                 content = column[frame - wanted[0]].as_py()["bytes"]
                 yield frame, decode_image(content, size)
             except (DatasetError, KeyError, TypeError) as error:
-                raise DatasetError(
-                    "holds an image that cannot be decoded",
-                    **entry.location,
-                    frame=frame,
-                    key=camera,
+                raise entry.error(
+                    "holds an image that cannot be decoded", frame=frame, key=camera
                 ) from error
 
 

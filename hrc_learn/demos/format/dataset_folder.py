@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
@@ -17,7 +17,7 @@ from hrc_learn.demos.format.files import (
     read_rows,
 )
 from hrc_learn.demos.format.metadata import QUANTILES, Feature, Statistics, read_features
-from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.issues import DatasetError, Issue
 from hrc_learn.store import resolved, settle
 
 _FASTEST = 1e6
@@ -42,6 +42,42 @@ class EpisodeEntry:
     def location(self) -> dict[str, Any]:
         """File and episode, as keywords of an `Issue` or a `DatasetError`."""
         return {"file": self.file, "episode": self.index}
+
+    def error(
+        self, message: str, frame: int | None = None, key: str | None = None
+    ) -> DatasetError:
+        """Reading error located in this episode."""
+        return DatasetError(message, **self.location, frame=frame, key=key)
+
+    def fault(
+        self,
+        message: str,
+        frame: int | None = None,
+        key: str | None = None,
+        components: tuple[str, ...] = (),
+        severity: float = 0.0,
+    ) -> Issue:
+        """Issue of level "error" located in this episode; arguments as in `Issue`."""
+        return Issue(
+            message=message,
+            **self.location,
+            frame=frame,
+            key=key,
+            components=components,
+            severity=severity,
+        )
+
+    def warning(
+        self,
+        message: str,
+        frame: int | None = None,
+        key: str | None = None,
+        components: tuple[str, ...] = (),
+        severity: float = 0.0,
+    ) -> Issue:
+        """Issue of level "warning" located in this episode; arguments as in `Issue`."""
+        fault = self.fault(message, frame, key, components, severity)
+        return replace(fault, level="warning")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.issues import Issue, warning
+from hrc_learn.demos.issues import Issue
 from hrc_learn.demos.read.profiles import ColumnProfile, EpisodeProfile, is_discrete
 from hrc_learn.demos.read.quantities import meaning_of_component
 
@@ -84,10 +84,9 @@ def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
     usual = float(np.median([entry.length for entry in entries]))
     for entry in entries:
         if not usual / 5 < entry.length < 5 * usual:
-            yield warning(
-                message=f"has {entry.length} frames where {usual:.0f} are usual: broken off, "
-                f"or several in one?",
-                **entry.location,
+            yield entry.warning(
+                f"has {entry.length} frames where {usual:.0f} are usual: broken off, "
+                f"or several in one?"
             )
 
 
@@ -100,10 +99,9 @@ def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
     absurd &= np.array([not _is_clock_name(name, feature.key) for name in feature.names])
     for number, component in np.argwhere(absurd):
         name, size = feature.names[component], largest[number, component]
-        yield Issue(
-            message=f"{name} reaches {size:.3g}, usually {usual[component]:.3g}: the file was "
+        yield feature.entries[number].fault(
+            f"{name} reaches {size:.3g}, usually {usual[component]:.3g}: the file was "
             f"damaged, or memory was never written; leave the episode out",
-            **feature.entries[number].location,
             key=feature.key,
             components=(name,),
             severity=float(np.log(size)),
@@ -126,11 +124,10 @@ def holds(feature: FeatureProfiles, fps: float) -> Iterator[Issue]:
     frozen &= feature.smooth & (feature.span > 0)
     for number, component in np.argwhere(frozen):
         name = feature.names[component]
-        yield warning(
-            message=f"{name} stays the same for {held[number, component]:.0f} of "
+        yield feature.entries[number].warning(
+            f"{name} stays the same for {held[number, component]:.0f} of "
             f"{frames[number]} frames, usually for {100 * usual[component]:.0f} %: the "
             f"encoder froze?",
-            **feature.entries[number].location,
             key=feature.key,
             components=(name,),
             severity=float(fraction[number, component]),
@@ -151,10 +148,8 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
         for number in np.flatnonzero(odd.any(1)):
             names = [feature.names[i] for i in np.flatnonzero(odd[number])]
-            yield warning(
-                message=f"is {what} than in the other episodes: "
-                f"{', '.join(names[:_MOST_NAMED])}",
-                **feature.entries[number].location,
+            yield feature.entries[number].warning(
+                (f"is {what} than in the other episodes: {', '.join(names[:_MOST_NAMED])}"),
                 key=feature.key,
                 components=tuple(names),
                 severity=float(odd[number].sum()),
@@ -183,12 +178,7 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
                 text = f"{name} switches the other way than in the other episodes"
             else:
                 continue
-            yield warning(
-                message=text,
-                **feature.entries[number].location,
-                key=feature.key,
-                components=(name,),
-            )
+            yield feature.entries[number].warning(text, key=feature.key, components=(name,))
 
 
 def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:

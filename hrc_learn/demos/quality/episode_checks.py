@@ -51,11 +51,10 @@ def finite_values(
         if len(bad):
             frame, component = (int(i) for i in bad[0])
             name = features[key].component(component)
-            yield Issue(
-                message=f"{name} is {values[frame, component]} ({len(bad)} values are not "
+            yield entry.fault(
+                f"{name} is {values[frame, component]} ({len(bad)} values are not "
                 f"finite); hrc repair --drop bad-frames (or bad-episodes) makes a copy "
                 f"without",
-                **entry.location,
                 frame=frame,
                 key=key,
             )
@@ -67,18 +66,16 @@ def repetitions(entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
         return
     same = repeated_frames(frames)[1:]
     if same.all():
-        yield warning(
-            message="the state never changes: the recorder lost the robot",
-            **entry.location,
+        yield entry.warning(
+            "the state never changes: the recorder lost the robot",
             frame=0,
             key="observation.state",
         )
     elif same.mean() > _REPEATED:
-        yield warning(
-            message=f"{100 * same.mean():.0f} % of the frames repeat the one before; the "
+        yield entry.warning(
+            f"{100 * same.mean():.0f} % of the frames repeat the one before; the "
             f"recording is faster than the robot reports, or the robot stood still; hrc repair "
             f"drops them",
-            **entry.location,
             frame=int(same.argmax()) + 1,
         )
 
@@ -104,7 +101,7 @@ def episode_length(entry: EpisodeEntry, fps: float) -> Iterator[Issue]:
     seconds = entry.length / fps
     if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:
         text = f"only {entry.length} frames ({seconds:.2g} s): a false start?"
-        yield warning(message=text, **entry.location)
+        yield entry.warning(text)
 
 
 def stamps(
@@ -266,15 +263,14 @@ def orientation_values(episode: MotionRecord) -> Iterator[Issue]:
     try:
         to_quaternion(role, values)
     except ValueError as error:
-        yield Issue(message=str(error), **episode.entry.location, key=role)
+        yield episode.entry.fault(str(error), key=role)
         return
     if role.startswith("quaternion"):
         flips = np.flatnonzero((values[1:] * values[:-1]).sum(1) < 0)
         if len(flips):
-            yield warning(
-                message=f"the quaternion changes its sign {len(flips)} times without turning; "
+            yield episode.entry.warning(
+                f"the quaternion changes its sign {len(flips)} times without turning; "
                 f"load_demos makes it continuous, hrc repair does so on disk",
-                **episode.entry.location,
                 frame=int(flips[0]) + 1,
                 key=role,
             )
@@ -286,10 +282,8 @@ def motion_present(episode: MotionRecord) -> Iterator[Issue]:
         return
     span = float(np.ptp(episode.motion, axis=0).max())
     if span < _SMALLEST_MOTION:
-        yield Issue(
-            message=f"moves by {span:.2g} in all: nothing was demonstrated; leave the episode "
-            f"out",
-            **episode.entry.location,
+        yield episode.entry.fault(
+            f"moves by {span:.2g} in all: nothing was demonstrated; leave the episode out"
         )
 
 
@@ -308,9 +302,8 @@ def rest_at_ends(episode: MotionRecord) -> Iterator[Issue]:
         ("ends", float(time[-1] - time[arrived]), arrived),
     ):
         if seconds > _STILL_SECONDS:
-            yield warning(
-                message=f"{place} with {seconds:.1f} s of standing still: hrc repair trims it",
-                **episode.entry.location,
+            yield episode.entry.warning(
+                f"{place} with {seconds:.1f} s of standing still: hrc repair trims it",
                 frame=frame,
             )
 
@@ -334,11 +327,10 @@ def spikes_and_jumps(episode: MotionRecord) -> Iterator[Issue]:
             size = np.where(odd, np.abs(steps[: len(odd)]) / np.maximum(step, 1e-9), 0.0)
             frame, joint = divmod(int(size.argmax()), size.shape[1])
             name = episode.joint_names[joint]
-            yield warning(
-                message=f"{name} {what} by {steps[frame, joint]:.3g}, "
+            yield episode.entry.warning(
+                f"{name} {what} by {steps[frame, joint]:.3g}, "
                 f"{size[frame, joint]:.0f} times its usual fast step; "
                 f"{int(odd.any(1).sum())} such frames in the episode",
-                **episode.entry.location,
                 frame=frame + 1,
                 key=f"{role} ({name})",
                 components=(name,),
@@ -369,11 +361,10 @@ def joint_speeds(episode: MotionRecord) -> Iterator[Issue]:
         if wrapped
         else "a glitch, or frames were lost: look at it, or leave the episode out"
     )
-    yield warning(
-        message=f"{names[joint]} jumps by {step:.3g} rad in one frame "
+    yield episode.entry.warning(
+        f"{names[joint]} jumps by {step:.3g} rad in one frame "
         f"({speed[frame, joint]:.3g} rad/s, limit {limits[joint]:.3g}); {cause}. "
         f"{int(too_fast.sum())} such frames in the episode",
-        **episode.entry.location,
         frame=frame + 1,
         key=f"joint_position ({names[joint]})",
         components=(names[joint],),
@@ -385,10 +376,8 @@ def copied_commands(episode: MotionRecord) -> Iterator[Issue]:
     joints = episode.quantities.get("joint_position")
     command = episode.quantities.get("command_position")
     if joints is not None and command is not None and np.array_equal(joints, command):
-        yield warning(
-            message="is a copy of the state at the same frame; a policy learns to stay where "
-            "it is",
-            **episode.entry.location,
+        yield episode.entry.warning(
+            ("is a copy of the state at the same frame; a policy learns to stay where it is"),
             key="action",
         )
 
@@ -413,10 +402,9 @@ def frozen_encoders(episode: MotionRecord) -> Iterator[Issue]:
             continue
         commanded = float(np.ptp(command[first : last + 1, joint]))
         if commanded > 0.25 * span[joint] and commanded > 0.02:
-            yield warning(
-                message=f"{name} stays exactly the same for {last - first} frames while its "
+            yield episode.entry.warning(
+                f"{name} stays exactly the same for {last - first} frames while its "
                 f"command moves by {commanded:.3g}: the encoder froze?",
-                **episode.entry.location,
                 frame=first,
                 key=f"joint_position ({name})",
                 components=(name,),
@@ -442,10 +430,9 @@ def duplicates(
         close = tree.query_ball_point(sketch, _SAME_EPISODE * span, p=np.inf)
         if span and min(close) < number:
             earlier = motions[min(close)][0]
-            yield warning(
-                message=f"shows the same motion as episode {earlier.index}: recorded once, "
-                f"stored twice?",
-                **entry.location,
+            yield entry.warning(
+                f"shows the same motion as episode {earlier.index}: recorded once, "
+                f"stored twice?"
             )
 
 

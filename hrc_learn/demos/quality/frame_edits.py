@@ -119,7 +119,7 @@ class EpisodeEdit:
     ) -> DatasetError:
         """An error that names the episode, and the frame of the old dataset."""
         original = None if frame is None or self.resampled else int(self.kept[frame])
-        return DatasetError(message, **self.entry.location, frame=original, key=key)
+        return self.entry.error(message, frame=original, key=key)
 
 
 def renew_stamps(edit: EpisodeEdit, fps: float) -> EpisodeEdit:

@@ -107,7 +107,7 @@ def _read_file(
             continue
         if entry.length > limit:
             text = f"is too long to be examined as a whole: {entry.length} frames"
-            report.add(warning(message=text, **entry.location))
+            report.add(entry.warning(text))
             end = entry.start + limit
         while first + len(table) < end and (piece := next(pieces, None)) is not None:
             arrived = pa.Table.from_batches([piece])
@@ -136,7 +136,7 @@ def _sound_columns(
             columns[key] = to_numpy(table.column(key))
         except (BadRowError, pa.ArrowException, TypeError) as error:
             row = error.row if isinstance(error, BadRowError) else 0
-            report.add(Issue(message=str(error), **entry.location, frame=row, key=key))
+            report.add(entry.fault(str(error), frame=row, key=key))
             continue
         fault = width_fault(folder, entry.file, key, columns[key])
         if fault is not None and key not in too_wide:
@@ -191,10 +191,9 @@ def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> It
         wrong = np.flatnonzero(frames[key][:, 0] != values) if key in frames else []
         if len(wrong):
             k = int(wrong[0])
-            yield Issue(
-                message=f"is {frames[key][k, 0]:g}, expected {values[k]:g}; frames were lost, "
+            yield entry.fault(
+                f"is {frames[key][k, 0]:g}, expected {values[k]:g}; frames were lost, "
                 f"repeated or moved",
-                **entry.location,
                 frame=k,
                 key=key,
             )
@@ -202,9 +201,8 @@ def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> It
         known = np.isin(frames["task_index"][:, 0], list(folder.tasks))
         if not known.all():
             k = int(known.argmin())
-            yield Issue(
-                message=f"task {frames['task_index'][k, 0]:g} is not in the list of tasks",
-                **entry.location,
+            yield entry.fault(
+                f"task {frames['task_index'][k, 0]:g} is not in the list of tasks",
                 frame=k,
                 key="task_index",
             )
@@ -294,7 +292,7 @@ def task_texts(folder: DatasetFolder) -> Iterator[Issue]:
         unknown = [task for task in entry.tasks if task not in texts]
         if unknown:
             text = f"task {unknown[0]!r} is not in the list of tasks"
-            yield warning(message=text, **entry.location)
+            yield entry.warning(text)
 
 
 def component_names(folder: DatasetFolder) -> Iterator[Issue]:
@@ -315,8 +313,7 @@ def offsets(folder: DatasetFolder) -> Iterator[Issue]:
         ordered = sorted(entries, key=lambda entry: entry.start)
         for before, entry in pairwise(ordered):
             if entry.start != before.start + before.length:
-                yield Issue(
-                    message=f"begins at row {entry.start}, but episode {before.index} ends at "
-                    f"{before.start + before.length}: offsets and lengths contradict",
-                    **entry.location,
+                yield entry.fault(
+                    f"begins at row {entry.start}, but episode {before.index} ends at "
+                    f"{before.start + before.length}: offsets and lengths contradict"
                 )

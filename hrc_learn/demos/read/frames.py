@@ -96,9 +96,7 @@ def _read_batch(
         except BadRowError as error:
             row = error.row + rows.start
             entry = next(e for e in entries if e.start <= row < e.start + e.length)
-            raise DatasetError(
-                str(error), **entry.location, frame=row - entry.start, key=key
-            ) from error
+            raise entry.error(str(error), frame=row - entry.start, key=key) from error
         if (fault := width_fault(folder, file, key, columns[key])) is not None:
             raise fault
     for entry in entries:
@@ -140,15 +138,14 @@ def width_fault(
 
 def _require_episode(entry: EpisodeEntry, frames: RawFrames) -> None:
     if not entry.length:
-        raise DatasetError("has no frames", **entry.location)
+        raise entry.error("has no frames")
     if "episode_index" not in frames:
         return
     wrong = np.flatnonzero(frames["episode_index"] != entry.index)
     if len(wrong):
-        raise DatasetError(
+        raise entry.error(
             f"the frame belongs to episode {int(frames['episode_index'][wrong[0], 0])} by its "
             f"episode_index: the offsets in the list of episodes are wrong",
-            **entry.location,
             frame=int(wrong[0]),
             key="episode_index",
         )
@@ -253,11 +250,10 @@ def frame_timestamps(
     stalled = np.flatnonzero(~(np.diff(time) > 0))
     if len(stalled):
         k = int(stalled[0])
-        raise DatasetError(
+        raise entry.error(
             f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s: "
             f"drop the repeated frames (hrc repair), or take frames as 1/fps apart "
             f"(mapping={{'time': None}} if the column is one of true stamps)",
-            **entry.location,
             frame=k + 1,
             key=key,
         )

@@ -138,10 +138,9 @@ class OpenedDataset:
                 bad &= seen != 0
             if bad.any():
                 frame, component = (int(i) for i in np.argwhere(bad)[0])
-                raise DatasetError(
+                raise entry.error(
                     f"{role} is {values[frame, component]} there; leave the episode out "
                     f"(episodes=[...]) or repair the recording",
-                    **entry.location,
                     frame=frame,
                     key=self.columns.selections[role].column_name(component),
                 )
@@ -307,7 +306,7 @@ def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
         )
     for entry in entries:
         if entry.length <= 0:
-            yield DatasetError("has no frames", **entry.location)
+            yield entry.error("has no frames")
 
 
 def select_episodes(

@@ -14,7 +14,6 @@ from hrc_learn.demos.demonstration import (
 )
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.image_features import missing_note, only_feature, with_feature
-from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.frames import disk_runs, frame_timestamps
 from hrc_learn.demos.read.opened_dataset import (
@@ -303,7 +302,7 @@ class DemonstrationSource(Sequence[Demonstration]):
                 pose["position"] = translation * self._decisions[role].factor
             return pose
         except ValueError as error:
-            raise DatasetError(str(error), **episode.entry.location, key=role) from error
+            raise episode.entry.error(str(error), key=role) from error
 
 
 def _task(folder: DatasetFolder, episode: RawEpisode) -> str:
