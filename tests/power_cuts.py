@@ -1,4 +1,4 @@
-"""Work that is cut off at any of its steps on disk, as by a power cut."""
+"""Work interrupted at any of its disk operations, as by a power cut."""
 
 import contextlib
 import itertools
@@ -7,23 +7,27 @@ from collections.abc import Callable, Iterator
 from unittest import mock
 
 STEPS = ("mkdir", "rename", "replace", "link", "unlink", "rmdir", "fsync")
-"""Functions of `os` that change what is on disk; what Path and shutil do goes through them."""
+"""Functions of `os` that change the disk; Path and shutil use them."""
 
 
 class PowerCutError(BaseException):
-    """Raised by the first step that is not done any more, and by all after it."""
+    """Raised by the first disk operation after the cut, and by all later ones."""
 
 
-def cut_off(work: Callable[[], object]) -> Iterator[int]:
-    """Do some work again and again, each time cut off one step later, until it gets to its end.
+def cut_off(work: Callable[[], object], every: int = 1) -> Iterator[int]:
+    """Repeat some work, interrupted later each time, until it completes.
 
-    Whatever cleans up after the cut changes nothing on disk any more. Only what is locked is
-    given back as if by a kill, because that closes files.
+    Cleaning up after the cut changes nothing on disk. Only locks are released, as by a kill,
+    which closes files.
+
+    Args:
+        work: The work.
+        every: Disk operations between two cuts.
 
     Yields:
-        After each time but the last, how many steps had been done.
+        Number of disk operations done, after each interrupted run.
     """
-    for survives in itertools.count():
+    for survives in itertools.count(step=every):
         left = iter(range(survives))
         with contextlib.ExitStack() as patches:
             for name in STEPS:
