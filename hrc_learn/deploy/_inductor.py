@@ -1,9 +1,9 @@
-"""What is changed inside inductor while a step is compiled, and the check that it still fits.
+"""Memory layout of compiled steps: patches of inductor during a compilation.
 
-Inductor has no public switch for how results lie in memory. So three of its private functions
-are replaced for the time of a compilation, as long as they look as expected; where they do not,
-as in a later torch, the step is compiled without the change: right, but several times slower
-for a batch of arms. `tests/deploy/test_inductor.py` fails on the day that happens.
+Inductor has no public option for the memory layout of results. So three of its private
+functions are replaced during a compilation, if they have the expected signatures. In a later
+torch without them, the step is compiled without the patches: correct, but several times slower
+for a batch of arms. `tests/deploy/test_inductor.py` then fails.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import torch
 from torch.fx import Graph, Node
 from torch.utils._pytree import tree_map_only
 
-# Memory that a step may take from the stack [bytes]: allocations there are free, those of
-# torch cost more than the arithmetic. Threads commonly have 8 MB.
+# Stack memory that a step may use [bytes]: allocations there are free, while those of torch
+# cost more than the arithmetic. Threads commonly have 8 MB.
 _STACK = 2**20
 
 _SIGNATURES = {
@@ -30,17 +30,17 @@ _SIGNATURES = {
     ("ComputedBuffer", "get_fill_order"): ("self",),
     ("View", "create"): ("x", "new_size"),
 }  # fmt: skip
-"""Functions of `torch._inductor.ir` that are replaced, with the names of their parameters."""
+"""Replaced functions of `torch._inductor.ir`, with the names of their parameters."""
 
 _CAT, _PERMUTE = torch.ops.aten.cat.default, torch.ops.aten.permute.default
 
 
 @contextmanager
 def tuned_for(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
-    """Compiles what is compiled within for a step of a batch, as fast as inductor lets us.
+    """Context in which inductor compiles fast code for a step of a batch.
 
     Args:
-        batch: Sizes of the batch, which tensors have as their leading axes; none for one arm.
+        batch: Sizes of the batch, the leading axes of tensors; empty for one arm.
 
     Yields:
         Options to compile with.
@@ -61,7 +61,7 @@ def tuned_for(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
 
 
 def unexpected_names() -> list[str]:
-    """Private names of inductor that are missing, or whose parameters are not as expected."""
+    """Private names of inductor that are missing or have unexpected parameters."""
     unexpected = []
     try:
         from torch._inductor import ir
@@ -83,15 +83,15 @@ def unexpected_names() -> list[str]:
 def _warn_of(names: str) -> None:
     warnings.warn(
         f"torch {torch.__version__} has changed {names} of inductor: control steps are "
-        "compiled without our layout of memory, right but slower",
+        "compiled without the batch-last memory layout, correct but slower",
         stacklevel=5,
     )
 
 
 @contextmanager
 def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """One attribute of a class or module, replaced for a while."""
-    # Not getattr, which would bind a classmethod: what is put back is what was there.
+    """Context in which one attribute of a class or module is replaced."""
+    # Not getattr, which would bind a classmethod: the original object has to be restored.
     before = vars(owner)[name]
     setattr(owner, name, value)
     try:
@@ -102,10 +102,10 @@ def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 @contextmanager
 def _batch_last(batch: list[int]) -> Iterator[None]:
-    """Lays out what has the batch first with the batch last in memory.
+    """Context in which tensors with leading batch axes have the batch last in memory.
 
-    So loops run over the batch innermost, a vector register of elements at a time. Left alone,
-    inductor keeps results with the batch first, and transposes them all along.
+    Then the innermost loops run over the batch, a vector register of elements at a time. By
+    default inductor keeps the batch first in memory, and transposes again and again.
     """
     from torch._inductor import ir
 
@@ -125,15 +125,15 @@ def _batch_last(batch: list[int]) -> Iterator[None]:
         plain(self, device, dtype, size, stride_order, is_pinned)
 
     def fill_order(self: Any) -> Any:
-        # Inductor would take that of what a buffer is computed from, and transpose.
+        # Inductor would take the order of the buffer's inputs, and transpose.
         size = self.get_size()
         if isinstance(self.layout, ir.FlexibleLayout) and _leads(batch, size):
             return _fill_order(len(batch), len(size))
         return preferred(self)
 
     def decided_view(x: Any, new_size: Sequence[Any]) -> Any:
-        # Inductor copies the strides of what it looks at, and may yet change those of the
-        # latter: to it only what has the last axis last is still undecided.
+        # Inductor copies the strides of the viewed buffer, and may change those later: it
+        # treats every layout as undecided that does not have the last axis last.
         if ir.is_storage_and_layout(x):
             x.freeze_layout()
         return view(x, new_size)
@@ -147,20 +147,20 @@ def _batch_last(batch: list[int]) -> Iterator[None]:
 
 
 def _leads(batch: Sequence[int], size: Sequence[Any]) -> bool:
-    """Whether a size has the batch first, and not last already."""
+    """True if a size begins with the batch and does not end with it already."""
     n = len(batch)
     return list(size[:n]) == batch and list(size[-n:]) != batch
 
 
 def _fill_order(first: int, axes: int) -> list[int]:
-    """Axes from the fastest running one: the first few, then the others."""
+    """Axes from the fastest one: the first ones, then the others."""
     return [*reversed(range(first)), *reversed(range(first, axes))]
 
 
 def cat_batch_last(batch: list[int]) -> Callable[[Graph], None]:
-    """A pass over a graph that permutes tensors before they are joined, and the whole back.
+    """Graph pass that permutes tensors before a concatenation, and its result back.
 
-    Inductor writes parts straight into the whole, which it lays out without asking.
+    Inductor writes the parts directly into the result, whose layout cannot be set otherwise.
     """
 
     def permute(graph: Graph) -> None:
@@ -169,7 +169,7 @@ def cat_batch_last(batch: list[int]) -> Callable[[Graph], None]:
             parts, dim, *_ = *args, 0  # aten.cat leaves out a dim of zero
             axes = range(node.meta["val"].ndim)
             dim = axes[dim]
-            # Joined along the batch, or with the batch last already: nothing to gain.
+            # Concatenation along the batch, or with the batch last already: nothing to gain.
             if dim < len(batch) or not _leads(batch, node.meta["val"].shape):
                 continue
             first, last = axes[: len(batch)], axes[len(batch) :]
@@ -184,7 +184,7 @@ def cat_batch_last(batch: list[int]) -> Callable[[Graph], None]:
 
 
 def _call(graph: Graph, function: Any, *args: Any) -> Node:
-    """A new node, with what inductor has to know of its result."""
+    """New node, with the metadata of its result that inductor needs."""
     node = graph.call_function(function, args)
     node.meta["val"] = function(*tree_map_only(Node, lambda x: x.meta["val"], args))
     return node

@@ -1,4 +1,4 @@
-"""The control step compiled ahead of time into one file, named by a hash of what it does."""
+"""Ahead-of-time compilation of a control step into one file, named by a hash of its content."""
 
 from __future__ import annotations
 
@@ -15,35 +15,37 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.deploy._inductor import tuned_for
-from hrc_learn.deploy.package import PackedStep, Seen, Steppable, describe, machine
+from hrc_learn.deploy.package import PackedStep, StepObservation, Steppable, describe, machine
 from hrc_learn.store import Claim, new_file
 
 
 class NoCompilerError(RuntimeError):
-    """There is no C++ compiler to build a package with."""
+    """No C++ compiler was found."""
 
 
-def export_step(controller: Steppable, observation: Seen, folder: Path | None = None) -> Path:
-    """Compile a controller's step, unless an equal one was compiled before.
+def export_step(
+    controller: Steppable, observation: StepObservation, folder: Path | None = None
+) -> Path:
+    """Compile the step of a controller, unless an equal one has been compiled before.
 
-    A package fits the machine it was built on. Its name in the folder is a hash of torch's
-    version, of the processor, of the source of this library, and of all settings and weights
-    of the controller. With parts of your own, whose source it cannot know, it is one of the
-    traced step, which takes seconds more.
+    A package runs on the machine that built it. Its file name is a hash of torch's version, of
+    the processor, of the source of this library, and of all settings and weights of the
+    controller. With classes from outside this library, whose source is unknown, the hash is
+    that of the traced step, which takes seconds longer.
 
     Args:
-        controller: Whose step.
-        observation: An example with exactly the fields that later ones will have. Fields
-            left out, and a `dt` that is a number, become constants; so do the controller's
-            own goals where it brings none. Its batch dimensions and dtype are those of the
-            package; float32 counts interventions to 16 million only.
-        folder: Where packages are kept; default: the user's cache.
+        controller: Controller with the step.
+        observation: An example with exactly the fields of later observations. Missing fields,
+            and a `dt` that is a number, become constants; so do the controller's own goals if
+            it has none. It sets batch dimensions and dtype of the package; float32 counts
+            interventions to 16 million only.
+        folder: Folder of the packages; default: the user's cache.
 
     Returns:
-        The `.pt2` package.
+        Path of the `.pt2` package.
 
     Raises:
-        NoCompilerError: No C++ compiler was found, and no package either.
+        NoCompilerError: There is neither a package nor a C++ compiler.
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
     folder = folder or _default_folder()
@@ -59,7 +61,7 @@ def export_step(controller: Steppable, observation: Seen, folder: Path | None = 
         return package
     _require_compiler()
     folder.mkdir(parents=True, exist_ok=True)
-    # Another process that compiles the same step is waited for: quicker than doing it too.
+    # Waiting for another process that compiles the same step is faster than compiling it again.
     with Claim(package, wait=True) as claim:
         if package.is_file():
             return package
@@ -73,20 +75,20 @@ def export_step(controller: Steppable, observation: Seen, folder: Path | None = 
     return package
 
 
-def trace(step: PackedStep, observation: Seen) -> torch.export.ExportedProgram:
-    """One graph of a step, in the form that AOTInductor takes."""
+def trace(step: PackedStep, observation: StepObservation) -> torch.export.ExportedProgram:
+    """Graph of a step in the form that AOTInductor needs."""
     with torch.no_grad():
         program = torch.export.export(step, tuple(step.example(observation)), strict=False)
     aten = torch.ops.aten
     for node in program.graph.nodes:
-        # Inductor of torch 2.11 cannot raise a constant number to a power.
+        # The inductor of torch 2.11 cannot raise a constant to a power.
         if node.target is aten.square.default:
             node.target, node.args = aten.mul.Tensor, (node.args[0], node.args[0])
     return program
 
 
-def _structure(observation: Seen) -> list[tuple[str, str]]:
-    """What of an example makes a difference to the step: all but the values of tensors."""
+def _structure(observation: StepObservation) -> list[tuple[str, str]]:
+    """Structure of an example: all fields, with shapes and dtypes in place of tensors."""
     leaves, _ = _pytree.tree_flatten_with_path(observation)
     return [
         (
@@ -98,7 +100,7 @@ def _structure(observation: Seen) -> list[tuple[str, str]]:
 
 
 def _digest(step: PackedStep, program: torch.export.ExportedProgram) -> str:
-    """Hash of all that decides what a package computes and where it runs."""
+    """Hash of a traced step, its constants and the machine."""
     digest = hashlib.sha256()
     fields = [field for layout in step.layouts for field in layout.fields]
     for text in (machine(), program.graph, program.graph_signature, fields):
@@ -116,9 +118,7 @@ def _require_compiler() -> None:
     try:
         cpp_builder.get_cpp_compiler()
     except exc.InvalidCxxCompiler as error:
-        raise NoCompilerError(
-            "no C++ compiler found: install g++, or name one in CXX"
-        ) from error
+        raise NoCompilerError("no C++ compiler found: install g++, or set CXX") from error
 
 
 def _default_folder() -> Path:
@@ -132,10 +132,7 @@ def _default_folder() -> Path:
     return base / "hrc_learn"
 
 
-# The hash that names a package: of all values within a controller and of the source of this
-# library. An equal hash means that the compiled code would do the same.
-
-# What a compiled step is made from: the package itself, and those it imports.
+# Sources of a compiled step, all hashed: equal hashes mean equal compiled code.
 _ROOT = Path(__file__).parents[1]
 _SOURCES = (
     "pytree.py",
@@ -146,22 +143,22 @@ _SOURCES = (
     "controller",
     "deploy",
 )
-# Values whose `repr` says all of them.
+# Types whose `repr` represents their whole value.
 _PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device)
 
 
 class UnknownCodeError(TypeError):
-    """An object is of a class, or holds a function, whose code is not ours to know."""
+    """The code of an object's class, or of a function it holds, is outside this library."""
 
 
 def content_hash(*objects: Any) -> str:
-    """Hash of all values within some objects, and of the source of this library.
+    """Hash of all values in some objects, and of the source of this library.
 
     Args:
-        objects: Modules, dataclasses and what they hold.
+        objects: Modules, dataclasses and their contents.
 
     Raises:
-        UnknownCodeError: They hold something whose code is not of this library or torch's.
+        UnknownCodeError: They hold an object of a class outside this library and torch.
     """
     hasher = _ObjectHasher()
     for x in objects:
@@ -172,22 +169,22 @@ def content_hash(*objects: Any) -> str:
 
 @final
 class _ObjectHasher:
-    """Hashes values in a fixed order; each object once, later visits by its number."""
+    """Hash of values in a fixed order; each object once, further references by its number."""
 
     def __init__(self):
         self.digest = hashlib.sha256()
-        self.seen: dict[int, Any] = {}  # keeps what it names alive, or ids would be reused
+        self.seen: dict[int, Any] = {}  # keeps the objects alive, so that ids stay unique
 
     def add(self, x: Any) -> None:
         kind = type(x)
-        self._say(f"{kind.__module__}.{kind.__qualname__}")
+        self._update(f"{kind.__module__}.{kind.__qualname__}")
         if isinstance(x, Tensor):
-            self._say(f"{x.dtype} {tuple(x.shape)} {x.device}")
+            self._update(f"{x.dtype} {tuple(x.shape)} {x.device}")
             self.digest.update(x.detach().cpu().contiguous().numpy().tobytes())
         elif isinstance(x, _PLAIN):
-            self._say(repr(x))
+            self._update(repr(x))
         elif id(x) in self.seen:
-            self._say(f"again {list(self.seen).index(id(x))}")
+            self._update(f"again {list(self.seen).index(id(x))}")
         else:
             self.seen[id(x)] = x
             self._add_parts(x)
@@ -207,10 +204,10 @@ class _ObjectHasher:
         ):
             self.add(x.__getstate__())
         else:
-            raise UnknownCodeError(f"cannot tell what a {type(x).__qualname__} does")
-        self._say("end")
+            raise UnknownCodeError(f"the code of {type(x).__qualname__} is unknown")
+        self._update("end")
 
-    def _say(self, text: str) -> None:
+    def _update(self, text: str) -> None:
         self.digest.update(f"{text}\n".encode())
 
 

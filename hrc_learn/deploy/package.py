@@ -1,8 +1,8 @@
-"""The control step as a function of vectors, and the file of its compiled form.
+"""The control step as a function of vectors, and the file format of its compiled form.
 
-Code compiled for real time takes and returns a few vectors of numbers, not dataclasses: any
-language can fill them, and nothing is allocated in a step. The file says where the named
-tensors of state, observation and command stand in them.
+A compiled step reads and writes three vectors of numbers instead of dataclasses: any language
+can fill them, and a step allocates nothing. The file's metadata maps the named tensors of
+state, observation and command to the rows of the vectors.
 """
 
 from __future__ import annotations
@@ -27,44 +27,45 @@ from torch.utils import _pytree
 from hrc_learn.controller import Observation, WantedVelocity
 from hrc_learn.kinematics import SerialChain
 
-type Seen = Observation | WantedVelocity
-"""What the steps of a controller are given."""
+type StepObservation = Observation | WantedVelocity
+"""Observation of a controller's step."""
 
 
 @runtime_checkable
 class Steppable(Protocol):
-    """A module with a step to run in a loop: `AdaptiveController` or `VelocityStep`."""
+    """Module with a control step: `AdaptiveController` or `VelocityStep`."""
 
     chain: SerialChain
 
     def initial_state(self, joint_position: Float[Tensor, "*batch n"], /) -> Any:
-        """State of an arm at rest [rad], a pytree."""
+        """State of an arm at rest at joint positions [rad], a pytree."""
         ...
 
     def step(self, state: Any, observation: Any, /) -> tuple[Any, Any]:
-        """Take one step on what it is given; command and next state, pytrees."""
+        """Take one step; returns command and next state, both pytrees."""
         ...
 
 
 @dataclass(frozen=True)
 class Field:
-    """One of the tensors."""
+    """Description of one tensor of a dataclass."""
 
     name: str
-    """Path in the dataclass, as in "safety.flags"."""
+    """Path in the dataclass, for example "safety.flags"."""
     dtype: torch.dtype
+    """Type of its elements."""
     batched: bool
     """False: one value for the whole batch."""
     shape: tuple[int, ...]
-    """Without the batch where there is one."""
+    """Shape without the batch axes."""
 
 
 @final
 class IOLayout:
-    """Where the tensors of a dataclass stand in a vector (rows, *batch).
+    """Positions of a dataclass's tensors in a vector (rows, *batch).
 
-    The batch comes last in memory: a row is one quantity of all its elements, which is what
-    vector instructions work on. All numbers are of one dtype, and flags are 0 or 1.
+    The batch is last in memory, so vector instructions work on rows: one quantity for all
+    elements of the batch. All numbers have one dtype, and flags are 0 or 1.
     """
 
     def __init__(
@@ -79,11 +80,11 @@ class IOLayout:
         """Number of rows."""
         names = (field.name for field in fields)
         self.rows = dict(zip(names, (slice(*ends) for ends in pairwise(edges)), strict=True))
-        """Of each field."""
+        """Rows of each field."""
 
     @staticmethod
     def of(tree: Any, batch: Sequence[int], dtype: torch.dtype = torch.float64) -> IOLayout:
-        """IOLayout of the tensors in a pytree; what else it holds is left out."""
+        """Layout of the tensors in a pytree, without its other leaves."""
         batch, fields = tuple(batch), []
         for path, x in _pytree.tree_flatten_with_path(tree)[0]:
             if isinstance(x, Tensor):
@@ -94,7 +95,7 @@ class IOLayout:
         return IOLayout(fields, batch, dtype)
 
     def empty(self) -> Float[Tensor, "rows *batch"]:
-        """A vector in which nothing is known: every number is NaN, no flag is set."""
+        """Vector with NaN for every number and 0 for every flag."""
         vector = torch.full((self.size, *self.batch), math.nan, dtype=self.dtype)
         for field, view in zip(self.fields, self.views(vector), strict=True):
             if field.dtype == torch.bool:
@@ -102,7 +103,7 @@ class IOLayout:
         return vector
 
     def pack(self, tensors: Sequence[Tensor]) -> Float[Tensor, "rows *batch"]:
-        """The vector of some tensors, in the order of the fields."""
+        """Vector of tensors given in the order of the fields."""
         parts = []
         for field, x in zip(self.fields, tensors, strict=True):
             if field.batched:
@@ -113,16 +114,16 @@ class IOLayout:
         return torch.cat(parts)
 
     def unpack(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
-        """The tensors in a vector: views of it, except those of another dtype."""
+        """Tensors of a vector: views of it, except those of another dtype."""
         views = zip(self.views(vector), self.fields, strict=True)
         return [view.to(field.dtype) for view, field in views]
 
     def views(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
-        """The parts of a vector in the shapes of the fields."""
+        """Views of a vector in the shapes of the fields."""
         return [self._part(field, vector) for field in self.fields]
 
     def arrays(self, vector: Float[Tensor, "rows *batch"]) -> dict[str, np.ndarray]:
-        """Views of a vector by field, to read from and to write into."""
+        """Views of a vector by field name, for reading and writing."""
         views = zip(self.rows, self.views(vector), strict=True)
         return {name: view.numpy() for name, view in views}
 
@@ -130,22 +131,22 @@ class IOLayout:
         part = vector[self.rows[field.name]].reshape((*field.shape, *self.batch))
         if field.batched:
             return part.movedim(self._last, self._first)
-        # One value for the whole batch stands there once for each element: read the first.
+        # A value for the whole batch is repeated for each element: read the first.
         return part[(..., *(0 for _ in self.batch))]
 
     @property
     def _first(self) -> list[int]:
-        """Where the batch stands in a tensor."""
+        """Batch axes of a tensor."""
         return list(range(len(self.batch)))
 
     @property
     def _last(self) -> list[int]:
-        """Where it stands in a vector."""
+        """Batch axes of a vector."""
         return list(range(-len(self.batch), 0))
 
 
 class Vectors(NamedTuple):
-    """What a step takes, in this order."""
+    """Vectors of a step, in the order of its arguments."""
 
     state: Tensor
     observation: Tensor
@@ -153,7 +154,7 @@ class Vectors(NamedTuple):
 
 
 class StepLayouts(NamedTuple):
-    """Where everything stands in them."""
+    """Layouts of the vectors of a step."""
 
     state: IOLayout
     observation: IOLayout
@@ -162,19 +163,19 @@ class StepLayouts(NamedTuple):
 
 @final
 class PackedStep(nn.Module):
-    """The step of a controller on vectors, in place.
+    """Step of a controller on vectors, in place.
 
     It reads the vectors of state and observation, and writes those of the command and of the
-    next state. What an observation leaves out, and a `dt` that is a number, are constants.
+    next state. Missing fields of the observation, and a `dt` that is a number, are constants.
     """
 
-    def __init__(self, controller: Steppable, observation: Seen):
-        """Take the structure of a step from an example.
+    def __init__(self, controller: Steppable, observation: StepObservation):
+        """Derive the layouts from an example.
 
         Args:
-            controller: Whose step.
-            observation: With exactly the fields that later ones will have. The vectors are of
-                the dtype of its joint position.
+            controller: Controller with the step.
+            observation: An example with exactly the fields of later observations. The vectors
+                have the dtype of its joint positions.
         """
         super().__init__()
         self.controller = controller
@@ -190,7 +191,7 @@ class PackedStep(nn.Module):
         )
         self.first_state = self.layouts.state.pack(tensors_of(state))
 
-    def example(self, observation: Seen) -> Vectors:
+    def example(self, observation: StepObservation) -> Vectors:
         """Vectors before the first step: at rest in the ready posture."""
         return Vectors(
             self.first_state.clone(),
@@ -204,13 +205,13 @@ class PackedStep(nn.Module):
         observation: Float[Tensor, "observations *batch"],
         command: Float[Tensor, "commands *batch"],
     ) -> None:
-        """One step."""
+        """Take one step."""
         layouts = self.layouts
         read = iter(layouts.state.unpack(state) + layouts.observation.unpack(observation))
         leaves = [next(read) if x is None else x for x in self._constants]
-        before, seen = _pytree.tree_unflatten(leaves, self._structure)
-        said, after = self.controller.step(before, seen)
-        command.copy_(layouts.command.pack(tensors_of(said)))
+        before, now = _pytree.tree_unflatten(leaves, self._structure)
+        result, after = self.controller.step(before, now)
+        command.copy_(layouts.command.pack(tensors_of(result)))
         state.copy_(layouts.state.pack(tensors_of(after)))
 
 
@@ -219,7 +220,7 @@ def tensors_of(tree: object) -> list[Tensor]:
     return [x for x in _pytree.tree_leaves(tree) if isinstance(x, Tensor)]
 
 
-# Keys of the package's metadata, which later versions must be able to read.
+# Keys of the package's metadata; later versions must be able to read them.
 _LAYOUT, _BATCH, _DTYPE = "hrc_learn.layout", "hrc_learn.batch", "hrc_learn.dtype"
 _STATE, _OBSERVATION = "hrc_learn.state", "hrc_learn.observation"
 _BUILT_FOR = "hrc_learn.built_for"
@@ -227,22 +228,23 @@ _BUILT_FOR = "hrc_learn.built_for"
 
 @dataclass(frozen=True)
 class Package:
-    """A compiled step, loaded."""
+    """A loaded compiled step."""
 
     run: Callable[[list[Tensor]], object]
-    """Takes the three vectors and updates state and command in place."""
+    """Function of the three vectors that updates state and command in place."""
     layouts: StepLayouts
+    """Layouts of the vectors."""
     first_state: Tensor
-    """Vector of an arm at rest in its ready posture."""
+    """State vector of an arm at rest in its ready posture."""
     example: Tensor
-    """Vector of the observation that it was exported with."""
+    """Observation vector of the export."""
 
 
-def describe(step: PackedStep, observation: Seen) -> dict[str, str]:
-    """Metadata of a package: what to know of its step, as text that any language can read.
+def describe(step: PackedStep, observation: StepObservation) -> dict[str, str]:
+    """Metadata of a package, as text that any language can read.
 
-    The layout has a line for each field: which vector, field, dtype, 1 if it is batched, and
-    its shape. Rows follow each other in the order of the lines.
+    The layout has a line for each field: its vector, name, dtype, 1 if it is batched, and its
+    shape. Rows are in the order of the lines.
     """
     lines = [
         " ".join([vector, field.name, _name(field.dtype), str(int(field.batched)),
@@ -266,7 +268,7 @@ def load(path: Path) -> Package:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is not a package of ours, or was built for another machine.
+        ValueError: `export_step` did not write the file, or wrote it for another machine.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no package {path}")
@@ -297,7 +299,7 @@ def load(path: Path) -> Package:
 
 
 def machine() -> str:
-    """What compiled code depends on: torch, and the instructions of the processor."""
+    """Description of the machine that compiled code depends on: torch and processor."""
     capability = torch.backends.cpu.get_cpu_capability()
     return (
         f"torch {torch.__version__} on {platform.machine()} with {capability}, "
@@ -307,7 +309,7 @@ def machine() -> str:
 
 @cache
 def _instructions() -> str:
-    """Short hash of the extensions of the processor, all of which a compiler may use."""
+    """Short hash of the instruction-set extensions of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -335,8 +337,8 @@ def _open(path: Path) -> tuple[Callable[[list[Tensor]], object], dict[str, str]]
         return loader.run, loader.get_metadata()
     except (AttributeError, TypeError):
         warnings.warn(
-            f"torch {torch.__version__} lacks the fast loader of packages: starting takes up "
-            "to half a minute, and each step some microseconds more",
+            f"torch {torch.__version__} lacks the fast loader of packages: loading takes up to "
+            "half a minute, and each step some microseconds longer",
             stacklevel=2,
         )
         model = torch._inductor.aoti_load_package(str(path))
@@ -344,5 +346,5 @@ def _open(path: Path) -> tuple[Callable[[list[Tensor]], object], dict[str, str]]
 
 
 def _fast_loader() -> Any:
-    """Private, but ready in milliseconds; the public one probes compilers for seconds."""
+    """Private loader of torch, ready in milliseconds; the public one probes compilers."""
     return torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore

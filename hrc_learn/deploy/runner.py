@@ -1,4 +1,4 @@
-"""Runs a control step in a loop, NumPy in and out, at a fixed rate without drift."""
+"""Runners of a control step with NumPy arrays, and a fixed loop rate without drift."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torch.utils import _pytree
 from hrc_learn.deploy.export import NoCompilerError, export_step
 from hrc_learn.deploy.package import (
     PackedStep,
-    Seen,
     StepLayouts,
+    StepObservation,
     Steppable,
     Vectors,
     load,
@@ -26,19 +26,19 @@ from hrc_learn.deploy.package import (
 )
 
 _POSITIONS = {"safety.position", "pose_drift.joint_position"}
-"""Fields that remember where the joints were, of the states that have them."""
+"""State fields with joint positions of an earlier step."""
 
 
 class StepRunner(ABC):
-    """A control step with its state, driven by writing into arrays.
+    """A control step with its state, operated by writing into arrays.
 
         runner.observation["joint_position"][:] = q
         velocity = runner.step()
 
     Attributes:
-        observation: Arrays to write each observation into, by field, as in "joint_position" or
-            "goals.vision.target"; flags are 0 or 1. They are what the step reads.
-        joint_velocity: What the last step commands [rad/s]; overwritten by the next.
+        observation: Arrays that the step reads, by field, for example "joint_position" or
+            "goals.vision.target"; flags are 0 or 1.
+        joint_velocity: Command of the last step [rad/s]; overwritten by the next.
     """
 
     def __init__(self, layouts: StepLayouts):
@@ -50,23 +50,23 @@ class StepRunner(ABC):
 
     @abstractmethod
     def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
-        """Forget everything: the arm is at rest in a joint position [rad]."""
+        """Reset the state to an arm at rest at joint positions [rad]."""
 
     @abstractmethod
     def step(self) -> Float[np.ndarray, "*batch n"]:
-        """Take one step on what stands in `observation`.
+        """Take one step with the values in `observation`.
 
         Returns:
             `joint_velocity`.
         """
 
-    def observe(self, observation: Seen) -> None:
+    def observe(self, observation: StepObservation) -> None:
         """Write all fields of an observation at once."""
         vector = self._layouts.observation.pack(tensors_of(observation))
         self._vectors.observation.copy_(vector)
 
     def command(self, field: str) -> np.ndarray:
-        """One field of the last command, as in "xi_x" or "safety.flags".
+        """One field of the last command, for example "xi_x" or "safety.flags".
 
         Raises:
             ValueError: There is no such field.
@@ -74,7 +74,7 @@ class StepRunner(ABC):
         return _named(field, self._command)
 
     def state(self, field: str) -> np.ndarray:
-        """One field of the state, as in "safety.counts".
+        """One field of the state, for example "safety.counts".
 
         Raises:
             ValueError: There is no such field.
@@ -82,37 +82,37 @@ class StepRunner(ABC):
         return _named(field, self._layouts.state.arrays(self._state_vector()))
 
     def set_state(self, field: str, value: Float[np.ndarray, "..."]) -> None:
-        """Replace one field of the state, as where an arm has not done what it was told.
+        """Replace one field of the state, for example after an arm ignored a command.
 
         Raises:
             ValueError: There is no such field.
         """
         vector = self._state_vector()
         _named(field, self._layouts.state.arrays(vector))[...] = value
-        self._take_state(vector)
+        self._set_state_vector(vector)
 
     @abstractmethod
     def _state_vector(self) -> torch.Tensor:
         """The state after the last step."""
 
     @abstractmethod
-    def _take_state(self, vector: torch.Tensor) -> None:
-        """Go on from a state."""
+    def _set_state_vector(self, vector: torch.Tensor) -> None:
+        """Continue from a state."""
 
 
 @final
 class PackageRunner(StepRunner):
-    """A step compiled ahead of time; it allocates nothing.
+    """A step compiled ahead of time; a step allocates nothing.
 
-    Numbers of the observation are NaN and its flags unset until they are written.
+    Numbers of the observation are NaN, and its flags 0, until they are written.
     """
 
     def __init__(self, package: Path):
-        """Load what `export_step` wrote, in milliseconds.
+        """Load a package written by `export_step`, in milliseconds.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It is not a package of ours, or was built for another machine.
+            ValueError: `export_step` did not write the file, or wrote it for another machine.
         """
         loaded = load(package)
         super().__init__(loaded.layouts)
@@ -134,16 +134,16 @@ class PackageRunner(StepRunner):
     def _state_vector(self) -> torch.Tensor:
         return self._vectors.state
 
-    def _take_state(self, vector: torch.Tensor) -> None:
+    def _set_state_vector(self, vector: torch.Tensor) -> None:
         self._vectors.state.copy_(vector)
 
 
 @final
 class EagerRunner(StepRunner):
-    """The same step uncompiled."""
+    """A step without compilation."""
 
-    def __init__(self, controller: Steppable, observation: Seen):
-        """Take a step as it is; later observations have the fields of this one."""
+    def __init__(self, controller: Steppable, observation: StepObservation):
+        """Prepare the step; later observations have the fields of this one."""
         super().__init__(PackedStep(controller, observation).layouts)
         self._controller, self._last_command = controller, None
         self._leaves, self._structure = _pytree.tree_flatten(observation)
@@ -164,7 +164,7 @@ class EagerRunner(StepRunner):
     @torch.inference_mode()
     def step(self) -> Float[np.ndarray, "*batch n"]:
         for k, view, dtype in self._views:
-            # A state that shared memory with an observation would change with the next.
+            # A state that used the observation's memory would change with the next one.
             self._leaves[k] = view.to(dtype, copy=True)
         observation = _pytree.tree_unflatten(self._leaves, self._structure)
         self._last_command, self._state = self._controller.step(self._state, observation)
@@ -180,7 +180,7 @@ class EagerRunner(StepRunner):
     def _state_vector(self) -> torch.Tensor:
         return self._layouts.state.pack(tensors_of(self._state))
 
-    def _take_state(self, vector: torch.Tensor) -> None:
+    def _set_state_vector(self, vector: torch.Tensor) -> None:
         leaves, structure = _pytree.tree_flatten(self._state)
         read = iter(self._layouts.state.unpack(vector))
         new = [next(read) if isinstance(x, torch.Tensor) else x for x in leaves]
@@ -194,14 +194,14 @@ def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def open_step(
-    controller: Steppable, observation: Seen, folder: Path | None = None
+    controller: Steppable, observation: StepObservation, folder: Path | None = None
 ) -> StepRunner:
-    """The fastest runner there is: compiled, or eager with a warning without a C++ compiler.
+    """The fastest available runner: compiled, or eager with a warning without a C++ compiler.
 
     Args:
-        controller: Whose step.
-        observation: The first, with exactly the fields that later ones will have.
-        folder: Where packages are kept; default: the user's cache.
+        controller: Controller with the step.
+        observation: First observation, with exactly the fields of later ones.
+        folder: Folder of the packages; default: the user's cache.
     """
     try:
         runner = PackageRunner(export_step(controller, observation, folder))
@@ -213,13 +213,13 @@ def open_step(
     return runner
 
 
-# Rest of a wait that is spent awake [s]: a sleeping process wakes up late by about as much.
+# Last part of a wait, spent spinning [s]: a sleeping process wakes up late by about as much.
 _SPIN = 0.0002
 
 
 @final
 class Rate:
-    """Keeps a loop at a fixed rate, and counts the periods that it was too slow for.
+    """Fixed rate of a loop, with a count of missed periods.
 
         rate = Rate(0.004)
         while running():
@@ -227,9 +227,9 @@ class Rate:
             rate.wait()
 
     Attributes:
-        ticks: Returns of `wait`.
-        missed: Ticks that never came, as the loop was still busy or woken too late when the
-            next one was due already.
+        ticks: Number of returns of `wait`.
+        missed: Number of skipped ticks: the loop was busy, or woken too late, until the next
+            one was due.
         latest: Largest lateness of a tick so far [s].
     """
 
@@ -240,12 +240,12 @@ class Rate:
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
     ):
-        """The first period starts now.
+        """Start the first period.
 
         Args:
-            period: Time between two returns of `wait` [s]: one over the rate.
-            clock: Tells the time [s].
-            sleep: Lets at least a given time pass [s].
+            period: Time between two returns of `wait` [s].
+            clock: Function that returns the time [s].
+            sleep: Function that waits for at least a given time [s].
 
         Raises:
             ValueError: The period is not positive.
@@ -258,17 +258,16 @@ class Rate:
 
     @property
     def missed_fraction(self) -> float:
-        """Share of the ticks that were due and never came, 0 to 1."""
+        """Fraction of skipped ticks, 0 to 1."""
         return self.missed / max(1, self.ticks + self.missed)
 
     def wait(self) -> float:
-        """Wait for the next tick; where several are due by then, all but one are missed.
+        """Wait for the next tick; if several are due, all but one are missed.
 
         Returns:
-            How long ago the first tick that was due should have come [s]: more than a period if
-            ticks are missed.
+            Lateness of the first due tick [s]; more than a period if ticks are missed.
         """
-        # Ticks are counted from the start, not from the last return: delays do not add up.
+        # Ticks count from the start, not from the last return, so delays do not add up.
         rest = self._next - self._clock()
         if rest > _SPIN:
             self._sleep(rest - _SPIN)
