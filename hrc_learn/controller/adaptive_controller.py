@@ -40,7 +40,6 @@ from hrc_learn.controller.resolved_rate import (
     scale_task,
 )
 from hrc_learn.controller.safety_filter import (
-    JointVector,
     SafetyConfig,
     SafetyFilter,
     SafetyReport,
@@ -48,6 +47,7 @@ from hrc_learn.controller.safety_filter import (
 )
 from hrc_learn.controller.way_making import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.arrays import ArrayLike
 from hrc_learn.geometry.numerics import is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain, TaskSpace, task_basis, task_rank
@@ -211,15 +211,14 @@ class AdaptiveController(nn.Module):
             ValueError: The arm has too few joints for the goals.
         """
         super().__init__()
-        chain: SerialChain = getattr(arm, "chain", arm)
-        self.chain = chain
+        self.chain = arm
         self.estimator = estimator
         self.goals = goals
         self.config = config = config or ControllerConfig()
         # Ranks depend on the arm alone; computing them once keeps branches out of a step.
-        self._ranks = {task: task_rank(chain, task) for task in TASK_ROWS}
+        self._ranks = {task: task_rank(arm, task) for task in TASK_ROWS}
         self._check_task(goals)
-        limits = chain.limits
+        limits = arm.limits
         self.joint_region = joint_region or JointRegion.from_limits(limits.lower, limits.upper)
         self.blending = VisionBlending(config.blending)
         self.safety = SafetyFilter(limits, config.safety)
@@ -263,7 +262,7 @@ class AdaptiveController(nn.Module):
             )
 
     def initial_state(
-        self, joint_position: JointVector, joint_velocity: JointVector | None = None
+        self, joint_position: ArrayLike, joint_velocity: ArrayLike | None = None
     ) -> ControllerState:
         """State at the start.
 

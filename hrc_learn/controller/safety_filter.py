@@ -7,11 +7,9 @@ playback of a learned motion, a joystick.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -23,12 +21,10 @@ from hrc_learn.controller.constraint_layer import (
     constrained_velocity,
 )
 from hrc_learn.controller.limit_barrier import LimitBarrier
+from hrc_learn.geometry.arrays import ArrayLike, as_tensor
 from hrc_learn.geometry.numerics import is_number
 from hrc_learn.kinematics import JointLimits
 from hrc_learn.pytree import pytree
-
-type JointVector = Tensor | np.ndarray | Sequence
-"""Joint positions or velocities (*batch, n): a tensor, an array or nested lists."""
 
 
 @runtime_checkable
@@ -245,7 +241,7 @@ class SafetyFilter(nn.Module):
             rests_outside=True,
         )
 
-    def joint_vector(self, values: JointVector, name: str) -> Float[Tensor, "*batch n"]:
+    def joint_vector(self, values: ArrayLike, name: str) -> Float[Tensor, "*batch n"]:
         """Joint values as a tensor (*batch, n); tensors are returned as they are.
 
         Args:
@@ -255,19 +251,19 @@ class SafetyFilter(nn.Module):
         Raises:
             ValueError: The last axis does not have one value for each joint.
         """
-        if not isinstance(values, Tensor):
-            like = self.barrier.velocity
-            values = torch.as_tensor(np.array(values), dtype=like.dtype, device=like.device)
+        vector = values
+        if not isinstance(vector, Tensor):
+            vector = as_tensor(vector, self.barrier.velocity)
         n = self.barrier.velocity.shape[-1]
-        if values.dim() == 0 or values.shape[-1] != n:
+        if vector.dim() == 0 or vector.shape[-1] != n:
             raise ValueError(
                 f"{name} needs {n} values, one for each joint, but has the shape "
-                f"{tuple(values.shape)}"
+                f"{tuple(vector.shape)}"
             )
-        return values
+        return vector
 
     def initial_state(
-        self, joint_position: JointVector, joint_velocity: JointVector | None = None
+        self, joint_position: ArrayLike, joint_velocity: ArrayLike | None = None
     ) -> SafetyState:
         """State of an arm at rest, or moving steadily.
 
@@ -312,7 +308,7 @@ class SafetyFilter(nn.Module):
         )
 
     def velocity_bounds(
-        self, joint_position: JointVector
+        self, joint_position: ArrayLike
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity [rad/s] that position and velocity limits allow."""
         return self.barrier.velocity_bounds(self.joint_vector(joint_position, "joint_position"))
@@ -320,8 +316,8 @@ class SafetyFilter(nn.Module):
     def step(
         self,
         state: SafetyState,
-        joint_position: JointVector,
-        joint_velocity_command: JointVector,
+        joint_position: ArrayLike,
+        joint_velocity_command: ArrayLike,
         dt: float | Float[Tensor, ""],
         *,
         jacobian: Float[Tensor, "*batch rows n"] | None = None,

@@ -16,6 +16,7 @@ from torch.utils import _pytree
 
 from hrc_learn.deploy._inductor import tuned_for
 from hrc_learn.deploy.package import PackedStep, StepObservation, Steppable, describe, machine
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.store import Claim, new_file
 
 
@@ -199,6 +200,9 @@ class _ObjectHasher:
         elif isinstance(x, list | tuple):
             for value in x:
                 self.add(value)
+        elif isinstance(x, SerialChain):
+            # The shape of an arm, which may be a function that reads it, is no part of a step.
+            self.add([x.joint_names, x.mounts, x.flange, x.tcp, x.limits, x.ready, x.kinds])
         elif type(x).__module__.split(".")[0] in ("hrc_learn", "torch") and hasattr(
             x, "__dict__"
         ):

@@ -92,7 +92,7 @@ def test_code_it_cannot_know_is_refused():
     class Own(FixedEstimator):
         """Somebody's own."""
 
-    with pytest.raises(UnknownCodeError, match=r"cannot tell what a .*Own does"):
+    with pytest.raises(UnknownCodeError, match=r"code of"):
         content_hash(controller(kind=Own))
     with pytest.raises(UnknownCodeError, match="function"):
         content_hash([lambda x: x])
