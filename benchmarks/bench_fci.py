@@ -130,7 +130,7 @@ def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, 
                 arm.recover()
             time.sleep(0.02)
         timing, reflexes = arm.timing, arm.faults
-    return timing.cost, timing.answered_share, reflexes
+    return timing.cost, timing.answered_fraction, reflexes
 
 
 def bare_loop(host: str, seconds: float) -> tuple[np.ndarray, float, int]:

@@ -22,8 +22,9 @@ from hrc_learn.protocols import ArmState
 from hrc_learn.watchdog import Watchdog, WatchdogError, bring_to_rest
 
 _PATIENCE = 60.0
-"""How long the process goes on trying to stop an arm whose loop has died [s]: longer than a
-control box takes to start again."""
+"""Longest time for which the process keeps trying to stop an arm whose loop has died [s]; a
+control box restarts in less.
+"""
 _STARTUP = 60.0
 """Longest that connecting may take [s]."""
 
@@ -223,13 +224,13 @@ class ArmProcess:
 def _serve(
     connection: Connection, open_arm: Callable[[], StoppableArm], timeout: float
 ) -> None:
-    """What runs in the process: answers requests until the loop's process closes or dies."""
+    """Answer requests in the driver's process until the loop's process closes or dies."""
     # Ctrl-C reaches all processes of a terminal: the loop decides what follows from it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         arm = open_arm()
     except Exception as error:
-        connection.send((None, _told(error), 0, 0))
+        connection.send((None, _describe(error), 0, 0))
         return
     dog = Watchdog(timeout, arm.stop)
     with ending_at_rest(arm.stop, patience=_PATIENCE):
@@ -251,7 +252,7 @@ def _answer_requests(connection: Connection, arm: StoppableArm, dog: Watchdog) -
         try:
             value = _carry_out(name, arguments, arm, dog)
         except Exception as raised:
-            error = _told(raised)
+            error = _describe(raised)
         try:
             connection.send((value, error, dog.trips, dog.failures))
         except OSError:
@@ -282,5 +283,5 @@ def _carry_out(name: str, arguments: list[Any], arm: StoppableArm, dog: Watchdog
     return None
 
 
-def _told(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"

@@ -1,8 +1,8 @@
-"""How late a camera's images are, measured by the robot's own motion.
+"""Delay of a camera's images, measured by moving the robot.
 
-A joint turns back and forth; where its marker is in the images is where the joint was some time
-before. No calibration is asked for: over so small a motion a pixel is a smooth function of one
-joint position, and it is fitted for each delay that is tried. The delay with the smallest rest
+A joint turns back and forth, and the position of its marker in the images lags behind the
+joint. No calibration is needed: over such a small motion a pixel is a smooth function of one
+joint position, which is fitted for each candidate delay. The delay with the smallest residual
 is the camera's.
 """
 
@@ -26,7 +26,7 @@ _SLOWEST, _FASTEST = 0.4, 1.0
 _POWERS = 3
 # Between the delays that are tried [s]; the smallest rest is found between them.
 _STEP = 2e-3
-# Images and share of the pixels' motion that the fit must explain for a delay to be told.
+# Fewest images, and smallest explained fraction of the pixels' motion, for a valid delay.
 _FEWEST, _EXPLAINED = 30, 0.9
 # Decay rate of the way back to where the joint was, and what is left of it [1/s, rad].
 _RETURN, _BACK = 2.0, 1e-3
@@ -34,10 +34,10 @@ _RETURN, _BACK = 2.0, 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class DelayMotion:
-    """How the joint moves while a delay is measured."""
+    """Joint motion during the measurement of a delay."""
 
     joint: int = 1
-    """Which turns, counted from 1: its motion must move the marker across the image."""
+    """Joint that turns, counted from 1; its motion must move the marker across the image."""
     speed: float = 0.15
     """Its fastest [rad/s]: of a hand at 0.5 m, 75 mm/s, by 3 cm to each side."""
     duration: float = 8.0
@@ -55,20 +55,21 @@ class DelayMotion:
             raise ValueError(f"joint is counted from 1, but is {self.joint}.")
 
     def velocity(self, passed: float) -> float:
-        """Of the joint after a time [s]: back and forth, ever faster, gently at its ends."""
-        share = passed / self.duration
-        turns = passed * (_SLOWEST + 0.5 * (_FASTEST - _SLOWEST) * share)
-        gentle = min(1.0, 8 * share, 8 * (1 - share))
+        """Joint velocity at a time [rad/s]: rising frequency, smooth at both ends."""
+        progress = passed / self.duration
+        turns = passed * (_SLOWEST + 0.5 * (_FASTEST - _SLOWEST) * progress)
+        gentle = min(1.0, 8 * progress, 8 * (1 - progress))
         return self.speed * gentle * math.sin(2 * math.pi * turns)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredDelay:
-    """Of a camera."""
+    """A measured camera delay."""
 
     delay: float
-    """From an image being taken until it is read; of a camera that tells its images' age, what
-    that leaves out [s]."""
+    """Time between exposure and reading of an image [s], without the age that the camera
+    reports.
+    """
     deviation: float
     """Standard deviation of the delay, by the rest of the fit [s]."""
     images: int

@@ -1,7 +1,7 @@
-"""Real cameras behind the protocol `Camera`: the devices, streams and files that OpenCV opens.
+"""Real cameras behind the protocol `Camera`: devices, streams and files that OpenCV opens.
 
-Nobody has to know a lens or where a camera stands. What an image needs is its time: by it the
-controller knows where the arm was when the image was taken.
+Neither lens nor camera pose has to be known. Each image carries its time, from which the
+controller finds the arm's position at exposure.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ type RGB = UInt8[np.ndarray, "height width 3"]
 """An image."""
 
 _FIRST_IMAGE = 5.0
-"""How much longer than later ones the first image may take [s]: cameras set their exposure, and
-streams come with a whole picture only now and then."""
+"""Additional time allowed for the first image [s]: cameras adjust their exposure, and streams
+send complete pictures only now and then.
+"""
 _CLOSING = 2.0
-"""How long closing waits for the thread that reads [s]."""
+"""Longest wait for the reading thread on closing [s]."""
 
 
 class CameraError(RuntimeError):
@@ -47,15 +48,15 @@ def open_camera(
 
     Args:
         source: Number of a device ("0" too), path of one (/dev/video0), URL of a stream
-            (rtsp://..., http://...), or path of a video file, which is played at its own rate.
-        size: Width and height of its images [px], which a device is asked for; None: its own.
-        delay: From an image being taken until it arrives, beside what the backend tells; see
-            `measure_delay` [s].
+            (rtsp://..., http://...), or path of a video file, which plays at its own rate.
+        size: Requested width and height of the images [px]; None: the device's own.
+        delay: Time between exposure and arrival of an image [s], in addition to what the
+            backend reports; see `measure_delay`.
         timeout: Longest time without an image [s].
 
     Raises:
         FileNotFoundError: There is no such file.
-        CameraError: It cannot be opened, or sends no image of this size.
+        CameraError: The source cannot be opened, or sends no image of this size.
     """
     name = str(source)
     if name.isdecimal() or "://" in name or name.startswith("/dev/"):
@@ -64,10 +65,10 @@ def open_camera(
 
 
 class CaptureCamera(TimedCamera):
-    """A camera or stream that OpenCV opens; a thread reads it and keeps the newest image only.
+    """A camera or stream that OpenCV opens; a thread reads it and keeps only the newest image.
 
-    Its backend holds several images back: who reads them at a lower rate than they are taken
-    would see ever older ones.
+    The backend buffers several images, so a reader slower than the camera would receive ever
+    older ones.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class CaptureCamera(TimedCamera):
 
     @property
     def age(self) -> float:
-        """From the newest image that was read being taken until it was read [s]."""
+        """Age of the newest image when it was read [s]."""
         return self._age
 
     def read(self) -> RGB:
@@ -154,7 +155,7 @@ class CaptureCamera(TimedCamera):
                 raise CameraError(self._failure or _silent(self._name, longest, self._timeout))
 
     def _keep_newest(self) -> None:
-        """What runs in the thread."""
+        """Read images until closed (body of the thread)."""
         while not self._closing:
             if not self._capture.grab():
                 self._fail(
@@ -177,16 +178,17 @@ class CaptureCamera(TimedCamera):
 
 
 def taken_by(capture: Any, now: float, oldest: float) -> float:
-    """When the image was taken that a capture has just grabbed, on `time.monotonic` [s].
+    """Time at which the image just grabbed was taken, on `time.monotonic` [s].
 
-    Drivers of Linux stamp their buffers by that clock, and OpenCV tells the stamps as the
-    position of the video (CAP_PROP_POS_MSEC, its backend V4L2). Where the position is no time
-    shortly before now it is one since the stream began, or nothing: what counts is the arrival.
+    Linux drivers stamp their buffers with that clock, and OpenCV reports the stamp as the
+    position of the video (CAP_PROP_POS_MSEC, backend V4L2). A position that is not shortly
+    before now is a time since the start of the stream, or nothing; then the time of arrival
+    counts.
 
     Args:
-        capture: Of OpenCV.
-        now: When it was grabbed [s].
-        oldest: From which age on it cannot be the image's [s].
+        capture: OpenCV's capture.
+        now: Time of the grab [s].
+        oldest: Age beyond which the position cannot be the image's time [s].
     """
     import cv2
 
@@ -229,14 +231,14 @@ class VideoFile(TimedCamera):
 
     @property
     def age(self) -> float:
-        """From when the newest image that was read was due until it was read [s]; 0 of one that
-        comes when it is read.
+        """Time by which the newest image was overdue when it was read [s]; 0 if images are read
+        one by one.
         """
         return self._age
 
     @property
     def number(self) -> int:
-        """How many images have been read or passed."""
+        """Number of images read or skipped."""
         return self._number
 
     def read(self) -> RGB:

@@ -15,31 +15,30 @@ from hrc_learn.watchdog import Report, bring_to_rest, report_failed_stop
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)
 )
-"""By which a program is told to end: by its surroundings, by Ctrl-C, by a closed terminal."""
+"""Signals that end a program: from its supervisor, from Ctrl-C, from a closed terminal."""
 
 
 @contextmanager
 def ending_at_rest(
     stop: Callable[[], object], *, patience: float = 5.0, report: Report = report_failed_stop
 ) -> Iterator[None]:
-    """Whatever ends this block, the arm is brought to rest before the process goes on.
+    """Bring the arm to rest however this block ends.
 
         with ending_at_rest(arm.stop):
             while servoing():
                 arm.command(runner.step())
 
     SIGTERM and SIGHUP end the block as `SystemExit` with status 128 + number, SIGINT as
-    `KeyboardInterrupt`; further ones change nothing until the arm is at rest. A signal that was
-    ignored stays so. In a thread other than the main one, which signals do not reach, they are
-    left alone.
+    `KeyboardInterrupt`; further signals change nothing until the arm is at rest. An ignored
+    signal stays ignored. Signals are left alone in threads other than the main one.
 
     Args:
         stop: Brings the arm to rest.
-        patience: How long to go on trying if that fails [s].
-        report: Told of each failure.
+        patience: Longest time for which a failing stop is repeated [s].
+        report: Called with each failure.
 
     Raises:
-        RuntimeError: The arm could not be stopped, and nothing else was wrong.
+        RuntimeError: The arm could not be stopped, and the block itself raised nothing.
     """
     ending = False
 

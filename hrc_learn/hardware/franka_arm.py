@@ -65,10 +65,10 @@ _PAUSE = 5e-4
 
 @dataclass(frozen=True, kw_only=True)
 class FrankaConfig:
-    """How an arm is driven."""
+    """Settings of an arm's 1 kHz loop."""
 
     hold: float = 0.15
-    """How long a velocity holds [s]; then the arm is brought to rest."""
+    """Time for which a velocity holds [s]; then the arm is brought to rest."""
     acceleration: float = 0.3
     """Fraction of the arm's acceleration limits that is used, above 0 to 1."""
     jerk: float = 0.3
@@ -79,27 +79,30 @@ class FrankaConfig:
     With these fractions that stays allowed on an FR3: 3 rad/s^2 in 1 ms and 1500 rad/s^3 are
     4500 of its 5000 rad/s^3."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    """Of the filter, which sees these limits."""
+    """Settings of the safety filter, which uses these limits."""
     realtime: bool = True
-    """Whether to insist on a realtime kernel and priority. Without the kernel cycles are late
-    now and then, which the control box tolerates up to 20 in a row; priority is taken where the
-    user may have it."""
+    """True requires a realtime kernel and priority. Without that kernel some cycles are late;
+    the control box tolerates up to 20 in a row. False still takes the priority if the user may
+    have it.
+    """
     lockstep: bool = False
-    """Whether the arm is a simulator that stands still until it is answered, and while nobody
-    calls it: then no answer is late, and each state gets one."""
+    """True for a simulator that stands still until it is answered and while no command comes:
+    no answer is late then, and each state gets one.
+    """
     compiled: bool = True
-    """Whether to compile the step, once for a machine, which takes a minute or two the first
-    time. Uncompiled it takes a whole cycle on a busy machine: for simulators only."""
+    """True compiles the step, once per machine, in a minute or two. An uncompiled step takes a
+    whole cycle on a busy machine: use it for simulators only.
+    """
     collision: CollisionConfig = field(default_factory=CollisionConfig)
-    """What the control box stops the arm at."""
+    """Thresholds at which the control box stops the arm."""
     load: Load | None = None
-    """What the arm carries besides its end effector."""
+    """Load besides the end effector."""
     gripper: bool = True
-    """Whether there is one."""
+    """True if a gripper is mounted."""
     grip_force: float = 40.0
-    """To squeeze with [N]."""
+    """Grasping force [N]."""
     grip_speed: float = 0.1
-    """Of the fingers [m/s]; the most that the Franka Hand has."""
+    """Finger speed [m/s]; the highest of the Franka Hand."""
 
     def __post_init__(self) -> None:
         for name in ("acceleration", "jerk"):
@@ -112,21 +115,22 @@ class FrankaConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LoopTiming:
-    """How the loop has kept time so far."""
+    """Timing of the loop so far."""
 
     answered: int
     """Cycles of motion that were answered."""
     lost: int
     """Cycles of motion of which no state was read in time."""
     success_rate: float
-    """Of the last 100 answers, those that the control box got in time, by its own count; zero
-    at rest."""
+    """Fraction of the last 100 answers that the control box received in time, by its own count;
+    zero at rest.
+    """
     cost: Float[np.ndarray, " bins"]
-    """How many answers took so many microseconds, from the state read to the answer sent."""
+    """Number of answers by the time they took, from reading the state to sending the answer."""
 
     @property
-    def answered_share(self) -> float:
-        """Of all cycles; 1 before the first."""
+    def answered_fraction(self) -> float:
+        """Fraction of all cycles answered in time; 1 before the first."""
         return self.answered / max(1, self.answered + self.lost) if self.answered else 1.0
 
     def percentile(self, percent: float) -> float:
@@ -211,18 +215,18 @@ class FrankaArm:
 
     @property
     def fault(self) -> str:
-        """What has stopped the arm; empty: nothing has."""
+        """Reason for which the arm has stopped; empty if it has not."""
         stopped = self._report().phase in (Phase.FAULTED, Phase.ENDED)
         return self._shared.message if stopped else ""
 
     @property
     def faults(self) -> int:
-        """How often something has."""
+        """Number of faults so far."""
         return self._report().faults
 
     @property
     def timing(self) -> LoopTiming:
-        """How the loop has kept time so far."""
+        """Timing of the loop so far."""
         report = self._report()
         return LoopTiming(
             answered=report.cycles,
@@ -388,7 +392,7 @@ class FrankaArm:
 
 
 def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner]:
-    """What opens the step of the loop, in whatever process."""
+    """Open the runner of the loop's step, in any process."""
     limits = replace(
         chain.limits,
         acceleration=config.acceleration * chain.limits.acceleration,

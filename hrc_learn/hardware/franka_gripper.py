@@ -29,7 +29,7 @@ _STARTUP = 60.0
 
 
 class GripperCalls(Protocol):
-    """What a driver can do with a gripper; each call may take seconds."""
+    """Calls of a gripper's driver; each may take seconds."""
 
     def width(self) -> float:
         """Read the opening [m]."""
@@ -87,15 +87,15 @@ class GripperProcess:
         Raises:
             RuntimeError: The gripper cannot be reached; it says why.
         """
-        self._wish, self._told = Mailbox(2), Mailbox(3)
+        self._wish, self._status = Mailbox(2), Mailbox(3)
         self._wish.write(np.array([0.0, np.nan]))
-        self._told.write(np.array([np.nan, 0.0, 0.0]))
+        self._status.write(np.array([np.nan, 0.0, 0.0]))
         self._text = RawArray("c", TEXT)
         self._wishes, self._seen, self._width = 0, 0.0, np.nan
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
             target=_serve,
-            args=(self._wish, self._told, self._text, open_gripper, os.getpid()),
+            args=(self._wish, self._status, self._text, open_gripper, os.getpid()),
             name="gripper",
             daemon=True,
         )
@@ -111,13 +111,13 @@ class GripperProcess:
     @property
     def width(self) -> float:
         """Opening, as last read; NaN before the first reading [m]."""
-        line = self._told.read()
+        line = self._status.read()
         return np.nan if line is None else float(line[0])
 
     @property
     def busy(self) -> bool:
-        """Whether the newest wish is still to be done."""
-        line = self._told.read()
+        """True while the newest request is not yet done."""
+        line = self._status.read()
         return line is not None and bool(line[2] < self._wishes)
 
     def move(self, width: float) -> None:
@@ -134,7 +134,7 @@ class GripperProcess:
             raise ValueError(f"width must be finite, but is {width}.")
         if not self._process.is_alive():
             raise RuntimeError(f"the process of the gripper has ended. {self._message}")
-        line = self._told.read()
+        line = self._status.read()
         if line is not None and line[1] > self._seen:
             self._seen, self._width = line[1], np.nan
             raise RuntimeError(f"the gripper has failed: {self._message}")
@@ -157,12 +157,12 @@ class GripperProcess:
 
 def _serve(
     wish: Mailbox,
-    told: Mailbox,
+    status: Mailbox,
     text: object,
     open_gripper: Callable[[], GripperCalls],
     parent: int,
 ) -> None:
-    """What runs in the process, until its parent has gone."""
+    """Serve the gripper in its process until the parent has gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def note(error: Exception) -> None:
@@ -189,5 +189,5 @@ def _serve(
         except Exception as error:
             note(error)
             failures += 1
-        told.write(np.array([width, failures, done]))
+        status.write(np.array([width, failures, done]))
         time.sleep(max(0.0, begin + _READ_EVERY - time.monotonic()))

@@ -34,41 +34,45 @@ from hrc_learn.hardware.franka_memory import COST_BINS, JOINTS, Orders, Phase, R
 from hrc_learn.hardware.franka_settings import CollisionConfig, Load
 
 CYCLE = 1e-3
-"""Of Franka's control interface [s]."""
+"""Period of Franka's control interface [s]."""
 
 _AGREES = 1e-5
-"""By how much the box's commanded velocity may differ from what was sent [rad/s]: it comes
-back in single precision, and where a cycle is lost it differs by a step of the acceleration."""
+"""Largest rounding difference between the box's commanded velocity and the one sent [rad/s].
+The box reports single precision; after a lost cycle the difference is a step of the
+acceleration.
+"""
 _SAME = 1e-9
-"""By how much a report differs from the one before if it is the same [rad/s]."""
+"""Largest difference between two reports of the same velocity [rad/s]."""
 _RESTS = 1e-6
 """Commanded velocities below this are rest [rad/s]."""
 _SLOWEST, _FOLLOWS = 4.0, 0.02
-"""Of a robot slower than its clock: the slowest, in seconds for a second of its own, and how
-fast that is learned, in 50 cycles."""
+"""Slowest robot clock, in seconds per second of its own time, and the rate at which a slower
+clock is learned (about 50 cycles).
+"""
 _PARENT_EVERY = 50
 """Cycles between two looks at whether the process that commands still lives."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """How to reach an arm, and what its control box is told."""
+    """Address of an arm and settings of its control box."""
 
     ip: str
     """Address of the control box."""
     realtime: bool
-    """Whether to refuse a kernel or a priority without realtime."""
+    """True refuses a kernel or a priority without realtime."""
     collision: CollisionConfig
     load: Load | None
     lockstep: bool = False
-    """Whether it is a simulator that waits for each answer, so that none is late."""
+    """True for a simulator that waits for each answer, so that none is late."""
 
     def connect(self) -> Any:
-        """Connect, clear what stopped the arm before, and tell what has to be told.
+        """Connect, clear earlier errors, and send the settings.
 
         Raises:
             ImportError: The driver is not installed.
-            RuntimeError: The arm cannot be reached, or realtime is missing; it says which.
+            RuntimeError: The arm cannot be reached, or realtime is missing; the message says
+                which.
         """
         driver = import_pylibfranka()
         config = driver.RealtimeConfig
@@ -97,10 +101,10 @@ class Robot:
 
 
 def import_pylibfranka() -> Any:
-    """Franka's binding.
+    """Import Franka's Python binding.
 
     Raises:
-        ImportError: It is not installed, or cannot be beside another driver.
+        ImportError: It is not installed, or conflicts with another driver in this process.
     """
     try:
         return importlib.import_module("pylibfranka")
@@ -133,8 +137,8 @@ def serve(
     hold: float,
     parent: int,
 ) -> None:
-    """What runs in the process: the loop, until it is told to end or its parent has died."""
-    # Ctrl-C reaches all processes of a terminal: who commands decides what follows from it.
+    """Run the loop in its process until it is ended or its parent has died."""
+    # Ctrl-C reaches all processes of a terminal: the commanding process decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
     try:
@@ -180,11 +184,11 @@ class Punctuality:
         self._skipped = self._skipped_before = False
 
     def late(self, now: float, period: float) -> bool:
-        """Whether to leave a state unanswered; asked once for each, before `overdue`.
+        """True if a state should stay unanswered; called once for each, before `overdue`.
 
         Args:
-            now: When it was read [s].
-            period: Time of the robot since the one before [s].
+            now: Time at which the state was read [s].
+            period: Robot time since the state before [s].
         """
         passed, self._last = now - self._last, now
         self._skipped_before, self._skipped = self._skipped, False
@@ -196,7 +200,7 @@ class Punctuality:
         return late
 
     def overdue(self, cost: float) -> bool:
-        """Whether to leave it unanswered as the answer has taken longer than a cycle.
+        """True if a state should stay unanswered because its answer took longer than a cycle.
 
         Args:
             cost: Time since the state was read [s].
@@ -220,14 +224,14 @@ class ControlLoop:
     def __init__(
         self, shared: Shared, robot: Robot, runner: StepRunner, hold: float, parent: int
     ):
-        """Connect.
+        """Connect to the arm.
 
         Args:
-            shared: With the process that commands.
-            robot: To connect to.
-            runner: Of the step, at `CYCLE`.
-            hold: How long a velocity holds [s].
-            parent: Process number of who commands; the loop ends when it has gone.
+            shared: Memory in common with the commanding process.
+            robot: Arm to connect to.
+            runner: Exported step with the period `CYCLE`.
+            hold: Time for which a velocity holds [s].
+            parent: Number of the commanding process; the loop ends when it has gone.
         """
         self.ending = False
         self._driver = import_pylibfranka()
@@ -243,7 +247,7 @@ class ControlLoop:
         self._link = robot.connect()
 
     def run(self) -> None:
-        """Loop until told to end."""
+        """Loop until ended."""
         while not self.ending:
             try:
                 self._read_orders()
@@ -278,7 +282,9 @@ class ControlLoop:
         return np.zeros(JOINTS) if self._idles() else self._orders.joint_velocity
 
     def _idles(self) -> bool:
-        """Whether nobody commands any more, or not since the last fault."""
+        """True without a current command: none is recent, or none has come since the last
+        fault.
+        """
         stamp = self._orders.stamp
         silent = time.monotonic() - stamp >= self._hold
         return silent or self._orders.stop or stamp <= self._recovered
@@ -294,7 +300,7 @@ class ControlLoop:
             self.ending = True
 
     def _move(self) -> None:
-        """One motion, until it rests and nobody commands any more, or the loop shall end."""
+        """Run one motion until the arm rests without a command, or until the loop is ended."""
         mode = self._driver.ControllerMode.JointImpedance
         control = self._link.start_joint_velocity_control(mode)
         self._sent = self._reported = np.full(JOINTS, np.nan)  # nothing yet
@@ -389,7 +395,7 @@ class ControlLoop:
         try:
             self._note(self._link.read_once())
         except Exception:
-            time.sleep(0.01)  # nothing can be read until somebody reconnects
+            time.sleep(0.01)  # nothing can be read until the connection is renewed
         self._publish(Phase.FAULTED)
 
 
@@ -399,17 +405,18 @@ def answer_was_lost(
     before: Float[np.ndarray, "7"],
     sent: Float[np.ndarray, "7"],
 ) -> bool:
-    """Whether the control box goes on without the last answer, with a constant acceleration.
+    """True if the control box has missed the last answer and extrapolates at constant
+    acceleration.
 
-    Then the next answer must start from where the box is. A velocity that has not changed in
-    spite of an acceleration says nothing of the kind: it was written before the answer that the
-    box has by now, and starting from it would be a jump back.
+    The next answer must then start from the state of the box. An unchanged velocity despite an
+    acceleration is no such sign: it was reported before the box received the last answer, and
+    starting from it would be a jump back.
 
     Args:
-        reported: What the box has as the commanded velocity [rad/s].
-        acceleration: And as the commanded acceleration [rad/s^2].
-        before: The velocity of the state before; NaN: there was none.
-        sent: The last answer; NaN: there was none.
+        reported: Commanded velocity that the box reports [rad/s].
+        acceleration: Commanded acceleration that it reports [rad/s^2].
+        before: Commanded velocity of the previous state; NaN: there was none.
+        sent: Last answer; NaN: there was none.
     """
     if not np.isfinite(reported).all():
         return False
@@ -423,7 +430,7 @@ def answer_was_lost(
 
 
 def _explained(error: Exception) -> str:
-    """What has stopped the arm, and what to do."""
+    """Explanation of a driver's error, with what to do."""
     kind = type(error).__name__
     advice = {
         "ControlException": "See that nothing touches the arm, then call recover().",

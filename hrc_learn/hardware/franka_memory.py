@@ -18,7 +18,9 @@ JOINTS = 7
 TEXT = 2000
 """Longest message about a fault [bytes]."""
 COST_BINS = 2000
-"""Of the histogram of what cycles cost, each 1 us wide; the last one has all that is longer."""
+"""Number of bins of the histogram of cycle costs, each 1 us wide; the last holds all longer
+ones.
+"""
 
 _TRIES = 100
 """Readings of a mailbox before its writer is taken for dead in the middle of a line: a line is
@@ -26,7 +28,7 @@ written within a microsecond or two."""
 
 
 class Phase(IntEnum):
-    """What the loop is doing."""
+    """Activity of the loop."""
 
     STARTING = 0
     IDLE = 1
@@ -81,16 +83,16 @@ def _zeros() -> Float[np.ndarray, "7"]:
 
 @dataclass
 class Orders:
-    """What the commanding process wants, as a line of a mailbox."""
+    """Orders of the commanding process, as a line of a mailbox."""
 
     stamp: float = -np.inf
-    """When the velocity was set, by time.monotonic() [s]."""
+    """Time at which the velocity was set, on `time.monotonic` [s]."""
     stop: bool = False
-    """Whether to brake to rest whatever is wanted."""
+    """True brakes to rest, whatever the velocity."""
     recoveries: int = 0
-    """How often recovery has been asked for."""
+    """Number of recoveries requested."""
     end: bool = False
-    """Whether to bring the arm to rest and end."""
+    """True brings the arm to rest and ends the loop."""
     joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
     """Wanted [rad/s]."""
 
@@ -103,19 +105,19 @@ class Orders:
 
     @classmethod
     def of(cls, line: Float[np.ndarray, " size"]) -> Orders:
-        """From a line."""
+        """Read the orders from a line."""
         return cls(float(line[0]), bool(line[1]), int(line[2]), bool(line[3]), line[4:])
 
 
 @dataclass
 class Report:
-    """What the loop tells, as a line of a mailbox."""
+    """State of the loop, as a line of a mailbox."""
 
     phase: Phase = Phase.STARTING
     stamp: float = -np.inf
-    """When the state was read, by time.monotonic() [s]."""
+    """Time at which the state was read, on `time.monotonic` [s]."""
     time: float = 0.0
-    """Of the robot's clock [s]."""
+    """Robot's clock [s]."""
     recoveries: int = 0
     """Requests for recovery that have been dealt with."""
     faults: int = 0
@@ -123,11 +125,12 @@ class Report:
     cycles: int = 0
     """Answered in motion."""
     lost: int = 0
-    """Of which no state was read in time to be answered."""
+    """Cycles whose state could not be answered in time."""
     success_rate: float = 0.0
-    """Share of the last 100 answers that the control box got in time, by its own count."""
+    """Fraction of the last 100 answers that the control box received in time, by its own count.
+    """
     resting: bool = True
-    """Whether the velocity that was sent last is zero."""
+    """True if the velocity sent last is zero."""
     joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
     """[rad]"""
     joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
@@ -150,7 +153,7 @@ class Report:
 
     @classmethod
     def of(cls, line: Float[np.ndarray, " size"]) -> Report:
-        """From a line."""
+        """Read the report from a line."""
         q, dq, torque = line[9:].reshape(3, JOINTS)
         return cls(
             phase=Phase(int(line[0])),
@@ -190,5 +193,5 @@ class Shared:
 
     @property
     def costs(self) -> Float[np.ndarray, " bins"]:
-        """How many cycles cost how many microseconds, from a state read to it answered."""
+        """Number of cycles by their cost [us], from reading a state to answering it."""
         return np.frombuffer(self._costs, dtype=float)

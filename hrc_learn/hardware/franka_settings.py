@@ -1,4 +1,4 @@
-"""What the control box of a Franka arm is told, whichever driver speaks to it."""
+"""Settings of a Franka arm's control box, common to both drivers."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Load:
-    """What is mounted to the flange beyond the end effector that the arm is set up for."""
+    """A load on the flange, in addition to the end effector that the arm is configured for."""
 
     mass: float = 0.0
     """[kg]"""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of mass, in the flange's frame [m]."""
+    """Centre of mass, in the flange's frame [m]."""
     inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
     """About that centre, along the flange's axes [kg m^2]."""
 
@@ -45,7 +45,7 @@ class CollisionConfig:
     torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
     """On each joint [N m]."""
     force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
-    """At the end effector: along x, y, z [N], about them [N m]."""
+    """Threshold at the end effector: forces along x, y, z [N], torques about them [N m]."""
 
     def __post_init__(self) -> None:
         for name, number in (("torque", 7), ("force", 6)):

@@ -23,7 +23,7 @@ from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
 
 Realtime = Literal["enforce", "ignore"]
-"""Whether a kernel without real-time scheduling is refused, or put up with."""
+"""Policy for a kernel without real-time scheduling: refuse it or accept it."""
 
 _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 """Holds 1 under a kernel with PREEMPT_RT."""
@@ -38,23 +38,23 @@ acceleration."""
 
 @dataclass(frozen=True, kw_only=True)
 class FrankyConfig:
-    """How the driver leads the arm."""
+    """Settings of the driver."""
 
     dynamics: float = 0.3
     """Fraction of the driver's own limits of acceleration and jerk, above 0 to 1. Velocities
     reach the driver's limits whatever it is."""
     timeout: float = 0.15
-    """How long a velocity holds [s]; then the driver brings the arm to rest."""
+    """Time for which a velocity holds [s]; then the driver brings the arm to rest."""
     realtime: Realtime = "enforce"
-    """Whether a kernel without real-time scheduling is refused. Ignore it for simulators."""
+    """"enforce" refuses a kernel without real-time scheduling; use "ignore" for simulators."""
     grip_force: float = 20.0
-    """With which the gripper squeezes [N]."""
+    """Grasping force [N]."""
     grip_speed: float = 0.1
-    """Of the fingers [m/s]."""
+    """Finger speed [m/s]."""
     collision: CollisionConfig = field(default_factory=CollisionConfig)
-    """When the arm stops by a reflex."""
+    """Thresholds at which the arm stops by a reflex."""
     load: Load | None = None
-    """At the flange; None: as the arm has been told before."""
+    """Load on the flange; None leaves the arm's earlier setting."""
 
     def __post_init__(self) -> None:
         if not 0 < self.dynamics <= 1:
@@ -78,18 +78,18 @@ class ArmFaultError(RuntimeError):
 
 
 class FrankyArm:
-    """The arm and its gripper.
+    """A Franka arm and its gripper.
 
-    A velocity holds for the config's `timeout` at most: the driver itself then brings the arm
-    to rest. If this process dies, its connection falls, which ends the motion at once. A
-    command that comes late starts from whatever velocity is left.
+    A velocity holds for at most the config's `timeout`; then the driver brings the arm to rest.
+    If this process dies, its connection drops, which ends the motion at once. A late command
+    starts from the remaining velocity.
 
-    After a reflex, a user stop or a lost connection every command raises `ArmFaultError`, until
-    `recover` has succeeded. The gripper has threads of its own (`GripperThread`): nothing here
-    waits for it, and what it fails at is told on stderr and by `gripper.check`.
+    After a reflex, a user stop or a lost connection every command raises `ArmFaultError` until
+    `recover` has succeeded. The gripper has its own threads (`GripperThread`): the arm never
+    waits for it; its failures appear on stderr and are raised by `gripper.check`.
 
     Attributes:
-        gripper: On its threads.
+        gripper: The gripper, on its threads.
     """
 
     def __init__(self, ip: str, config: FrankyConfig | None = None):
@@ -284,7 +284,7 @@ class FrankyArm:
             os.sched_setscheduler(0, *before)
 
     def _is_moving(self) -> bool:
-        """Whether a motion is under way; raises what has ended the last one, once."""
+        """True during a motion; raises the error that ended the last one, once."""
         # Its own result is no answer: it says True where nothing moves, against its
         # documentation (franky 2.0).
         self._robot.poll_motion()
@@ -327,7 +327,7 @@ class FrankyArm:
             mode.UserStopped: "release the user stop, then call recover()",
             mode.Guiding: "let go of the guiding buttons, then call recover()",
         }.get(state.robot_mode, "make room around the arm, then call recover()")
-        errors = ", ".join(map(str, _names(state.current_errors))) or "no error is told"
+        errors = ", ".join(map(str, _names(state.current_errors))) or "no error is reported"
         self._fault = (
             f"the arm at {self._ip} is in mode {state.robot_mode.name} ({errors}), and {what}: "
             f"{cure}."
@@ -408,7 +408,7 @@ def _no_realtime(why: str) -> RealtimeError:
 
 
 def _names(errors: Any) -> list[str]:
-    """Of the errors that are set."""
+    """Names of the errors that are set."""
     return [name for name in dir(errors) if not name.startswith("_") and getattr(errors, name)]
 
 

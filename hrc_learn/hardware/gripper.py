@@ -12,8 +12,9 @@ _NARROW = 0.005
 """Openings below this are a wish to squeeze, and such a difference is none [m]: a tenth of what
 an object that two fingers take is wide."""
 _BETWEEN_READINGS = 0.02
-"""From one reading of the width to the next [s]: skills look at it every 10 ms and act on
-differences of millimetres, which fingers at 0.1 m/s take 20 ms for."""
+"""Period of the width readings [s]: skills read it every 10 ms and act on millimetres, for
+which fingers at 0.1 m/s take 20 ms.
+"""
 _BEFORE_NEXT_TRY = 1.0
 """After the connection failed [s]: a control box takes some seconds to start again."""
 
@@ -22,7 +23,7 @@ _ENDING = 2.0
 
 
 class GripperError(RuntimeError):
-    """A gripper did not do what it was told, or cannot be reached."""
+    """A gripper failed to move, or cannot be reached."""
 
 
 @runtime_checkable
@@ -52,17 +53,17 @@ def report_failure(failure: GripperError) -> None:
 
 @final
 class GripperThread:
-    """A `Gripper` that neither waits nor raises in the middle of an arm's loop.
+    """A `Gripper` that neither blocks nor raises within an arm's control loop.
 
-    with GripperThread(open_driver) as gripper:
-        gripper.move(0.0)  # returns at once; 0 squeezes
-        gripper.width  # the newest known
-        gripper.check()  # raises what has failed since `move`
+        with GripperThread(open_driver) as gripper:
+            gripper.move(0.0)  # returns at once; 0 squeezes
+            gripper.width  # newest reading
+            gripper.check()  # raises what has failed since `move`
 
-    One thread reads the width, another one carries out moves: the newest one asked for, after
-    the one under way. A connection that falls is opened again. What fails is told to `report`
-    and kept until the next move, so that a task can look for it where it is ready to, and a
-    control loop goes on.
+    One thread reads the width; another carries out moves, always the newest request after the
+    current one. A dropped connection is opened again. Failures are passed to `report` and kept
+    until the next move, so that a task can check for them at a suitable moment while the
+    control loop continues.
     """
 
     def __init__(
@@ -76,11 +77,11 @@ class GripperThread:
 
         Args:
             open_driver: Connects to the gripper.
-            startup: Longest that connecting may take [s].
-            report: Told of each failure, by the thread that met it.
+            startup: Longest time for connecting [s].
+            report: Called with each failure, by the thread that met it.
 
         Raises:
-            GripperError: It cannot be reached.
+            GripperError: The gripper cannot be reached.
         """
         self._open, self._report = open_driver, report
         self._width: float | None = None
@@ -106,7 +107,7 @@ class GripperThread:
             failure = self._failure
         self.close()
         raise failure or GripperError(
-            f"the gripper has not told its width for {startup:g} s: is it mounted, switched on "
+            f"the gripper has not reported its width for {startup:g} s: is it mounted, switched on "
             "and homed?"
         )
 
@@ -118,7 +119,7 @@ class GripperThread:
 
     @property
     def failure(self) -> GripperError | None:
-        """What failed since the last new opening was asked for; None: nothing did."""
+        """Failure since the last new opening was requested; None if there was none."""
         return self._failure
 
     def check(self) -> None:
@@ -215,8 +216,8 @@ class GripperThread:
         because = "" if error is None else f" ({type(error).__name__}: {error})"
         failure = GripperError(f"the gripper {what}{because}.")
         with self._news:
-            told = str(self._failure) == str(failure)
+            known = str(self._failure) == str(failure)
             self._failure = failure
             self._news.notify_all()
-        if not told and not self._closed:
+        if not known and not self._closed:
             self._report(failure)

@@ -13,7 +13,7 @@ from hrc_learn.protocols import TimedCamera
 
 @runtime_checkable
 class ConnectedCamera(Protocol):
-    """What is used of the cameras of LeRobot, by `lerobot.cameras.Camera` of 0.6."""
+    """The methods used of LeRobot's cameras (`lerobot.cameras.Camera`, 0.6)."""
 
     @property
     def is_connected(self) -> bool: ...
@@ -33,16 +33,16 @@ class LeRobotCamera(TimedCamera):
         delay: float = 0.0,
         timeout: float = 1.0,
     ):
-        """Take it, and connect to it if nobody has.
+        """Wrap a camera, and connect to it unless it is connected.
 
         Args:
             camera: A `lerobot.cameras.Camera`.
-            size: Width and height that its images should have [px]; None: any.
-            delay: From an image being taken until it arrives; see `measure_delay` [s].
+            size: Required width and height of its images [px]; None: any.
+            delay: Time between exposure and arrival of an image [s]; see `measure_delay`.
             timeout: Longest time without an image [s].
 
         Raises:
-            CameraError: It cannot be connected.
+            CameraError: The camera cannot be connected.
             ValueError: The delay is negative, or the timeout is not positive.
         """
         check_times(delay, timeout)
@@ -60,7 +60,7 @@ class LeRobotCamera(TimedCamera):
 
     @property
     def age(self) -> float:
-        """From the newest image that was read being taken until it was read [s]."""
+        """Age of the newest image when it was read [s]."""
         return self._age
 
     def read(self) -> RGB:
@@ -91,6 +91,8 @@ class LeRobotCamera(TimedCamera):
             self._camera.disconnect()
 
     def _stamp(self) -> float | None:
-        """When the newest image came, on `time.perf_counter` [s]; None: it does not tell."""
+        """Time at which the newest image arrived, on `time.perf_counter` [s]; None if not
+        reported.
+        """
         stamp = getattr(self._camera, "latest_timestamp", None)
         return stamp if isinstance(stamp, float) else None

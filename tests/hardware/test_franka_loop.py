@@ -183,10 +183,10 @@ def test_timing_counts_cycles_and_what_they_cost():
     cost = np.zeros(2000)
     cost[[100, 150, 900]] = 50, 48, 2
     timing = LoopTiming(answered=98, lost=2, success_rate=0.98, cost=cost)
-    assert timing.answered_share == 0.98
+    assert timing.answered_fraction == 0.98
     assert timing.percentile(50.0) == pytest.approx(101e-6)
     assert timing.percentile(98.0) == pytest.approx(151e-6)
     assert timing.percentile(99.0) == pytest.approx(901e-6)
     nothing = LoopTiming(answered=0, lost=0, success_rate=0.0, cost=np.zeros(2000))
-    assert nothing.answered_share == 1.0
+    assert nothing.answered_fraction == 1.0
     assert np.isnan(nothing.percentile(50.0))

@@ -84,7 +84,7 @@ def test_no_command_trips_anything_that_is_enforced(server):
         assert arm.read().gripper_width == pytest.approx(0.03, abs=1e-3)
     assert aborted(trace) == []
     assert timing.answered > 10_000
-    assert timing.answered_share > 0.99
+    assert timing.answered_fraction > 0.99
     moved = Trace.read(trace)
     chosen = (moved.moment > began) & (moved.moment < ended)
     assert (np.ptp(moved.position[chosen], axis=0) > 0.2).all()
@@ -102,7 +102,7 @@ def test_lost_packets_trip_nothing(tmp_path, loss):
         assert arm.faults == 0, arm.fault
     assert aborted(trace) == []
     # States that are lost; answers that are lost only the control box counts.
-    assert 0.7 * loss < 1 - timing.answered_share < 2 * loss
+    assert 0.7 * loss < 1 - timing.answered_fraction < 2 * loss
 
 
 def test_an_arm_whose_loop_is_killed_is_at_rest_at_once(server):
