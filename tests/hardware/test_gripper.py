@@ -159,7 +159,7 @@ def test_a_gripper_that_tells_no_width_is_not_waited_for_for_ever():
             return 0.0
 
     threading.Timer(0.5, silence.set).start()
-    with pytest.raises(GripperError, match=r"has not told its width for 0\.1 s"):
+    with pytest.raises(GripperError, match=r"has not reported its width for 0\.1 s"):
         GripperThread(Silent, startup=0.1)
 
 
