@@ -307,6 +307,7 @@ def _thumbnails(
 ) -> StampedImages | DatasetError:
     """Thumbnails of one camera, or the error of its video."""
     last = reader.length(demo.episode) - 1
+    # Evenly spread, and never more than the frames there are.
     count = min(last + 1, most, 1 + int(demo.duration * _THUMBNAIL_RATE))
     frames = sorted({*np.linspace(0, last, count).astype(int).tolist()})
     try:

@@ -285,6 +285,7 @@ def _episodes_v2(root: Path, info: dict) -> Iterator[EpisodeEntry]:
     template = info.get("data_path")
     for row in rows:
         index = integer(row["episode_index"], "episode_index", name)
+        # Version 2 keeps one file per episode, and `chunks_size` files per folder.
         places = {"episode_chunk": index // size, "episode_index": index}
         yield EpisodeEntry(
             index=index,

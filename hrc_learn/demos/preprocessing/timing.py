@@ -413,6 +413,7 @@ def _matching_times(
 
     The path advances by whole frames; a line fitted around each frame interpolates.
     """
+    # Several pairs may share a frame of the reference: their mean time counts.
     partners = np.bincount(path.first, weights=demo.time[path.second])
     times = partners / np.bincount(path.first)
     if len(reference) > 2:

@@ -169,6 +169,7 @@ class _Survey:
             report.episodes += 1
             report.frames += entry.length
             size += sum(values.nbytes for values in frames.values())
+            # A second read of a small dataset costs more than its memory.
             if self._kept is None or size >= _KEPT_BYTES:
                 self._kept = None
             else:
@@ -262,6 +263,7 @@ def _check_motions(
                 report.run(
                     "true stamps", episode_checks.stamps, entry, "time", time, folder.fps
                 )
+            # Stamps that do not increase are reported as such; speeds make no sense then.
             for name, check in MOTION_CHECKS.items() if episode.is_ordered else ():
                 report.run(name, check, episode)
         if episode.motion is not None:

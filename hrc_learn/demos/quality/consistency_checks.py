@@ -83,6 +83,7 @@ def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
         return
     usual = float(np.median([entry.length for entry in entries]))
     for entry in entries:
+        # Operators differ by a factor of two or three, not by five.
         if not usual / 5 < entry.length < 5 * usual:
             yield entry.warning(
                 f"has {entry.length} frames where {usual:.0f} are usual: broken off, "
@@ -120,6 +121,7 @@ def holds(feature: FeatureProfiles, fps: float) -> Iterator[Issue]:
     held, frames = feature.stack("held"), feature.lengths
     fraction = held / frames[:, None]
     usual = np.median(fraction, axis=0)
+    # Long in itself, long for this component, and longer than any pause of the operator.
     frozen = (fraction > 0.1) & (fraction > 5 * usual + 0.02) & (held > max(10, 0.3 * fps))
     frozen &= feature.smooth & (feature.span > 0)
     for number, component in np.argwhere(frozen):
@@ -140,9 +142,11 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
         return
     noise, span = feature.stack("noise"), feature.span
     moving = feature.smooth & (span > 0)
+    # Second differences vary by a factor of three between operators, not by ten.
     noisy = (noise > 10 * np.median(noise, axis=0)) & (noise > 0.005 * span) & moving
     frames = feature.lengths[:, None]
     levels = feature.stack("distinct") / frames
+    # A fifth of the usual levels: values were rounded or the encoder lost bits.
     coarse = (levels < 0.2 * np.median(levels, axis=0)) & moving
     coarse &= feature.stack("held") / frames < 0.1  # otherwise it rests
     for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
@@ -163,8 +167,10 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
     span, usual_span = feature.stack("span"), feature.span
     ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)
     usual = np.median(ends, axis=0)
+    # Ends within a tenth of the range count as the same level.
     near = np.abs(ends - usual) <= 0.1 * usual_span
     opposite = np.abs(ends - usual[::-1]) <= 0.1 * usual_span
+    # Only components that usually change their level from start to goal.
     switching = ~feature.smooth & (np.ptp(usual, axis=0) > 0.5 * usual_span) & (usual_span > 0)
     for component in np.flatnonzero(switching):
         alike = near[:, :, component].all(1)
@@ -198,7 +204,9 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
     ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)[..., moving]
     figures = np.concatenate([levels, ends], axis=1)
     usual = np.median(figures, axis=0)
+    # 1.4826 scales a median deviation to the standard deviation of a normal distribution.
     spread = 1.4826 * np.median(np.abs(figures - usual), axis=0).mean(0)
+    # Nearly identical episodes have no spread; 5 % of the range replaces it.
     scale = np.maximum(spread, 0.05 * feature.span[moving]) + 1e-9
     names = [feature.names[i] for i in moving]
     for number, own in enumerate(figures):
@@ -234,9 +242,11 @@ def _permuted(
     from scipy.optimize import linear_sum_assignment
 
     cost = np.abs(own[:, :, None] - usual[:, None, :]).mean(0) / scale
+    # The bound keeps one outlier from deciding the whole assignment.
     _, best = linear_sum_assignment(np.minimum(cost, 50))
     exchanged = _displaced_cycles(best, off > _FAR_OFF)
     after = cost[exchanged, best[exchanged]]
+    # In their new places all components must look usual: within two spreads.
     if len(exchanged) < 2 or after.max() >= 2:
         return None
     if after.mean() >= 0.3 * off[exchanged].mean():
@@ -267,6 +277,7 @@ def _negated(
 ) -> tuple | None:
     """Components with the opposite sign; negation exchanges the quantiles 5 and 95 %."""
     turned = np.abs(-own[[2, 1, 0, 3, 4]] - usual).mean(0) / scale
+    # The negated figures must be usual, and far closer than the original ones.
     negated = np.flatnonzero((off > _FAR_OFF) & (turned < 1.5) & (turned < 0.25 * off))
     if not len(negated):
         return None
@@ -279,6 +290,7 @@ def _reversed(
 ) -> tuple | None:
     """A motion from the usual goal to the usual start."""
     back = np.abs(own[[0, 1, 2, 4, 3]] - usual).mean(0) / scale
+    # All components together: single ones look alike in both directions.
     if off.mean() > 2 and back.mean() < 0.4 * off.mean():
         return "warning", "runs the other way than the other episodes"
     return None
@@ -290,6 +302,7 @@ def _offset(
     """Components shifted as a whole, or far from the other episodes in another way."""
     moved = np.flatnonzero(off > 3 * _FAR_OFF)
     shift = own - usual
+    # A moved zero shifts all five figures by the same amount.
     alike = np.ptp(shift, axis=0) < 0.2 * np.abs(shift.mean(0))
     offset = [i for i in moved if alike[i]]
     if offset:

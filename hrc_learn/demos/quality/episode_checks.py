@@ -130,6 +130,7 @@ def stamps(
             frame=0,
             **place,
         )
+    # The median step ignores gaps and repetitions.
     if abs(usual * fps - 1) > _RATE_TOLERANCE:
         yield warning(
             message=f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
@@ -398,9 +399,11 @@ def frozen_encoders(episode: MotionRecord) -> Iterator[Issue]:
         edges = np.concatenate([[-1], moves, [len(joints) - 1]])
         longest = int(np.diff(edges).argmax())
         first, last = int(edges[longest]) + 1, int(edges[longest + 1])
+        # Shorter holds occur at turning points.
         if last - first < 10:
             continue
         commanded = float(np.ptp(command[first : last + 1, joint]))
+        # A quarter of the usual range, and more than backlash and friction explain [rad].
         if commanded > 0.25 * span[joint] and commanded > 0.02:
             yield episode.entry.warning(
                 f"{name} stays exactly the same for {last - first} frames while its "

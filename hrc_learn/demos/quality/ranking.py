@@ -263,6 +263,7 @@ def _measure(quality: EpisodeQuality, demo: Demonstration) -> None:
     quality.measures["idle"] = float(rest.mean())
     moving = np.flatnonzero(~rest)
     if len(moving):
+        # A tenth of a second of rest stays at either end of a proposed cut.
         margin = round(0.1 * demo.fps)
         quality.start = max(0, int(moving[0]) - margin)
         quality.stop = min(len(demo), int(moving[-1]) + 1 + margin)
@@ -336,6 +337,7 @@ def _principal_components(
     scale = np.maximum(scale, 0.05 * scale.max())
     centred = ((columns - np.median(columns, axis=0)) / scale).reshape(len(shapes), -1)
     # Outliers would determine all components.
+    # Twenty ranges: far beyond any motion of the same task.
     centred = np.clip(centred, -20, 20)
     # The smaller of both products, whose principal axes span the same space.
     if centred.shape[1] <= len(centred):

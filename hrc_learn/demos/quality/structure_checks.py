@@ -249,6 +249,7 @@ def statistics_fit(
         # A part of a dataset may keep the statistics of the whole, which enclose it.
         wrong |= (summary.low < low - 0.02 * span) | (summary.high > high + 0.02 * span)
         wrong |= (mean < low - 0.02 * span) | (mean > high + 0.02 * span)
+        # Far wider statistics belong to other data or to another unit.
         wrong |= (high - low) > 20 * span + 1
         if wrong.any():
             yield warning(

@@ -48,7 +48,9 @@ def command_tracking(
     for profile, tracking in zip(known, trackings, strict=True):
         place = {**entries[profile.index].location, "key": key, "components": (*names,)}
         shift = tracking.delay - delay
+        # The own delay must explain far more of the motion than the usual one.
         better = gain_over(tracking, round(delay)) > 0.8
+        # Three frames are the scatter of estimated delays.
         if abs(shift) > max(3, 0.1 * abs(delay)) and better and agreement > 0.5:
             yield Issue(
                 message=f"the state comes {tracking.delay} frames after its command, in the "
@@ -81,6 +83,7 @@ def _component_tracking(
     fit, slope, partner = tracking.fit, tracking.slope, tracking.partner
     follows = follow & (fit > _FOLLOWS)
     lost = np.flatnonzero(follow & ~(fit > _LOST) & ~np.isnan(fit))
+    # The slope equals minus the usual one, within half of it.
     opposite = np.abs(slope + usual_slope) < 0.5 * np.abs(usual_slope)
     against = np.flatnonzero(follows & opposite)
     swapped = [i for i in lost if tracking.similarity[i] > 0.9 and partner[i] != i]
@@ -102,6 +105,7 @@ def _component_tracking(
         )
     with np.errstate(all="ignore"):
         ratio = np.abs(slope / np.where(usual_slope, usual_slope, 1))
+    # A factor of exp(0.5) = 1.6: payload and contact explain less.
     size = np.flatnonzero(follows & (np.abs(np.log(ratio + 1e-9)) > 0.5))
     if len(size):
         yield warning(
@@ -130,6 +134,7 @@ def _velocity_commands(
     # If both readings fit a smooth motion, the one without a long delay is meant.
     prompt = rate_delay <= _PROMPT < position_delay
     fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
+    # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
     speeds = (fit > _FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
     speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
     if speeds.sum() > len(speeds) / 2:

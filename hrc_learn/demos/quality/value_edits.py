@@ -94,6 +94,7 @@ def _turns(
     padded = np.pad(usual, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)))
     around = sliding_window_view(padded, 2 * _NEIGHBOURS + 1, axis=0).max(-1)
     # Three times the neighbouring steps, and a thousandth of a turn for noise.
+    # The factor allows for acceleration between neighbouring frames.
     jumps[left > 3 * around + 1e-3] = 0.0
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(jumps, axis=0)])
 

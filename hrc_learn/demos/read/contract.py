@@ -316,6 +316,7 @@ def infer_contract(
         ]
         if not feature.numeric or feature.key in INDEX_KEYS or not known:
             continue
+        # Quantiles over episodes, so that a single episode does not set the range.
         low = np.quantile([p.levels[0] for p, _ in known], 0.05, axis=0)
         high = np.quantile([p.levels[-1] for p, _ in known], 0.95, axis=0)
         discrete = np.mean([is_discrete(p, length) for p, length in known], axis=0)
@@ -402,5 +403,6 @@ def _agreement(tracked: Sequence[Tracking], number: int) -> tuple[float, float, 
     if not np.isfinite(fits).any():
         return np.nan, np.nan, np.nan, 0
     delay = float(np.median(delays))
+    # Estimated delays scatter by two frames.
     agreeing = int((np.abs(delays - delay) <= 2).sum())
     return float(np.nanmedian(fits)), float(np.nanmedian(slopes)), delay, agreeing

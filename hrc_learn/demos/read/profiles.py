@@ -153,6 +153,7 @@ def profile_episode(
 
 
 def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
+    # Five frames suppress single glitches and are still at rest.
     few = max(1, min(5, len(values) // 4))
     # One sort gives the quantiles and the number of distinct values.
     ordered = np.sort(values, axis=0)
@@ -190,8 +191,10 @@ def is_discrete(profile: ColumnProfile, length: int) -> np.ndarray:
 
     They have few levels in all, or rest most of the time and jump between few levels.
     """
+    # Up to 12 levels in long episodes: grippers with several openings.
     few = profile.distinct <= max(4, min(12, length // 20))
     span = np.maximum(profile.levels[-1] - profile.levels[0], 1e-12)
+    # Mostly at rest, then a fifth of the range in one step, and not many values.
     switching = (profile.flat > 0.9) & (profile.step > 0.2 * span) & (profile.distinct < 50)
     return few | switching
 
@@ -245,10 +248,12 @@ def track(
         first = (frames - _MOST_FRAMES) // 2
         command, state = (v[first : first + _MOST_FRAMES] for v in (command, state))
         frames = _MOST_FRAMES
+    # At least half of the frames must remain to compare at every delay.
     reach = min(round(_LONGEST_DELAY * fps), frames // 4)
     if frames < 20 or reach < 1:
         return None
     size = np.minimum(state.std(0), command.std(0))
+    # Larger than rounding errors of the values.
     moving = size > 1e-9 * (1 + np.abs(state).max(0))
     if not moving.any():
         return None

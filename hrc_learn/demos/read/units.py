@@ -207,6 +207,7 @@ def _guess(role: str, peaks: np.ndarray, hands: Sequence[bool]) -> UnitDecision:
         "tick": " (1/4096 of a turn, zero unknown)",
     }.get(unit, "")
     if caution:
+        # A range of exactly 100 is typical of normalised values.
         confidence = 0.5 if 95 <= largest <= 101 else 0.8
     others = sorted({*units} - {unit})
     fingers = f", fingers for {', '.join(others)}" if others else ""

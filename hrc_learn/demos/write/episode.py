@@ -250,6 +250,7 @@ def require_valid(episode: Episode) -> None:
     if len(stalled):
         raise ValueError(f"time must increase, but does not after frame {stalled[0]}")
     if "orientation" in episode:
+        # The tolerance allows for float32.
         wrong = np.abs(np.linalg.norm(episode["orientation"], axis=1) - 1) > 1e-3
         if wrong.any():
             raise ValueError(
