@@ -47,18 +47,10 @@ RAW_EPISODE_CHECKS: dict[
     str, Callable[[DatasetFolder, EpisodeEntry, RawFrames], Iterable[Issue]]
 ] = {
     "indices": structure_checks.indices,
-    "finite values": lambda folder, entry, frames: episode_checks.finite_values(
-        folder.features, entry, frames
-    ),
-    "repetitions": lambda _, entry, frames: episode_checks.repetitions(entry, frames),
-    "episode length": lambda folder, entry, _: episode_checks.episode_length(entry, folder.fps),
-    "stamps": lambda folder, entry, frames: (
-        episode_checks.stamps(
-            entry, "timestamp", frames["timestamp"][:, 0].astype(float), folder.fps
-        )
-        if "timestamp" in frames
-        else ()
-    ),
+    "finite values": episode_checks.finite_values,
+    "repetitions": episode_checks.repetitions,
+    "episode length": episode_checks.episode_length,
+    "stamps": episode_checks.recorded_stamps,
 }
 SUMMARY_CHECKS: dict[
     str, Callable[[DatasetFolder, Mapping[str, ColumnSummary]], Iterable[Issue]]
@@ -74,14 +66,12 @@ MOTION_CHECKS: dict[str, Callable[[MotionRecord], Iterable[Issue]]] = {
     "copied commands": episode_checks.copied_commands,
     "frozen encoders": episode_checks.frozen_encoders,
 }
-CONSISTENCY_CHECKS: dict[
-    str, Callable[[consistency.FeatureProfiles, float], Iterable[Issue]]
-] = {
-    "sizes": lambda feature, _: consistency.sizes(feature),
+CONSISTENCY_CHECKS: dict[str, Callable[[consistency.FeatureProfiles], Iterable[Issue]]] = {
+    "sizes": consistency.sizes,
     "holds": consistency.holds,
-    "noise": lambda feature, _: consistency.noise(feature),
-    "switches": lambda feature, _: consistency.switches(feature),
-    "exchanged columns": lambda feature, _: consistency.exchanged_columns(feature),
+    "noise": consistency.noise,
+    "switches": consistency.switches,
+    "exchanged columns": consistency.exchanged_columns,
 }
 
 
@@ -284,7 +274,7 @@ def _check_consistency(
     report.run("command tracking", command_tracking, folder, columns, entries, profiles)
     for feature in consistency.feature_profiles(folder, entries, profiles):
         for name, check in CONSISTENCY_CHECKS.items():
-            report.run(name, check, feature, folder.fps)
+            report.run(name, check, feature)
 
 
 def _renewed(

@@ -30,6 +30,8 @@ class FeatureProfiles:
     """Profiles of one feature in all episodes that hold it."""
 
     key: str
+    fps: float
+    """Frame rate [1/s]."""
     entries: list[EpisodeEntry]
     profiles: list[ColumnProfile]
     names: list[str]
@@ -70,6 +72,7 @@ def feature_profiles(
         discrete = np.mean([is_discrete(p.columns[key], p.length) for p in known], axis=0)
         yield FeatureProfiles(
             key=key,
+            fps=folder.fps,
             entries=[entries[p.index] for p in known],
             profiles=[p.columns[key] for p in known],
             names=[declared.component(i) for i in range(declared.width)],
@@ -114,7 +117,7 @@ def _is_clock_name(name: str, key: str) -> bool:
     return any("time" in text.lower() or "stamp" in text.lower() for text in (name, key))
 
 
-def holds(feature: FeatureProfiles, fps: float) -> Iterator[Issue]:
+def holds(feature: FeatureProfiles) -> Iterator[Issue]:
     """Components that froze in one episode, and hardly ever rest in the others."""
     if not feature.is_comparable:
         return
@@ -122,7 +125,9 @@ def holds(feature: FeatureProfiles, fps: float) -> Iterator[Issue]:
     fraction = held / frames[:, None]
     usual = np.median(fraction, axis=0)
     # Long in itself, long for this component, and longer than any pause of the operator.
-    frozen = (fraction > 0.1) & (fraction > 5 * usual + 0.02) & (held > max(10, 0.3 * fps))
+    frozen = (
+        (fraction > 0.1) & (fraction > 5 * usual + 0.02) & (held > max(10, 0.3 * feature.fps))
+    )
     frozen &= feature.smooth & (feature.span > 0)
     for number, component in np.argwhere(frozen):
         name = feature.names[component]

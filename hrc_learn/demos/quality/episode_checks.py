@@ -43,14 +43,14 @@ _LEAST_SPIKE, _LEAST_JUMP = 0.03, 0.1
 
 
 def finite_values(
-    features: Mapping[str, Feature], entry: EpisodeEntry, frames: RawFrames
+    folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
 ) -> Iterator[Issue]:
     """Values that are finite."""
     for key, values in frames.items():
         bad = np.argwhere(~np.isfinite(values.astype(float)))
         if len(bad):
             frame, component = (int(i) for i in bad[0])
-            name = features[key].component(component)
+            name = folder.features[key].component(component)
             yield entry.fault(
                 f"{name} is {values[frame, component]} ({len(bad)} values are not "
                 f"finite); hrc repair --drop bad-frames (or bad-episodes) makes a copy "
@@ -60,7 +60,7 @@ def finite_values(
             )
 
 
-def repetitions(entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
+def repetitions(_: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
     """Frames that repeat the previous one: the robot was read too fast, or stood still."""
     if entry.length < 3:
         return
@@ -96,12 +96,21 @@ def is_clock(values: np.ndarray) -> bool:
     return values.shape[1] == 1 and bool((np.diff(values[:, 0]) > 0).all())
 
 
-def episode_length(entry: EpisodeEntry, fps: float) -> Iterator[Issue]:
+def episode_length(folder: DatasetFolder, entry: EpisodeEntry, _: RawFrames) -> Iterator[Issue]:
     """Episodes long enough for a demonstration."""
-    seconds = entry.length / fps
+    seconds = entry.length / folder.fps
     if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:
         text = f"only {entry.length} frames ({seconds:.2g} s): a false start?"
         yield entry.warning(text)
+
+
+def recorded_stamps(
+    folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
+) -> Iterator[Issue]:
+    """LeRobot's own time stamps."""
+    if "timestamp" in frames:
+        time = frames["timestamp"][:, 0].astype(float)
+        yield from stamps(entry, "timestamp", time, folder.fps)
 
 
 def stamps(
