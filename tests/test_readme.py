@@ -100,11 +100,14 @@ def command_options(name: str) -> set[str]:
 
 def options(program: Path) -> set[str]:
     """Options of a program, the fields of its dataclass `Args`."""
-    (args,) = (
+    classes = [
         node
         for node in ast.parse(program.read_text()).body
         if isinstance(node, ast.ClassDef) and node.name == "Args"
-    )
+    ]
+    if not classes:  # a module that programs import
+        return set()
+    (args,) = classes
     fields = [
         node.target.id.replace("_", "-")
         for node in args.body

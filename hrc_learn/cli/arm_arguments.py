@@ -84,7 +84,7 @@ class WithImperfections(Measured):
 class Demo(WithImperfections, WithRobot, Written):
     """Run the whole job in simulation: demonstrate, learn, grasp, place.
 
-    Records demonstrations, fits a movement primitive and an image Jacobian, then grasps a can
+    Records demonstrations, fits a movement primitive and an image Jacobian, then grasps a box
     with an uncalibrated camera while a scripted person pulls the elbow aside, and places it on
     a shelf. Demonstrations and models in the folder are kept if they are up to date. Exit
     status 1 if the job failed or a target was missed.

@@ -63,6 +63,12 @@ def test_the_command_line_keeps_its_budget():
     assert sum(map(len, options.values())) <= MOST_OPTIONS
 
 
+def test_the_page_of_commands_lists_every_command():
+    page = Path(__file__).parents[2] / "docs" / "howto" / "commands.md"
+    text = page.read_text(encoding="utf-8")
+    assert not [name for name in COMMANDS if f"`hrc {name}" not in text]
+
+
 def test_help_waits_for_no_library():
     """Help of all commands, one after another in a fresh interpreter."""
     program = f"""
