@@ -102,8 +102,8 @@ where it started) and of the session."""
 class HumanInput:
     """What a person asks for at one instant."""
 
-    nullspace_input: Float[np.ndarray, " joints"] = field(default_factory=lambda: np.zeros(7))
-    """Null-space effort d on the joints (paper, eq. globalControl)."""
+    nullspace_input: Float[np.ndarray, " joints"] | None = None
+    """Null-space effort d on the joints [N m] (paper, eq. globalControl); None: no effort."""
     twist: Float[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     """End-effector motion, linear [m/s] and angular [rad/s], in the base frame."""
     gripper: float | None = None
@@ -121,6 +121,24 @@ class HumanInput:
     """Whether the task waits where it is, as long as this is asked for."""
     stop: str = ""
     """Why the arm comes to rest and the task is given up; empty: it goes on."""
+
+    def effort(self, joints: int) -> Float[np.ndarray, " joints"]:
+        """Null-space effort d on the joints of an arm [N m]; zeros if none is requested.
+
+        Args:
+            joints: Number of joints of the arm.
+
+        Raises:
+            ValueError: The requested effort is for another number of joints.
+        """
+        if self.nullspace_input is None:
+            return np.zeros(joints)
+        if len(self.nullspace_input) != joints:
+            raise ValueError(
+                f"nullspace_input has {len(self.nullspace_input)} entries, but the arm has "
+                f"{joints} joints: give one effort [N m] per joint, or None for no effort."
+            )
+        return self.nullspace_input
 
 
 Hindrance = Literal[

@@ -146,7 +146,8 @@ class ComplementaryMotion:
         Returns:
             Joint positions [rad] and opening of the gripper [m].
         """
-        push = torch.from_numpy(np.array(self._human.read(state).nullspace_input, dtype=float))
+        effort = self._human.read(state).effort(len(state.joint_position))
+        push = torch.from_numpy(np.array(effort, dtype=float))
         pushed = bool(push.any())
         self._take(torch.from_numpy(np.array(wish, dtype=float)), width)
         if self.posture is None or self.joints is None:

@@ -432,7 +432,7 @@ class VisualServo:
                 feature_new=new,
                 feature_age=age,
                 image_joint_position=observation.joints,
-                nullspace_input=torch.from_numpy(self._cell.human_input.nullspace_input),
+                nullspace_input=torch.from_numpy(asked.effort(len(self._cell.joints))),
                 goals=goals,
                 dt=self._cell.config.dt,
                 distances=self._cell.distances,
@@ -456,7 +456,7 @@ class VisualServo:
 
     def _resting(self, goals: Goals, rest: Float[Tensor, " joints"] | None) -> Goals:
         """The goals with a null space that goes back, but while a person pushes it."""
-        pushed = self._cell.human_input.nullspace_input.any()
+        pushed = self._cell.human_input.effort(len(self._cell.joints)).any()
         self._rests = float(changed_rate(self._rests, float(not pushed), self._cell.config.dt))
         if self._rests == 0:
             return goals

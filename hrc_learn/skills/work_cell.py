@@ -511,7 +511,7 @@ class WorkCell:
         watched = None
         if self._watch is not None:
             watched = self._watch.look(state.time, joints, self.load)
-        push, way = asked.nullspace_input, self.config.way_making
+        push, way = asked.effort(len(joints)), self.config.way_making
         pushing = bool(push.any()) and (way is None or way.expert)
         pose, jacobian = self.chain.forward_and_jacobian(joints)
         scale = None if watched is None else joints.new_tensor(watched.speed_scale)
@@ -593,7 +593,7 @@ class WorkCell:
             joint_position=self.state.joint_position,
             joint_velocity=self.state.joint_velocity,
             command_velocity=velocity.numpy(),
-            nullspace_input=self.human_input.nullspace_input,
+            nullspace_input=self.human_input.effort(len(self._no_joints)),
             gripper=self.state.gripper_width,
             followed=told.followed if told.pushed else _NAN,
             hindered=_hindered(told),

@@ -49,8 +49,9 @@ class CombinedInput(Human):
     def read(self, state: ArmState) -> HumanInput:
         """What all sources ask for together."""
         inputs = [source.read(state) for source in self._sources]
+        joints = len(state.joint_position)
         return HumanInput(
-            nullspace_input=np.sum([i.nullspace_input for i in inputs], axis=0),
+            nullspace_input=np.sum([i.effort(joints) for i in inputs], axis=0),
             twist=np.sum([i.twist for i in inputs], axis=0),
             gripper=next((i.gripper for i in inputs if i.gripper is not None), None),
             region=next((i.region for i in inputs if i.region is not None), None),
@@ -102,7 +103,7 @@ class LinkGuide(Human):
         )
         return replace(
             asked,
-            nullspace_input=bounded(asked.nullspace_input + d, config.max_nullspace_input),
+            nullspace_input=bounded(asked.effort(len(d)) + d, config.max_nullspace_input),
             twist=np.zeros(6),
         )
 

@@ -279,7 +279,7 @@ class GuidedStep:
             "position": self.pose.position.numpy(),
             "orientation": self.pose.orientation.numpy(),
             "gripper": self.state.gripper_width,
-            "human_effort": self.human_input.nullspace_input,
+            "human_effort": self.human_input.effort(len(self.command)),
             "command_velocity": self.command,
         }
 
@@ -344,7 +344,8 @@ class HandGuidedArm:
         # Direct motion overrides the attraction: the person may leave a region they have drawn.
         if not human_input.twist.any():
             twist[:3] = self._attraction(human_input, pose.position)
-        null_velocity = torch.from_numpy(human_input.nullspace_input / self.config.damping)
+        effort = human_input.effort(len(q))
+        null_velocity = torch.from_numpy(effort / self.config.damping)
         task, null = resolved_rate(J, twist, null_velocity)
         desired = task + null
         if (way := self._way_to_posture(q, human_input)) is not None:
@@ -355,7 +356,7 @@ class HandGuidedArm:
         command = velocity.numpy()
         self._arm.command(command)
         hindrances, pushed = self._feedback.hindrances, bool(human_input.twist.any())
-        if human_input.nullspace_input.any():
+        if effort.any():
             pushed = True
             hindrances.note_across(null_velocity, null_projection(J, null_velocity))
         if (cause := filter_hindrance(report)) is not None:
@@ -367,7 +368,7 @@ class HandGuidedArm:
         self, q: Float[torch.Tensor, " joints"], human_input: HumanInput
     ) -> Float[torch.Tensor, " joints"] | None:
         """Joint velocity towards the posture to move to [rad/s]; None: there is none."""
-        if human_input.twist.any() or human_input.nullspace_input.any():
+        if human_input.twist.any() or human_input.effort(len(q)).any():
             self._posture = None
         if self._posture is None:
             return None

@@ -238,7 +238,8 @@ class PageHuman(Human):
 
 def _locked(asked: HumanInput) -> HumanInput:
     for array in (asked.nullspace_input, asked.twist):
-        array.setflags(write=False)
+        if array is not None:
+            array.setflags(write=False)
     return asked
 
 
