@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetError, Demonstration, DemonstrationSet
 
@@ -96,3 +97,18 @@ def test_sets_hold_one_robot():
         DemonstrationSet([demonstration(), demonstration(joint_names=("x", "y", "z"))])
     with pytest.raises(ValueError, match="no padded form"):
         DemonstrationSet([]).padded()
+
+
+def test_lists_and_tensors_become_arrays():
+    joints = torch.tensor([[0.0, 1.0], [0.5, 2.0]], requires_grad=True)
+    with shapes_unchecked():
+        demo = Demonstration(
+            time=[0.0, 0.1],  # type: ignore[arg-type]
+            joint_position=joints,  # type: ignore[arg-type]
+            joint_names=("a", "b"),
+            fps=10,
+        )
+    assert demo.joint_position is not None
+    assert demo.joint_position.dtype == np.float64
+    np.testing.assert_array_equal(demo.joint_position, joints.detach().numpy())
+    assert demo.duration == pytest.approx(0.1)
