@@ -32,8 +32,8 @@ from hrc_learn.controller import (
     Observation,
     SafetyConfig,
     WayMakingConfig,
-    way_making_velocity,
 )
+from hrc_learn.controller.way_making import way_making_velocity
 from hrc_learn.deploy import EagerRunner, open_step
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda

@@ -20,12 +20,8 @@ from worker_job import JobCycle
 from worker_tables import Workers, WorkerTables
 
 from hrc_learn.controller import Distances, WayMakingConfig
-from hrc_learn.controller.arm_loop import (
-    ArmLoop,
-    ArmLoopConfig,
-    ArmReading,
-    FollowPath,
-)
+from hrc_learn.controller.arm_loop import ArmLoop
+from hrc_learn.controller.arm_loop_state import ArmLoopConfig, ArmReading, FollowPath
 from hrc_learn.controller.joint_path import JointPaths
 from hrc_learn.experiments.collaboration.worker import margin_to_stop
 from hrc_learn.kinematics import CapsuleArm, Separation, panda, separation

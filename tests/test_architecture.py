@@ -33,7 +33,15 @@ CORE: dict[str, set[str]] = {
     "dmp": {"store", "model_files", "distributed", "geometry"},
     "regions": {"pytree", "geometry"},
     "jacobian": {"pytree", "model_files", "distributed", "geometry"},
-    "controller": {"pytree", "watchdog", "geometry", "kinematics", "regions", "jacobian"},
+    "controller": {
+        "pytree",
+        "protocols",
+        "watchdog",
+        "geometry",
+        "kinematics",
+        "regions",
+        "jacobian",
+    },
     "deploy": {
         "pytree",
         "store",

@@ -7,6 +7,9 @@ from hrc_learn.controller.action_chunk_filter import ActionChunkState as ActionC
 from hrc_learn.controller.adaptive_controller import AdaptiveController as AdaptiveController
 from hrc_learn.controller.adaptive_controller import ControllerConfig as ControllerConfig
 from hrc_learn.controller.adaptive_controller import ControllerState as ControllerState
+from hrc_learn.controller.arm_loop import ArmLoop as ArmLoop
+from hrc_learn.controller.arm_loop_state import ArmLoopConfig as ArmLoopConfig
+from hrc_learn.controller.arm_loop_state import ArmReading as ArmReading
 from hrc_learn.controller.constraint_layer import (
     ConstrainedVelocity as ConstrainedVelocity,
 )
@@ -31,7 +34,6 @@ from hrc_learn.controller.interface import Observation as Observation
 from hrc_learn.controller.interface import paper_goals as paper_goals
 from hrc_learn.controller.interface import paper_joint_region as paper_joint_region
 from hrc_learn.controller.limit_barrier import LimitMonitor as LimitMonitor
-from hrc_learn.controller.resolved_rate import scale_null_space as scale_null_space
 from hrc_learn.controller.safety_filter import INTERVENTIONS as INTERVENTIONS
 from hrc_learn.controller.safety_filter import ConstraintReport as ConstraintReport
 from hrc_learn.controller.safety_filter import SafetyConfig as SafetyConfig
@@ -39,6 +41,5 @@ from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
 from hrc_learn.controller.safety_filter import SafetyReport as SafetyReport
 from hrc_learn.controller.safety_filter import SafetyState as SafetyState
 from hrc_learn.controller.way_making import WayMakingConfig as WayMakingConfig
-from hrc_learn.controller.way_making import way_making_velocity as way_making_velocity
 from hrc_learn.watchdog import Watchdog as Watchdog
 from hrc_learn.watchdog import WatchdogError as WatchdogError

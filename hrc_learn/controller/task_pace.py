@@ -38,6 +38,22 @@ class TaskPace:
     full_speed: float = static(1.0)
     """Speed scale of a task that is not paused."""
 
+    @classmethod
+    def begin(cls, time: Float[Tensor, "*batch"], full_speed: float) -> TaskPace:
+        """Pace of a task at full speed.
+
+        Args:
+            time: Reading of the clock [s].
+            full_speed: Speed scale of a task that is not paused.
+        """
+        return cls(
+            time=time,
+            people_scale=torch.ones_like(time),
+            speed_override=torch.full_like(time, full_speed),
+            blocked_for=torch.zeros_like(time),
+            full_speed=full_speed,
+        )
+
     @property
     def scale(self) -> Float[Tensor, "*batch"]:
         """Speed scale of the task now, 0 to 1."""

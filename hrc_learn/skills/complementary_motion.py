@@ -10,20 +10,21 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import SafetyConfig
-from hrc_learn.controller.arm_loop import (
-    ArmLoop,
+from hrc_learn.controller.arm_loop import ArmLoop
+from hrc_learn.controller.arm_loop_state import (
     ArmLoopConfig,
     ArmLoopState,
     ArmReading,
     FollowPath,
 )
-from hrc_learn.controller.joint_path import NARROW, DirectReturn, JointPaths
+from hrc_learn.controller.direct_return import DirectReturn
+from hrc_learn.controller.joint_path import NARROW, JointPaths
 from hrc_learn.controller.null_space_motion import (
     Clearance,
     YieldingConfig,
     smallest_singular_value,
 )
-from hrc_learn.kinematics import MotionLimits, SerialChain
+from hrc_learn.kinematics import JointLimits, SerialChain
 from hrc_learn.protocols import ArmState, Human
 from hrc_learn.skills.arm_motion import joints_near
 from hrc_learn.skills.person_feedback import PersonFeedback
@@ -69,7 +70,7 @@ class ComplementaryMotion:
         chain: SerialChain,
         human: Human,
         dt: float,
-        limits: MotionLimits,
+        limits: JointLimits,
         config: YieldingConfig | None = None,
         clearance: Clearance | None = None,
     ):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import INTERVENTIONS, SafetyReport
-from hrc_learn.controller.arm_loop import ArmReport, Limitation
+from hrc_learn.controller.arm_loop_state import ArmReport, Limitation
 from hrc_learn.controller.null_space_motion import fraction_in_null_space, fraction_kept
 from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.protocols import ArmState, Feedback, Hindrance, Reason

@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,8 +12,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hrc_learn.controller import INTERVENTIONS, Command, Distances, SafetyConfig
-from hrc_learn.controller.arm_loop import (
-    ArmLoop,
+from hrc_learn.controller.arm_loop import ArmLoop
+from hrc_learn.controller.arm_loop_state import (
     ArmLoopConfig,
     ArmLoopState,
     ArmReading,
@@ -458,7 +459,7 @@ class WorkCell:
         *,
         explained: bool = True,
         region: PositionRegion | None = None,
-        columns: dict[str, object] = _NO_VISION,
+        columns: dict[str, Any] = _NO_VISION,
     ) -> None:
         """Send what the loop makes of a request, let one step pass, and read again.
 
@@ -584,7 +585,7 @@ class WorkCell:
         velocity: Float[Tensor, " joints"],
         report: ArmReport,
         told: Feedback,
-        columns: dict[str, object],
+        columns: dict[str, Any],
     ) -> None:
         """Append a row to the log."""
         goal, joints = report.goal, report.path_joints

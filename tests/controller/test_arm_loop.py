@@ -9,8 +9,8 @@ from torch.utils import _pytree
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import ConstraintConfig, Distances, SafetyConfig
-from hrc_learn.controller.arm_loop import (
-    ArmLoop,
+from hrc_learn.controller.arm_loop import ArmLoop
+from hrc_learn.controller.arm_loop_state import (
     ArmLoopConfig,
     ArmReading,
     FollowPath,

@@ -18,8 +18,8 @@ from hrc_learn.controller import (
     Observation,
     SafetyConfig,
     WayMakingConfig,
-    way_making_velocity,
 )
+from hrc_learn.controller.way_making import way_making_velocity
 from hrc_learn.jacobian import FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 

@@ -1,0 +1,245 @@
+"""Values of the arm loop: settings, readings, requests, state and report.
+
+Readings, requests and states have any number of leading batch dimensions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hrc_learn.controller.constraint_layer import Distances
+from hrc_learn.controller.direct_return import DirectReturn
+from hrc_learn.controller.interface import Command
+from hrc_learn.controller.joint_path import JointPaths
+from hrc_learn.controller.null_space_motion import YieldingConfig
+from hrc_learn.controller.safety_filter import SafetyConfig, SafetyReport, SafetyState
+from hrc_learn.controller.task_pace import TaskPace
+from hrc_learn.controller.way_making import WayMakingConfig
+from hrc_learn.geometry import Pose
+from hrc_learn.protocols import Hindrance
+from hrc_learn.pytree import pytree, static
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmLoopConfig(YieldingConfig):
+    """Settings of the loop."""
+
+    dt: float = 0.01
+    """Control step [s]."""
+    command_delay: float = 0.01
+    """Time from a command until the arm follows it, with the lag of its servos [s]. By default
+    that of the simulated servos; networks and schedulers add to it on real arms."""
+    limit_margin: float = 0.1
+    """Distance from the joint limits that a push leaves to the task, beyond the margin of the
+    safety filter [rad]: some centimetres of the end effector."""
+    speed: float = 1.0
+    """Speed of the task relative to its planned speed, above 0 to 1, as for a first run on a
+    real arm. Motions of the null space off a path are not slowed down."""
+    longest_wait: float = 300.0
+    """Time after which a task fails that people block or hold aside [s]."""
+    back_after: float = 2.0
+    """Time after which a path goes back whose joints come no nearer [s]."""
+    direct_return_after: float = 20.0
+    """Time after which joints that come no nearer to their path return to it directly [s]."""
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    """Safety filter, with what the arm's driver can do."""
+    way_making: WayMakingConfig | None = None
+    """Source of null-space motion: the person who pushes, the repulsion from people near the
+    arm, or both; None: the person who pushes."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.speed <= 1:
+            raise ValueError(f"speed must be in (0, 1], but is {self.speed}.")
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class ArmReading:
+    """One reading of the arm and of the people near it."""
+
+    joint_position: Float[Tensor, "*batch n"]
+    """Measured joint positions [rad]."""
+    pose: Pose
+    """Pose of the end effector at these joints."""
+    jacobian: Float[Tensor, "*batch 6 n"]
+    """Geometric Jacobian of the end effector at these joints."""
+    nullspace_input: Float[Tensor, "*batch n"]
+    """Push of a person on the null space [N m]."""
+    pause: Bool[Tensor, "*batch"]
+    """True while a person pauses the task."""
+    distances: Distances | None = None
+    """Distances from people, which the safety filter keeps; None: people are not tracked."""
+    person_speed_scale: Float[Tensor, "*batch"] | None = None
+    """Speed scale imposed by approaching people, 0 to 1; None: 1."""
+    stop: Bool[Tensor, "*batch"] | None = None
+    """True where the arm must come to rest for the sake of people; None: nowhere."""
+    explain: bool = static(False)
+    """Report what limits the push."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class PathState:
+    """Progress along a joint path, and how the last step tracked it."""
+
+    progress: Float[Tensor, "*batch"]
+    """Number of the sample to track."""
+    rate: Float[Tensor, "*batch"]
+    """Rate relative to the path's own speed, -1 to 1."""
+    last: Float[Tensor, "*batch"]
+    """Number of the last sample."""
+    followed: Bool[Tensor, "*batch"]
+    """True if the last step followed the path."""
+    goal: Float[Tensor, "*batch n"]
+    """Joint positions that were tracked [rad]."""
+    pose: Pose
+    """Pose of the end effector at them."""
+    twist: Float[Tensor, "*batch 6"]
+    """Velocity of that pose along the path (linear [m/s], angular [rad/s])."""
+    blocked: Bool[Tensor, "*batch"]
+    """True if the arm, off its path, would have met something had the path gone on."""
+    narrow_ahead: Bool[Tensor, "*batch"]
+    """True if the joints could not leave the path somewhere before it stops."""
+    waited: Float[Tensor, "*batch"]
+    """Time for which it has waited for joints that come no nearer [s]."""
+    nearest: Float[Tensor, "*batch"]
+    """Distance of the joints from the path when they last had come nearer [rad]."""
+    held: Float[Tensor, "*batch"]
+    """Time for which it has waited while the arm was pushed [s]."""
+    direct_return: DirectReturn
+
+    @classmethod
+    def none(cls, joint_position: Float[Tensor, "*batch n"], pose: Pose) -> PathState:
+        """State of an arm that follows no path.
+
+        Args:
+            joint_position: Joint positions [rad].
+            pose: Pose of the end effector.
+        """
+        zero = torch.zeros_like(joint_position[..., 0])
+        never = torch.zeros_like(zero, dtype=torch.bool)
+        return cls(
+            progress=zero,
+            rate=zero + 1,
+            last=zero - 1,
+            followed=never,
+            goal=joint_position,
+            pose=pose,
+            twist=zero.new_zeros(*zero.shape, 6),
+            blocked=never,
+            narrow_ahead=never,
+            waited=zero,
+            nearest=zero + torch.inf,
+            held=zero,
+            direct_return=DirectReturn.none(joint_position),
+        )
+
+    @property
+    def finished(self) -> Bool[Tensor, "*batch"]:
+        """True once the last sample has been tracked."""
+        return self.progress > self.last
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class ArmLoopState:
+    """All that the loop remembers from one step to the next."""
+
+    safety: SafetyState
+    pace: TaskPace
+    null_velocity: Float[Tensor, "*batch n"]
+    """Null-space velocity that a push amounts to, without jumps [rad/s]."""
+    return_velocity: Float[Tensor, "*batch n"]
+    """Null-space velocity back to the path, without jumps [rad/s]."""
+    aside: Bool[Tensor, "*batch"]
+    """True while the joints are off their path."""
+    lost: Bool[Tensor, "*batch"]
+    """True while the null space might lead them to another posture than that of the path."""
+    path: PathState
+
+    @property
+    def pushed(self) -> Bool[Tensor, "*batch"]:
+        """True while the null space is pushed."""
+        return (self.null_velocity != 0).any(-1)
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class FollowPath:
+    """Request to follow joint paths; the null space yields, and returns to them."""
+
+    paths: JointPaths
+    path: Int[Tensor, "*batch"]
+    """Index of the path of each arm."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class TrackPose:
+    """Request to track a moving pose of the end effector; the null space yields."""
+
+    pose: Pose
+    twist: Float[Tensor, "*batch 6"]
+    """Velocity of the pose (linear [m/s], angular [rad/s])."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class MoveJoints:
+    """Request for a joint velocity."""
+
+    joint_velocity: Float[Tensor, "*batch n"]
+    """Joint velocity [rad/s]."""
+
+
+class SendCommand(NamedTuple):
+    """Request to send a command of the adaptive controller, which has its own safety filter."""
+
+    command: Command
+
+
+type ArmRequest = FollowPath | TrackPose | MoveJoints | SendCommand
+
+
+class Limitation(NamedTuple):
+    """Part of a push that one cause takes away."""
+
+    cause: Hindrance
+    kept: Float[Tensor, "*batch"]
+    """Fraction of the motion that is left, 0 to 1."""
+    joint: Int[Tensor, "*batch"] | None = None
+    """Joint at its limit, from 0."""
+    distance: Float[Tensor, "*batch"] | None = None
+    """Distance from an obstacle [m]."""
+    mentioned: Bool[Tensor, "*batch"] | None = None
+    """True where the cause is reported although it takes nothing away."""
+
+
+class ArmReport(NamedTuple):
+    """What a step did, and why."""
+
+    safety: SafetyReport
+    limitations: tuple[Limitation, ...] = ()
+    """What limits the push; empty unless the reading asks for an explanation."""
+    goal: Pose | None = None
+    """Pose that the end effector tracks."""
+    path_joints: Float[Tensor, "*batch n"] | None = None
+    """Joint positions on the path [rad]."""
+    slowed_by_people: Bool[Tensor, "*batch"] | None = None
+    """True where people near the arm hold it back; None: not explained."""
+    null_motion: tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]] | None = None
+    """Null-space velocity before and after the safety filter [rad/s]; None: not explained."""
+
+
+class WantedMotion(NamedTuple):
+    """Joint velocity before the safety filter, with the parts of the report known by then."""
+
+    joint_velocity: Tensor
+    limitations: tuple[Limitation, ...] = ()
+    goal: Pose | None = None
+    path_joints: Tensor | None = None

@@ -1,0 +1,310 @@
+"""The law of joint paths: they go on, wait or go back as the arm, pushed aside, can follow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.controller.arm_loop_state import (
+    ArmLoopState,
+    ArmReading,
+    FollowPath,
+    Limitation,
+    PathState,
+    WantedMotion,
+)
+from hrc_learn.controller.direct_return import DirectReturn
+from hrc_learn.controller.joint_path import (
+    begins_aside,
+    changed_rate,
+    deviation_ratio,
+    eased_return,
+    may_not_return,
+    nears_singularity,
+    push_fraction,
+    return_alignment,
+    stays_aside,
+    waiting_time,
+)
+from hrc_learn.controller.null_space_motion import fraction_kept
+from hrc_learn.controller.pose_tracking import PoseTracking, twist_of
+from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.pytree import apply_where
+
+
+class PathTarget(NamedTuple):
+    """Point of a joint path."""
+
+    goal: Tensor
+    """Joint positions [rad]."""
+    velocity: Tensor
+    """Joint velocity along the path [rad/s]."""
+    narrow: Tensor
+    """True where the joints cannot leave the path."""
+    narrow_ahead: Tensor
+    """True where they could not before the path stops."""
+
+
+class OffPath(NamedTuple):
+    """Joints off their path, and the null-space velocity that they have there."""
+
+    aside: Tensor
+    lost: Tensor
+    fraction: Tensor
+    """Fraction of the push that is followed."""
+    push: Tensor
+    """That fraction of the push [rad/s]."""
+    back: Tensor
+    """Velocity of the return [rad/s]."""
+
+
+class PathLaw:
+    """Progress along joint paths, and the joint velocities that follow them."""
+
+    def __init__(self, tracking: PoseTracking):
+        """Put the parts together.
+
+        Args:
+            tracking: Law of joints off their path.
+        """
+        self._tracking = tracking
+        self.chain, self.config = tracking.chain, tracking.config
+
+    def begin(
+        self,
+        state: ArmLoopState,
+        joint_position: Float[Tensor, "*batch n"],
+        request: FollowPath,
+    ) -> ArmLoopState:
+        """State at the start of joint paths.
+
+        Args:
+            state: State of the last step.
+            joint_position: Joint positions now [rad].
+            request: The paths.
+        """
+        paths, which = request.paths, request.path
+        zero = torch.zeros_like(state.path.progress)
+        goal = paths.position[which, 0]
+        path = replace(
+            state.path,
+            progress=zero,
+            rate=zero + 1,
+            last=zero + paths.last[which],
+            followed=torch.zeros_like(state.aside),
+            goal=goal,
+            waited=zero,
+            nearest=zero + torch.inf,
+            held=zero,
+            direct_return=DirectReturn.none(joint_position),
+        )
+        return replace(state, aside=begins_aside(goal - joint_position), path=path)
+
+    def go_on(self, state: ArmLoopState, reading: ArmReading) -> PathState:
+        """Progress along the path, one step later."""
+        path, q, dt = state.path, reading.joint_position, self.config.dt
+        moves = path.followed & ~path.finished
+        if not bool(moves.any()):
+            return path
+        pushed, zero = state.pushed, torch.zeros_like(path.rate)
+        waited, nearest = waiting_time(
+            path.waited,
+            path.nearest,
+            (path.goal - q).norm(dim=-1),
+            path.rate,
+            ~pushed & state.pace.at_full_speed,
+            self.config.back_after,
+            dt,
+        )
+        waited = torch.where(state.aside, waited, 0.0)
+        held = torch.where((path.rate <= 0) & pushed, path.held + dt, 0.0)
+        # Joints that found no way back here do so where they left the path.
+        backs = (waited > self.config.back_after) & (path.progress > 0)
+        ratio = apply_where(
+            state.aside,
+            lambda part: deviation_ratio(part[0].twist_to(part[1]), part[2]),
+            (reading.pose, path.pose, path.twist),
+            zero,
+        )
+        singular = apply_where(
+            state.aside,
+            lambda part: nears_singularity(self.chain, *part),
+            (q, state.safety.velocity),
+            torch.zeros_like(state.aside),
+        )
+        stops = ~backs & state.aside & (state.lost | path.narrow_ahead | singular)
+        ratio = torch.where(path.blocked | stops, torch.inf, ratio)
+        rate = changed_rate(path.rate, 2.0 - ratio, dt, torch.where(backs, -1, 1))
+        progress = (path.progress + rate * state.pace.scale).clamp(min=0)
+        return replace(
+            path,
+            progress=torch.where(moves, progress, path.progress),
+            rate=torch.where(moves, rate, path.rate),
+            waited=torch.where(moves, waited, path.waited),
+            nearest=torch.where(moves, nearest, path.nearest),
+            held=torch.where(moves, held, path.held),
+        )
+
+    def follow(
+        self, state: ArmLoopState, reading: ArmReading, request: FollowPath
+    ) -> tuple[WantedMotion, ArmLoopState]:
+        """Joint velocity along joint paths, off them, or directly back to them."""
+        q, config = reading.joint_position, self.config
+        path = self._returning(state.path, q, request)
+        direct = path.direct_return
+        target = self._target(path, state.pace.speed_override, request)
+        off = self._off_path(state, reading, path, target)
+        pose, twist = self._target_motion(target, off.aside)
+
+        along = target.velocity + config.pose_gain * (target.goal - q)
+        null = target.velocity + off.back + off.push
+        tracked = self._tracking.track(state, reading, pose, twist, null, off.aside, slows=True)
+        velocity = torch.where(off.aside.unsqueeze(-1), tracked.joint_velocity, along)
+        straight = config.pose_gain * (direct.joint_position() - q)
+        velocity = torch.where(direct.active.unsqueeze(-1), straight, velocity)
+
+        limitations = ()
+        if reading.explain:
+            limitations = (
+                *self._path_limitations(state, reading, path, target, off),
+                *tracked.limitations(),
+            )
+        path = replace(
+            path,
+            followed=~direct.active,
+            goal=target.goal,
+            pose=pose,
+            twist=twist,
+            blocked=off.aside & tracked.blocked,
+            narrow_ahead=target.narrow_ahead,
+            direct_return=direct.later(config.dt * state.pace.speed_override),
+        )
+        state = replace(
+            state, return_velocity=off.back, aside=off.aside, lost=off.lost, path=path
+        )
+        return WantedMotion(velocity, limitations, pose, target.goal), state
+
+    def _target(
+        self, path: PathState, speed_override: Tensor, request: FollowPath
+    ) -> PathTarget:
+        """Joint positions and velocities of the paths now."""
+        paths, which, config = request.paths, request.path, self.config
+        rate = path.rate * speed_override
+        # The velocity is that of the time at which the arm follows.
+        later = (path.progress + rate * config.command_delay / config.dt).clamp(min=0)
+        velocity = rate.unsqueeze(-1) * paths.interpolated(paths.velocity, which, later)
+        sample = torch.minimum(path.progress.long(), paths.last[which])
+        return PathTarget(
+            goal=paths.interpolated(paths.position, which, path.progress),
+            velocity=velocity.masked_fill(path.finished.unsqueeze(-1), 0.0),
+            narrow=paths.narrow[which, sample],
+            narrow_ahead=paths.narrow_ahead[which, sample],
+        )
+
+    def _target_motion(self, target: PathTarget, aside: Tensor) -> tuple[Pose, Tensor]:
+        """Pose of the end effector on the path, and its twist for joints off it."""
+        ahead = target.goal + self.config.command_delay * target.velocity
+        twist = apply_where(
+            aside,
+            lambda part: twist_of(self.chain.jacobian(part[0]), part[1]),
+            (ahead, target.velocity),
+            target.goal.new_zeros(*aside.shape, 6),
+        )
+        return self.chain.forward(target.goal), twist
+
+    def _off_path(
+        self, state: ArmLoopState, reading: ArmReading, path: PathState, target: PathTarget
+    ) -> OffPath:
+        """Joints off their path: how far a push may take them, and how they return."""
+        config, error = self.config, target.goal - reading.joint_position
+        direct = path.direct_return.active
+        pushed, aside = state.pushed & ~direct, state.aside & ~direct
+        aside = (~target.narrow | aside) & stays_aside(pushed, aside, error)
+        null_error = null_projection(reading.jacobian, error)
+        null_error = null_error.masked_fill(~aside.unsqueeze(-1), 0.0)
+        lost = torch.zeros_like(aside)
+        fraction = torch.ones_like(path.rate)
+        # Joints return where the path waits for them, and once they are let go.
+        returns = path.rate <= 0
+        if config.after_push == "return":
+            alignment = return_alignment(null_error, error)
+            lost = aside & may_not_return(error, alignment, state.lost & ~pushed)
+            kept = push_fraction(state.null_velocity, null_error, alignment)
+            fraction = torch.where(aside, kept, 1.0)
+            returns = returns | ~pushed
+        null_error = null_error.masked_fill(~returns.unsqueeze(-1), 0.0)
+        back = eased_return(state.return_velocity, null_error, config.dt, config)
+        return OffPath(
+            aside=aside,
+            lost=lost,
+            fraction=fraction,
+            push=fraction.unsqueeze(-1) * state.null_velocity,
+            back=back.masked_fill(~aside.unsqueeze(-1), 0.0),
+        )
+
+    def _path_limitations(
+        self,
+        state: ArmLoopState,
+        reading: ArmReading,
+        path: PathState,
+        target: PathTarget,
+        off: OffPath,
+    ) -> tuple[Limitation, ...]:
+        """What a path takes from a push."""
+        J, direct, one = reading.jacobian, path.direct_return.active, torch.ones_like(path.rate)
+        push = null_projection(J, state.null_velocity)
+        kept = fraction_kept(push, null_projection(J, off.push) + off.back)
+        kept = torch.where(off.aside, kept, 1.0)
+        far = off.lost | (off.fraction < 1)
+        bound = target.narrow & ~off.aside & ~direct
+        return (
+            Limitation("narrow_path", torch.where(bound, 0.0, one)),
+            Limitation("too_far", torch.where(direct, 0.0, one)),
+            Limitation("too_far", torch.where(far, kept, one)),
+            Limitation("task_waits", torch.where(far, one, kept), mentioned=path.rate <= 0),
+        )
+
+    def _returning(
+        self, path: PathState, joint_position: Tensor, request: FollowPath
+    ) -> PathState:
+        """The path with direct returns begun where it has waited too long, and ended."""
+        direct, dt = path.direct_return, self.config.dt
+        arrived = direct.active & (direct.time > direct.duration + dt)
+        if bool(arrived.any()):
+            path = replace(
+                path,
+                progress=torch.where(arrived, direct.progress, path.progress),
+                waited=torch.where(arrived, 0.0, path.waited),
+                nearest=torch.where(arrived, torch.inf, path.nearest),
+                held=torch.where(arrived, 0.0, path.held),
+                direct_return=replace(direct, active=direct.active & ~arrived),
+            )
+            direct = path.direct_return
+        begins = path.waited > self.config.direct_return_after
+        begins = begins & ~direct.active & ~direct.blocked
+        if bool(begins.any()):
+            direct = apply_where(
+                begins,
+                lambda part: self._direct_return(request, *part),
+                (request.path, path.progress, joint_position),
+                direct,
+            )
+            path = replace(path, direct_return=direct)
+        return path
+
+    def _direct_return(
+        self, request: FollowPath, which: Tensor, progress: Tensor, joint_position: Tensor
+    ) -> DirectReturn:
+        return DirectReturn.planned(
+            request.paths,
+            which,
+            progress,
+            joint_position,
+            self.config,
+            self._tracking.clearance,
+        )
