@@ -1,7 +1,6 @@
-"""The ways in which LeRobot datasets are met broken, each done to a copy of a sound one.
+"""Common defects of LeRobot datasets, each applied to a copy of a sound one.
 
-What LeRobotDataset 0.6.1 makes of them: it takes most for a fault of the network, and opens
-the others without a word.
+LeRobotDataset 0.6.1 reports most of them as network faults, and opens the others silently.
 """
 
 import json
@@ -18,7 +17,7 @@ STATE = "observation.state"
 
 
 class Copy:
-    """A dataset of any version, to be damaged where its second episode is concerned."""
+    """A dataset of any version whose second episode is to be damaged."""
 
     episode = 1
 
@@ -50,7 +49,7 @@ class Copy:
         pq.write_table(change(pq.read_table(self.root / self.data)), self.root / self.data)
 
     def change_rows(self, key: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
-        """Replace a column of the episode by what `change` makes of its values."""
+        """Change the values of a column in the episode."""
 
         def replace(table: pa.Table) -> pa.Table:
             values = np.array(table.column(key).to_pylist())
@@ -73,17 +72,17 @@ class Copy:
 
 @dataclass(frozen=True, kw_only=True)
 class Defect:
-    """One kind of damage and the finding it has to give."""
+    """One kind of damage and the expected finding."""
 
     damage: Callable[[Copy], object]
     finding: str
-    """Pattern that the message contains."""
+    """Pattern of the message."""
     error: bool = True
-    """An error, which `load_demos` raises too; else a warning, and the dataset can be read."""
+    """True for an error, which `load_demos` raises too; False for a warning."""
     file: str | None = None
-    """How the file ends that is named; "data" and "episodes" stand for the version's own."""
+    """End of the file name; "data" and "episodes" stand for the files of the version."""
     episode: bool = False
-    """Whether the second episode is named."""
+    """True if the second episode is named."""
     frame: int | None = None
     key: str | None = None
 
@@ -283,8 +282,9 @@ DEFECTS = {
         damage=remove_statistics, finding="no statistics", error=False, file="meta/stats.json"
     ),
 }
-"""By name. Names in a dict or nested are none: they are read like any others."""
+"""Defects by name."""
 
+# Unusual forms that are read like any other.
 HARMLESS = {
     "names in a dict": lambda c: c.change_feature(names={"motors": names(c)}),
     "names nested": lambda c: c.change_feature(names=[names(c)]),

@@ -1,4 +1,4 @@
-"""How many kinds of defects a check of datasets finds, and what it makes of sound sets."""
+"""Score of a dataset check: defects found in broken copies, messages on sound sets."""
 
 import re
 import resource
@@ -19,24 +19,24 @@ Line = tuple[str, str]
 """A finding: its level, and the whole of its text."""
 
 Examine = Callable[[str], list[Line]]
-"""Looks at the dataset in a folder; raises where it breaks down."""
+"""Check of the dataset in a folder; it raises if it fails."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What a check made of one broken copy."""
+    """Result of a check of one broken copy."""
 
     dataset: str
     kind: str
     severe: bool
     noticed: bool
-    """Something is said that is not said of the sound set."""
+    """True if there is a message that the sound set does not give."""
     found: bool
-    """The same, with its place where it has one."""
+    """True if such a message names the place of the defect."""
     error: bool
-    """That is said as an error."""
+    """True if such a message is an error."""
     crash: str
-    """Why the check ended without a report: an exception, or the time limit."""
+    """Reason for a missing report: an exception, or the time limit."""
     seconds: float
     megabytes: float
     """Most memory the process held."""
@@ -44,10 +44,10 @@ class Outcome:
 
 
 def examine(root: str) -> list[Line]:
-    """What `check_dataset` says.
+    """Messages of `check_dataset`.
 
     Raises:
-        RuntimeError: A step of the check did not foresee what it met: a fault of the check.
+        RuntimeError: A step of the check failed unexpectedly, which is a fault of the check.
     """
     from hrc_learn.demos import check_dataset
 
@@ -62,7 +62,7 @@ def examine(root: str) -> list[Line]:
 
 
 def _run(examine: Examine, root: str, pipe) -> None:
-    """In a process of its own: findings, or why there are none."""
+    """Run a check in its own process, and send its findings or the reason of its failure."""
     start = time.monotonic()
     lines: list[Line] = []
     crash = ""
@@ -83,12 +83,11 @@ class Checker:
         examine: Examine = examine,
         modules: Sequence[str] = ("hrc_learn.demos.quality.check",),
     ):
-        """Prepare.
-
+        """
         Args:
-            limit: Time that a check may take [s].
-            examine: The check; ours unless told otherwise.
-            modules: What it imports, once for all processes.
+            limit: Time limit of a check [s].
+            examine: The check.
+            modules: Modules imported once for all processes.
         """
         self.limit, self._examine = limit, examine
         self._context = get_context("forkserver")
@@ -113,7 +112,7 @@ class Checker:
 
 
 def broken_copy(clean: Path, kind: Kind, folder: Path) -> Copy | None:
-    """A copy with the defect; None where it does not apply to the set."""
+    """A copy with the defect; None if the defect does not apply to the set."""
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(clean, folder)
     copy = Copy(folder)
@@ -127,14 +126,14 @@ def broken_copy(clean: Path, kind: Kind, folder: Path) -> Copy | None:
 def outcomes(
     clean: Path, name: str, kinds: Iterable[str], work: Path, check: Checker
 ) -> Iterator[Outcome]:
-    """Do every kind of damage to copies of a set and check them.
+    """Check copies of a set with each kind of damage.
 
     Args:
         clean: The sound set.
-        name: What it is called in the outcomes.
+        name: Name of the set in the outcomes.
         kinds: Names in `KINDS`.
         work: Folder for the copies.
-        check: Checks one.
+        check: Check of one copy.
     """
     before = {_plain(line, clean) for line in check(clean)[0]}
     for kind_name in kinds:
@@ -169,7 +168,7 @@ def _plain(line: Line, root: Path) -> Line:
 
 
 def _names(text: str, copy: Copy) -> bool:
-    """Whether a finding names the second episode, or its file."""
+    """True if a finding names the second episode or its file."""
     number = rf"(?i)episodes?(?:\(s\))?[ a-z:]*[\[(]*(?:\d+, )*{copy.episode}\b"
     if re.search(number, text) or copy.data in text:
         return True

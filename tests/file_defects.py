@@ -305,11 +305,11 @@ FILES = {
         statistics(lambda s: s.update({k: s[k][:-1] for k in ("min", "max", "mean", "std")}))
     ),
 }
-"""What happens to files and metadata."""
+"""Defects of files and metadata."""
 
 
 def video(change: Callable[[Path, Copy], object]) -> Callable[[Copy], None]:
-    """A defect of the file that shows the second episode."""
+    """Defect of the video of the second episode."""
 
     def damage(copy: Copy) -> None:
         shown = sorted(copy.root.glob(f"videos/**/*{CAMERA}*/**/*.mp4"))
@@ -321,7 +321,7 @@ def video(change: Callable[[Path, Copy], object]) -> Callable[[Copy], None]:
 
 
 def again(**other) -> Callable[[Copy], None]:
-    """Encode the file anew, with as many images as before unless told otherwise."""
+    """Encode the file anew, by default with the same number of images."""
 
     def write(path: Path, copy: Copy) -> None:
         frames = other.pop("frames", None) or (
@@ -338,7 +338,7 @@ def fewer(path: Path, copy: Copy) -> None:
 
 
 def exchange_videos(path: Path, copy: Copy) -> None:
-    """Of the second episode and the first."""
+    """Exchange the videos of the first two episodes."""
     if copy.v3:
         raise NotHereError("one file for all")
     other = path.with_name("episode_000000.mp4")
@@ -396,4 +396,4 @@ VIDEOS = {
         video(lambda _, c: c.change_info(video_path="{nobody}.mp4"))
     ),
 }
-"""What happens to images."""
+"""Defects of images."""

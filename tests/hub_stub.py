@@ -19,7 +19,7 @@ import yaml
 TOKEN = "hf_of_alice"
 OWNER = "alice"
 FIRST_ATTRIBUTES = "*.parquet filter=lfs diff=lfs merge=lfs -text\n*.zip filter=lfs -text\n"
-"""What the Hub puts into a new repository: large files of some kinds, not of all."""
+"""Attributes of a new repository on the Hub, which cover some kinds of large files."""
 
 
 @dataclass
@@ -263,5 +263,5 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _oid(content: bytes) -> str:
-    """As Git names a file's content."""
+    """Git's identifier of a file's content."""
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()

@@ -71,9 +71,9 @@ PEERS = {
     "lerobot-lint": (lint, ("lerobot_lint.engine", "lerobot.datasets.lerobot_dataset")),
     "lerobot-quality-gates": (gates, ("lerobot_quality_gates",)),
 }
-"""How each is called, and what it imports."""
+"""Checker -> its call and its imports."""
 
 
 def cannot_open(lines: Sequence[Line]) -> bool:
-    """Whether a checker says that it cannot read a dataset at all."""
+    """True if a checker reports that it cannot read the dataset."""
     return any("Error loading" in text or "Could not load" in text for _, text in lines)

@@ -89,7 +89,7 @@ def component(key: str, change: Change) -> Callable[[Copy], None]:
 
 
 def at(frame: float, value: Callable[[np.ndarray], float]) -> Change:
-    """Set one value, at a share of the episode, to what is made of all of them."""
+    """Set one value, at a fraction of the episode, to a function of all values."""
 
     def change(values: np.ndarray) -> np.ndarray:
         values[int(frame * len(values))] = value(values)
@@ -333,7 +333,7 @@ VALUES = {
     ),
     "a gripper that stays": Kind(switch(lambda v: 0 * v + v[0]), severe=False, local=True),
 }
-"""What happens to numbers."""
+"""Defects of values."""
 
 
 def stamps(change: Change) -> Callable[[Copy], None]:
@@ -370,4 +370,4 @@ STAMPS = {
     "an index that begins anew": Kind(whole("index", lambda v: v - v[0] + 2), local=True),
     "a task that is not listed": Kind(whole("task_index", lambda v: v + 99), local=True),
 }
-"""What happens to clocks and counters."""
+"""Defects of clocks and counters."""

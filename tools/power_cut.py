@@ -1,13 +1,12 @@
-"""Kill writing programs at random moments, and see that nothing is lost or left behind.
+"""Kill writing programs at random moments, and check that nothing is lost or left behind.
 
-Writers of this package are killed while they write one thing after another, and say of each
-when it is safe. What a kill leaves is mended in turns by `recover_all` and by the next start.
-With --commands, those of `hrc` are watched while they write, see `power_cut_commands.py`:
+Writers of this package are killed while they write one result after another and acknowledge
+each. The leftovers are repaired in turns by `recover_all` and by the next start. With
+--commands, commands of `hrc` are watched while they write, see `power_cut_commands.py`:
 
     tools/power_cut.py --commands all --inputs outputs/power_cut --json outputs/power_cut.json
 
-Exit status 1 if anything that had been acknowledged is lost, a result is broken, or something
-is left over.
+Exit status 1 if an acknowledged result is lost, a result is incomplete, or files are left over.
 """
 
 import itertools
@@ -28,8 +27,8 @@ from rich.table import Table
 
 from hrc_learn import cli
 
-# How long a writer goes on after the first thing it wrote, at most [s]: many times over what
-# one thing takes, so that the kill comes at any of its steps.
+# Longest time of a writer after its first result [s]: many times that of one result, so that a
+# kill comes at any of its steps.
 WINDOW = 0.5
 
 
@@ -42,15 +41,15 @@ class Args:
     commands: tuple[str, ...] = ()
     """Commands to watch instead, such as "record placing"; "all" for every one."""
     inputs: Path | None = None
-    """What they are given; made there where it is missing, which takes minutes."""
+    """Folder of inputs, made if missing, which takes minutes."""
     seed: int = 0
-    """Of the moments."""
+    """Seed of the random moments."""
     json: Path | None = None
     """File for the counts."""
     write: str = ""
-    """Be this writer, which is what the kills are for."""
+    """Run as this writer (used for the processes that are killed)."""
     out: Path | None = None
-    """What it writes."""
+    """Output of the writer."""
 
 
 def main(args: Args) -> int:
@@ -138,9 +137,9 @@ class Writer(NamedTuple):
 
     write: Callable[[Path], None]
     read: Callable[[Path], int]
-    """Number of the last thing written."""
+    """Number of the last result written."""
     goes_on: bool = True
-    """Whether its next start goes on with what is there."""
+    """True if its next start continues with the existing results."""
 
 
 def write_files(out: Path) -> None:

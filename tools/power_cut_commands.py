@@ -35,22 +35,22 @@ PATIENCE = 2.0
 
 @dataclass(frozen=True)
 class Case:
-    """A command with inputs as small as let it write all that it can write."""
+    """A command with the smallest inputs that make it write everything."""
 
     words: str
-    """After its name. It runs in an empty folder; {inputs} stands for the folder of inputs."""
+    """Arguments. It runs in an empty folder; {inputs} stands for the folder of inputs."""
     copies: tuple[str, ...] = ()
-    """Inputs that it changes, copied to where it runs."""
+    """Inputs that it changes, copied to its folder."""
     datasets: tuple[str, ...] = ()
-    """What it records episode by episode: whatever was saved is kept."""
+    """Datasets recorded episode by episode: saved episodes are kept."""
     grows: tuple[str, ...] = ()
-    """Folders whose files are each complete by themselves."""
+    """Folders of files that are each complete."""
     resumed: tuple[str, ...] = ()
-    """What is left for the next start, which goes on with it; * matches anything."""
+    """Files that the next start continues with; * matches anything."""
     depth: int = 1
     """Parts of a path that name one result."""
     long: bool = False
-    """Minutes: run with nothing there only, and not killed."""
+    """True if it takes minutes: run once from scratch, not killed."""
 
 
 CASES = {
@@ -108,26 +108,26 @@ CASES = {
 
 @dataclass
 class Count:
-    """What came of the states of a command."""
+    """Results of the states of a command."""
 
     moments: int = 0
-    """Random ones at which it was stopped since it had begun to write."""
+    """Random moments at which it was stopped after it began to write."""
     states: int = 0
-    """Different ones that were seen, each mended by `recover_all`."""
+    """Different states, each repaired by `recover_all`."""
     interrupted: int = 0
-    """Those that left something to mend."""
+    """States that needed a repair."""
     starts: int = 0
-    """States from which it was started again."""
+    """Restarts from a state."""
     refusals: int = 0
-    """Starts that asked for `recover` first, or found the result complete."""
+    """Restarts that asked for `recover` first, or found the result complete."""
     kills: int = 0
-    """That were really done."""
+    """Kills."""
     differing: int = 0
-    """Kills that left something else than was copied while the command was stopped."""
+    """Kills that left another state than the copy made while the command was stopped."""
     lost: int = 0
-    """Acknowledged, and not there afterwards."""
+    """Acknowledged results that are missing afterwards."""
     broken: int = 0
-    """There, but not whole."""
+    """Incomplete results."""
     orphans: int = 0
     """Files that belong to nothing."""
     stuck: int = 0
@@ -264,7 +264,7 @@ class Recorder:
         self._known: dict[str, tuple] = {}
 
     def take(self) -> bool:
-        """Whether it has changed; it is copied then."""
+        """Copy the folder if it has changed; True if it has."""
         found: dict[str, tuple] = {}
         for place, folders, files in os.walk(self._root):
             base = os.path.relpath(place, self._root)
@@ -401,7 +401,7 @@ def start_again(run: Run, root: Path, count: Count) -> None:
 
 
 def tree(folder: Path) -> Tree:
-    """What is in a folder."""
+    """Content of a folder."""
     found: Tree = {}
     for path in folder.rglob("*"):
         name = path.relative_to(folder).as_posix()

@@ -48,11 +48,11 @@ HEAD = (
     "| errors | LeRobot | loss of ACT |"
 )
 FEW = 0.1
-"""Share of its frames that a column takes fewer values than, where it switches."""
+"""Fraction of the frames below which the number of values marks a switching column."""
 
 
 def damaged(root: Path, *kinds: str) -> Path:
-    """A dataset to which these kinds of damage are done."""
+    """Damage a dataset in several ways."""
     for kind in kinds:
         VALUES[kind].damage(Copy(root))
     return root

@@ -1,15 +1,15 @@
-"""Which defects of datasets does `hrc check` find? A copy of sound sets for each tells.
+"""Score `hrc check` on copies of sound datasets, each with one kind of defect.
 
-The defects stand in tests/value_defects.py and tests/file_defects.py, the sets made here in
-tests/clean_sets.py; real ones are given by their path. Every copy is checked by a process of
-its own, with a time limit. A defect counts as found where something is said that is not said
-of the sound set, naming the episode or the file where the defect has one. Copies that hold
-nothing a defect could concern (no video, no gripper) are left out.
+The defects are defined in tests/value_defects.py and tests/file_defects.py, the synthetic
+sets in tests/clean_sets.py; real sets are given by their path. Every copy is checked by its own process
+with a time limit. A defect counts as found if there is a message that the sound set does not
+give, naming the episode or file of the defect. Defects that do not apply to a set (no video, no
+gripper) are left out.
 
     python tools/score_checker.py path/to/dataset --json score.json
 
-With `--peers FOLDER` other checkers look at the same copies; tests/peer_checkers.py says how
-they come into that folder. Those that cannot open the sound set are left out for it.
+With `--peers FOLDER` other checkers see the same copies; tests/peer_checkers.py tells how to
+install them. A checker that cannot open the sound set is left out for it.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from peer_checkers import PEERS, cannot_open  # noqa: E402
 
 OURS = "hrc check"
 Scored = tuple[str, str, Outcome]
-"""Set, checker and what it made of one broken copy."""
+"""Set, checker and outcome of one broken copy."""
 
 
 def arguments() -> argparse.Namespace:
@@ -51,7 +51,7 @@ def arguments() -> argparse.Namespace:
 def score(
     checker: str, sets: Mapping[str, Path], work: Path, args: argparse.Namespace
 ) -> tuple[list[Scored], dict[str, Mapping[str, int]]]:
-    """What a checker makes of all copies, and what it says of the sound sets."""
+    """Outcomes of a checker for all copies, and its messages on the sound sets."""
     if checker == OURS:
         check = Checker(args.limit)
     else:

@@ -1,4 +1,4 @@
-"""The limits from which an episode is told from the others, by cases on both sides of each."""
+"""Thresholds of the comparison between episodes, with cases on both sides of each."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def ramp(frames=100):
 
 
 def loop(frames=100):
-    """From the middle up, down, and back: both ends are the same."""
+    """One period of a sine: start and goal are equal."""
     return np.sin(2 * np.pi * ramp(frames)) / 2
 
 
@@ -62,7 +62,7 @@ def test_an_encoder_froze_that_stays_long_and_longer_than_usual(
 
 
 def three(second, noise=0):
-    """Three joints, of which the second does as told."""
+    """Three joints, the second one given."""
     frames = len(second)
     jitter = 1e-3 * np.random.default_rng(noise).normal(size=3)
     others = (0.3 + ramp(frames), -0.4 - 0.7 * ramp(frames))
@@ -135,7 +135,7 @@ def test_a_state_that_goes_further_or_less_far_than_its_command(tmp_path, gain, 
 
 
 def test_rows_between_episodes_are_passed_over(tmp_path, monkeypatch):
-    """Of three episodes in a file the one in the middle is of none that is listed."""
+    """The middle one of three episodes in a file is not listed."""
     monkeypatch.setattr(structure_checks, "_BATCH_ROWS", 8)
     values = [k + np.tile(ramp(frames), (3, 1)).T for k, frames in ((1, 13), (2, 40), (3, 11))]
     root = write_folder(tmp_path / "set", [{STATE: q} for q in values], {STATE: JOINTS})

@@ -1,4 +1,4 @@
-"""The contract of a dataset: what it says of its columns, and that readers obey it."""
+"""The contract of a dataset describes its columns, and readers obey it."""
 
 import errno
 import json
@@ -213,7 +213,7 @@ def test_units_stay_with_the_columns_that_a_mapping_puts_in_order(hand, mapping)
     mapped = load_demos(hand, mapping={"joint_position": mapping})
     expected = every[0].select_joints(mapped.joint_names)
     np.testing.assert_array_equal(mapped[0].joint_position, expected.joint_position)
-    # Who checks and who repairs reads them alike.
+    # Check and repair read them alike.
     mapping = {"joint_position": mapping}
     said = [str(issue) for issue in check_dataset(hand, mapping=mapping).errors]
     assert said == [str(issue) for issue in check_dataset(hand).errors]

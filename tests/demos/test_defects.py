@@ -1,4 +1,4 @@
-"""Every kind of broken copy is told for what it is; none opens silently."""
+"""Every kind of broken copy is reported; none opens silently."""
 
 import re
 
@@ -54,7 +54,7 @@ def test_every_defect_is_found_and_located(copy, name):
     assert found, str(report)
     named = [f for f in found if f.episode == copy.episode] if defect.episode else found
     assert_place(named[0], defect, copy)
-    # An arm that never moves shows nothing, which is an error beside the warning.
+    # An arm that never moves shows nothing, which is an additional error.
     assert report.ok != (defect.error or name == "frozen state")
     if not defect.error:
         assert len(load_demos(copy.root)) == 3
@@ -62,7 +62,7 @@ def test_every_defect_is_found_and_located(copy, name):
     with pytest.raises(DatasetError) as raised:
         load_demos(copy.root)
     assert not NETWORK.search(str(raised.value))
-    if name != "one episode missing":  # its counts disagree, which is told before the gap
+    if name != "one episode missing":  # its counts disagree, which is reported before the gap
         assert_place(raised.value.issue, defect, copy)
 
 

@@ -1,4 +1,4 @@
-"""What names say, and what they must not be taken to say."""
+"""Meaning of names, and units guessed from values."""
 
 import math
 

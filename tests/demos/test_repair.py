@@ -1,4 +1,4 @@
-"""What a repair changes, and that its result is a sound dataset."""
+"""A repair makes the permitted changes, and its result is a sound dataset."""
 
 import json
 from fractions import Fraction

@@ -1,4 +1,4 @@
-"""What may be replaced: what was written here, and nothing else."""
+"""Only files written by this package are replaced or deleted."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What a writer that was killed has left is mended."""
+"""Leftovers of killed writers are completed or removed."""
 
 import json
 import os
