@@ -74,7 +74,7 @@ _WITH_TAB = 8
 def _record_demonstrations(args: Show, out: Path) -> None:
     # Rerun and PyTorch, which a report does not need.
     from hrc_learn.demos import open_demos, thumbnails
-    from hrc_learn.learning.channels import demonstrations_recording
+    from hrc_learn.learning.fit_recordings import demonstrations_recording
     from hrc_learn.viz.learning_dashboards import record_demonstrations
 
     source = open_demos(args.dataset, episodes=args.episodes or None)

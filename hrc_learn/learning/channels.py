@@ -1,8 +1,6 @@
-"""Channels of demonstrations to learn (joints, position, orientation, or pose), how far motions
-are from them in the measures of the field, and demonstrations as a recording to look at.
-"""
+"""Channels of demonstrations (joints, position, orientation, pose) and reproduction errors."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, overload
@@ -16,9 +14,6 @@ from hrc_learn.demos import Demonstration, DemonstrationSet, PaddedDemonstration
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import arm_angle, fr3, panda
-from hrc_learn.kinematics.arm_shapes import panda_bodies
-from hrc_learn.log import JointRanges
-from hrc_learn.viz import DemonstrationsRecording, DemonstrationTrace
 
 type Channel = Literal["joint", "position", "orientation", "pose"]
 type Primitive = JointDMP | OrientationDMP | PoseDMP
@@ -29,7 +24,7 @@ CHANNELS: dict[str, tuple[str, ...]] = {
     "orientation": ("orientation",),
     "pose": ("position", "orientation"),
 }
-"""Every channel, with the columns that it is learned from."""
+"""Columns that each channel is learned from."""
 CLASSES = {
     "joint": JointDMP,
     "position": JointDMP,
@@ -39,7 +34,7 @@ CLASSES = {
 
 
 class LazyMap[S, T](Sequence[T]):
-    """Items of a sequence through a function, each when it is asked for."""
+    """Lazy map of a sequence: an item is computed when it is accessed."""
 
     def __init__(self, items: Sequence[S], function: Callable[[S], T]):
         self._items, self._function = items, function
@@ -61,29 +56,27 @@ class LazyMap[S, T](Sequence[T]):
 
 
 _LEAST_MOTION = 1e-4
-"""Less is noise of encoders and trackers [rad, m, or of a quaternion's components]."""
+"""Smallest motion above the noise of encoders and trackers [rad, m, quaternion components]."""
 
 
 def require_motion(demo: Demonstration, source: str) -> None:
-    """Refuse a demonstration that shows nothing: errors relative to its motion are no numbers.
+    """Refuse a demonstration without motion, as its relative errors are not defined.
 
     Raises:
-        ValueError: Neither its joints nor its pose move, or they are not finite.
+        ValueError: Neither joints nor pose move, or values are not finite.
     """
     columns = (demo.joint_position, demo.position, demo.orientation)
     shown = [column for column in columns if column is not None and column.size]
     place = f"{source}, episode {demo.episode}"
     if any(not np.isfinite(column).all() for column in shown):
-        raise ValueError(f"{place}: holds values that are no numbers; `hrc check` names them")
+        raise ValueError(f"{place}: values are not finite; `hrc check` names them")
     if shown and max(float(np.ptp(column, axis=0).max()) for column in shown) < _LEAST_MOTION:
-        raise ValueError(
-            f"{place}: nothing moves in it; leave it out (--episodes names those to learn from)"
-        )
+        raise ValueError(f"{place}: nothing moves; leave it out (--episodes names the others)")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motions:
-    """Demonstrations of one motion, ready for a primitive of any channel."""
+    """Demonstrations of one motion, padded to one batch."""
 
     demos: PaddedDemonstrations
     joint_names: tuple[str, ...]
@@ -91,26 +84,26 @@ class Motions:
 
     @classmethod
     def of(cls, demos: DemonstrationSet) -> "Motions":
-        """Pad them; of a Panda, the pose of the end effector follows from the joints.
+        """Pad demonstrations to one batch.
 
-        Not where a position or an orientation was recorded: it may be of another frame, and
-        nothing is learned from a pose of two.
+        A Panda's end-effector pose is computed from its joints, unless a position or an
+        orientation was recorded, which may refer to another frame.
 
         Raises:
-            ValueError: A demonstration shows nothing, or holds values that are no numbers.
+            ValueError: A demonstration has no motion, or values that are not finite.
         """
         for demo in demos:
             require_motion(demo, demos.source)
         padded = demos.padded()
         joints = padded.joint_position if demos.joint_names == panda.joint_names else None
         if joints is not None and padded.position is None and padded.orientation is None:
-            hand = panda.forward(joints)
-            pose = {"position": hand.position, "orientation": hand.orientation}
+            tool = panda.forward(joints)
+            pose = {"position": tool.position, "orientation": tool.orientation}
             padded = PaddedDemonstrations(**(vars(padded) | pose))
         return cls(demos=padded, joint_names=demos.joint_names, source=demos.source)
 
     def available(self) -> tuple[str, ...]:
-        """Kinds that can be learned."""
+        """Channels whose columns were recorded."""
         return tuple(
             channel
             for channel, columns in CHANNELS.items()
@@ -118,31 +111,31 @@ class Motions:
         )
 
     def column(self, name: str) -> Tensor:
-        """A column that is there."""
+        """Column of all demonstrations, (demos, frames, components)."""
         values = getattr(self.demos, name)
         assert values is not None, name
         return values
 
     def position(self, channel: str) -> Float[Tensor, "demos frames D"]:
-        """What a primitive of a channel with linear coordinates is fitted to."""
+        """Linear coordinates of a channel: joint positions [rad] or position [m]."""
         return self.column(CHANNELS[channel][0])
 
     def naming(self, channel: str) -> dict[str, Any]:
-        """Names and unit of the coordinates of a linear channel."""
+        """Arguments of `JointDMP.fit` that name the coordinates and their unit."""
         if channel == "joint":
             return {"joint_names": self.joint_names or None, "units": "rad"}
         return {"joint_names": ("x", "y", "z"), "units": "m"}
 
     def fit(self, channel: str, n_basis: int, **options: Any) -> Primitive:
-        """One primitive for each demonstration.
+        """Fit one primitive to each demonstration.
 
         Args:
             channel: One of `available()`.
             n_basis: Number of basis functions.
-            options: See `FitOptions`.
+            options: Fields of `FitOptions`.
 
         Raises:
-            ValueError: The demonstrations lack what the channel needs.
+            ValueError: The demonstrations lack a column of the channel.
         """
         self.require(channel)
         time, mask = self.demos.time, self.demos.mask
@@ -158,16 +151,16 @@ class Motions:
         )
 
     def require(self, channel: str) -> None:
-        """Raise ValueError unless a channel can be learned."""
+        """Raise ValueError unless the columns of a channel were recorded."""
         missing = [name for name in CHANNELS[channel] if getattr(self.demos, name) is None]
         if missing:
             raise ValueError(
-                f"{self.source}: the demonstrations hold no {' and no '.join(missing)}, which "
-                f"a primitive of channel {channel!r} is learned from. Look with hrc check."
+                f"{self.source}: the demonstrations have no {' and no '.join(missing)}, which "
+                f"channel {channel!r} needs. hrc check lists the columns."
             )
 
     def adapted(self, channel: str, primitive: Primitive) -> "Reproduction":
-        """A primitive with the start, goal and duration of each demonstration."""
+        """Motion of a common primitive with start, goal and duration of each demonstration."""
         last = (self.demos.length - 1)[:, None, None]
 
         def ends(name: str) -> tuple[Tensor, Tensor]:
@@ -190,7 +183,7 @@ class Motions:
         return Reproduction(motion.position, motion.orientation)
 
     def own(self, primitive: Primitive) -> "Reproduction":
-        """What each demonstration's own primitive makes of it."""
+        """Motion of each demonstration's own primitive."""
         if isinstance(primitive, OrientationDMP):
             return Reproduction(orientation=primitive.rollout().orientation)
         if isinstance(primitive, JointDMP):
@@ -199,7 +192,7 @@ class Motions:
         return Reproduction(motion.position, motion.orientation)
 
     def _body_shape(self) -> Tensor | None:
-        """Arm angle of a Franka arm, continuous, and alike in turns at the start [rad]."""
+        """Arm angle of a Franka arm [rad], continuous, in the same turn at the start."""
         franka = {arm.joint_names: arm for arm in (panda, fr3)}
         if self.demos.joint_position is None or self.joint_names not in franka:
             return None
@@ -211,11 +204,12 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """Motions at the stamps of demonstrations; None where a channel says nothing about it."""
+    """Motions at the time stamps of demonstrations."""
 
     position: Float[Tensor, "demos frames D"] | None = None
-    """Joints [rad] or position [m]."""
+    """Joint positions [rad] or position [m]; None for orientations."""
     orientation: Float[Tensor, "demos frames 4"] | None = None
+    """Unit quaternions; None for joints and positions."""
 
     def __post_init__(self):
         for name, values in vars(self).items():
@@ -224,20 +218,20 @@ class Reproduction:
 
 
 def load_primitive(folder: Path, channel: str) -> Primitive:
-    """A saved primitive of that channel.
+    """Load the primitive of a channel.
 
     Raises:
-        FileNotFoundError: No saved primitive there.
-        ValueError: It is a model of another channel.
+        FileNotFoundError: The folder holds no saved primitive.
+        ValueError: The primitive belongs to another channel.
     """
     return CLASSES[channel].load(folder)
 
 
 def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
-    """Kinds to learn: those wanted, or, if none is named, joints and pose or what there is.
+    """Channels to learn: those given, or else joints and pose as far as they were recorded.
 
     Raises:
-        ValueError: The demonstrations lack what a channel needs, or hold no motion at all.
+        ValueError: The demonstrations lack a column of a channel, or hold no motion at all.
     """
     for channel in wanted:
         motions.require(channel)
@@ -247,7 +241,7 @@ def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
     if not available:
         raise ValueError(
             f"{motions.source}: the demonstrations hold neither joint positions nor "
-            "end-effector poses, so there is no motion to learn. Look with hrc check."
+            "end-effector poses. hrc check lists the columns."
         )
     whole = [channel for channel in ("joint", "pose") if channel in available]
     parts = [channel for channel in ("position", "orientation") if channel in available]
@@ -256,28 +250,27 @@ def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReproductionError:
-    """One row a demonstration; None where a channel of motion has no such measure."""
+    """Errors of each demonstration; None if a measure does not apply to the channel."""
 
     nrmse: Float[Tensor, " demos"] | None = None
-    """Root mean square error over the largest range of any coordinate."""
+    """Root mean square error divided by the largest range of any coordinate."""
     largest: Float[Tensor, " demos"] | None = None
     """Largest error of any coordinate [rad] or [m]."""
     goal_error: Float[Tensor, " demos"] | None = None
     """Distance of the last samples [rad] or [m]."""
     jerk: Float[Tensor, " demos"] | None = None
-    """Dimensionless jerk of the motion over that of the demonstration (see
-    `dimensionless_jerk`): below one, it is smoother."""
+    """Ratio of the dimensionless jerk to that of the demonstration. Below 1: smoother."""
     turn_rmse: Float[Tensor, " demos"] | None = None
     """Root mean square angle between orientations [deg]."""
     turn_at_goal: Float[Tensor, " demos"] | None = None
     """Angle between the last orientations [deg]."""
 
     def columns(self) -> dict[str, Float[Tensor, " demos"]]:
-        """The measures there are, by name."""
+        """Measures that apply, by name."""
         return {name: values for name, values in vars(self).items() if values is not None}
 
     def summary(self, prefix: str) -> dict[str, float]:
-        """Median and maximum of each, by name."""
+        """Median and maximum of each measure, by name."""
         figures = {}
         for name, values in self.columns().items():
             figures[f"{prefix}_{name}_median"] = float(values.quantile(0.5))
@@ -286,12 +279,12 @@ class ReproductionError:
 
 
 def reproduction_error(channel: str, motions: Motions, made: Reproduction) -> ReproductionError:
-    """Compare motions with the demonstrations they are of.
+    """Errors of reproductions.
 
     Args:
-        channel: What they are motions of.
-        motions: The demonstrations.
-        made: At their stamps.
+        channel: Channel of the motions.
+        motions: Demonstrations.
+        made: Reproductions at their time stamps.
     """
     measures: dict[str, Tensor] = {}
     mask, last = motions.demos.mask, (motions.demos.length - 1)[:, None]
@@ -332,11 +325,11 @@ def _linear(motions: Motions, shown: Tensor, made: Tensor) -> dict[str, Tensor]:
 def dimensionless_jerk(
     time: Float[Tensor, "T"], position: Float[Tensor, "T D"]
 ) -> Float[Tensor, ""]:
-    """Integral of the squared jerk, times duration^5 / length^2 of the path.
+    """Integral of the squared jerk times duration^5 / (path length)^2, without unit.
 
-    Neither units, nor speed, nor size change it (Hogan and Sternad 2009, "Sensitivity of
-    smoothness measures to movement duration, amplitude, and arrests"). By differences of
-    samples, so noise counts.
+    Invariant to units, speed and size (Hogan and Sternad 2009, "Sensitivity of smoothness
+    measures to movement duration, amplitude, and arrests"). Computed from differences of
+    samples, so that noise counts.
     """
     values = position
     for _ in range(3):
@@ -345,56 +338,3 @@ def dimensionless_jerk(
     length = position.diff(dim=0).norm(dim=-1).sum().clamp_min(1e-12)
     square = torch.trapezoid(values.square().sum(dim=-1), time)
     return square * duration**5 / length**2
-
-
-def demonstrations_recording(
-    demos: DemonstrationSet,
-    title: str,
-    images: Mapping[int, Mapping[str, tuple[np.ndarray, tuple[bytes, ...]]]] | None = None,
-) -> DemonstrationsRecording:
-    """Everything worth looking at; a Panda is drawn, and its hand's path found if unrecorded.
-
-    Args:
-        demos: All by one robot.
-        title: What they are.
-        images: By episode and camera: times [s], and a JPEG file for each.
-    """
-    images = images or {}
-    names = demos[0].joint_names
-    known = names == panda.joint_names
-    limits = panda.limits
-    return DemonstrationsRecording(
-        title=title,
-        joint_names=names,
-        demonstrations=tuple(
-            _shown(demo, known, images.get(demo.episode, {})) for demo in demos
-        ),
-        joint_limits=JointRanges(lower=limits.lower.numpy(), upper=limits.upper.numpy())
-        if known
-        else None,
-        notes=tuple(str(note) for note in demos.notes),
-    )
-
-
-def _shown(demo: Demonstration, is_panda: bool, images: Mapping) -> DemonstrationTrace:
-    q, position = demo.joint_position, demo.position
-    bodies = ()
-    if is_panda and q is not None:
-        bodies = panda_bodies(q)
-        if position is None:
-            position = panda.forward(torch.from_numpy(q)).position.numpy()
-    feature = demo.feature
-    if feature is not None and demo.feature_visible is not None:
-        feature = np.where(demo.feature_visible[:, None], feature, np.nan)
-    return DemonstrationTrace(
-        episode=demo.episode,
-        task=demo.task,
-        time=demo.time,
-        joint_position=q,
-        position=position,
-        feature=feature,
-        human_effort=demo.human_effort,
-        gripper=demo.gripper,
-        bodies=bodies,
-        images=images,
-    )

@@ -1,5 +1,6 @@
-"""Which model predicts demonstrations it has not seen best: their mean, a function of start and
-goal, or the nearest of them.
+"""Choice of the model that predicts held-out demonstrations best.
+
+Candidates are the mean, a function of start and goal, and the nearest demonstration.
 """
 
 import json
@@ -30,39 +31,37 @@ from hrc_learn.learning.primitive_fitting import (
 from hrc_learn.store import write_text
 
 CHOICE = "prediction.json"
-"""Says in the folder of a model what predicts each channel."""
+"""File in a model's folder that names the model of each channel."""
 MODELS = ("mean", "contextual", "nearest")
-"""The simplest first."""
+"""Candidates, the simplest first."""
 LINEAR = ("joint", "position")
-"""Channels of which models are compared."""
+"""Channels whose models are compared."""
 FEWEST = 4
-"""Demonstrations from which held-out errors tell models apart."""
+"""Smallest number of demonstrations whose held-out errors distinguish models."""
 _WORTH = 0.9
-"""A model that is less simple has to bring the error down to this share."""
+"""Largest error, relative to a simpler model, that justifies a less simple one."""
 _REGULARIZATIONS = (1e-6, 1e-3, 1e-1, 1.0)
-"""Of a function of the context, from hardly any to nearly the mean."""
+"""Candidates for the regularisation of the contextual model; the largest is nearly the mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutErrors:
-    """Errors of each demonstration, told its start, goal and duration and predicted from the
-    others.
-    """
+    """Errors of each demonstration when it is predicted from all others."""
 
     nrmse: Mapping[str, Float[Tensor, " demos"]]
-    """By model: root mean square error over the range of the motion."""
+    """Root mean square error divided by the range of motion, by model."""
     regularization: float
-    """Of the function of the context. It is chosen by these very errors, from so few that they
-    stay honest."""
+    """Regularisation of the contextual model. It is chosen by these errors among so few
+    candidates that their bias is negligible."""
 
     @property
     def median(self) -> dict[str, float]:
-        """Of each model."""
+        """Median error by model."""
         return {model: float(error.median()) for model, error in self.nrmse.items()}
 
     @property
     def best(self) -> str:
-        """The simplest model that no other beats clearly."""
+        """Simplest model that no other improves on clearly."""
         best, *others = (model for model in MODELS if model in self.nrmse)
         for model in others:
             if self.median[model] < _WORTH * self.median[best]:
@@ -73,15 +72,15 @@ class HeldOutErrors:
 def held_out_errors(
     fitted: FittedPrimitives, channel: str, context: Float[Tensor, "demos C"]
 ) -> HeldOutErrors:
-    """Predict each demonstration from all others by every model.
+    """Predict each demonstration from all others with every model.
 
-    Nothing is fitted anew: the mean of the others and the ridge regression on them (PRESS)
-    follow from the primitives of all in closed form.
+    Mean and ridge regression of the others (PRESS) follow from the primitives of all in closed
+    form, without further fits.
 
     Args:
-        fitted: With a primitive of every demonstration.
+        fitted: Primitives of every demonstration.
         channel: One of `LINEAR`.
-        context: What each demonstration was about.
+        context: Context of each demonstration.
     """
     each = cast(JointDMP, fitted.each[channel])
     x, n = each.coordinates().detach().double(), len(context)
@@ -106,12 +105,12 @@ def held_out_errors(
 def _nearest(
     asked: Float[Tensor, "asked C"], known: Float[Tensor, "known C"], others: bool = False
 ) -> Tensor:
-    """Which known context is nearest, in spreads of each number.
+    """Index of the nearest known context, each component scaled by its standard deviation.
 
     Args:
         asked: Contexts.
-        known: Those of demonstrations.
-        others: The two are the same, and none is its own neighbour.
+        known: Contexts of demonstrations.
+        others: Both are the same, and no context is its own neighbour.
     """
     spread = known.std(0)
     varies = spread > 1e-9 * (1 + known.abs().amax(0))
@@ -125,13 +124,13 @@ def _nearest(
 def keep_best(
     fitted: FittedPrimitives, demos: DemonstrationSet, columns: tuple[str, ...], folder: Path
 ) -> dict[str, float]:
-    """Compare models, and save beside the mean what predicts better, where that is the case.
+    """Compare models, and save the best one if it is not the mean.
 
     Args:
-        fitted: To the demonstrations.
-        demos: The demonstrations.
-        columns: Whose first row is the context; none: start and goal.
-        folder: Of the model.
+        fitted: Primitives of the demonstrations.
+        demos: Demonstrations.
+        columns: Columns whose first row is the context. Default: start and goal.
+        folder: Folder of the model.
 
     Returns:
         Median held-out errors, `held_out_CHANNEL_MODEL_nrmse_median`.
@@ -144,7 +143,7 @@ def keep_best(
         context = contexts(demos, columns, fitted.motions, channel)
         errors = held_out_errors(fitted, channel, context)
         if columns:
-            # Saved demonstrations know their start and goal, but none of these columns.
+            # Saved primitives hold start and goal, but not these columns.
             kept = {k: v for k, v in errors.nrmse.items() if k != "nearest"}
             errors = replace(errors, nrmse=kept)
         chosen[channel] = errors.best
@@ -163,7 +162,7 @@ def keep_best(
 
 
 def best_models(folder: Path) -> dict[str, str]:
-    """What predicts each channel, of the folder of a model; empty where that is the mean.
+    """Best model of each channel in a model's folder, without those that are the mean.
 
     Raises:
         ValueError: The file is damaged.
@@ -189,17 +188,17 @@ def _choice(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
 def predict(
     folder: Path, channel: str, motions: Motions, demos: DemonstrationSet
 ) -> Reproduction:
-    """Motions as the best model of a folder predicts them from start, goal and duration.
+    """Motions that the best model predicts from start, goal and duration.
 
     Args:
-        folder: Of a model, as `hrc fit` leaves it.
-        channel: What is to be predicted.
-        motions: Those of the demonstrations.
-        demos: Which tell the context.
+        folder: Folder of `hrc fit`.
+        channel: Channel to predict.
+        motions: Padded demonstrations.
+        demos: The same demonstrations, with the columns of the context.
 
     Raises:
-        FileNotFoundError: No saved model there.
-        ValueError: It is damaged, or a demonstration lacks a column of the context.
+        FileNotFoundError: The folder holds no model.
+        ValueError: The model is damaged, or a demonstration lacks a column of the context.
     """
     models, columns = _choice(folder)
     model = models.get(channel, "mean")

@@ -1,11 +1,8 @@
-"""From demonstrations of visual servoing: image Jacobian, target in the image, approach; and a
-recording of what was learned.
-"""
+"""Visual servoing skills of demonstrations: image Jacobian, target in the image, approach."""
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +14,6 @@ from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     EvidenceConfig,
-    EvidenceResult,
     EvidenceRound,
     ImageDemonstration,
     ImageJacobianFitConfig,
@@ -38,13 +34,9 @@ from hrc_learn.skills.visual_skill import (
     VisualTarget,
 )
 from hrc_learn.vision.camera_model import IMAGE_SIZE
-from hrc_learn.viz import (
-    ErrorMap,
-    LearningRecording,
-)
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
-"""In memory, or read one by one."""
+"""Demonstrations in memory, or read one by one."""
 
 _REST = 0.3
 """Time at the end of a demonstration in which the end effector rests above the object [s]."""
@@ -57,18 +49,18 @@ def fit_visual_servo(
     learning: EvidenceConfig | None = None,
     on_round: Callable[[int, EvidenceRound], None] = lambda number, state: None,
 ) -> VisualServoSkill:
-    """Fit image Jacobian and, where an object was watched, visual target and approach.
+    """Fit the image Jacobian and, if an object was observed, target and approach.
 
     Args:
-        demos: With image features and end-effector poses, or joint positions of a Panda.
-        neurons: Of the network; None: about the poses that were shown.
+        demos: Demonstrations with image features and end-effector poses, or a Panda's joints.
+        neurons: Neurons of the network. Default: around the demonstrated poses.
         config: Noise, prior and choice of key frames.
-        learning: How to learn neurons, noise and prior; None: not at all. Too few
-            demonstrations to hold one out are fitted without.
-        on_round: Told of every round of learning.
+        learning: Learning of neurons, noise and prior. None, or too few demonstrations to hold
+            one out: they stay as they are.
+        on_round: Called after every round of learning.
 
     Raises:
-        ValueError: If a demonstration lacks a column; names it and the episode.
+        ValueError: A demonstration lacks a column; the message names it and the episode.
     """
     camera = feature_trajectories(demos)
     config = config or ImageJacobianFitConfig()
@@ -92,7 +84,7 @@ def fit_visual_servo(
 
 
 def feature_trajectories(demos: Demonstrations) -> Sequence[ImageDemonstration]:
-    """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
+    """Poses and image features of demonstrations, read on access."""
     return LazyMap(demos, partial(_watched, source=demos.source))
 
 
@@ -113,7 +105,7 @@ def _watched(demo: Demonstration, source: str) -> ImageDemonstration:
 
 
 def _pose(demo: Demonstration) -> Pose | None:
-    """Of the end effector, as recorded or from the joints of a known arm."""
+    """Pose of the end effector, recorded or computed from a Panda's joints."""
     if demo.position is not None and demo.orientation is not None:
         position, orientation = map(torch.from_numpy, (demo.position, demo.orientation))
         return Pose(position.double(), orientation.double())
@@ -123,10 +115,10 @@ def _pose(demo: Demonstration) -> Pose | None:
 
 
 class _End(NamedTuple):
-    """How a demonstration came to stand above the object."""
+    """Final state of a demonstration, at rest above the object."""
 
     object_pixel: Float[np.ndarray, "2"]
-    hand_pixel: Float[np.ndarray, "2"]
+    tool_pixel: Float[np.ndarray, "2"]
     jacobian: Float[np.ndarray, "2 6"]
     path: Pose
     orientation: Tensor
@@ -134,7 +126,7 @@ class _End(NamedTuple):
 
 
 def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
-    """Of all demonstrations if an object was watched in them; none if in none."""
+    """Final states of all demonstrations, or none if no object was observed."""
     ends, without = [], []
     network = copy.deepcopy(network).double()
     for demo in demos:
@@ -144,26 +136,26 @@ def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
             without.append(demo.episode)
     if ends and without:
         raise ValueError(
-            f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, which others have."
+            f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, as in other episodes."
         )
     return ends
 
 
 def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
-    """Means over the rest at the end."""
+    """Final state of a demonstration, averaged over the rest at its end."""
     watched = _watched(demo, source)
     at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
     last = (watched.visible & at_rest).nonzero()[:, 0]
     if not len(last):
         raise ValueError(
-            f"{source}, episode {demo.episode}: the end effector's marker is not seen in "
-            f"the last {_REST} s, where it is above the object. Leave this episode out."
+            f"{source}, episode {demo.episode}: the end effector's marker is not visible in "
+            f"the last {_REST} s, at rest above the object. Leave this episode out."
         )
     with torch.no_grad():
         jacobian = network(watched.pose[last]).mean(dim=0)
     return _End(
         object_pixel=demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0),
-        hand_pixel=watched.feature[last].mean(dim=0).numpy(),
+        tool_pixel=watched.feature[last].mean(dim=0).numpy(),
         jacobian=jacobian.numpy(),
         path=watched.pose,
         orientation=watched.pose.orientation[last[-1]],
@@ -174,7 +166,7 @@ def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
 def _angles(
     demo: Demonstration, watched: ImageDemonstration, last: int
 ) -> AngleDemonstration | None:
-    """Directions of the markers along a demonstration; None where they were not recorded."""
+    """Directions of the markers along a demonstration; None if they were not recorded."""
     if ANGLE_FEATURE not in demo.extra:
         return None
     tool, item = torch.from_numpy(demo.extra[ANGLE_FEATURE]).double().T
@@ -193,79 +185,8 @@ def _marker_angle(demonstrations: Sequence[AngleDemonstration]) -> MarkerAngle |
 def _visual_target(ends: Sequence[_End], focal: float) -> VisualTarget:
     return VisualTarget.fit(
         np.array([end.object_pixel for end in ends]),
-        np.array([end.hand_pixel for end in ends]),
+        np.array([end.tool_pixel for end in ends]),
         np.array([end.jacobian for end in ends]),
         torch.stack([end.orientation for end in ends]),
         focal,
     )
-
-
-# Paths drawn at most: more hide each other.
-_MOST_PATHS = 30
-# Distance of the error map under the lowest path, so that both can be seen [m].
-_BELOW = 0.03
-
-
-def learning_recording(
-    skill: VisualServoSkill,
-    demos: Demonstrations,
-    title: str,
-    images: Mapping[str, bytes] | None = None,
-) -> LearningRecording:
-    """What is to be shown of a skill just fitted.
-
-    Args:
-        skill: With its held-out errors, and the rounds of learning if there were any.
-        demos: That it was fitted to; the first of them are drawn.
-        title: Of the recording.
-        images: JPEG files by what they show.
-
-    Raises:
-        ValueError: If the skill was loaded: only one just fitted knows how it was learned.
-    """
-    measured, cells = skill.metrics(), skill.cells
-    assert cells is not None  # or there would be no metrics
-    shown = islice(feature_trajectories(demos), _MOST_PATHS)
-    paths = tuple(watched.pose.position.numpy() for watched in shown)
-    height = float(np.mean([path[:, 2].mean() for path in paths]))
-    x, y = cells.edges.mT.numpy()
-    learned = skill.learned
-    return LearningRecording(
-        title=title,
-        measured=measured,
-        curves={} if learned is None else _curves(learned),
-        best=0 if learned is None else learned.best,
-        centers=np.zeros((1, 0, 3))
-        if learned is None
-        else np.stack([_places(state.neurons, height) for state in learned.rounds]),
-        paths=paths,
-        errors=ErrorMap(
-            x=x,
-            y=y,
-            z=min(float(path[:, 2].min()) for path in paths) - _BELOW,
-            share=cells.relative.numpy(),
-        ),
-        images=images or {},
-    )
-
-
-def _curves(learned: EvidenceResult) -> dict[str, np.ndarray]:
-    rounds, configs = learned.rounds, [state.config for state in learned.rounds]
-    return {
-        "Error on demonstrations held out [px]": np.array([s.held_out_error for s in rounds]),
-        "Negative log evidence per pair [-]": np.array([s.evidence for s in rounds]),
-        "Width of the neurons [m, rad]": np.array([float(s.neurons.width) for s in rounds]),
-        "Noise of the camera [px]": np.array([c.pixel_noise for c in configs]),
-        "Prior deviation, common part [px/m]": np.array([c.bias_std for c in configs]),
-        "Prior deviation, weights [px/m]": np.array([c.weight_std for c in configs]),
-    }
-
-
-def _places(neurons: RBFCenters, height: float) -> np.ndarray:
-    """Where neurons stand [m]; those that do not see a coordinate, in the middle of it."""
-    centers, places = neurons.centers.numpy(), np.zeros((len(neurons.centers), 3))
-    places[:, 2] = height
-    for column, component in enumerate(neurons.input_indices):
-        if component < 3:
-            places[:, component] = centers[:, column]
-    return places

@@ -5,7 +5,8 @@ import torch
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.arm_shapes import panda_bodies
-from hrc_learn.learning.channels import Motions, demonstrations_recording
+from hrc_learn.learning.channels import Motions
+from hrc_learn.learning.fit_recordings import demonstrations_recording
 
 
 @pytest.fixture
@@ -64,7 +65,7 @@ def test_a_recorded_position_is_learned_as_it_is_and_no_pose_of_two_frames(joint
     motions = Motions.of(DemonstrationSet([demonstration(joints, position=recorded)]))
     np.testing.assert_array_equal(motions.position("position")[0], recorded)
     assert motions.available() == ("joint", "position")
-    with pytest.raises(ValueError, match=r"no orientation, .* Look with hrc check"):
+    with pytest.raises(ValueError, match=r"no orientation, .* hrc check"):
         motions.require("pose")
     found = Motions.of(DemonstrationSet([demonstration(joints)]))
     np.testing.assert_allclose(found.position("pose")[0], hand.position, atol=1e-12)
