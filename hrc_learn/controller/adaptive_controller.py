@@ -30,7 +30,6 @@ from hrc_learn.controller.interface import Command, Goals, Observation
 from hrc_learn.controller.resolved_rate import (
     PoseDrift,
     excess_speed,
-    led_descent,
     measure_drift,
     planned_motion,
     resolved_rate,
@@ -38,6 +37,7 @@ from hrc_learn.controller.resolved_rate import (
     saturate_in_null_space,
     scale_null_space,
     scale_task,
+    task_descent,
 )
 from hrc_learn.controller.safety_filter import (
     SafetyConfig,
@@ -432,7 +432,7 @@ class AdaptiveController(nn.Module):
         basis, controlled = self._basis(goals, pose, J), J
         if basis is not None:
             controlled = basis.mT @ (basis @ J)
-            descent = led_descent(J, basis, descent)
+            descent = task_descent(J, basis, descent)
         twist = task_twist = -descent / excess_speed(descent, self.caps[0])
         pose_drift = None
         if d is not None and rate > 0:

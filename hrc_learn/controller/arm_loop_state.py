@@ -49,8 +49,8 @@ class ArmLoopConfig(YieldingConfig):
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter, with what the arm's driver can do."""
     way_making: WayMakingConfig | None = None
-    """Source of null-space motion: the person who pushes, the repulsion from people near the
-    arm, or both; None: the person who pushes."""
+    """Source of null-space motion: a person's push, the repulsion from people near the arm, or
+    both; None: a person's push."""
 
     def __post_init__(self) -> None:
         if not 0 < self.speed <= 1:
@@ -221,11 +221,11 @@ class Limitation(NamedTuple):
 
 
 class ArmReport(NamedTuple):
-    """What a step did, and why."""
+    """Report of one step."""
 
     safety: SafetyReport
     limitations: tuple[Limitation, ...] = ()
-    """What limits the push; empty unless the reading asks for an explanation."""
+    """Limitations of the push; empty unless the reading asks for an explanation."""
     goal: Pose | None = None
     """Pose that the end effector tracks."""
     path_joints: Float[Tensor, "*batch n"] | None = None

@@ -45,7 +45,7 @@ class TrackedPose(NamedTuple):
     """Joint that limits it most."""
 
     def limitations(self) -> tuple[Limitation, ...]:
-        """What limits the null space, for the report."""
+        """Limitations of the null space, for the report."""
         return (
             Limitation("speed", self.slowdown),
             Limitation("obstacle", self.clear, distance=self.distance),

@@ -1,7 +1,7 @@
 """Resolved-rate control: one joint velocity from a tool twist and a null-space velocity.
 
-The second half compensates the pose drift that null-space motion causes: the projector is
-right to first order of a step only, so what it lets through is measured and given back.
+The second half compensates the pose drift that null-space motion causes: the projector holds
+to first order of a step only, so its error is measured and corrected.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hrc_learn.geometry.numerics import (
 from hrc_learn.kinematics.redundancy import SINGULAR_BELOW
 from hrc_learn.pytree import pytree
 
-# Lets the Cholesky factorisation go through at a singularity; used there only to see how
-# near it is, never in a solution.
+# Keeps the Cholesky factorisation possible at a singularity. It serves to judge how near that
+# is, and never enters a solution.
 _FLOOR = 1e-9
 _EYE = {rows: Constant(torch.eye(rows, dtype=torch.float64)) for rows in range(1, 7)}
 
@@ -32,31 +32,31 @@ _EYE = {rows: Constant(torch.eye(rows, dtype=torch.float64)) for rows in range(1
 def excess_speed(
     twist: Float[Tensor, "*batch 6"], caps: Float[Tensor, "2"]
 ) -> Float[Tensor, "*batch 1"]:
-    """What to divide a motion by to keep its twist within the caps; at least 1.
+    """Factor by which a twist exceeds the speed caps; at least 1.
 
     Args:
-        twist: Of the tool (linear [m/s], angular [rad/s]).
+        twist: Twist of the tool (linear [m/s], angular [rad/s]).
         caps: Highest linear and angular speed [m/s, rad/s].
     """
     speeds = torch.linalg.vector_norm(twist.view(*twist.shape[:-1], 2, 3), dim=-1)
     return (speeds / caps).amax(-1, keepdim=True).clamp(min=1)
 
 
-def led_descent(
+def task_descent(
     J: Float[Tensor, "*batch 6 n"],
     basis: Float[Tensor, "*batch rows 6"],
     gradient: Float[Tensor, "*batch 6"],
 ) -> Float[Tensor, "*batch 6"]:
-    """The part of a gradient that leading fewer than six dimensions of the tool descends along.
+    """Part of a gradient along which a task of fewer than six dimensions descends.
 
-    With J_t = B J the joints move by J_t^+ y for a motion y of the task, and the tool by all of
-    J J_t^+ y, turns that nobody leads included. So the gradient over y is (J J_t^+)^T s, and
-    the potential falls by its square. Where the task leads all that s asks for, it is B s.
+    With J_t = B J the joints move by J_t^+ y for a motion y of the task, and the tool by
+    J J_t^+ y, which includes rotations outside the task. So the gradient over y is
+    (J J_t^+)^T s, and the potential falls by its square. It is B s where s lies in the task.
 
     Args:
         J: Geometric Jacobian.
-        basis: B, orthonormal twists that the task leads (`task_basis`).
-        gradient: s, of the potentials over small motions of the tool.
+        basis: B, orthonormal twists of the task (`task_basis`).
+        gradient: s, gradient of the potentials over small motions of the tool.
 
     Returns:
         B^T y, a twist.
@@ -71,25 +71,25 @@ def resolved_rate(
     twist: Float[Tensor, "*batch rows"],
     null_velocity: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
-    """J^+ twist and N w, for a null-space velocity w.
+    """Joint velocities J^+ twist of the task and N w of the null space.
 
         J^+ v = J^T (J J^T + lambda^2 I)^-1 v,   N w = w - Q Q^T w,   J^T = Q R
 
-    The damping lambda is exactly zero unless J is near a singularity. It is judged by
+    The damping lambda is exactly zero unless J is near a singularity. The distance from one is
     |(J J^T)^-1|_F^(-1/2), which is at most sigma_min and close to it where sigma_min is small.
 
     N is never damped: |J N w| <= 1e-12 |w| in float64 at any J, singular ones included. There
-    the null space has a dimension more, of which N keeps n - 6, and which ones may change from
-    one step to the next; the safety filter limits the acceleration that takes.
+    the null space gains a dimension, of which N keeps n - 6 that may change from one step to
+    the next; the safety filter limits the resulting acceleration.
 
     Args:
-        J: Geometric Jacobian, or the rows of it that the task leads: 6 or fewer, at most n.
-        twist: Wanted motion of the tool (linear [m/s], angular [rad/s]), or of those.
-        null_velocity: Wanted joint velocity w, of which N keeps what leaves the tool at rest
-            [rad/s].
+        J: Geometric Jacobian, or its rows in the task: at most 6, and at most n.
+        twist: Twist of the tool (linear [m/s], angular [rad/s]), or its part in the task.
+        null_velocity: Wanted joint velocity w, of which N keeps the part that leaves the tool
+            at rest [rad/s].
 
     Returns:
-        Joint velocity of the task, and that of the null space [rad/s].
+        Joint velocity of the task, and joint velocity of the null space [rad/s].
     """
     return task_rate(J, twist), null_projection(J, null_velocity)
 
@@ -97,7 +97,7 @@ def resolved_rate(
 def task_rate(
     J: Float[Tensor, "*batch rows n"], twist: Float[Tensor, "*batch rows"]
 ) -> Float[Tensor, "*batch n"]:
-    """J^+ twist, the smallest joint velocity for a twist, damped near singularities [rad/s].
+    """Smallest joint velocity for a twist, J^+ twist, damped near singularities [rad/s].
 
     Arguments are those of `resolved_rate`.
     """
@@ -120,24 +120,23 @@ def saturate_in_null_space(
     lower: Float[Tensor, "*#batch n"],
     upper: Float[Tensor, "*#batch n"],
 ) -> Float[Tensor, "*batch n"]:
-    """Let the other joints do what limits take from single ones of the task.
+    """Shift the motion of joints at a limit to the other joints.
 
-    Joints that a limit cuts move as fast as it lets them, and the others are solved for what is
-    left of the twist: one round of the saturation in the null space (Flacco, De Luca and
-    Khatib, "Control of redundant robots under hard joint constraints", T-RO 2015). Without it
-    an arm with a joint at its limit may stand still short of where it could go: where the least
-    velocity for the twist is of that joint alone.
+    Joints beyond a limit move at it, and the others are solved for the rest of the twist: one
+    round of the saturation in the null space (Flacco, De Luca and Khatib, "Control of redundant
+    robots under hard joint constraints", T-RO 2015). Without it an arm with a joint at its
+    limit may stop short of its goal, where the smallest velocity is one of that joint alone.
 
     Args:
         task: Joint velocity of the task, by `resolved_rate` [rad/s].
-        J: As there.
-        twist: As there.
+        J: Jacobian given to `resolved_rate`.
+        twist: Twist given to `resolved_rate`.
         lower: Lowest allowed velocity [rad/s].
         upper: Highest allowed velocity [rad/s].
 
     Returns:
-        The velocity, in which only joints that were not cut may leave their bounds; or the one
-        given, where that, cut, comes nearer to the twist [rad/s].
+        The velocity, in which only joints that were within their bounds may leave them; or the
+        given one, if that comes nearer to the twist once it is limited [rad/s].
     """
     cut = torch.minimum(torch.maximum(task, lower), upper)
     free = cut == task
@@ -151,7 +150,7 @@ def saturate_in_null_space(
         missing = twist - torch.linalg.vecdot(J, within.unsqueeze(-2))
         return torch.linalg.vecdot(missing, missing).unsqueeze(-1)
 
-    # Of a task that is not cut both are alike, but for rounding.
+    # Both are equal, but for rounding, where no limit acts.
     better = (off(shared) < off(task)) & ~free.all(-1, keepdim=True)
     return torch.where(better, shared, task)
 
@@ -163,21 +162,21 @@ def scale_task(
     upper: Float[Tensor, "*#batch n"],
     caps: Float[Tensor, "2"],
 ) -> Float[Tensor, "*batch n"]:
-    """Slow the task down where limits that cut single joints would make the tool faster.
+    """Slow the task down where limits of single joints would make the tool faster.
 
-    A limit that cuts one of two joints which nearly undo each other's motion lets the other
-    swing the tool off its path, faster than was asked for. Slowed down as a whole, less is
-    cut. Where a cut makes the tool slower the task goes on, and slides along the limit.
+    If one of two joints that nearly cancel each other's motion is limited, the other swings the
+    tool off its path, faster than was asked for. Slowing down the task as a whole avoids that.
+    Where the limit makes the tool slower the task goes on, and slides along the limit.
 
     Args:
         task: Joint velocity of the task [rad/s].
         J: Geometric Jacobian of the tool.
         lower: Lowest allowed velocity [rad/s].
         upper: Highest allowed velocity [rad/s].
-        caps: Highest linear and angular speed [m/s, rad/s], by which both are compared.
+        caps: Highest linear and angular speed [m/s, rad/s], as a scale for both.
 
     Returns:
-        The velocity, scaled no further than to where nothing is cut [rad/s].
+        The velocity, scaled down at most until no limit acts [rad/s].
     """
     cut = torch.minimum(torch.maximum(task, lower), upper)
     asked, done = (
@@ -199,13 +198,12 @@ def scale_null_space(
     lower: Float[Tensor, "*#batch n"],
     upper: Float[Tensor, "*#batch n"],
 ) -> Float[Tensor, "*batch n"]:
-    """Scale the null-space velocity as a whole so that limits need not cut single joints.
+    """Scale the null-space velocity as a whole to keep the limits of single joints.
 
-    A limit that cuts one joint of a null-space motion makes it move the tool; scaled as a
-    whole it does not. The factor is 0 to 1, the largest that fits; where none fits because
-    the task alone is too fast, the one that comes closest. (Factors beyond would let the
-    redundant joints give way to the task. They were measured to whip the elbow into the
-    limits near singularities.)
+    Limiting single joints would move the tool. The factor is the largest from 0 to 1 that fits;
+    where none fits because the task alone is too fast, the one that comes closest. (Factors
+    beyond would let the redundant joints give way to the task. In measurements they whipped the
+    elbow into the limits near singularities.)
 
     Args:
         task: Joint velocity of the task [rad/s].
@@ -216,8 +214,8 @@ def scale_null_space(
     Returns:
         The scaled null-space velocity [rad/s].
     """
-    # A joint that does not move bounds no factor: divided by the smallest number the bounds
-    # are infinite, or of the wrong sign where the task alone is too fast.
+    # A joint at rest does not bound the factor: divided by the smallest number its bounds are
+    # infinite, or of the wrong sign where the task alone is too fast.
     null_or_tiny = torch.where(null == 0, torch.finfo(null.dtype).tiny, null)
     at_lower, at_upper = (lower - task) / null_or_tiny, (upper - task) / null_or_tiny
     least = torch.minimum(at_lower, at_upper).amax(-1, keepdim=True)
@@ -228,30 +226,30 @@ def scale_null_space(
     return factor * null
 
 
-# Bound on each component of the remembered drift [m, rad]: a person who blocks the arm must
-# not wind it up.
+# Bound on each component of the accumulated drift [m, rad], against windup while a person
+# blocks the arm.
 _MAX_DRIFT = 0.005
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class PoseDrift:
-    """How far the tool has drifted from where the task sent it, and what that needs."""
+    """Deviation of the tool from the motion of its task, and the data of the last step."""
 
     drift: Float[Tensor, "*batch 6"]
-    """Motion still owed to the task (linear [m], angular [rad])."""
+    """Motion still to be made up for (linear [m], angular [rad])."""
     joint_position: Float[Tensor, "*batch n"]
-    """Of the last step [rad]."""
+    """Joint positions of the last step [rad]."""
     jacobian: Float[Tensor, "*batch 6 n"]
-    """Of the last step."""
+    """Jacobian of the last step."""
     planned: Float[Tensor, "*batch 6"]
     """Motion the task had planned for the last step (linear [m], angular [rad])."""
     active: Bool[Tensor, "*batch"]
-    """Whether drift was measured in the last step; where not, the rest may be old."""
+    """True if the drift was measured in the last step; otherwise the rest may be old."""
 
 
 def restored_drift(drift: PoseDrift) -> PoseDrift:
-    """The same, or none where it is not of numbers."""
+    """The drift, reset where a field is not a number."""
     numbers = (drift.drift, drift.joint_position, drift.planned, drift.jacobian.flatten(-2))
     known = is_number(torch.cat(numbers, dim=-1)).all(-1)
     unknown = ~known.unsqueeze(-1)
@@ -270,17 +268,17 @@ def measure_drift(
     jacobian: Float[Tensor, "*batch 6 n"],
     active: Bool[Tensor, "*batch"],
 ) -> PoseDrift:
-    """Add the drift of the last step: what was planned, less what the tool did.
+    """Add the drift of the last step: planned motion minus motion of the tool.
 
-    The motion of the tool is (J_0 + J_1)/2 dq, right to the third order of the step, where
-    the J_0 dq by which it was planned is right to the second: the difference is the drift.
+    The motion of the tool is (J_0 + J_1)/2 dq to third order of the step. It was planned by
+    J_0 dq, which holds to second order: the difference is the drift.
 
     Args:
-        before: After the last step.
-        joint_position: Now [rad].
-        jacobian: Now.
-        active: Where to compensate. Elsewhere, and in the first step of it, the drift is zero,
-            so that every null-space input starts afresh.
+        before: Drift after the last step.
+        joint_position: Joint positions now [rad].
+        jacobian: Jacobian now.
+        active: True where to compensate. Elsewhere, and in the first step of a null-space
+            input, the drift is zero.
     """
     step = (joint_position - before.joint_position).unsqueeze(-2)
     moved = torch.linalg.vecdot(before.jacobian + jacobian, step)  # twice the motion
@@ -292,7 +290,7 @@ def measure_drift(
     )
 
 
-# Speed below which what is done of a twist cannot be told [m/s, rad/s]; all of it then.
+# Speed below which the executed fraction of a twist counts as 1 [m/s, rad/s].
 _NO_SPEED = 1e-6
 
 
@@ -303,18 +301,18 @@ def planned_motion(
     joint_velocity: Float[Tensor, "*batch n"],
     dt: float | Float[Tensor, ""],
 ) -> Float[Tensor, "*batch 6"]:
-    """The part of the step to come that the task has planned.
+    """Motion of the tool that the task plans for the coming step (linear [m], angular [rad]).
 
     Limits may slow the motion down. That is no drift, so only the fraction that the filtered
-    joint velocity carries out counts as planned. The fraction is that of the whole twist: the
-    correction of measured noise, which is as large as a slow task's own twist, would make that
-    of the task alone seem not to be carried out.
+    joint velocity executes counts as planned. It is the fraction of the whole twist: for a slow
+    task the correction of measured noise is as large as the task's own twist, and would hide
+    the fraction of the task alone.
 
     Args:
-        task_twist: Of the task alone.
-        twist: Of the task and the correction of the drift.
-        jacobian: Of the tool.
-        joint_velocity: Filtered [rad/s].
+        task_twist: Twist of the task alone.
+        twist: Twist of the task and of the drift correction.
+        jacobian: Jacobian of the tool.
+        joint_velocity: Filtered joint velocity [rad/s].
         dt: Step [s].
     """
     done = torch.linalg.vecdot(jacobian, joint_velocity.unsqueeze(-2))

@@ -1,4 +1,4 @@
-"""Making way by the null space: the elbow moves off by itself when somebody comes near."""
+"""Way-making: the null space moves the elbow away from approaching people."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from hrc_learn.geometry.numerics import safe_norm
 
 @dataclass(frozen=True, kw_only=True)
 class WayMakingConfig:
-    """Who moves the null space, and how it makes way by itself."""
+    """Source of null-space motion, and the repulsion from what is near."""
 
     mode: Literal["none", "expert", "automatic", "both"] = "both"
-    """Who moves it: nobody, the person by their null-space input, the repulsion from what is
-    near, or both, whose velocities add up."""
+    """Source of null-space motion: none, the null-space input of a person, the repulsion from
+    what is near, or the sum of both."""
     far: float = 0.3
-    """Distance at which making way begins [m]: well before the 0.13 m at which
-    `ConstraintConfig` begins to slow down what comes nearer at 0.5 m/s."""
+    """Distance at which the repulsion begins [m]: well before the 0.13 m at which
+    `ConstraintConfig` begins to slow down an approach at 0.5 m/s."""
     near: float = 0.08
-    """Distance at which it is as fast as it gets [m], before the constraints bind."""
+    """Distance at which the repulsion is largest [m], before the constraints bind."""
     speed: float = 0.5
-    """Largest joint velocity wanted, of which the null-space part acts [rad/s]."""
+    """Joint velocity at the largest repulsion, of which the null-space part acts [rad/s]."""
     smoothing: float = 0.02
-    """Differences of distances below which several pairs count alike [m]. Without it the
-    direction would jump where another pair becomes the nearest."""
+    """Difference of distances below which pairs count alike [m]. Without it the direction
+    would jump where another pair becomes the nearest."""
 
     def __post_init__(self):
         if self.mode not in ("none", "expert", "automatic", "both"):
@@ -44,26 +44,26 @@ class WayMakingConfig:
 
     @property
     def automatic(self) -> bool:
-        """Whether the null space makes way by itself."""
+        """True if the repulsion moves the null space."""
         return self.mode in ("automatic", "both")
 
     @property
     def expert(self) -> bool:
-        """Whether a person's null-space input acts."""
+        """True if the null-space input of a person moves it."""
         return self.mode in ("expert", "both")
 
 
 def way_making_velocity(
     distances: Distances, config: WayMakingConfig | None = None
 ) -> Float[Tensor, "*batch n"]:
-    """Joint velocity that leads away from what is near, for the null space to follow.
+    """Joint velocity away from what is near, whose null-space part acts [rad/s].
 
-    Along the gradient of the smoothed least distance d = -k log sum exp(-d_i/k), as down the
-    potential of a repulsion (Khatib 1986): its speed rises smoothly from zero at `far` to
-    `speed` at `near`. Zero where a distance is not a number, as the arm brakes there.
+    It follows the gradient of the smoothed least distance d = -k log sum exp(-d_i/k), as down
+    the potential of a repulsion (Khatib 1986). Its speed rises smoothly from zero at `far` to
+    `speed` at `near`. Zero where a distance is not a number: the arm brakes there.
 
     Args:
-        distances: To what the arm should keep away from.
+        distances: Distances from what the arm should keep away from.
         config: Default: the recommended settings.
     """
     config = config or WayMakingConfig()

@@ -74,7 +74,7 @@ class ComplementaryMotion:
         config: YieldingConfig | None = None,
         clearance: Clearance | None = None,
     ):
-        """Begin where the first step is.
+        """Begin at the first step.
 
         Args:
             chain: Kinematics of the arm.

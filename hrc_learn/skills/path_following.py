@@ -18,7 +18,7 @@ def follow_path(
     While a person pushes, the end effector keeps to the poses of the path, and the null space
     yields. The path waits where the arm, pushed aside, cannot follow: where it would meet
     something, before a singularity of the path, and where the joints might not find back. After
-    a push the joints return to the path, at its end too, or stay beside it
+    a push the joints return to the path, at its end too, or stay off it
     (`WorkCellConfig.after_push`).
 
     Args:

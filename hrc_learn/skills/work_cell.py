@@ -625,7 +625,7 @@ class WorkCell:
 
 
 def _hindered(told: Feedback) -> Bool[np.ndarray, " hindrances"]:
-    """Hindrances told to the person, in the order of `HINDRANCE_COLUMNS`."""
+    """Hindrances of the person, in the order of `HINDRANCE_COLUMNS`."""
     if not told.reasons:
         return _UNHINDERED
     reasons = {reason.hindrance for reason in told.reasons}

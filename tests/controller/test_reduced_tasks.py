@@ -10,7 +10,7 @@ from servoing import CENTRE, DOUBLE, DOWN, grasping, near_starts, network, obser
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
-from hrc_learn.controller.resolved_rate import led_descent
+from hrc_learn.controller.resolved_rate import task_descent
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
 from hrc_learn.kinematics import Arm, arm_from_file, panda, solve_inverse, task_basis, task_rank
@@ -104,7 +104,7 @@ def test_the_potential_falls_whatever_the_gradient(five, task, joints):
     J_t = basis @ J
     regular = torch.linalg.svdvals(J_t)[:, -1] > 0.06
     assert regular.sum() > 100
-    y = (basis @ led_descent(J, basis, s)[..., None])[regular]
+    y = (basis @ task_descent(J, basis, s)[..., None])[regular]
     tool = J[regular] @ torch.linalg.pinv(J_t[regular]) @ -y
     rate = (s[regular] * tool[..., 0]).sum(-1)
     torch.testing.assert_close(rate, -y.square().sum((-2, -1)), rtol=1e-8, atol=1e-10)

@@ -367,7 +367,7 @@ def test_a_job_beside_a_worker_keeps_its_distance_and_is_done(skills):
     assert distance.max() > 1.0
     assert job.separation_margin.min() > 0
     assert job.cell.log["pace"].min() < 0.5
-    assert job.cell.time > job.cell.pace.time + 0.5
+    assert job.cell.time > job.cell.task_time + 0.5
     seen = job.cell.log["person_distance"]
     error = seen[np.isfinite(seen)] - distance[np.isfinite(seen)]
     assert np.abs(np.median(error)) < 0.03

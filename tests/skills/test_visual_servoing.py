@@ -25,7 +25,7 @@ class StillCell:
     joints, time = panda.ready + 0.2, 1.0
 
     def __init__(self, image_joints):
-        self.pace = SimpleNamespace(time=1.0)
+        self.task_time = 1.0
         self.observation = MarkerObservation(time=0.9, joints=image_joints)
 
 
@@ -154,7 +154,7 @@ def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
     def step(target):
         heights.append(target.raised)
         # Every other step the arm waits for somebody.
-        servo._cell.pace.time += 0.01 * (len(heights) % 2)
+        servo._cell.task_time += 0.01 * (len(heights) % 2)
 
     servo.step = step
     above = Workplace().hover()
@@ -215,7 +215,7 @@ def test_a_descent_is_repeated_until_it_teaches_nothing_new(astray, moves, probe
         side = quaternion.to_matrix(orientation)[:, 1].numpy()
         return np.add(side, [0.0, 0.0, 1.0]) / np.sqrt(2)
 
-    cell = SimpleNamespace(time=0.0, pace=SimpleNamespace(time=0.0), pose=above)
+    cell = SimpleNamespace(time=0.0, task_time=0.0, pose=above)
     servo, descents = servo_in(cell)[0], []
     along = torch.from_numpy(line(turned) / line(turned)[2])
     start = Pose(above.position + CONFIG.probe * along, turned)

@@ -210,7 +210,7 @@ def test_who_holds_the_hand_makes_the_task_wait(force):
     assert speed[time > paused.max() + 0.3].max() > 0.1
     assert beside_path(cell).max() < 2.5e-3
     assert off_path(cell)[1].max() < 8e-3
-    waited = cell.time - cell.pace.time
+    waited = cell.time - cell.task_time
     assert waited == pytest.approx(paused.max() - paused.min(), abs=0.05)
     assert [remark.text for remark in cell.remarks] == ["The task waits.", "The task goes on."]
 

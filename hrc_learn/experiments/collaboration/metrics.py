@@ -269,13 +269,13 @@ def _waited(run: CollaborationRun) -> float | None:
 
 def _free_volume(run: CollaborationRun) -> float | None:
     """Mean over the reaches [l]."""
-    rooms = run.reach_rooms
+    rooms = run.reach_spaces
     return 1e3 * float(np.mean([room.free_volume for room in rooms])) if rooms else None
 
 
 def _comfortable(run: CollaborationRun) -> float | None:
     """Mean over the reaches [%]."""
-    rooms = run.reach_rooms
+    rooms = run.reach_spaces
     return 100.0 * float(np.mean([room.comfortable for room in rooms])) if rooms else None
 
 

@@ -18,15 +18,15 @@ from hrc_learn.experiments.collaboration.hand_over import (
     waiting,
 )
 from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
+from hrc_learn.experiments.collaboration.reach_space import (
+    ReachSpace,
+    reach_spaces,
+    space_over_bench,
+)
 from hrc_learn.experiments.collaboration.worker import (
     draw_visit,
     move_worker,
     separation_margin,
-)
-from hrc_learn.experiments.collaboration.worker_room import (
-    ReachRoom,
-    over_bench,
-    reach_rooms,
 )
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
@@ -195,16 +195,16 @@ class CollaborationRun:
         )
 
     @cached_property
-    def reach_rooms(self) -> list[ReachRoom]:
+    def reach_spaces(self) -> list[ReachSpace]:
         """What room the arm left the worker at each marker; empty if nobody was there."""
         if self.visit is None or not len(self.visit.markers):
             return []
         x, y, _ = self.visit.markers.mean(axis=0).tolist()
-        return reach_rooms(
+        return reach_spaces(
             self.cell.log,
             self.visit,
             whole_arm(self.world.config.arm),
-            over_bench((x, y), self.world.table_top),
+            space_over_bench((x, y), self.world.table_top),
             self.world.arm.encoder_offset,
         )
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.experiments.collaboration.worker import draw_visit
-from hrc_learn.experiments.collaboration.worker_room import (
+from hrc_learn.experiments.collaboration.reach_space import (
     CLEAR,
     bench_places,
     free_volume,
     least_leans,
-    over_bench,
-    reach_rooms,
+    reach_spaces,
+    space_over_bench,
 )
+from hrc_learn.experiments.collaboration.worker import draw_visit
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, panda
 from hrc_learn.log import StepLog
@@ -123,8 +123,8 @@ def test_rooms_are_of_the_true_joints_while_a_hand_is_there():
     for t in time:
         log.append(time=t, joint_position=WAITING.numpy() + offset)
     top = WORKPLACE.scene.table.centre[2] + 0.02
-    box = over_bench((0.05, 0.35), top)
-    rooms = reach_rooms(log, VISIT, ARM, box, offset)
+    box = space_over_bench((0.05, 0.35), top)
+    rooms = reach_spaces(log, VISIT, ARM, box, offset)
     # The run ended before the others.
     assert len(rooms) == 2
     leans = least_leans(ARM, WAITING, VISIT, bench_places(box))
@@ -147,5 +147,5 @@ def test_a_marker_out_of_reach_has_no_lean():
     nobody = replace(VISIT, markers=np.zeros((0, 3)), reaches=np.zeros((0, 2)))
     log = StepLog()
     log.append(time=0.0, joint_position=WAITING.numpy())
-    box = over_bench((0.0, 0.0), 0.0)
-    assert reach_rooms(log, nobody, ARM, box, np.zeros(7)) == []
+    box = space_over_bench((0.0, 0.0), 0.0)
+    assert reach_spaces(log, nobody, ARM, box, np.zeros(7)) == []

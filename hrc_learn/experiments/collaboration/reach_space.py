@@ -1,7 +1,7 @@
-"""What room an arm leaves a worker who reaches under it: free volume, and the posture it takes.
+"""Space that an arm leaves to a worker who reaches under it: free volume and posture.
 
-Both are of the arm alone, at the moments at which he has a hand at a marker. Where he stands
-and how he leans is looked for anew, so that arms can be compared whatever he did there.
+Both depend on the arm alone, at the moments at which the worker has a hand at a marker. The
+worker's stance and lean are searched for, so that arms compare whatever the worker did there.
 """
 
 from __future__ import annotations
@@ -21,61 +21,60 @@ from hrc_learn.sim.worker import Posture
 from hrc_learn.sim.worker_visit import HAND_OVER_BENCH
 
 CLEAR = 0.05
-"""Distance from the arm that a posture has to leave [m]: intrusion beyond the capsules of body
+"""Distance from the arm that a posture has to keep [m]: intrusion beyond the capsules of body
 and arm, as in the clearance of the protective distance."""
+# Distance from the arm at which there is room for a hand [m]: its half breadth and `CLEAR`.
 _HAND = 0.10
-"""Distance from the arm from which on a place is free for a hand [m]: its half breadth and
-`CLEAR`."""
+# Spacing of the points that are counted [m].
 _GRID = 0.02
-"""Of the places that are counted [m]."""
+# Height of the space over the bench [m]: that of an elbow over a hand on the bench.
 _ABOVE = 0.40
-"""Height over the bench up to which they are [m]: that of an elbow over a hand on the bench."""
+# Half width of the space around the point where the arm works [m]: the markers lie there.
 _AROUND = (0.25, 0.20)
-"""How far they are around what the arm is at work above [m]: where the markers lie."""
+# Stances that are tried along the bench, from the worker's own [m]: a step to either side.
 _ASIDE = np.linspace(-0.45, 0.45, 7)
-"""Places along the bench that are tried, from where he stands [m]: a step to either side."""
+# Leans that are tried [rad], up to the last step of RULA, a measure of ergonomics.
 _LEANS = np.deg2rad(np.arange(0.0, 61.0, 5.0))
-"""Leans that are tried [rad], up to what ergonomics take for the worst (RULA's last step)."""
+# Lean of a comfortable posture [rad]: the first step of RULA (McAtamney and Corlett 1993,
+# "RULA: a survey method", Applied Ergonomics 24).
 _COMFORTABLE = np.deg2rad(20.0)
-"""Lean up to which a posture is comfortable [rad]: RULA's first step (McAtamney and Corlett
-1993, "RULA: a survey method", Applied Ergonomics 24)."""
+# Points on the bench to reach, along either side of the space.
 _PLACES = 5
-"""On the bench, along either side of the box in which room is wanted, that he is to reach."""
-_AT_ONCE = 1000
-"""Postures that are measured at once: some 100 MB."""
+# Postures that are measured together: some 100 MB.
+_BLOCK = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReachRoom:
-    """What room there is while a hand is at a marker."""
+class ReachSpace:
+    """Space while a hand is at a marker."""
 
     time: float
-    """[s]"""
+    """Time in the middle of the reach [s]."""
     free_volume: float
-    """Over the bench under the arm, for a hand [m^3]."""
+    """Volume over the bench, under the arm, with room for a hand [m^3]."""
     comfortable: float
-    """Fraction of the bench there that he reaches clear of the arm without leaning far."""
+    """Fraction of the bench that can be reached clear of the arm without leaning far."""
     reachable: float
-    """Fraction that he reaches clear of the arm at all."""
+    """Fraction of the bench that can be reached clear of the arm."""
 
 
-def reach_rooms(
+def reach_spaces(
     log: LoggedSteps,
     visit: WorkerVisit,
     arm: CapsuleArm,
     over: Box,
     encoder_offset: Float[np.ndarray, " joints"],
-) -> list[ReachRoom]:
-    """One for each marker that was reached for during a run.
+) -> list[ReachSpace]:
+    """Space at each marker that the worker reached for during a run.
 
     Args:
-        log: Of the run.
-        visit: Of the worker.
+        log: Log of the run.
+        visit: Visit of the worker.
         arm: Capsules of arm and tool.
-        over: Where room is wanted (`over_bench`).
-        encoder_offset: What the joint positions of the log are too large by [rad].
+        over: Box in which space is counted (`space_over_bench`).
+        encoder_offset: Offset of the logged joint positions: measured minus true [rad].
     """
-    rooms = []
+    spaces = []
     places = bench_places(over)
     for begin, end in visit.reaches:
         k = int(np.searchsorted(log["time"], (begin + end) / 2))
@@ -83,22 +82,22 @@ def reach_rooms(
             continue
         q = torch.from_numpy(log["joint_position"][k] - encoder_offset)
         leans = least_leans(arm, q, visit, places)
-        rooms.append(
-            ReachRoom(
+        spaces.append(
+            ReachSpace(
                 time=float(log["time"][k]),
                 free_volume=free_volume(arm, q, over),
                 comfortable=float((leans <= _COMFORTABLE + 1e-9).mean()),
                 reachable=float(np.isfinite(leans).mean()),
             )
         )
-    return rooms
+    return spaces
 
 
-def over_bench(centre: tuple[float, float], top: float) -> Box:
-    """The box in which room is counted.
+def space_over_bench(centre: tuple[float, float], top: float) -> Box:
+    """Box in which space is counted.
 
     Args:
-        centre: Of what the arm is at work above [m].
+        centre: Point above which the arm works [m].
         top: Height of the bench [m].
     """
     half = (*_AROUND, _ABOVE / 2)
@@ -110,8 +109,8 @@ def free_volume(arm: CapsuleArm, joint_position: Float[Tensor, " joints"], over:
 
     Args:
         arm: Capsules of arm and tool.
-        joint_position: [rad]
-        over: The box.
+        joint_position: Joint positions [rad].
+        over: Box.
     """
     axes = [
         torch.arange(c - h + _GRID / 2, c + h, _GRID, dtype=torch.float64)
@@ -124,7 +123,7 @@ def free_volume(arm: CapsuleArm, joint_position: Float[Tensor, " joints"], over:
 
 
 def bench_places(over: Box) -> Float[np.ndarray, "places 3"]:
-    """Where markers may lie under a box: a grid on the bench, as high as a hand on it [m]."""
+    """Grid of points on the bench under a box, at the height of a hand on it [m]."""
     x, y = (
         c + h * np.linspace(-1.0, 1.0, _PLACES)
         for c, h in zip(over.centre[:2], over.half_size[:2], strict=True)
@@ -139,20 +138,20 @@ def least_leans(
     visit: WorkerVisit,
     markers: Float[np.ndarray, "markers 3"],
 ) -> Float[np.ndarray, " markers"]:
-    """How far a worker has to lean to reach each marker and keep clear of an arm [rad].
+    """Smallest lean with which a worker reaches each marker clear of an arm [rad].
 
-    From the best place along the bench, with either hand; NaN if there is no such posture.
+    The stance along the bench and the hand are free; NaN if there is no such posture.
 
     Args:
         arm: Capsules of arm and tool.
-        joint_position: [rad]
-        visit: Who, and where he stands at the bench.
-        markers: Where a hand has to be [m].
+        joint_position: Joint positions [rad].
+        visit: Visit of the worker, with the stance at the bench.
+        markers: Positions of the hand [m].
     """
     which, postures = _reaching(visit, markers)
     leans = np.full(len(markers), np.nan)
-    for first in range(0, len(which), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    for first in range(0, len(which), _BLOCK):
+        some = slice(first, first + _BLOCK)
         part = Posture(**{f.name: getattr(postures, f.name)[some] for f in fields(Posture)})
         ends = torch.from_numpy(visit.worker.ends(part))
         radius = torch.from_numpy(visit.worker.radius).expand(len(ends), -1)
@@ -167,7 +166,7 @@ def least_leans(
 def _reaching(
     visit: WorkerVisit, markers: Float[np.ndarray, "markers 3"]
 ) -> tuple[Int[np.ndarray, " postures"], Posture]:
-    """Postures that reach a marker, and which one each of them does."""
+    """Postures that reach a marker, and the index of the marker of each."""
     worker = visit.worker
     standing = visit.posture(np.array(visit.released))
     heading = float(standing.heading)
