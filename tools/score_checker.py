@@ -1,10 +1,10 @@
 """Score `hrc check` on copies of sound datasets, each with one kind of defect.
 
 The defects are defined in tests/value_defects.py and tests/file_defects.py, the synthetic
-sets in tests/clean_sets.py; real sets are given by their path. Every copy is checked by its own process
-with a time limit. A defect counts as found if there is a message that the sound set does not
-give, naming the episode or file of the defect. Defects that do not apply to a set (no video, no
-gripper) are left out.
+sets in tests/clean_sets.py; real sets are given by their path. Every copy is checked by its own
+process with a time limit. A defect counts as found if there is a message that the sound set
+does not give, naming the episode or file of the defect. Defects that do not apply to a set (no
+video, no gripper) are left out.
 
     python tools/score_checker.py path/to/dataset --json score.json
 
