@@ -84,7 +84,7 @@ def _record_demonstrations(args: Show, out: Path) -> None:
         shown = source.spread(min(_SHOWN, max(1, _SHOWN_FRAMES // usual)))
     demos = shown.load()
     title = f"Demonstrations in {args.dataset.resolve().name}"
-    images, missing = thumbnails(args.dataset, demos[:_WITH_TAB])
+    images, missing = thumbnails(source.folder, demos[:_WITH_TAB])
     record_demonstrations(out, demonstrations_recording(demos, title, images), most=_WITH_TAB)
     for image in missing:
         print(f"left out: {image}")

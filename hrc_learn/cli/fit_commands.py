@@ -62,7 +62,7 @@ def fit_primitives(args: FitPrimitives) -> None:
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(source)} demonstrations"):
             fitted, metrics = _learn(args, source, demos, folder)
-        missing = _draw(fitted, args, demos, metrics, folder)
+        missing = _draw(fitted, args, source, demos, metrics, folder)
         _finish(args, metrics, folder)
     for image in missing:
         print(f"left out: {image}")
@@ -221,6 +221,7 @@ _IMAGED_DEMOS, _IMAGES = 3, 30
 def _draw(
     fitted: FittedPrimitives,
     args: FitPrimitives,
+    source: DemonstrationSource,
     demos: DemonstrationSet,
     metrics: dict[str, float],
     folder: Path,
@@ -232,7 +233,7 @@ def _draw(
     """
     if set(fitted.each) == {"orientation"}:
         return []
-    images, missing = thumbnails(args.dataset, demos[:_IMAGED_DEMOS], _IMAGES)
+    images, missing = thumbnails(source.folder, demos[:_IMAGED_DEMOS], _IMAGES)
     episodes = [demo.episode for demo in demos]
     shown = fit_recording(fitted, f"Fit of {args.dataset.name}", episodes, images)
     record_fit(folder / "fit.rrd", shown)
@@ -324,7 +325,7 @@ def _write(
             figure = learning_figure(held_out, skill.learned.best, "px")
             figure.savefig(folder / "learning.png", dpi=120)
         title = f"Image Jacobian from {args.dataset.name}"
-        seen, missing = thumbnails(args.dataset, islice(demos, _IMAGED_DEMOS), 2)
+        seen, missing = thumbnails(demos.folder, islice(demos, _IMAGED_DEMOS), 2)
         ends = {
             f"End of episode {episode}, {camera}": files[-1]
             for episode, cameras in seen.items()

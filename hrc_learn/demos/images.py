@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
 from hrc_learn.demos.format.files import INFO_PATH, open_parquet, read_table
 from hrc_learn.demos.format.videos import Image, Segments, decode, decode_image, read_segments
 from hrc_learn.demos.issues import DatasetError
@@ -49,15 +49,15 @@ class ImageReader:
         cameras: Features that hold images.
     """
 
-    def __init__(self, path: str | Path):
+    def __init__(self, path: str | Path | DatasetFolder):
         """
         Args:
-            path: Folder of the dataset.
+            path: Folder of the dataset, or its metadata.
 
         Raises:
             DatasetError: The metadata cannot be read.
         """
-        self._folder = open_folder(path)
+        self._folder = path if isinstance(path, DatasetFolder) else open_folder(path)
         self._entries = {entry.index: entry for entry in self._folder.episodes}
         self.cameras = tuple(k for k, f in self._folder.features.items() if f.is_picture)
         self._segments: dict[int, Segments] = read_segments(self._folder, missing=True)
@@ -273,12 +273,12 @@ def load_images(
 
 
 def thumbnails(
-    path: str | Path, demos: Iterable[Demonstration], most: int = 200
+    path: str | Path | DatasetFolder, demos: Iterable[Demonstration], most: int = 200
 ) -> tuple[dict[int, Thumbnails], list[str]]:
     """Small images of episodes: enough to see the motion.
 
     Args:
-        path: Folder of the dataset.
+        path: Folder of the dataset, or its metadata (`DemonstrationSource.folder`).
         demos: Demonstrations of it, with all their frames or some spread evenly over them.
         most: Largest number of images per camera and episode: 200 take about 2 MB.
 

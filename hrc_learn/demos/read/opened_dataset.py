@@ -239,9 +239,10 @@ class OpenedDataset:
         try:
             decisions = self.survey_units(folder.episodes, units or {})
             profiles = [
-                profile_episode(entry.index, episode.frames, episode.quantities, folder.fps)
-                for entry in self.sample(_CONTRACT_EPISODES)
-                for episode in self.read([entry])
+                profile_episode(
+                    episode.entry.index, episode.frames, episode.quantities, folder.fps
+                )
+                for episode in self.read(self.sample(_CONTRACT_EPISODES))
             ]
         except DatasetError as error:
             return self, f"no contract of the columns is kept: {error}"

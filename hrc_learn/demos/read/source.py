@@ -227,6 +227,11 @@ class DemonstrationSource(Sequence[Demonstration]):
         )
 
     @property
+    def folder(self) -> DatasetFolder:
+        """Metadata of the dataset."""
+        return self._dataset.folder
+
+    @property
     def lengths(self) -> tuple[int, ...]:
         """Number of frames of each demonstration."""
         return tuple(entry.length for entry in self._entries)
