@@ -21,6 +21,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -83,7 +84,7 @@ def main(args: Args) -> None:
     if not PYTHON.exists():
         raise ValueError("tools/make_franka_sim.sh makes the environment of the checker first")
     aiming = VisualServoSkill.load(args.models / "aiming")
-    placing = PlacingSkill.load(args.models / "placing")
+    placing = PlacingSkill.load(args.models / "placing", panda)
     rows = _done_before(args.json)
     for seed in range(args.first_seed, args.first_seed + args.jobs):
         if any(row["seed"] == seed for row in rows):
@@ -117,7 +118,7 @@ def job(
             yield server
 
     begun = time.monotonic()
-    through = through_franky if args.driver == "franky" else through_franka
+    through = through_franky if args.driver == "franky" else partial(through_franka, panda)
     try:
         run = simulate_collaboration(
             aiming,

@@ -203,7 +203,8 @@ def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoArmRobot) -
             continue
         during = posture[torch.from_numpy(rows)]
         rooms = [
-            elbow_room(q, pull, clearance=robot.clearance) for q in during[:: len(during) // 3]
+            elbow_room(q, pull, panda, clearance=robot.clearance)
+            for q in during[:: len(during) // 3]
         ]
         effects.append(
             Pulled(

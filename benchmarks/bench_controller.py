@@ -234,7 +234,7 @@ def _mink_call() -> Callable[[], object]:
 
     spec = mujoco.MjSpec()  # pyright: ignore[reportAttributeAccessIssue]
     spec.compiler.degree = False
-    add_arm(spec, ArmModelConfig())
+    add_arm(spec, ArmModelConfig(robot=panda))
     model = spec.compile()
     configuration = mink.Configuration(model)
     q = configuration.q.copy()

@@ -72,7 +72,7 @@ class Listener(Human):
 def main(args: Args) -> None:
     """Do the jobs and count."""
     aiming = VisualServoSkill.load(args.models / "aiming")
-    placing = PlacingSkill.load(args.models / "placing")
+    placing = PlacingSkill.load(args.models / "placing", panda)
     table = Table("", "jobs done", "hours", "elbow pushed", "task paused", "arm stopped")
     figures: dict[str, float] = {}
     for name, forces in (("nobody", ()), ("a person leads the elbow", NULL_SPACE_FORCES)):

@@ -19,7 +19,6 @@ from hrc_learn.skills.arm_motion import (
     StraightLine,
     joint_line,
     joints_near,
-    nearest_configuration,
 )
 from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.grasping import (
@@ -95,7 +94,7 @@ def plan_cycle(
     over = Pose(
         hover.position.new_tensor([*position, workplace.hover_height]), hover.orientation
     )
-    above = nearest_configuration(over, near=workplace.hover_joints())
+    above = panda.inverse(over, near=workplace.hover_joints())
     table = hover.position.new_tensor([*position, item.half_size[2]])
     picked_up = Pose(table, over.orientation)
 
@@ -105,7 +104,9 @@ def plan_cycle(
     up = _straight(down[-1], raised(picked_up, grasping.lift), _LIFTING_SPEED, dt)
     back = joint_line(up[-1], home, JOINT_SPEED, dt)
     for way in (there, back):
-        check_plan(Plan(goal=panda.forward(way[-1]), dt=dt, path=way.numpy()), world)
+        check_plan(
+            Plan(goal=panda.forward(way[-1]), dt=dt, path=way.numpy(), chain=panda), world
+        )
     world.hold(item.name, home.numpy())
     plan = _free_plan(workplace, placing, world, goal, config, dt)
     transfer = torch.from_numpy(plan.path)

@@ -111,7 +111,7 @@ def main(args: Args) -> int:
     sizes = Imperfections.nominal().scaled(args.imperfections)
     config = WorkerStudyConfig(runs=args.runs, seed=args.seed, imperfections=sizes)
     workplace = Workplace().approached(VisualServoSkill.load(args.aiming).approach)
-    placing = PlacingSkill.load(args.placing)
+    placing = PlacingSkill.load(args.placing, workplace.robot)
     with Progress() as progress, torch.inference_mode():
         # A seed of another length than those of the runs.
         rng = np.random.default_rng([args.seed, 0, 1])

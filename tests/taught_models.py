@@ -6,6 +6,7 @@ from pathlib import Path
 from commands import done
 from unchecked import shapes_unchecked
 
+from hrc_learn.kinematics import panda
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 
@@ -23,4 +24,4 @@ def teach(folder: Path) -> tuple[VisualServoSkill, PlacingSkill]:
     done("fit", "--dataset", placing, "--out", folder / "placing")
     done("fit", "image-jacobian", "--dataset", servoing, "--out", folder / "aiming")
     aiming = VisualServoSkill.load(folder / "aiming")
-    return aiming, PlacingSkill.load(folder / "placing")
+    return aiming, PlacingSkill.load(folder / "placing", panda)

@@ -232,7 +232,9 @@ def _evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
         workspace = torch.stack([shown.quantile(0.05, dim=0), shown.quantile(0.95, dim=0)])
         near = workplace.hover_joints()
         with Console().status("Closed loops") as status:
-            loops = ClosedLoops.draw(camera, offset, workspace, near, StartsConfig())
+            loops = ClosedLoops.draw(
+                camera, offset, workspace, near, StartsConfig(), workplace.robot
+            )
             figures |= compare_starts(
                 network,
                 loops,

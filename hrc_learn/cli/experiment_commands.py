@@ -32,7 +32,7 @@ from hrc_learn.experiments.on_arm import (
 from hrc_learn.experiments.placing.experiment import PlacingExperiment, dataset_of
 from hrc_learn.experiments.run_recording import LiveViewConfig
 from hrc_learn.hardware import open_camera
-from hrc_learn.kinematics import ArmChoice
+from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
@@ -123,7 +123,8 @@ def _placing(args: Run) -> tuple[PlacingExperiment, Callable[..., tuple[Workplac
     )
 
     def task(experiment: PlacingExperiment) -> tuple[Workplace, Task]:
-        workplace, skill = Workplace(), PlacingSkill.load(folder)
+        workplace = Workplace()
+        skill = PlacingSkill.load(folder, workplace.robot)
         return workplace, placing_task(skill, workplace, args.shelf[0], experiment.speed)
 
     return experiment, task
@@ -171,9 +172,9 @@ def _collaboration(
     )
 
     def task(experiment: CollaborationExperiment) -> tuple[Workplace, Task]:
-        servoing, skill = VisualServoSkill.load(aiming), PlacingSkill.load(placing)
+        servoing, skill = VisualServoSkill.load(aiming), PlacingSkill.load(placing, panda)
         shelves = experiment.shelves
-        workplace = workplace_for(shelves, experiment.shelf_x, experiment.shelf_depth)
+        workplace = workplace_for(shelves, panda, experiment.shelf_x, experiment.shelf_depth)
         workplace = workplace.approached(servoing.approach)
         return workplace, collaboration_task(
             servoing, skill, workplace, shelves, experiment.config

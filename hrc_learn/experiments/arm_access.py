@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Literal
 
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
-from hrc_learn.kinematics import Arm, SerialChain, panda
+from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import OpenedArm
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import ArmServer, ServedArm, serve_world
@@ -69,14 +69,14 @@ def through_franky(config: FrankyConfig | None = None, serve: Serve = serve_worl
 
 
 def through_franka(
-    config: FrankaConfig | None = None, chain: SerialChain = panda, serve: Serve = serve_world
+    chain: SerialChain, config: FrankaConfig | None = None, serve: Serve = serve_world
 ) -> ArmAccess:
     """Over the network protocol, by our loop at 1 kHz.
 
     Args:
+        chain: The arm.
         config: How the arm is driven; None: as for `through_franky`, and in lockstep with the
             server.
-        chain: The arm.
         serve: Puts the arm behind its protocol.
     """
     config = config or FrankaConfig(realtime=False, lockstep=True)
@@ -92,7 +92,7 @@ ArmDriver = Literal["sim", "franky", "franka"]
 """What leads an arm: the simulator itself, or a driver of the real one."""
 
 
-def access_by(driver: ArmDriver, robot: Arm = panda) -> ArmAccess:
+def access_by(driver: ArmDriver, robot: Arm) -> ArmAccess:
     """How a driver leads the arm of a world.
 
     Args:
@@ -109,7 +109,7 @@ def access_by(driver: ArmDriver, robot: Arm = panda) -> ArmAccess:
             f"--arm {driver} drives Franka's arms, not the {robot.name}: leave it out, and the "
             "simulated arm is led without a driver."
         )
-    return through_franky() if driver == "franky" else through_franka(chain=robot.chain)
+    return through_franky() if driver == "franky" else through_franka(robot)
 
 
 def through_protocol(

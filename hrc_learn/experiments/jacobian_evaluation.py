@@ -21,7 +21,7 @@ from hrc_learn.jacobian import (
     KalmanEstimator,
     RBFImageJacobian,
 )
-from hrc_learn.kinematics import Arm, gripper_down, panda
+from hrc_learn.kinematics import Arm, gripper_down
 from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from hrc_learn.skills.visual_skill import guessed_network
 from hrc_learn.vision import CameraModel
@@ -95,7 +95,7 @@ class ClosedLoops:
     """[rad]"""
     goals: Goals
     config: StartsConfig
-    robot: Arm = panda
+    robot: Arm
 
     @classmethod
     def draw(
@@ -105,7 +105,7 @@ class ClosedLoops:
         workspace: Float[Tensor, "2 3"],
         near: Float[Tensor, "joints"],
         config: StartsConfig,
-        robot: Arm = panda,
+        robot: Arm,
     ) -> "ClosedLoops":
         """Draw them at random.
 

@@ -18,7 +18,7 @@ from hrc_learn.demos import Demonstration
 from hrc_learn.experiments.path_distance import path_distance
 from hrc_learn.geometry import Box, Pose, quaternion
 from hrc_learn.geometry.numerics import null_projection
-from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import CameraRecording, JointRanges, LoggedSteps, RunRecording
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
@@ -81,7 +81,7 @@ def body_poses(motion: MotionLog, name: str, steps: int) -> Pose:
     return Pose(torch.from_numpy(body.position), torch.from_numpy(body.orientation))
 
 
-def link_poses(log: LoggedSteps, chain: SerialChain = panda) -> Pose:
+def link_poses(log: LoggedSteps, chain: SerialChain) -> Pose:
     """Poses of the joint frames, the flange and the tool at every step, (time, links)."""
     return chain.link_poses(torch.from_numpy(log["joint_position"]))
 

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import Arm, CapsuleArm, LinkCapsule, panda
+from hrc_learn.kinematics import Arm, CapsuleArm, LinkCapsule
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections, Imperfections
 from hrc_learn.vision import Marker, marker_texture
@@ -116,7 +116,7 @@ def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
 class ArmModelConfig:
     """How the arm is built and driven."""
 
-    robot: Arm = panda
+    robot: Arm
     """Which arm it is."""
     stiffness: tuple[float, ...] = ()
     """Position gain of the joint servos [N m/rad]; none given: by the torques of the joints."""
@@ -359,16 +359,16 @@ class MujocoArm:
         self,
         model: mujoco.MjModel,
         data: mujoco.MjData,
+        robot: Arm,
         imperfections: DrawnImperfections | None = None,
-        robot: Arm = panda,
     ):
         """Find its joints and servos.
 
         Args:
             model: With the arm of `add_arm`.
             data: Its state.
+            robot: The arm's kinematics and limits.
             imperfections: Of its encoders, its driver and its joints; None: none.
-            robot: Which arm it is.
         """
         self.robot, chain = robot, robot.chain
         self._errors = imperfections or Imperfections().draw(

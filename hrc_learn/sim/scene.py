@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from hrc_learn.geometry import Box
+from hrc_learn.kinematics import panda
 from hrc_learn.sim.arm_model import (
     FIRM,
     ArmModelConfig,
@@ -142,7 +143,7 @@ def marked_plate() -> Plate:
 
 
 def _marked_arm() -> ArmModelConfig:
-    return ArmModelConfig(marker=marked_plate())
+    return ArmModelConfig(robot=panda, marker=marked_plate())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -162,7 +162,7 @@ class World:
         self.model = self.describe().compile()
         self.data = mujoco.MjData(self.model)
         self._watch = PhysicsWatch(self.model, self.data)
-        self.arm = MujocoArm(self.model, self.data, self.imperfections, self.config.arm.robot)
+        self.arm = MujocoArm(self.model, self.data, self.config.arm.robot, self.imperfections)
         obstacles = [box.name for box in self.config.obstacles]
         cabinet = [box.name for box in self.config.cabinet.boxes()] + obstacles
         self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)

@@ -4,7 +4,6 @@ from hrc_learn.skills.arm_motion import PositionServo as PositionServo
 from hrc_learn.skills.arm_motion import PositionServoConfig as PositionServoConfig
 from hrc_learn.skills.arm_motion import StraightLine as StraightLine
 from hrc_learn.skills.arm_motion import joint_line as joint_line
-from hrc_learn.skills.arm_motion import nearest_configuration as nearest_configuration
 from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
 from hrc_learn.skills.failures import BlockedPathError as BlockedPathError
 from hrc_learn.skills.failures import MissedGraspError as MissedGraspError

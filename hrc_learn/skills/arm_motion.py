@@ -16,8 +16,7 @@ from hrc_learn.controller import (
 )
 from hrc_learn.controller.resolved_rate import task_rate
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import Arm as ArmModel
-from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState
 
 # Mean angular speed on a straight line, where that takes longer than the translation [rad/s].
@@ -74,26 +73,6 @@ def joint_line(
         [minimum_jerk(k * dt / duration)[0] for k in range(steps + 1)], dtype=start.dtype
     )
     return torch.lerp(start, goal, progress[:, None])
-
-
-def nearest_configuration(
-    goal: Pose,
-    near: Float[Tensor, "*#batch joints"],
-    samples: int = 57,
-    robot: ArmModel = panda,
-) -> Float[Tensor, "*batch joints"]:
-    """Joint positions that reach poses, the nearest to given ones.
-
-    Args:
-        goal: Poses of the tool centre point.
-        near: Joint positions to stay near [rad].
-        samples: Number of solutions compared, for arms with a redundant joint.
-        robot: Arm.
-
-    Raises:
-        UnreachableError: No joint positions within the limits reach a pose.
-    """
-    return robot.inverse(goal, near=near, samples=samples)
 
 
 def joints_near(

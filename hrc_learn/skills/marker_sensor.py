@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import StepLog
 from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, angle, centre
@@ -193,9 +193,7 @@ _OVER_TABLE = 0.22
 its marker [m]: the camera's view reaches about 0.25 m to each side."""
 
 
-def longest_occlusion(
-    log: StepLog, middle: Pose, since: float, chain: SerialChain = panda
-) -> float:
+def longest_occlusion(log: StepLog, middle: Pose, since: float, chain: SerialChain) -> float:
     """Longest time without a detection while the end effector was over the table [s].
 
     Args:

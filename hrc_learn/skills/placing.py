@@ -27,7 +27,6 @@ from hrc_learn.kinematics import (
     UnreachableError,
     arm_angle,
     arm_angle_and_motion,
-    panda,
     task_basis,
     task_error,
     task_rank,
@@ -53,7 +52,7 @@ class Plan:
     """[s]"""
     path: Float[np.ndarray, "steps joints"]
     """Joint positions [rad]."""
-    chain: SerialChain = panda
+    chain: SerialChain
     """The arm."""
 
     @property
@@ -105,11 +104,11 @@ class PlacingSkill:
     pose: PoseDMP
     """Motion of the end effector together with the arm angle, its null-space posture, of an arm
     that has one."""
-    robot: Arm = panda
+    robot: Arm
     """The arm that they are of."""
 
     @classmethod
-    def load(cls, folder: Path, robot: Arm = panda) -> "PlacingSkill":
+    def load(cls, folder: Path, robot: Arm) -> "PlacingSkill":
         """Read what `hrc fit` wrote.
 
         Args:

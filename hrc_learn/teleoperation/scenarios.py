@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.controller import SafetyConfig
-from hrc_learn.kinematics import Arm, gripper_down, panda
+from hrc_learn.kinematics import Arm, gripper_down
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections, World, open_camera
 from hrc_learn.sim.cameras import hidden_markers
@@ -423,7 +423,7 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
         raise ValueError("placing begins with the object in the gripper, so it has no pixels.")
 
 
-def make_scenario(name: str, shelf: str, robot: Arm = panda) -> Scenario:
+def make_scenario(name: str, shelf: str, robot: Arm) -> Scenario:
     """A scenario in the workplace of an arm.
 
     Raises:

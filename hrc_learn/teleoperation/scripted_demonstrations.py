@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import Arm, SerialChain, coarse_orientation, gripper_down, panda
+from hrc_learn.kinematics import Arm, SerialChain, coarse_orientation, gripper_down
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
@@ -104,10 +104,10 @@ def write_demonstrations(
     task: str,
     fps: float,
     *,
+    robot: Arm,
     features: Mapping[str, Sequence[str]] | None = None,
     details: Mapping[str, object] | None = None,
     overwrite: bool = False,
-    robot: Arm = panda,
 ) -> None:
     """Write demonstrations of an arm as a LeRobot dataset, one episode each, as they come.
 
@@ -116,10 +116,10 @@ def write_demonstrations(
         demonstrations: Frames of each.
         task: What is demonstrated, in words.
         fps: Frames per second.
+        robot: The arm.
         features: Columns beyond the usual ones: key, and names of the components.
         details: Anything else worth keeping with the dataset.
         overwrite: Replace an older dataset in that folder.
-        robot: The arm.
 
     Raises:
         FileExistsError: If there is something at `path` that may not be replaced.

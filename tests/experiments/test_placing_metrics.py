@@ -26,7 +26,6 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, Touch, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.placing import PlaceCorrection
 
@@ -157,7 +156,7 @@ def test_random_starts_are_free_and_each_another():
 
 def true_tool(world, read):
     """Where the tool is when the arm reads a pose."""
-    joints = nearest_configuration(read, near=WORKPLACE.home_joints()).numpy()
+    joints = panda.inverse(read, near=WORKPLACE.home_joints()).numpy()
     world.reset(joints - world.imperfections.encoder_offset)
     return world.arm.tcp_pose()
 

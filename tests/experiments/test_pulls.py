@@ -74,7 +74,7 @@ def pushed_aside(planned):
 def test_the_elbow_moved_as_far_as_it_is_from_where_it_was(planned):
     log = pushed_aside(planned)
     pull = ScriptedForce(start=0.5, duration=1.5, towards=(0.0, 0.0, 0.0))
-    effects = pull_effects(log, [pull])
+    effects = pull_effects(log, [pull], panda)
     assert [effect.phase for effect in effects] == ["home", "transfer"]
     elbows = panda.link_poses(torch.from_numpy(log["joint_position"])).position[:, 3].numpy()
     home, transfer = TIME < 1.5, TIME >= 1.5
@@ -99,14 +99,14 @@ def test_the_elbow_moved_as_far_as_it_is_from_where_it_was(planned):
     shift = (unseen[1] - unseen[0]).numpy()
     away = np.linalg.norm(hand + shift - shift[0] - log["goal_position"], axis=1)
     assert np.linalg.norm(shift - shift[0], axis=1).max() > 1e-3
-    true = pull_effects(log, [pull], encoder_offset=offset)
+    true = pull_effects(log, [pull], panda, encoder_offset=offset)
     assert true[1].hand == pytest.approx(away[transfer].max(), rel=1e-3)
     assert true[1].elbow == effects[1].elbow
     # A pull that is not followed counts as well.
     refused = ScriptedForce(start=2.5, duration=0.2, towards=(0.0, 0.0, 0.0))
-    assert [effect.phase for effect in pull_effects(log, [refused])] == ["transfer"]
+    assert [effect.phase for effect in pull_effects(log, [refused], panda)] == ["transfer"]
     after = ScriptedForce(start=3.5, duration=0.2, towards=(0.0, 0.0, 0.0))
-    assert not pull_effects(log, [after])
+    assert not pull_effects(log, [after], panda)
 
 
 @pytest.mark.parametrize("planned", [True, False])
@@ -135,7 +135,7 @@ def test_the_room_of_an_elbow_is_what_the_analytic_self_motion_has(side):
     way = side * (J @ unit) / (J @ unit).norm()
     towards = (elbow + 10.0 * way).tolist()
     pull = ScriptedForce(start=0.0, duration=2.0, towards=tuple(towards), max_force=60.0)
-    room = elbow_room(q, pull)
+    room = elbow_room(q, pull, panda)
     # By the analytic inverse along joint 7, both ways, as far as the pull goes with it.
     reached = []
     for step in (-0.005, 0.005):
@@ -161,7 +161,10 @@ def test_the_room_of_an_elbow_is_what_the_analytic_self_motion_has(side):
         assert max(reached) - 0.015 < room < 0.3
     # Something in the way ends it.
     short = elbow_room(
-        q, pull, clearance=lambda joints: 0.08 - (panda.joint_origins(joints)[3] - elbow).norm()
+        q,
+        pull,
+        panda,
+        clearance=lambda joints: 0.08 - (panda.joint_origins(joints)[3] - elbow).norm(),
     )
     assert short == pytest.approx(0.05, abs=0.012)
 

@@ -17,6 +17,7 @@ from hrc_learn.experiments.grasping.trial import (
 )
 from hrc_learn.experiments.placing.trial import place
 from hrc_learn.hardware import FrankyConfig
+from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections
 from hrc_learn.sim.protocol_server import serve_world
 from hrc_learn.sim.workplace import Workplace
@@ -105,7 +106,7 @@ def test_an_object_is_placed_by_our_loop_which_answers_each_cycle(skills):
             servers.append(server)
             yield server
 
-    place_on_shelf(skills[1], through_franka(serve=serve))
+    place_on_shelf(skills[1], through_franka(panda, serve=serve))
     # A state after a pause is none that comes late; a machine that is held up may miss some.
     (server,) = servers
     assert server.missed < 0.01 * server.cycles

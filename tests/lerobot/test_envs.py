@@ -6,6 +6,7 @@ from gymnasium.vector import SyncVectorEnv
 from lerobot.teleoperators import make_teleoperator_from_config
 from unchecked import shapes_unchecked
 
+from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
 from hrc_learn.lerobot.robots.mujoco_arm import ImagesConfig
 from hrc_learn.lerobot.teleoperators import ArmExpertConfig
@@ -77,7 +78,7 @@ def held(env):
 
 def test_an_episode_has_a_quarter_more_time_than_a_demonstration():
     config, env = environment()
-    duration = make_scenario("grasping", "middle").duration
+    duration = make_scenario("grasping", "middle", panda).duration
     assert config.gym_kwargs["max_episode_steps"] == round(1.25 * duration * FPS)
     env.close()
 

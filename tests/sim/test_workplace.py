@@ -4,7 +4,6 @@ import torch
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import nearest_configuration
 
 WORKPLACE = Workplace()
 
@@ -18,7 +17,7 @@ def test_shelves_go_from_bottom_to_top():
 @pytest.mark.parametrize("shelf", WORKPLACE.shelf_names())
 def test_every_shelf_can_be_reached_with_room_to_the_limits(shelf):
     goal = WORKPLACE.shelf(shelf)
-    q = nearest_configuration(goal, near=WORKPLACE.home_joints())
+    q = panda.inverse(goal, near=WORKPLACE.home_joints())
     reached = panda.forward(q)
     torch.testing.assert_close(reached.position, goal.position, atol=1e-6, rtol=0)
     assert float(quaternion.angle(reached.orientation, goal.orientation)) < 1e-6
@@ -27,7 +26,7 @@ def test_every_shelf_can_be_reached_with_room_to_the_limits(shelf):
 
 def test_the_nearest_of_all_configurations_is_taken():
     q = WORKPLACE.home_joints()
-    found = nearest_configuration(WORKPLACE.home(), near=q, samples=200)
+    found = panda.inverse(WORKPLACE.home(), near=q, samples=200)
     assert float((found - q).norm()) < 1e-9
 
 
@@ -52,7 +51,7 @@ def test_a_place_beside_the_board_is_refused(place):
 def test_an_unreachable_pose_is_told_with_its_numbers():
     far = Pose(torch.tensor([0.4, -1.6, 0.4]).double(), WORKPLACE.shelf("middle").orientation)
     with pytest.raises(UnreachableError, match=r"-1\.600"):
-        nearest_configuration(far, near=WORKPLACE.home_joints())
+        panda.inverse(far, near=WORKPLACE.home_joints())
 
 
 def test_an_object_is_let_down_no_further_than_the_hand_is_clear_of_the_board():

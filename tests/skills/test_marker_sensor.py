@@ -71,14 +71,14 @@ def test_the_longest_occlusion_over_the_table_is_found(since):
         running = running + 1 if there and not seen and k * step >= since else 0
         longest = max(longest, running)
     assert longest > 1
-    found = longest_occlusion(log, WORKPLACE.hover(), since)
+    found = longest_occlusion(log, WORKPLACE.hover(), since, panda)
     assert found == pytest.approx(longest * step)
 
 
 def test_a_log_of_one_step_tells_of_no_occlusion():
     log = StepLog()
     log.append(time=0.0, joint_position=WORKPLACE.hover_joints().numpy(), feature=np.ones(2))
-    assert longest_occlusion(log, WORKPLACE.hover(), 0.0) == 0.0
+    assert longest_occlusion(log, WORKPLACE.hover(), 0.0, panda) == 0.0
 
 
 def seen_held(pixels, poses, jacobian, tolerance=1.5):

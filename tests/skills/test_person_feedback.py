@@ -146,7 +146,7 @@ def test_who_pushes_the_arm_at_somebody_is_told_so(towards):
     elbow = panda.link_poses(Q).position[3].numpy()
     way = panda.joint_jacobian(Q, 4)[:3].numpy() @ push
     at = elbow + 0.35 * way / np.linalg.norm(way)
-    watch = PersonWatch(Bystander(arm, at), whole_arm(ArmModelConfig()))
+    watch = PersonWatch(Bystander(arm, at), whole_arm(ArmModelConfig(robot=panda)))
     person = Pusher(push if towards else -push)
     cell = cell_of(person, arm, watch=watch)
     with shapes_unchecked():

@@ -57,7 +57,7 @@ def fitted(demos):
 def skill(fitted, tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
     fitted.save(folder)
-    return PlacingSkill.load(folder)
+    return PlacingSkill.load(folder, panda)
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +203,7 @@ def test_a_skill_of_another_arm_is_refused(fitted, tmp_path):
     renamed = fit_primitives(_renamed(fitted)).joint
     renamed.save(tmp_path / "joint")
     with pytest.raises(ValueError, match="j1"):
-        PlacingSkill.load(tmp_path)
+        PlacingSkill.load(tmp_path, panda)
 
 
 def _renamed(fitted):

@@ -10,6 +10,7 @@ from taught_models import teach
 
 from hrc_learn.experiments.collaboration.trial import simulate_collaboration
 from hrc_learn.experiments.run_recording import ELBOW, Deviation, link_poses, span
+from hrc_learn.kinematics import panda
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.teleoperation import page_session as task_page
 from hrc_learn.teleoperation.page import Page, PageConfig
@@ -52,7 +53,7 @@ class Job:
         return events[-1].text if events else ""
 
     def link(self, index: int) -> np.ndarray:
-        return link_poses(self.cell.log.snapshot()).position[-1, index].numpy()
+        return link_poses(self.cell.log.snapshot(), panda).position[-1, index].numpy()
 
     def __enter__(self):
         self._thread.start()
@@ -92,6 +93,6 @@ def test_the_elbow_yields_to_the_mouse_while_the_end_effector_servoes(tmp_path, 
     assert np.nan_to_num(deviation.elbow).max() > 0.05
     assert np.nan_to_num(deviation.position).max() < 1e-3
     # To the right of the screen is +y.
-    moved = link_poses(log).position.numpy()[:, ELBOW] - elbow
+    moved = link_poses(log, panda).position.numpy()[:, ELBOW] - elbow
     assert moved[effort > 0][-1, 1] > 0
     assert result.world.rests_on("box", "board_middle")

@@ -15,7 +15,6 @@ from hrc_learn.protocols import DrawnRegion, Feedback, Human, HumanInput, Reason
 from hrc_learn.regions import PositionRegion
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
@@ -97,7 +96,7 @@ def test_an_arm_with_a_driver_moves_home_and_never_jumps(tmp_path):
 @shapes_unchecked()
 def test_an_arm_with_a_driver_does_not_go_home_through_a_board(tmp_path):
     home, shelf = Workplace().home_joints(), Workplace().shelf("upper")
-    with session_from(nearest_configuration(shelf, near=home), tmp_path) as session:
+    with session_from(panda.inverse(shelf, near=home), tmp_path) as session:
         steps = [session.step() for _ in range(50)]
         note = session._status(steps[-1]).note
     assert "would meet board_upper" in note

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.page_session import place_target_hint, place_targets
@@ -24,9 +25,8 @@ def test_a_thing_let_go_at_a_shelf_stands_on_the_field_drawn_there(shelf):
 
 
 def _joints(goal):
-    from hrc_learn.skills.arm_motion import nearest_configuration
 
-    return nearest_configuration(goal, near=WORKPLACE.home_joints()).numpy()
+    return panda.inverse(goal, near=WORKPLACE.home_joints()).numpy()
 
 
 def test_the_way_is_told_in_the_words_of_the_keys():

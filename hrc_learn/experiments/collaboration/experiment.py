@@ -99,7 +99,7 @@ class CollaborationExperiment:
             PlacingSkill.load(self.placing, self.robot.work_arm()),
             self.shelves,
             workplace=workplace_for(
-                self.shelves, self.shelf_x, self.shelf_depth, self.robot.work_arm()
+                self.shelves, self.robot.work_arm(), self.shelf_x, self.shelf_depth
             ),
             camera=self.camera,
             forces=self._forces(),
@@ -113,7 +113,7 @@ class CollaborationExperiment:
             drawings=self.drawings,
             seed=seed,
             page=self.page,
-            access=access_by(self.arm),
+            access=access_by(self.arm, self.robot.work_arm()),
             view=observer.view,
             on_phase=lambda phase, time: observer.tell(f"  {time:6.2f} s  {phase}"),
             on_page=lambda address: observer.tell(f"Page at {address}"),

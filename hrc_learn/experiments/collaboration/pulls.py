@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from hrc_learn.experiments.path_distance import path_distance
 from hrc_learn.geometry.numerics import null_projection
-from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain, panda
+from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain
 from hrc_learn.log import LoggedSteps
 from hrc_learn.teleoperation import ScriptedForce
 
@@ -52,7 +52,7 @@ class PullEffect:
 def pull_effects(
     log: LoggedSteps,
     pulls: Sequence[ScriptedForce],
-    chain: SerialChain = panda,
+    chain: SerialChain,
     encoder_offset: Float[np.ndarray, " joints"] | None = None,
     clearance: Clearance | None = None,
 ) -> list[PullEffect]:
@@ -96,7 +96,7 @@ def pull_effects(
 def elbow_room(
     joint_position: Float[torch.Tensor, " joints"],
     pull: ScriptedForce,
-    chain: SerialChain = panda,
+    chain: SerialChain,
     clearance: Clearance | None = None,
 ) -> float:
     """How far a pull can move the elbow of an arm whose end effector stays [m].

@@ -30,7 +30,7 @@ from hrc_learn.experiments.collaboration.worker import (
 )
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import Arm, panda
+from hrc_learn.kinematics import Arm
 from hrc_learn.sim import (
     CameraChange,
     CameraKind,
@@ -422,17 +422,17 @@ def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workpla
 
 def workplace_for(
     shelves: Sequence[str],
+    robot: Arm,
     shelf_x: float | None = None,
     shelf_depth: float | None = None,
-    robot: Arm = panda,
 ) -> Workplace:
     """A workplace with an object for each shelf.
 
     Args:
         shelves: Their names.
+        robot: The arm.
         shelf_x: Where along the boards objects are put [m]; None: as the cell is laid out.
         shelf_depth: How far behind the boards' front edge [m]; likewise.
-        robot: The arm.
 
     Raises:
         ValueError: If there are more shelves named than objects known, or none.

@@ -116,7 +116,7 @@ class GraspingExperiment:
             rng=np.random.default_rng([seed, 1]),
             drawings=() if compared else self.drawings,
             page=None if compared else self.page,
-            access=access_by(self.arm),
+            access=access_by(self.arm, self.robot.work_arm()),
             view=observer.view,
             on_page=lambda address: observer.tell(f"Page at {address}"),
         )

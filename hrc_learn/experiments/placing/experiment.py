@@ -138,7 +138,7 @@ class PlacingExperiment:
                     speed=self.speed,
                     world=world,
                     correction=correction,
-                    access=access_by(self.arm),
+                    access=access_by(self.arm, self.robot.work_arm()),
                     view=view,
                 )
                 placings[space, shelf] = placed

@@ -26,7 +26,7 @@ from hrc_learn.experiments.run_recording import (
     unwanted_contacts,
 )
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
@@ -299,7 +299,7 @@ def _edge(workplace: Workplace) -> float:
 
 
 def demonstrated_path(
-    demonstration: Demonstration, chain: SerialChain = panda
+    demonstration: Demonstration, chain: SerialChain
 ) -> Float[np.ndarray, "frames 3"]:
     """Of the tool centre point, from the demonstrated joints [m].
 
