@@ -328,7 +328,7 @@ def test_the_null_space_goes_back_but_while_a_person_pushes_it():
     planned = CONFIG.goals(panda.forward(panda.ready), np.array([700.0, 500.0]))
     speeds = []
     for push in [0.0] * 5 + [2.0] * 60 + [0.0] * 60:
-        servo._cell.human_input = SimpleNamespace(nullspace_input=np.array([0.0, push]))
+        servo._cell.human_input = SimpleNamespace(effort=lambda joints: np.array([0.0, push]))
         goals = servo._resting(planned, rest)
         far = torch.full((7,), 10.0, dtype=torch.float64)
         back = (
