@@ -1,8 +1,8 @@
-"""Learn robot arm motions from a few demonstrations and work safely beside people.
+"""Learn robot arm motions from a few demonstrations and work safely near people.
 
-The names of the core; demonstrations, simulation, vision and dashboards are imported from
-their own packages: `hrc_learn.demos`, `.sim`, `.vision`, `.viz`. Each name is imported when it
-is first asked for, so that `hrc --help` need not wait for torch.
+This module exports the names of the core; demonstrations, simulation, vision and dashboards are
+imported from their own packages: `hrc_learn.demos`, `.sim`, `.vision`, `.viz`. Names are
+imported on first use, so that `hrc --help` need not wait for torch.
 """
 
 from importlib import import_module

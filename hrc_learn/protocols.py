@@ -1,7 +1,7 @@
-"""What a skill asks of an arm, a gripper, a camera and a person.
+"""Protocols of an arm, a gripper, a camera and a person, as skills use them.
 
-Skills know these protocols only; MuJoCo, a recording or real hardware stands behind them.
-Arrays are NumPy float64: that is what drivers and simulators speak.
+Skills know these protocols only; MuJoCo, a recording or real hardware implements them. Arrays
+are NumPy float64, as in drivers and simulators.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ class ArmState:
     gripper_width: float
     """Opening between the finger pads [m]."""
     external_torque: Float[np.ndarray, " joints"] | None = None
-    """Estimate of what the surroundings exert on the joints [N m]; None: the arm has none."""
+    """Estimated external torques on the joints [N m]; None if the arm gives no estimate."""
 
 
 @runtime_checkable
@@ -52,17 +52,17 @@ class Gripper(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class OpenedArm:
-    """An arm that is ready to be led."""
+    """An arm ready for commands."""
 
     arm: Arm
     gripper: Gripper
     advance: Callable[[float], None]
-    """Lets a time pass in its world [s]."""
+    """Lets a duration pass: waits, or steps a simulation [s]."""
 
 
 @runtime_checkable
 class Camera(Protocol):
-    """A camera whose intrinsics and pose nobody needs to know."""
+    """An uncalibrated camera."""
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Return the newest image, RGB."""
@@ -71,22 +71,22 @@ class Camera(Protocol):
 
 @runtime_checkable
 class TimedCamera(Camera, Protocol):
-    """A camera that tells when its images were taken; those of others count as just taken."""
+    """A camera with image time stamps; images of other cameras count as just taken."""
 
     @property
     def age(self) -> float:
-        """From the newest image that was read being taken until it was read [s]."""
+        """Time between the exposure of the newest image and its reading [s]."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnRegion:
-    """A box that a person has drawn for the end effector, along the axes of the base frame."""
+    """An axis-aligned box in the base frame, drawn by a person for the end effector."""
 
     centre: tuple[float, float, float]
-    """[m]"""
+    """Centre [m]."""
     half_size: tuple[float, float, float]
-    """[m]"""
+    """Half the edge lengths [m]."""
 
     def __post_init__(self) -> None:
         if min(self.half_size) <= 0:
@@ -94,33 +94,34 @@ class DrawnRegion:
 
 
 Request = Literal["start", "stop", "save", "discard", "home", "finish"]
-"""What a person asks for once: of the demonstration being recorded, then of the arm (back to
-where it started) and of the session."""
+"""One-off request of a person: about the demonstration being recorded, about the arm ("home":
+back to where it started), or about the session.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class HumanInput:
-    """What a person asks for at one instant."""
+    """A person's input at one instant."""
 
     nullspace_input: Float[np.ndarray, " joints"] | None = None
     """Null-space effort d on the joints [N m] (paper, eq. globalControl); None: no effort."""
     twist: Float[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     """End-effector motion, linear [m/s] and angular [rad/s], in the base frame."""
     gripper: float | None = None
-    """Opening the gripper should have [m]; None: nothing is asked."""
+    """Requested opening of the gripper [m]; None: no request."""
     region: DrawnRegion | None = None
-    """Where the end effector should be; None: anywhere."""
+    """Region to keep the end effector in; None: no region."""
     target: tuple[float, float, float] | None = None
-    """Point marked for the end effector, in the base frame [m]; None: none is."""
+    """Target point of the end effector, in the base frame [m]; None: no target."""
     turn: tuple[float, float, float] | None = None
-    """Rotation added to the orientation that a rule or a task has for the end effector, as a
-    rotation vector in the base frame [rad]; None: none is."""
+    """Rotation added to the end effector's orientation by rule or task, as a rotation vector in
+    the base frame [rad]; None: no rotation."""
     requests: tuple[Request, ...] = ()
-    """Asked for since the last reading, in this order."""
+    """Requests since the last reading, in order."""
     pause: bool = False
-    """Whether the task waits where it is, as long as this is asked for."""
+    """True while the task should pause where it is."""
     stop: str = ""
-    """Why the arm comes to rest and the task is given up; empty: it goes on."""
+    """Reason to stop the arm and abort the task; empty: go on."""
 
     def effort(self, joints: int) -> Float[np.ndarray, " joints"]:
         """Null-space effort d on the joints of an arm [N m]; zeros if none is requested.
@@ -153,91 +154,96 @@ Hindrance = Literal[
     "person",
     "stopped",
 ]
-"""What keeps an arm from following the person who leads it: a joint near its limit; a
-singularity ahead; something it would meet; the speed that people may lead it with; the task,
-whose end effector would have to move; a path that nobody can push it off; a posture that it
-would not come back from; a task that waits until it is back; somebody near it; the safety
-filter, which brakes it."""
+"""Reason why an arm does not follow a person's guidance: a joint near its limit; a singularity
+ahead; an obstacle ahead; the speed limit of hand guiding; the task, whose end effector would
+have to move; a path without null-space motion; a posture that the arm could not return from; a
+task that waits until the arm is back; a person near the arm; the safety filter, which brakes.
+"""
 HINDRANCES: tuple[Hindrance, ...] = get_args(Hindrance)
-"""All of them, in the order of the log's column "hindered"."""
+"""All hindrances, in the order of the log's column "hindered"."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reason:
-    """Why an arm does not follow, or only in part."""
+    """Reason why an arm does not follow, or only in part."""
 
     hindrance: Hindrance
     text: str
-    """In words, such as "joint 4 is at its limit"."""
+    """Text for the person, such as "joint 4 is at its limit"."""
     kept: float = 1.0
-    """Share of the motion that it leaves, 0 to 1; 1 of what only goes along with the push."""
+    """Fraction of the motion that remains, 0 to 1; 1 for a reason that merely accompanies the
+    push.
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Feedback:
-    """What an arm tells the person who leads it."""
+    """Feedback of an arm to the person who guides it."""
 
     pushed: bool = False
-    """Whether the person asks for a motion now."""
+    """True while the person requests a motion."""
     followed: float = 1.0
-    """Share of what is asked that the arm follows, 0 to 1; 1 while nothing is. Of a push that
-    is of the motion that it would have in the null space. The time that an arm needs to get
-    under way takes nothing from it."""
+    """Fraction of the requested motion that the arm follows, 0 to 1; 1 while no motion is
+    requested. For a push, the requested motion is its null-space motion. The arm's acceleration
+    phase does not lower it.
+    """
     reasons: tuple[Reason, ...] = ()
-    """Why that is less, what takes the most first; none while nothing is asked."""
+    """Reasons why it is below 1, the strongest first; empty while no motion is requested."""
     contact_force: Float[np.ndarray, "3"] | None = None
-    """Force that the external torques amount to at the end effector, in the base frame [N];
-    None: the arm tells none."""
+    """Force at the end effector equivalent to the external torques, in the base frame [N]; None
+    if the arm gives no estimate."""
     near_limits: tuple[str, ...] = ()
     """Names of the joints that are near their limits."""
     person_distance: float | None = None
-    """Of the nearest person [m], NaN while it is not known; None: nobody watches for them."""
+    """Distance of the nearest person [m], NaN while unknown; None: no person tracking."""
     pace: float = 1.0
-    """Share of its speed that people near it leave the task, 0 to 1."""
+    """Speed scale of the task due to nearby people, 0 to 1."""
     slip: float = 0.0
-    """By how much the gripper's opening has changed since it holds its object [m]."""
+    """Change of the gripper's opening since the object was grasped [m]."""
     contact_expected: bool = False
-    """Whether the task feels its way or has just done so: what is met at the end effector is
-    part of it."""
+    """True while or shortly after the task probes for contact: contacts at the end effector are
+    then expected.
+    """
 
 
 @runtime_checkable
 class Human(Protocol):
-    """A person beside the arm: scripted, at a gamepad, or in a browser."""
+    """A person near the arm: scripted, at a gamepad, or in a browser."""
 
     def read(self, state: ArmState) -> HumanInput:
-        """Return what the person asks for, now that the arm is in `state`."""
+        """Return the person's input for the arm in `state`."""
         ...
 
     def tell(self, feedback: Feedback) -> None:
-        """Tell the person what the arm feels, and how far it follows.
+        """Notify the person of contacts and of how far the arm follows.
 
-        Called at each step, by the control loop: devices that take their time do so elsewhere.
-        One by which nothing is felt ignores it, as this does for all that derive from it.
+        The control loop calls this at each step: slow devices must defer their work. Devices
+        without feedback ignore the call, which is the default here.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class PersonObservation:
-    """Where a person's body was, as capsules: all points within a radius of a segment."""
+    """Observed capsules of a person's body: all points within a radius of a segment."""
 
     time: float
-    """When they were there: of the image, not of its arrival [s]."""
+    """Time of exposure, not of arrival [s]."""
     ends: Float[np.ndarray, "parts 2 3"]
-    """Of the segments, in the base frame [m]."""
+    """Ends of the segments, in the base frame [m]."""
     radius: Float[np.ndarray, " parts"]
-    """[m]"""
+    """Radii of the capsules [m]."""
     velocity: Float[np.ndarray, "parts 2 3"]
-    """Of the ends; zero as long as only one image is known [m/s]."""
+    """Velocities of the ends [m/s]; zero after the first image."""
 
 
 @runtime_checkable
 class PersonTracker(Protocol):
-    """Sees where the people beside an arm are."""
+    """Tracks the people near an arm."""
 
     def read(self) -> PersonObservation | None:
-        """Return the newest observation that has arrived; None: none has, for whatever reason.
+        """Return the newest observation that has arrived; None if there is none, for whatever
+        reason.
 
-        Who relies on it allows for what a person can do since its time.
+        Callers allow for the largest motion of a person since its time.
         """
         ...

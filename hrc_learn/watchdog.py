@@ -1,4 +1,4 @@
-"""Stops an arm whose control loop has fallen silent, however often the stop fails at first."""
+"""Watchdog: stops an arm whose control loop no longer reports, retrying stops that fail."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ recover within some tens of milliseconds, a control box within seconds."""
 
 
 class WatchdogError(RuntimeError):
-    """Nobody watches any more: the arm must not be moved on."""
+    """The watchdog is no longer alive: do not move the arm."""
 
 
 def report_failed_stop(error: BaseException, attempts: int) -> None:
-    """Tell on stderr that a stop failed, and how often it has been tried."""
+    """Print on stderr that a stop failed, and the number of attempts."""
     if attempts & (attempts - 1) == 0:  # the 1st, 2nd, 4th, ...
-        print(f"watchdog: stop failed {attempts} times, trying on: {error!r}", file=sys.stderr)
+        print(f"watchdog: stop failed {attempts} times, retrying: {error!r}", file=sys.stderr)
 
 
 Report = Callable[[BaseException, int], object]
-"""Told of each stop that failed, and how many did in a row."""
+"""Callback for each failed stop, with the error and the number of failures in a row."""
 
 
 def bring_to_rest(
     stop: Callable[[], object],
-    patience: float,
+    timeout: float,
     report: Report = report_failed_stop,
     sleep: Callable[[float], None] = time.sleep,
 ) -> bool:
-    """Stop an arm, trying again with growing pauses.
+    """Stop an arm, retrying with growing pauses.
 
     Args:
-        stop: Brings it to rest.
-        patience: How long to go on trying [s].
-        report: Told of each failure.
-        sleep: Lets at least a given time pass [s].
+        stop: Brings the arm to rest.
+        timeout: Time to go on retrying [s].
+        report: Called with each failure.
+        sleep: Waits at least a given time [s].
 
     Returns:
-        Whether an attempt succeeded.
+        True if an attempt succeeded.
     """
-    end, pause, attempts = time.monotonic() + patience, _FIRST_PAUSE, 0
+    end, pause, attempts = time.monotonic() + timeout, _FIRST_PAUSE, 0
     while (error := _attempt(stop)) is not None:
         attempts += 1
         _tell(report, error, attempts)
@@ -59,7 +59,7 @@ def bring_to_rest(
 
 
 def _attempt(stop: Callable[[], object]) -> BaseException | None:
-    """Try once; what went wrong."""
+    """Try to stop once; return the error, or None."""
     try:
         stop()
     except (Exception, SystemExit) as error:  # a driver's sys.exit() must not end the watch
@@ -74,24 +74,23 @@ def _tell(report: Report, error: BaseException, attempts: int) -> None:
 
 @final
 class Watchdog:
-    """Calls for a stop once a loop has not reported for too long.
+    """Stops an arm once its control loop has not reported for too long.
 
     with Watchdog(0.05, arm.stop) as watchdog:
         while servoing():
             arm.command(runner.step())
             watchdog.feed()
 
-    It runs in a thread of its own, so it also notices a loop that hangs, but not one that holds
-    the interpreter, nor a process that is stopped or killed: for a real arm take `ArmProcess`.
-    A stop that fails is tried again, with growing pauses, until it succeeds or the loop reports
-    again. After a trip the arm is at rest, which the controller does not know: start from
-    `initial_state` again. Left by an exception, or with a stop that has not succeeded, the
-    context stops the arm.
+    The watchdog runs in its own thread. It notices a loop that hangs, but neither one that holds
+    the interpreter lock nor a stopped or killed process: for a real arm use `ArmProcess`. A stop
+    that fails is retried, with growing pauses, until it succeeds or the loop reports again. After
+    a trip the arm is at rest and the controller's state is stale: start from `initial_state`
+    again. If the context ends with an exception, or with a stop still pending, it stops the arm.
 
     Attributes:
-        trips: How often it had to act.
-        failures: How many stops failed.
-        error: Why the last of them did; None: none has.
+        trips: Number of times the loop was silent for too long.
+        failures: Number of failed stops.
+        error: Error of the last failed stop; None if no stop has failed.
     """
 
     def __init__(
@@ -107,8 +106,8 @@ class Watchdog:
         Args:
             timeout: Longest silence [s]; it is noticed up to a quarter of it late.
             stop: Brings the arm to rest. Called once for every silence, and again if it fails.
-            clock: Tells the time [s].
-            report: Told of each stop that failed; by default a line on stderr.
+            clock: Current time [s].
+            report: Called with each failed stop; by default it prints a line to stderr.
 
         Raises:
             ValueError: The timeout is not positive.
@@ -129,14 +128,14 @@ class Watchdog:
 
     @property
     def tripped(self) -> bool:
-        """Whether it has acted since it was last fed."""
+        """True if the watchdog has acted since it was last fed."""
         return self.trips > 0 and self._fed is None
 
     def feed(self) -> None:
         """Report that the loop is alive.
 
         Raises:
-            WatchdogError: The watchdog is not: its thread has ended, or hangs in a stop.
+            WatchdogError: The watchdog's thread has ended, or hangs in a stop.
         """
         with self._lock:
             if self._thread.ident is not None and not self._thread.is_alive():
@@ -147,7 +146,11 @@ class Watchdog:
             self._fed, self._due = now, None
 
     def check(self) -> bool:
-        """Stop the arm if that is due; whether it was. The thread does this by itself."""
+        """Stop the arm if a stop is due. The thread calls this by itself.
+
+        Returns:
+            True if a stop was due and succeeded.
+        """
         with self._lock:
             now = self._clock()
             if self._fed is not None and now - self._fed > self._timeout:
@@ -173,11 +176,11 @@ class Watchdog:
         return True
 
     def start(self) -> None:
-        """Begin to watch, from the first `feed` on."""
+        """Start the thread; silences count from the first `feed` on."""
         self._thread.start()
 
     def close(self) -> None:
-        """Watch no more. A stop that hangs is not waited for: the process must end."""
+        """End the thread. A stop that hangs is not waited for: the process must end."""
         self._done.set()
         self._thread.join(self._timeout + _LONGEST_PAUSE)
 

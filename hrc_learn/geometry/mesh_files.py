@@ -248,7 +248,7 @@ def _translation(values: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
 
 
 def _rotation(values: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4 4"]:
-    """Of an axis and an angle in degrees, by Rodrigues' formula."""
+    """Rotation matrix of an axis and an angle in degrees, by Rodrigues' formula."""
     x, y, z = values[:3] / np.linalg.norm(values[:3])
     cross, angle, frame = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), values[3], np.eye(4)
     angle = np.deg2rad(angle)

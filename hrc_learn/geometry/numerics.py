@@ -69,7 +69,7 @@ _LARGEST_VALID = 1e12
 
 
 def is_number(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
-    """Where x is a number one can compute with: not NaN, not infinite, not absurdly large."""
+    """True where x is usable in computations: not NaN, not infinite, not absurdly large."""
     return x.abs() < _LARGEST_VALID  # NaN compares false
 
 

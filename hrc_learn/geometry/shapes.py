@@ -13,7 +13,7 @@ Colour = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
 
 PLAIN: Colour = (0.86, 0.87, 0.89, 1.0)
-"""Of a robot's link that has no colour of its own."""
+"""Colour of a robot link without a colour of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +53,7 @@ class MeshFile:
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Factors on the file's coordinates, along its own axes."""
     colour: Colour | None = None
-    """Of what the file gives no colour; None: plain."""
+    """Colour of parts without a colour in the file; None: the default."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,4 +1,4 @@
-"""From a description's tree of links to the numbered links of a serial arm."""
+"""Conversion of a description's tree of links to the numbered links of a serial arm."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ class LinkVisual:
     """A mesh to be drawn on a link."""
 
     link: int
-    """As `CapsuleArm` numbers them: 0 the base, i that of joint i, then flange and tool."""
+    """Link number as in `CapsuleArm`: 0 the base, i the link of joint i, then flange and tool.
+    """
     mesh: MeshFile
     pose: Transform
     """In the frame of the link; of a finger with the gripper open."""
@@ -48,7 +49,7 @@ class FingerJoint:
     kind: str
     """"revolute" or "prismatic"."""
     pose: Transform
-    """Of its frame at position zero; it moves about or along z."""
+    """Joint frame at position zero; the joint moves about or along z."""
     closed: float
     """[rad] or [m]"""
     opened: float
@@ -89,7 +90,7 @@ class LinkShape:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Assembly:
-    """What `assemble` finds in a description."""
+    """Serial arm read from a description."""
 
     base: str
     tip: str
@@ -102,7 +103,7 @@ class Assembly:
     shapes: tuple[LinkShape, ...]
     gripper: GripperDescription | None
     masses: tuple[float | None, ...]
-    """Of base, links, flange and tool [kg], where the description tells."""
+    """Masses of base, links, flange and tool [kg]; None where the description has none."""
 
 
 def assemble(
@@ -201,7 +202,7 @@ class _Finger:
     joint: FingerJoint
     child: str
     postures: tuple[Transform, ...]
-    """Of the child in the frame of the tool, from closed to opened."""
+    """Poses of the child in the frame of the tool, from closed to opened."""
 
     @property
     def opened(self) -> Transform:

@@ -50,19 +50,19 @@ _PARTING_STEPS = 200
 
 
 def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape, Transform]]) -> CapsuleArm:
-    """Capsules around shapes on an arm's links.
+    """Fit capsules around the shapes on an arm's links.
 
-    As MoveIt's setup assistant does, pairs of links are left out that are neighbours, that
-    overlap in all random postures, or that never come near to each other in any. Capsules are
-    rounder than links: around a short, wide link they meet those of the link after the next.
-    Such a pair is left out where the convex hulls themselves never meet, whatever the two
-    joints between; or where its capsules overlap in most positions of these, and so tell
-    nothing (Universal Robots, whose links pass beside each other a centimetre apart).
+    Like MoveIt's setup assistant, this ignores pairs of links that are neighbours, that overlap
+    in all random postures, or that never come near each other in any. Capsules are rounder than
+    links: around a short, wide link they overlap those of the link after the next. Such a pair
+    is ignored if the convex hulls never meet, whatever the two joints in between; or if its
+    capsules overlap in most positions of these joints and so carry no information (Universal
+    Robots, whose links pass each other at a distance of a centimetre).
 
     Args:
         chain: The arm.
-        shapes: Number of the link's frame, the shape, and its pose there. Links without any are
-            given a capsule from their own frame to the next.
+        shapes: Number of the link's frame, the shape, and its pose there. Without any shape,
+            each link gets a capsule from its own frame to the next.
     """
     hulls: dict[int, list[_Hull]] = defaultdict(list)
     capsules: list[LinkCapsule] = []
@@ -342,7 +342,7 @@ def _meet(
     pair: tuple[int, int],
     hulls: Mapping[int, Sequence[_Hull]],
 ) -> bool:
-    """Whether convex hulls of two links meet, or may, in any of several postures."""
+    """True if the convex hulls of two links meet, or may meet, in any of several postures."""
     frames = chain.link_frames(q)
     base = torch.eye(4, dtype=torch.float64)[:3].expand(len(q), 3, 4)
     R, p = zip(
@@ -363,16 +363,16 @@ def _parted(
     turn: Float[torch.Tensor, "poses 3 3"],
     shift: Float[torch.Tensor, "poses 3"],
 ) -> Bool[torch.Tensor, " poses"]:
-    """Where a plane between two convex hulls is found, so that they certainly do not meet.
+    """True where a plane separates two convex hulls, so that they certainly do not meet.
 
     Gilbert's method (1966) walks, among differences of their points, towards the shortest one:
-    the plane across it parts the hulls as soon as all differences lie beyond the plane.
+    its normal plane separates the hulls as soon as all differences lie beyond the plane.
 
     Args:
-        first: Corners of one.
-        second: Corners of the other, in its own frame.
-        turn: Of that frame in the first one's.
-        shift: Its origin there [m].
+        first: Corners of one hull.
+        second: Corners of the other hull, in its own frame.
+        turn: Rotation of that frame in the first one's.
+        shift: Origin of that frame in the first one's [m].
     """
     a, b = torch.from_numpy(first), torch.from_numpy(second)
     parted = torch.zeros(len(shift), dtype=torch.bool)

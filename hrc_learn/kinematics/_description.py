@@ -1,6 +1,6 @@
-"""What a description file says of a robot, whatever its format: a tree of links and joints.
+"""Content of a robot description file, independent of its format: a tree of links and joints.
 
-All transforms are homogeneous, float64, as the numbers in the file give them.
+All transforms are homogeneous, float64, with the numbers of the file.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Shape:
     kind: str
     """"mesh", "box", "cylinder", "sphere" or "capsule"."""
     size: tuple[float, ...] = ()
-    """Of a box its half edges, of the others radius and half length [m]."""
+    """Half edges of a box; radius and half length of other shapes [m]."""
     path: Path | None = None
-    """Of a mesh."""
+    """File of a mesh."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Of a mesh."""
+    """Scale of a mesh along its axes."""
     colour: Colour | None = None
 
 
@@ -186,7 +186,7 @@ class Description:
         )
 
     def _joints_above(self, link: str, base: str) -> int:
-        """How many joints move a link against the base."""
+        """Number of joints between a link and the base."""
         count = 0
         while link != base and (joint := self.above(link)) is not None:
             count += joint.kind in MOVING

@@ -182,7 +182,7 @@ class _Reader:
         return joints
 
     def _effort(self, j: int) -> float | None:
-        """What the joint's actuators can do, or what the joint lets through."""
+        """Largest force or torque of the joint's actuators, or that of the joint."""
         model = self.model
         if model.jnt_actfrclimited[j]:
             return float(np.abs(model.jnt_actfrcrange[j]).max())

@@ -47,9 +47,9 @@ _HAND = ("hand", "finger_left", "finger_right")
 
 
 def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
-    """What a link, the hand or a finger of an arm looks like; nothing if that is not known.
+    """Meshes of a link, the gripper or a finger of an arm; empty if unknown.
 
-    Franka's arms look alike, and all arms carry the same hand.
+    Franka's arms share their meshes, and all arms of the work cell carry the same gripper.
 
     Args:
         robot: The arm.

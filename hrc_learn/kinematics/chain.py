@@ -21,7 +21,7 @@ from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics.limits import JointLimits
 
 type JointKind = Literal["revolute", "continuous", "prismatic"]
-"""How a joint moves about or along its axis; a continuous one turns without end."""
+"""Kind of a joint; a continuous one rotates without limits."""
 
 type _Row = list[Tensor]
 

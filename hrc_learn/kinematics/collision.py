@@ -218,10 +218,11 @@ def segment_distance(
 def nearest_on_segments(
     first: Float[Tensor, "*#batch 2 3"], second: Float[Tensor, "*#batch 2 3"]
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Where two segments are nearest to each other (Ericson 2005, section 5.1.9).
+    """Nearest points of two segments (Ericson 2005, section 5.1.9).
 
     Returns:
-        On the first and on the second, each as a fraction of its length from its first end.
+        Points on the first and the second segment, as fractions of their length from the first
+        end.
     """
     start, along = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
     other, across = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
@@ -254,9 +255,10 @@ def nearest_on_segment_and_box(
     centre: Float[Tensor, "*#batch 3"],
     half_size: Float[Tensor, "*#batch 3"],
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
-    """Where a segment and a box with edges along the axes are nearest to each other.
+    """Nearest points of a segment and an axis-aligned box.
 
-    The distance from a convex set is convex along a line: the root of its slope is sought.
+    The distance from a convex set is convex along a line; the root of its slope gives the
+    minimum.
 
     Returns:
         The point of the box, and the point of the segment as a fraction of its length.

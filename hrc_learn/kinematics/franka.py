@@ -152,12 +152,12 @@ LINK_CAPSULES = tuple(
         (7, (0.0, 0.0, -0.02), (0.0, 0.0, 0.062), 0.045),
     )
 )
-"""Of the links of either arm; the simulated one is built from the same."""
+"""Capsules of the links of either arm; the simulated arm is built from the same ones."""
 
 LINK_MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
-"""Of links 1 to 7 [kg], from franka_description."""
+"""Masses of links 1 to 7 [kg], from franka_description."""
 HAND_MASS = 0.73
-"""Of the hand without its fingers [kg], from the same."""
+"""Mass of the gripper without its fingers [kg], from franka_description."""
 
 # Links whose capsules overlap by design although they are no neighbours. The flange (8) has
 # none, so the hand follows link 7.

@@ -59,8 +59,10 @@ FR3_VINTAGES = {
         **_FR3,
     ),
 }
-"""By source. They differ in positions and in the offsets of the position-based velocity limits:
-a robot goes by the URDF that it sends to its driver, so by its system image."""
+"""Limits by source. They differ in the position limits and in the offsets of the position-based
+velocity limits. A robot uses those of the URDF that it sends to its driver, hence of its system
+image.
+"""
 
 
 def strictest(*vintages: JointLimits) -> JointLimits:

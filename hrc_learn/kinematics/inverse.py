@@ -22,7 +22,9 @@ from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics.chain import SerialChain
 
 type TaskSpace = Literal["pose", "position+axis", "position"]
-"""What of the tool's pose matters: all, all but the turn about its z axis, the position."""
+"""Constrained part of the tool's pose: all, all but the rotation about its z axis, or the
+position.
+"""
 
 TASK_ROWS: dict[TaskSpace, int] = {"pose": 6, "position+axis": 5, "position": 3}
 # Weight of an angle against a distance [m/rad]: turning by 1 rad moves what is this far away.
@@ -43,22 +45,22 @@ class InverseSolution:
     position: Float[Tensor, "*batch joints"]
     """[rad, m]; the best tried where none was found."""
     found: Bool[Tensor, "*batch"]
-    """Whether the pose is reached within limits."""
+    """True if the pose is reached within limits."""
 
 
 def task_error_and_jacobian(
     chain: SerialChain, q: Float[Tensor, "rows joints"], pose: Pose, task: TaskSpace = "pose"
 ) -> tuple[Float[Tensor, "rows task"], Float[Tensor, "rows task joints"]]:
-    """What is left to a pose, and its Jacobian with respect to the joints.
+    """Error to a pose, and the Jacobian of the task with respect to the joints.
 
     Rows are the linear ones [m] in the base frame, then for "pose" the angular ones there
-    [rad], for "position+axis" the two angular ones across the wanted tool axis.
+    [rad], for "position+axis" the two angular ones perpendicular to the wanted tool axis.
 
     Args:
         chain: The arm.
         q: Joint positions [rad, m].
-        pose: Wanted, of the tool centre point.
-        task: What of it matters.
+        pose: Wanted pose of the tool centre point.
+        task: Constrained part of the pose.
     """
     T, J = chain.transform_and_jacobian(q)
     if task == "pose":
@@ -111,13 +113,14 @@ def null_space_dimension(
     *,
     below: float = _RANK,
 ) -> Float[Tensor, "*batch"]:
-    """How many dimensions of joint motion leave a task alone: 1 of a 7-joint arm's pose.
+    """Dimension of the joint motion that leaves a task unchanged: 1 for the pose of a 7-joint
+    arm.
 
     Args:
         chain: The arm.
-        q: Joint positions [rad, m]. At singularities there are more.
-        task: What must not move.
-        below: Singular values below this part of the largest count as none.
+        q: Joint positions [rad, m]. The dimension is larger at singularities.
+        task: Constrained part of the pose.
+        below: Singular values below this fraction of the largest one count as zero.
     """
     flat = q.reshape(-1, q.shape[-1])
     _, J = task_error_and_jacobian(chain, flat, chain.forward(flat), task)
@@ -130,15 +133,16 @@ _SAMPLES = 64  # joint positions at which `task_rank` looks: nearly all are regu
 
 
 def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
-    """How many dimensions of a task an arm leads, away from its singularities.
+    """Number of task dimensions that an arm controls, away from its singularities.
 
-    6 of a pose by six joints or more. Of "position+axis" 5, but 4 of five joints the last of
-    which turns the tool about its axis: position and tilt. What is left of the joints is null
-    space. Directions that take 50 times as much motion as others are not led.
+    Six for a pose and six or more joints. For "position+axis" five, but four for an arm of five
+    joints whose last joint turns the tool about its axis: position and tilt. The remaining
+    joint motion is null space. A direction that takes 50 times as much joint motion as another
+    one does not count.
 
     Args:
         chain: The arm.
-        task: What of the tool's pose is led.
+        task: Constrained part of the tool's pose.
     """
     limits, rng = chain.limits, torch.Generator().manual_seed(0)
     share = torch.rand(_SAMPLES, len(chain.joint_names), generator=rng, dtype=torch.float64)

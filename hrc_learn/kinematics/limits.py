@@ -91,7 +91,7 @@ class JointLimits(MotionLimits):
     torque: Float[Tensor, " joints"]
     """[N m]"""
     vintage: str
-    """Who published these numbers, and when: manufacturers revise them."""
+    """Publisher and date of these numbers: manufacturers revise them."""
 
     @property
     def middle(self) -> Float[Tensor, " joints"]:
@@ -99,7 +99,7 @@ class JointLimits(MotionLimits):
         return (self.lower + self.upper) / 2
 
     def contain(self, q: Float[Tensor, "*batch joints"]) -> Bool[Tensor, "*batch"]:
-        """Whether all joints are within their range, limits included."""
+        """True where all joints are within their range, limits included."""
         lower, upper = self.lower.to(q), self.upper.to(q)
         return torch.all((q >= lower) & (q <= upper), dim=-1)
 

@@ -39,8 +39,9 @@ class _Source:
     tool: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Tool in the frame of the tip: origin [m] and the direction of approach, its z axis."""
     limits: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """What the file does not tell. Velocities are those of the descriptions for ROS that are
-    named beside them: compare them with the data sheet before a real arm is led by them."""
+    """Limits missing in the file. Velocities are those of the ROS descriptions cited next to
+    them: compare them with the data sheet before moving a real arm.
+    """
 
 
 def _degrees(*speeds: int | float, names: str, first: int = 1) -> dict[str, dict[str, float]]:
@@ -182,7 +183,7 @@ def registered_arms() -> tuple[str, ...]:
 
 
 def maker_of(name: str) -> str:
-    """Who makes a registered arm."""
+    """Manufacturer of a registered arm."""
     return "Franka Robotics" if name in _OWN else _SOURCES[name].maker
 
 

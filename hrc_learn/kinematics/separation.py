@@ -1,7 +1,7 @@
-"""How far an arm is from a person beside it, and how every joint changes that.
+"""Distance of an arm from a person, and its derivative with respect to every joint.
 
 Each pair of a capsule of the arm and one of the person has a signed distance, a direction and a
-gradient in closed form, so that a controller can keep all of them above zero:
+gradient in closed form, so that a controller can keep all distances above zero:
 
     d_dot = gradient @ q_dot + direction . v
 
@@ -48,23 +48,22 @@ class Separation:
     """Unit vector from the arm to the person; zero where the axes of two capsules meet, or the
     axis of one a box: there no direction leads out."""
     fraction: Float[Tensor, "*batch C H"]
-    """Where on the axis of the person's capsule its nearest point lies, 0 to 1 from its first
-    end."""
+    """Nearest point on the axis of the person's capsule, 0 to 1 from its first end."""
     arm_point: Float[Tensor, "*batch C H 3"]
     """Nearest point on the axis of the arm's capsule, or on the held box, in the base frame
     [m]."""
     person_point: Float[Tensor, "*batch C H 3"]
     """Nearest point on the axis of the person's capsule [m]."""
     arm_radius: Float[Tensor, " C"]
-    """Of the arm's capsules; zero of the held box [m]."""
+    """Radii of the arm's capsules; zero for the held box [m]."""
     person_radius: Float[Tensor, "*#batch H"]
     """[m]"""
     joint_axes: Float[Tensor, "*#batch joints 3"]
-    """Of the arm, in the base frame."""
+    """Nearest points of the arm, in the base frame."""
     joint_origins: Float[Tensor, "*#batch joints 3"]
     """[m]"""
     moved: Bool[Tensor, "C joints"]
-    """Which joints move which of the arm's capsules."""
+    """Mask of the joints that move each of the arm's capsules."""
 
     @property
     def on_arm(self) -> Float[Tensor, "*batch C H 3"]:
@@ -78,7 +77,7 @@ class Separation:
 
     @cached_property
     def gradient(self) -> Float[Tensor, "*batch C H joints"]:
-        """Of the distance with respect to the joint positions [m/rad]."""
+        """Gradient of the distance with respect to the joint positions [m/rad]."""
         shape = self.distance.shape[-2:]
         every = torch.arange(shape.numel(), device=self.distance.device)
         return self.gradient_of(every).unflatten(-2, shape)
@@ -106,10 +105,10 @@ class Separation:
     def person_rate(
         self, person_velocity: Float[Tensor, "*#batch H 2 3"]
     ) -> Float[Tensor, "*batch C H"]:
-        """How fast the distances change while the arm rests [m/s].
+        """Rate of change of the distances while the arm rests [m/s].
 
         Args:
-            person_velocity: Of both ends of the person's capsules [m/s].
+            person_velocity: Velocities of both ends of the person's capsules [m/s].
         """
         first, second = person_velocity[..., None, :, :, :].unbind(-2)
         velocity = first + self.fraction[..., None] * (second - first)
@@ -120,11 +119,12 @@ class Separation:
         joint_velocity: Float[Tensor, "*#batch joints"],
         person_velocity: Float[Tensor, "*#batch H 2 3"],
     ) -> Float[Tensor, "*batch C H"]:
-        """How fast the distances change [m/s]; negative where arm and person come closer.
+        """Rate of change of the distances [m/s]; negative where arm and person approach each
+        other.
 
         Args:
-            joint_velocity: Of the arm [rad/s].
-            person_velocity: Of both ends of the person's capsules [m/s].
+            joint_velocity: Joint velocities of the arm [rad/s].
+            person_velocity: Velocities of both ends of the person's capsules [m/s].
         """
         by_arm = (self.gradient @ joint_velocity[..., None, :, None]).squeeze(-1)
         return by_arm + self.person_rate(person_velocity)
@@ -187,7 +187,7 @@ def separation(
 
 @cache
 def _moved(links: tuple[int, ...], joints: int) -> Bool[Tensor, "links joints"]:
-    """Which joints carry a link: those up to its own number."""
+    """Mask of the joints that move a link: those up to its own number."""
     with torch.inference_mode(False):
         return torch.arange(joints) < torch.tensor(links)[:, None]
 

@@ -87,7 +87,7 @@ class Approach:
     spread: float
     """Angle of the demonstrations' tangents to their mean, root mean square [rad]."""
     turned: float
-    """Angle from the mean demonstrated orientation [rad]; 0 where tangents told nothing."""
+    """Angle from the mean demonstrated orientation [rad]; 0 where the tangents are not used."""
 
     @property
     def direction(self) -> Float[Tensor, "3"]:

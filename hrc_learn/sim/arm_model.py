@@ -1,8 +1,8 @@
-"""An arm in MuJoCo: model, gripper, marker plate, and its driver.
+"""An arm in MuJoCo: model, gripper, marker plate and driver.
 
 Body frames come from the arm's own chain, so that simulator and controller share one table of
-numbers. Capsules and boxes follow the shapes of the links to a few centimetres: physics with
-them is faster than with meshes, and their contacts are clean.
+numbers. Capsules and boxes follow the shapes of the links to a few centimetres: they are faster
+to simulate than meshes and make clean contacts.
 """
 
 import math
@@ -32,8 +32,9 @@ _WHITE = (0.92, 0.93, 0.95, 1.0)
 _GREY = (0.35, 0.37, 0.40, 1.0)
 
 FIRM = {"condim": 4, "solref": (0.004, 1.0), "solimp": (0.97, 0.99, 0.0005, 0.5, 2)}
-"""Of contacts that hold a grasp: with torsional friction, and a fifth of MuJoCo's default time
-constant."""
+"""Contact settings for grasps: torsional friction, and a fifth of MuJoCo's default time
+constant.
+"""
 
 FINGER_STROKE = 0.04
 """Travel of one finger [m]; the gripper opens to twice this."""
@@ -48,13 +49,13 @@ class Plate:
     """A square plate that carries one marker, facing +z of its own frame."""
 
     marker: Marker
-    """Which marker, and the edge length of its black square [m]."""
+    """Marker and the edge length of its black square [m]."""
     position: tuple[float, float, float]
     """Centre of the plate's face in the frame of the body that carries it [m]."""
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation of the plate's frame (wxyz): x along the marker's top edge, y up its side."""
     solid: bool = True
-    """Whether the plate touches objects. A sticker on a box does not."""
+    """True if the plate collides with objects; a sticker on a box does not."""
 
 
 def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
@@ -114,10 +115,10 @@ def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ArmModelConfig:
-    """How the arm is built and driven."""
+    """Construction and servo gains of the simulated arm."""
 
     robot: Arm
-    """Which arm it is."""
+    """Kinematics, limits and shape of the arm."""
     stiffness: tuple[float, ...] = ()
     """Position gain of the joint servos [N m/rad]; none given: by the torques of the joints."""
     damping: tuple[float, ...] = ()
@@ -153,8 +154,9 @@ _SERVOS = dict.fromkeys(
 )
 """Gains of Franka's arms."""
 _STIFFNESS, _DAMPING = 230.0, 0.03
-"""Of other arms: of the Panda's strongest joint, per torque [1/rad], and damping per stiffness
-[s]."""
+"""Servo gains of other arms, scaled from the Panda's strongest joint: stiffness per torque
+[1/rad] and damping per stiffness [s].
+"""
 _HAND = "hand"
 
 
@@ -327,8 +329,8 @@ def _add_hand(spec: mujoco.MjSpec, hand, config: ArmModelConfig) -> None:
 
 
 class _UnknownWeights:
-    """Weights that the arm does not compensate: of a load that nobody entered, and of its links
-    where its own model is wrong.
+    """Weights that the arm does not compensate: an unknown load, and errors of its own model's
+    link masses.
     """
 
     def __init__(self, model: mujoco.MjModel, joints: tuple[str, ...]):
@@ -344,7 +346,7 @@ class _UnknownWeights:
         self._gravity = model.opt.gravity
 
     def torque(self, data: mujoco.MjData) -> Float[np.ndarray, " joints"]:
-        """Which they exert on the joints [N m]."""
+        """Joint torques exerted by these weights [N m]."""
         if not self._any:
             return np.zeros(len(self._links))
         anchor, axis = data.xanchor[self._joints], data.xaxis[self._joints]
@@ -406,10 +408,10 @@ class MujocoArm:
         )
 
     def _external_torque(self) -> Float[np.ndarray, " joints"]:
-        """What an arm takes for external torques that measures those of its joints [N m].
+        """External torque as estimated from joint torque sensors [N m].
 
-        Contacts and forces from outside, friction, which no arm of this kind knows well, and
-        the weights that it was not told of.
+        Contains contacts and external forces, joint friction, which such arms do not model
+        well, and weights that the arm does not know.
         """
         data = self._data
         torque = data.qfrc_constraint + data.qfrc_applied
@@ -465,7 +467,7 @@ class MujocoArm:
 
     @property
     def encoder_offset(self) -> Float[np.ndarray, " joints"]:
-        """What the encoders read too much, which no program is told [rad]."""
+        """Encoder offsets, unknown to the controller [rad]."""
         return self._errors.encoder_offset
 
     @property

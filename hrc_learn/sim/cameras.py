@@ -58,7 +58,7 @@ class Arrow:
     colour: Colour
     """RGBA, 0 to 1."""
     width: float = 0.012
-    """Of its shaft [m]."""
+    """Radius of the shaft [m]."""
     head: bool = True
     """Without one it is a line."""
 
@@ -286,12 +286,12 @@ _BOARD_HEIGHT = 0.10
 
 @dataclass(frozen=True, kw_only=True)
 class CameraChange:
-    """How much a camera is changed at a time."""
+    """Size of one change of a camera's pose."""
 
     distance: float = 0.10
-    """By which it is moved, in any direction [m]."""
+    """Translation in a random direction [m]."""
     angle: float = np.deg2rad(10.0)
-    """By which it is turned, about any axis [rad]."""
+    """Rotation about a random axis [rad]."""
     focus: float = 1.0
     """Factor on its focal length."""
 

@@ -1,8 +1,8 @@
-"""Batched simulation of the closed loop in plain torch, against a camera of which the
-controller knows nothing.
+"""Batched kinematic simulation of the closed loop in torch, with a camera unknown to the
+controller.
 
-Kinematics alone (the arm moves as it is told), so thousands of runs fit into one batch and
-gradients pass through. For contacts, images and marker detection use the simulator.
+The arm follows its commands exactly, so thousands of runs fit into one batch and gradients pass
+through. Contacts, images and marker detection need the MuJoCo simulator.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PinholeCamera:
     """Fixed camera that sees a marker on the end effector."""
 
     pose: Pose
-    """Of the camera in the base frame: it looks along its z axis, x right, y down."""
+    """Pose of the camera in the base frame: z along the optical axis, x right, y down."""
     marker: Float[Tensor, "*#batch 3"]
     """Marker in the frame of the tool centre point [m]."""
     corners: Float[Tensor, "points 3"] | None = None
@@ -136,7 +136,7 @@ class ProjectiveCamera(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Imperfections:
-    """What a real camera and real encoders do to the measurement."""
+    """Measurement errors of a real camera and of real encoders."""
 
     frame_steps: int = 1
     """Control steps from one image to the next."""
@@ -147,7 +147,7 @@ class Imperfections:
     nan_fraction: float = 0.0
     """Fraction of images whose measurement is NaN though it claims to be visible."""
     loss_rate: float = 0.0
-    """How often the marker gets covered [1/s]."""
+    """Rate at which occlusions of the marker begin [1/s]."""
     loss_time: float = 3.0
     """Longest time it stays covered [s]; the mean is half of it."""
     encoder_noise: float = 0.0
@@ -202,7 +202,7 @@ class VirtualCamera:
         del self._images[: -1 - imperfections.latency_frames]
 
     def _cover(self, visible: Tensor, frame_time: float) -> Tensor:
-        """Whether something stands between marker and camera."""
+        """True while an obstacle stands between marker and camera."""
         remaining = torch.zeros_like(visible, dtype=torch.float64)
         if self._covered is not None:
             remaining = self._covered - frame_time
@@ -231,17 +231,18 @@ def simulate_closed_loop(
     """Run the closed loop.
 
     Args:
-        controller: With its goals.
-        camera: What it sees.
+        controller: Controller with its goals.
+        camera: True camera.
         joint_position: Start [rad].
         steps: Number of control steps.
-        dt: Their length [s].
-        nullspace_input: Of the operator, from step number and joint position.
-        goals: Goals from the step number; default: those of the controller.
+        dt: Control step [s].
+        nullspace_input: Null-space input of a person, as a function of step number and joint
+            position.
+        goals: Goals as a function of the step number; default: those of the controller.
         on_step: Called after each step with its number, the joint position it started from,
             observation, command and new state.
-        advance: Joint position [rad] after a step [s], from that before it and the commanded
-            velocity [rad/s]; default: the arm moves as it is told.
+        advance: Joint position [rad] after a step [s], from the joint position before it and
+            the commanded velocity [rad/s]; default: exact integration.
 
     Returns:
         Joint position at the end [rad].

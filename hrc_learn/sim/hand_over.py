@@ -1,8 +1,8 @@
-"""A worker who lays a thing on the bench, takes it up again, and holds it out to the robot.
+"""A worker who lays an object on the bench, takes it up again, and holds it out to the robot.
 
-Whoever watches his hand has to tell these movements apart: two of the three are none of the
-robot's business. From where he holds the thing out he brings it on to the robot's hand, once
-that has come.
+A controller that tracks the hand has to tell these movements apart: only the third one is an
+offer. Once the gripper has come to the offered object, the worker brings it on into the
+gripper.
 """
 
 from __future__ import annotations
@@ -30,13 +30,15 @@ from hrc_learn.sim.worker_visit import (
 RIGHT = 1
 """The hand that he uses, as numbered in the worker's capsules."""
 HELD_OUT = np.array([0.0, -0.09, -0.03])
-"""From where his hand grips to the middle of what it holds out by its near end, in the base
-frame [m]; he faces its -y. The capsule of a hand leaves out how thin fingers are."""
+"""Offset from the grip of the hand to the middle of an object held by its near end, in the base
+frame [m]; the worker faces -y. A hand's capsule is thicker than its fingers.
+"""
 BENCH, BACK, HAND_OVER = "to the bench", "back", "hand over"
 """Kinds of his movements."""
 
 UNHURRIED = HumanSpeeds(reaching=0.9)
-"""Of people who hand something over: half of what they can, so that it takes about a second."""
+"""Hand speeds during handovers: half the largest ones, so that a handover takes about a second.
+"""
 
 # How far over the bench the thing is held out, from its edge, and how high [m]: a forearm over
 # it, at the height of the elbow.
@@ -61,17 +63,17 @@ class Reach(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandOver:
-    """What he does, so far as it is settled: the rest depends on the robot."""
+    """The planned part of a handover; the rest depends on the robot."""
 
     visit: WorkerVisit
     """His postures; at the end of them he holds the thing out."""
     reaches: tuple[Reach, ...]
     carried: tuple[tuple[float, float], ...]
-    """From when to when the thing is in his hand [s]; between them it lies on the bench."""
+    """Intervals in which the hand holds the object [s]; between them it lies on the bench."""
     place: Float[np.ndarray, "3"]
-    """Where he holds it out, its middle [m]."""
+    """Middle of the object where it is held out [m]."""
     leaving: Float[np.ndarray, "2"]
-    """Where he goes at last [m]."""
+    """Final position of the worker [m]."""
     speeds: HumanSpeeds
     """His."""
 
@@ -138,18 +140,18 @@ def random_hand_over(
     begin: tuple[float, float] = (1.0, 3.0),
     speeds: HumanSpeeds | None = None,
 ) -> HandOver:
-    """Draw a worker's way to the far side of the bench, with a thing for the robot.
+    """Draw a worker's walk to the far side of the bench, with an object for the robot.
 
     Args:
-        worker: Who comes.
-        rng: Source of chance.
+        worker: Body of the worker.
+        rng: Random generator.
         bench: The table, whose far side (+y) is free.
-        thickness: Half the height of the thing [m].
-        begin: When he comes in, earliest and latest [s].
-        speeds: How fast he is at most; each visit takes 50 to 95 % of it.
+        thickness: Half the height of the object [m].
+        begin: Earliest and latest time of entering [s].
+        speeds: Largest speeds; each visit takes 50 to 95 % of them.
 
     Raises:
-        ValueError: He is too small to hold anything out over the bench.
+        ValueError: The worker is too small to hold an object out over the bench.
     """
     most, h = speeds or UNHURRIED, worker.config.stature
     pace = HumanSpeeds(
@@ -231,7 +233,9 @@ def _held_out(
     edge: float,
     top: float,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Where he holds a thing out, where his hand is then in his own frame, and his lean."""
+    """Position of the offered object, hand position in the worker's frame, and lean of the
+    trunk.
+    """
     for _ in range(_TRIED):
         place = np.array(
             [
@@ -250,7 +254,7 @@ def _held_out(
 
 
 def _own(worker: Worker, stand: np.ndarray, facing: float, point: Sequence[float] | np.ndarray):
-    """A point of the base frame in the frame of the worker who stands there [m]."""
+    """A point of the base frame in the frame of a standing worker [m]."""
     c, s = np.cos(facing), np.sin(facing)
     x, y = np.asarray(point)[:2] - stand
     return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])

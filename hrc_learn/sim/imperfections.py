@@ -1,6 +1,6 @@
-"""How far a simulated work cell departs from an ideal one: arm, calibration, camera, objects.
+"""Imperfections of a simulated work cell: arm, calibration, camera, objects.
 
-`Imperfections` says how large the errors are, `Imperfections.draw` what they are in one run.
+`Imperfections` holds the size of the errors, `Imperfections.draw` draws the errors of one run.
 """
 
 from __future__ import annotations
@@ -42,14 +42,15 @@ class Imperfections:
     encoder_offset: float = 0.0
     """Range of the constant error of each joint's zero [rad]. Nominal 2 mrad."""
     command_delay: float = 0.0
-    """From a command being sent until the servos follow it [s]. Nominal 20 ms."""
+    """Delay between a command and the motion of the servos [s]. Nominal 20 ms."""
     command_jitter: float = 0.0
     """Standard deviation of that delay from one command to the next [s]. Nominal 2 ms."""
     servo_lag: float = 0.0
     """Time constant with which the servos follow a changed velocity [s]. Nominal 10 ms."""
     slowness: float = 0.0
-    """How much of the joint limits of acceleration the driver does not use, 0 to 1: drivers
-    such as franky plan with a fraction of them. Nominal 0.3."""
+    """Fraction of the acceleration limits that the driver leaves unused, 0 to 1: drivers such
+    as franky plan with reduced limits. Nominal 0.3.
+    """
     joint_friction: float = 0.0
     """Dry friction of every joint [N m]. Nominal 1 N m."""
     gravity_error: float = 0.0
@@ -70,7 +71,7 @@ class Imperfections:
     tool_turn: float = 0.0
     """Range of the turn of the tool about each axis [rad]. Nominal 3 mrad."""
     image_delay: float = 0.0
-    """From an image being taken until its markers are known [s]. Nominal 80 ms."""
+    """Delay between exposure and detected markers [s]. Nominal 80 ms."""
     image_loss: float = 0.0
     """Fraction of the images that never arrive. Nominal 20 %."""
     image_noise: float = 0.0
@@ -90,10 +91,9 @@ class Imperfections:
     person_noise: float = 0.0
     """Standard deviation of where a person is seen, along each axis [m]. Nominal 1 cm."""
     person_delay: float = 0.0
-    """From an image of a person being taken until it is known where they were [s]. Nominal
-    80 ms."""
+    """Delay between exposure and the estimated body pose of a person [s]. Nominal 80 ms."""
     person_loss: float = 0.0
-    """Fraction of the images in which nobody is found. Nominal 20 %."""
+    """Fraction of images in which a person present is missed. Nominal 20 %."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -157,13 +157,15 @@ class Imperfections:
 
     @property
     def camera_noise(self) -> ImageNoise:
-        """Of images, the camera's own included."""
+        """Delay of images, the camera's own included [s]."""
         return ImageNoise(
             blur=ImageNoise.blur + self.image_blur, noise=ImageNoise.noise + self.image_noise
         )
 
     def plant(self, safety: SafetyConfig) -> SafetyConfig:
-        """Settings of a safety filter that is told what this arm's driver and tracker do."""
+        """Safety filter settings for the delays and limits of this arm's driver and person
+        tracker.
+        """
         # Of normally distributed delays one in 700 is more than three deviations late.
         delay = self.command_delay + 3 * self.command_jitter + self.servo_lag
         separation = SeparationConfig(
@@ -174,15 +176,15 @@ class Imperfections:
 
     @property
     def following_delay(self) -> float:
-        """From a command until the arm follows it, on average [s]."""
+        """Mean delay between a command and the motion of the arm [s]."""
         return max(self.command_delay + self.servo_lag, _SIMULATED_SERVOS)
 
     def draw(self, rng: np.random.Generator, joints: int = 7) -> DrawnImperfections:
-        """What they are in one run.
+        """Draw the errors of one run.
 
         Args:
-            rng: Source of chance, also of the noise during the run.
-            joints: Of the arm.
+            rng: Random generator, also for the noise during the run.
+            joints: Number of joints of the arm.
         """
 
         def uniform(size: int | None = None):
@@ -210,23 +212,23 @@ class DrawnImperfections:
     sizes: Imperfections
     rng: np.random.Generator
     encoder_offset: Float[np.ndarray, " joints"]
-    """What the encoders read too much [rad]."""
+    """Encoder offsets: reading minus true position [rad]."""
     gravity_error: float
     """Fraction of the arm's weight that is compensated too much."""
     payload: float
     """Unknown mass at the hand [kg]."""
     base_shift: Float[np.ndarray, "3"]
-    """Where the base stands, less where it is believed to [m]."""
+    """True minus assumed position of the base [m]."""
     base_turn: float
     """About the vertical [rad]."""
     tool_shift: Float[np.ndarray, "3"]
-    """Where the tool is, less where it is believed to be, in the hand's frame [m]."""
+    """True minus assumed position of the tool, in the gripper's frame [m]."""
     tool_turn: Float[np.ndarray, "3"]
     """Rotation vector in the hand's frame [rad]."""
     table_height: float
     """Height of the table's top above where it is believed to be [m]."""
     object_heights: Float[np.ndarray, " objects"]
-    """By which each object is higher than believed [m]."""
+    """True minus assumed height of each object [m]."""
 
     def apply(self, spec: mujoco.MjSpec) -> None:
         """Give a scene's description the errors of the arm: calibration, friction, weights."""

@@ -1,9 +1,9 @@
-"""How well an arm does the work in a cell, from its kinematics alone.
+"""Quality of a layout for an arm, from kinematics alone.
 
-The arm is led along the paths of the job without physics: how much room that leaves to limits,
-singularities and furniture is the quality of a posture to begin in. Above the table the marker
-on the hand has to be seen besides, at half a turn of the hand, which is as good as a whole one
-to a parallel gripper.
+The arm follows the paths of the job without physics. The smallest margin to joint limits,
+singularities and furniture is the quality of the posture it starts from. Above the table the
+camera must also see the marker on the gripper, within half a turn of the gripper: a parallel
+gripper grasps the same after half a turn.
 """
 
 import math
@@ -54,7 +54,7 @@ def _quality(
     q: Float[Tensor, "steps *rows joints"],
     error: Float[Tensor, "steps *rows"],
 ) -> Float[Tensor, "steps *rows"]:
-    """From 0, where the arm does not get or touches something, to 1, where there is room."""
+    """Quality from 0 (pose not reached, or contact) to 1 (ample margins)."""
     chain = robot.chain
     room = torch.minimum(q - chain.limits.lower, chain.limits.upper - q).amin(-1)
     smallest = torch.linalg.svdvals(chain.jacobian(q))[..., -1]
@@ -98,16 +98,16 @@ def way_quality(
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedTurns:
-    """How the hand turns above the table, and on which side of it the marker is."""
+    """Half turn of the gripper above the table, and the side of the marker."""
 
     plate: Plate
-    """Which carries the marker."""
+    """Plate that carries the marker."""
     turns: tuple[float, float]
     """Least and greatest turn about the vertical [rad], half a turn apart."""
     quality: float
     """Least there, from 0 to 1."""
     seen: float
-    """Share of poses that are reached with the marker in view."""
+    """Fraction of poses that are reached with the marker in view."""
 
 
 def marked_turns(
@@ -192,12 +192,13 @@ def _other_side(plate: Plate) -> Plate:
 def marker_seen(
     robot: Arm, camera: CameraModel, plate: Plate, q: Float[Tensor, "*batch joints"]
 ) -> Bool[Tensor, "*batch"]:
-    """Whether a camera sees all of a plate on the hand: no link between, and in the image.
+    """True if a camera sees the whole plate on the gripper: in the image, and no link in
+    between.
 
     Args:
         robot: The arm.
         camera: The camera.
-        plate: In the frame of the hand.
+        plate: Plate in the frame of the gripper.
         q: Joint positions [rad].
     """
     tool = robot.chain.forward(q)

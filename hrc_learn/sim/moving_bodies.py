@@ -31,7 +31,7 @@ class MovingBodies:
         self.names = tuple(model.body(b).name for b in self._indices)
 
     def poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 4"]]:
-        """Where they are now: positions [m] and unit quaternions (w, x, y, z)."""
+        """Current positions [m] and unit quaternions (w, x, y, z) of the bodies."""
         data = self._world.data
         return data.xpos[self._indices].copy(), data.xquat[self._indices].copy()
 
@@ -134,7 +134,7 @@ class MotionLog:
         return self._bodies.drawn(positions, np.stack(self._orientations[:steps]))
 
     def nearest(self, steps: int | None = None) -> tuple[NearestPair, ...]:
-        """Where worker and robot, with what it held, were nearest to each other at each step.
+        """Nearest points of worker and robot, its load included, at each step.
 
         Empty in a world without a worker.
 
@@ -144,5 +144,5 @@ class MotionLog:
         return tuple(self._nearest[:steps])
 
     def held(self, name: str) -> Bool[np.ndarray, " steps"]:
-        """Whether the robot held an object, at each step in a world with a worker."""
+        """True where the robot held an object, at each step of a world with a worker."""
         return np.array([name in held for held in self._held], dtype=bool)

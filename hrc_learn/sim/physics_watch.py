@@ -27,7 +27,7 @@ _WARNINGS = {
     mujoco.mjtWarning.mjWARN_BADCTRL: ("a command is not finite, or huge", ""),
     mujoco.mjtWarning.mjWARN_BADQACC: ("an acceleration is not finite, or huge", "qacc"),
 }
-"""What it means, and where the coordinate stands that it is about, if it is about one."""
+"""Meaning of each MuJoCo warning, and the array that its coordinate indexes, if any."""
 
 
 class PhysicsError(RuntimeError):

@@ -1,11 +1,10 @@
 """The simulated workplace behind the network protocol of a Franka arm.
 
-A driver for the real arm connects to it over sockets and leads the arm of our scene in cycles
-of 1 ms. The protocol is spoken by the package franky-sim, the physics is `World`'s. What there
-is differs from what is spoken about: a Panda with our limits answers as a Franka Research 3
-(server version 10). For velocities and positions of the joints that is one and the same, as
-their limits are the driver's business here; poses are those of the other arm's model, dynamics
-are not told, and commands of torque come to nothing.
+A driver for the real arm connects over sockets and controls the simulated arm in cycles of 1
+ms. The package franky-sim implements the protocol, `World` the physics. The server reports a
+Franka Research 3 (server version 10), whereas the physics is a Panda with our limits. Joint
+velocities and positions are not affected, as their limits are up to the driver. Poses are those
+of the Research 3 model; dynamics are not reported, and torque commands have no effect.
 """
 
 from __future__ import annotations
@@ -28,10 +27,11 @@ if TYPE_CHECKING:
     from franky_sim.base_simulator import BaseSimulator
 
 CYCLE = 1e-3
-"""Of the protocol [s]."""
+"""Cycle time of the protocol [s]."""
 _LATE = 0.01
-"""For which a cycle waits for the driver's answer [s]: ten times what it takes, on a machine
-that does something else besides."""
+"""Longest wait for the driver's answer in a cycle [s]: ten times what it takes on a busy
+machine.
+"""
 _SIGN_OF_LIFE = 0.05
 """A driver that has heard nothing for 1 s takes its connection for lost (libfranka). While
 whoever advances the time is busy, a cycle goes by after each of these [s]."""
@@ -51,12 +51,12 @@ class DrivenCycle(NamedTuple):
     velocity: Float[np.ndarray, " joints"]
     """Commanded, or gone on with where no answer has come [rad/s]."""
     position: Float[np.ndarray, " joints"]
-    """Of the joints, as the driver was told before [rad]."""
+    """Previous joint positions, as sent to the driver [rad]."""
     answered: bool
 
 
 class ArmServer:
-    """Lets a world go on in cycles of the arm's protocol, as one who drives it lets time pass.
+    """Steps a world in cycles of the arm's protocol.
 
         with serve_world(world) as server:
             arm = FrankyArm(server.address, FrankyConfig(realtime="ignore"))
@@ -64,22 +64,21 @@ class ArmServer:
                 arm.command(velocity)
             server.advance(0.01)
 
-    The clock is the world's, and no faster or slower than the machine can answer: within
-    `advance` each cycle waits for the driver's answer to the last. Elsewhere the world stands
-    still, but for signs of life, so that it may be looked at; calls of the driver, which may
-    wait for the next cycle, belong within `running`.
+    The clock is the world's: within `advance` each cycle waits for the driver's answer to the
+    last one. Outside `advance` the world stands still, apart from keep-alive messages, so that
+    it may be inspected. Driver calls that may wait for the next cycle belong within `running`.
 
-    In a cycle whose answer does not come the arm goes on with its acceleration, as a control
-    box lets it, where velocities are commanded.
+    In a cycle without an answer the arm keeps its acceleration, as a control box does for
+    velocity commands.
 
     Attributes:
         world: The world.
-        address: Of the arm, for its driver.
-        cycles: How many have gone by.
-        missed: How many of them the driver had a motion in, and did not answer in time.
-        lost: How many packets of motions were lost on purpose, states and answers.
-        longest_gap: Most cycles of a motion in a row without an answer. A control box stops the
-            arm after 20; this server does not, and holds the velocity from then on.
+        address: Network address of the arm, for its driver.
+        cycles: Number of cycles so far.
+        missed: Number of cycles of a motion that the driver did not answer in time.
+        lost: Number of packets of motions dropped on purpose, states and answers.
+        longest_gap: Largest number of consecutive cycles of a motion without an answer. A
+            control box stops the arm after 20; this server holds the velocity from then on.
     """
 
     def __init__(
@@ -90,18 +89,18 @@ class ArmServer:
         loss: float = 0.0,
         on_cycle: Callable[[DrivenCycle], None] | None = None,
     ):
-        """Listen; `serve_world` does this and ends it.
+        """Listen; `serve_world` calls this and closes the server.
 
         Args:
-            world: The world. Its physics goes by steps of a cycle from now on.
-            addresses: Of this machine; the first one is taken that is free.
-            loss: Share of the packets that are lost, of states and of answers each.
-            on_cycle: Told of each cycle of a motion, on the server's thread.
+            world: The world. Its physics runs in steps of a cycle from now on.
+            addresses: Addresses of this machine; the first free one is taken.
+            loss: Fraction of the packets that are dropped, of states and of answers each.
+            on_cycle: Called with each cycle of a motion, on the server's thread.
 
         Raises:
             ImportError: The package franky-sim is not installed.
             OSError: None of the addresses is free.
-            ValueError: A share that is not in [0, 1).
+            ValueError: The loss is not in [0, 1).
         """
         if not 0 <= loss < 1:
             raise ValueError(f"loss must be in [0, 1), got {loss}")
@@ -128,7 +127,7 @@ class ArmServer:
 
     @property
     def clock_offset(self) -> float:
-        """Of the arm's clock, which starts as a driver connects, from the world's [s]."""
+        """Offset of the world's clock from the arm's, which starts as a driver connects [s]."""
         # Cycles are numbered from 0, and the number of the last is the driver's time.
         return self.world.time - (self._sent - 1) * CYCLE
 
@@ -211,7 +210,9 @@ class ArmServer:
                 time.sleep(max(0.0, CYCLE - (time.monotonic() - started)))
 
     def _cycle(self) -> None:
-        """One step of the physics, told to the driver; its answer counts in the next."""
+        """Send the state to the driver and step the physics; the answer counts in the next
+        cycle.
+        """
         server, robot = self._server, self._robot
         self._simulator.step()
         robot.begin_cycle()
@@ -249,9 +250,9 @@ class ArmServer:
 
 @final
 class ServedArm:
-    """The driver of an arm whose server stands still while nobody calls it.
+    """The driver of an arm whose server stands still between calls.
 
-    Its times are the world's.
+    Times are the world's.
     """
 
     def __init__(self, arm: Any, server: ArmServer):
@@ -307,16 +308,16 @@ def serve_world(
     """A server of a world's arm, until the block ends.
 
     Args:
-        world: The world, at rest, and not to be reset meanwhile. Its physics goes by steps of
+        world: The world, at rest, and not to be reset meanwhile. Its physics runs in steps of
             1 ms meanwhile.
-        addresses: Of this machine; the first one is taken that is free. None: any.
-        loss: Share of the packets that are lost, of states and of answers each.
-        on_cycle: Told of each cycle of a motion, on the server's thread.
+        addresses: Addresses of this machine; the first free one is taken. None: any.
+        loss: Fraction of the packets that are dropped, of states and of answers each.
+        on_cycle: Called with each cycle of a motion, on the server's thread.
 
     Raises:
         ImportError: The package franky-sim is not installed.
         OSError: None of the addresses is free.
-        ValueError: A share that is not in [0, 1).
+        ValueError: The loss is not in [0, 1).
     """
     step = world.model.opt.timestep
     world.model.opt.timestep = CYCLE
@@ -386,7 +387,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
                 self.joint_velocity_control(self._velocity, has_new_command=False)
 
         def driven(self, motion: int) -> DrivenCycle:
-            """What this cycle was."""
+            """Record of this cycle."""
             position = self._read.joint_position
             return DrivenCycle(motion, self._velocity, position, self.answered)
 
@@ -462,7 +463,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
             world.advance(CYCLE)
 
     class LossyServer(FrankaRobotServer):
-        """Loses the state of a cycle, or the answer to it, when told to, and late answers."""
+        """Drops states, answers, and answers that come late."""
 
         lose_state = lose_answer = has_lost_answer = False
 

@@ -1,7 +1,7 @@
 """The workplace: arm, table with objects, a cabinet with three shelves, a fixed camera.
 
-The robot stands at the origin. To its left (+y) is the table, which people share; to its
-right (-y) the cabinet, whose open door stands in the way of a careless elbow.
+The robot stands at the origin. To its left (+y) is the table, where people work too; to its
+right (-y) the cabinet, whose open door obstructs a careless elbow.
 """
 
 from collections.abc import Mapping
@@ -41,7 +41,7 @@ WORKER_BODIES = tuple(f"worker_{part}" for part in PARTS)
 WORKER_ITEM = "worker_item"
 """Name of what the worker puts on the table: seen, but nothing can touch it."""
 NOWHERE = (0.0, 0.0, -5.0)
-"""Where objects are that are not in the scene: far below the floor [m]."""
+"""Position of objects that are not in the scene: far below the floor [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +65,9 @@ class CabinetConfig:
     )
     """Height of each board's upper face, by name [m]."""
     thickness: float = 0.02
-    """Of boards and walls [m]."""
+    """Thickness of boards and walls [m]."""
     door_reach: float = 0.34
-    """How far the open door stands out of the cabinet [m]; 0: it has none."""
+    """Width of the open door [m]; 0: no door."""
 
     def boxes(self) -> list[Box]:
         """Boards, walls, back and door."""
@@ -158,7 +158,7 @@ class SceneConfig:
     obstacles: tuple[Box, ...] = ()
     """Obstacles that people put in the way and take away again (`World.move_obstacle`)."""
     worker: WorkerConfig | None = None
-    """Who works at the table beside the robot (`World.move_worker`); None: nobody."""
+    """Worker at the table (`World.move_worker`); None: no worker."""
     timestep: float = 0.002
     """Physics step [s]."""
 
@@ -260,8 +260,8 @@ _FEELS_WORKER = 2
 
 
 def _add_worker(spec: mujoco.MjSpec, worker: Worker, objects: tuple[ObjectConfig, ...]) -> None:
-    """Add a person whom arm and objects touch without a force: he yields to nobody here, and a
-    body that is moved by hand would push with any.
+    """Add a worker with contacts that exert no force: the worker does not yield, and a body
+    moved by hand would push with any force.
     """
     for mover in ("link0", *(item.name for item in objects)):
         for geom in spec.body(mover).find_all(mujoco.mjtObj.mjOBJ_GEOM):

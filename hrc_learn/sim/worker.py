@@ -46,7 +46,7 @@ _PELVIS_HALF = 0.346 / 2 / _MEASURED - _RADII["pelvis"]  # of the hips' breadth
 STATURES = {"women": (1.518, 1.724), "men": (1.649, 1.869)}
 
 WORKER_ITEM_HALF_SIZE = (0.035, 0.025, 0.025)
-"""Of what a worker carries to the bench [m]."""
+"""Half size of the object that a worker carries to the bench [m]."""
 
 _SKIN: Colour = (0.85, 0.66, 0.53, 1.0)
 _SHIRT: Colour = (0.20, 0.42, 0.62, 1.0)
@@ -76,7 +76,7 @@ _PARTS = (
 PARTS = tuple(name for name, _, _ in _PARTS)
 """Names of the body's capsules, in the order of all arrays."""
 COLOURS = tuple(colour for _, _, colour in _PARTS)
-"""Of the capsules."""
+"""Radii of the capsules [m]."""
 # Numbers of the parts that come in pairs, left and right.
 _PAIRS = {
     kind: [PARTS.index(f"{kind}_{side}") for side in ("left", "right")]
@@ -130,21 +130,22 @@ class WorkerConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posture:
-    """How and where a body stands, at any number of times."""
+    """Postures and places of a body, at any number of times."""
 
     place: Float[np.ndarray, "*time 2"]
     """Point of the floor under the pelvis, in the base frame [m]."""
     heading: Float[np.ndarray, "*time"]
-    """Where he faces: angle of x from the base's [rad]."""
+    """Heading: angle of the worker's x axis from the base's [rad]."""
     lean: Float[np.ndarray, "*time"]
-    """Of the trunk, forward [rad]."""
+    """Forward lean of the trunk [rad]."""
     stride: Float[np.ndarray, "*time"]
-    """How far the left foot is before the pelvis, and the right one behind it [m]."""
+    """Distance of the left foot before the pelvis, and of the right foot behind it [m]."""
     swing: Float[np.ndarray, "*time"]
-    """Which foot is lifted and how high: 1 the left one, -1 the right one, 0 none."""
+    """Lifted foot and its relative height: 1 the left one, -1 the right one, 0 none."""
     hands: Float[np.ndarray, "*time 2 3"]
-    """Where the left and the right hand hold things, in the worker's own frame [m]; both sink
-    with the body by what a stride takes of its height."""
+    """Grip of the left and the right hand, in the worker's frame [m]; both sink with the pelvis
+    during a stride.
+    """
 
 
 class Worker:
@@ -162,17 +163,17 @@ class Worker:
 
     @property
     def lengths(self) -> Float[np.ndarray, " parts"]:
-        """Of the axis of each capsule, the same in any posture [m]."""
+        """Length of the axis of each capsule [m], constant."""
         ends = self.ends(self.standing())
         return np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
 
     @property
     def arm_length(self) -> float:
-        """From the shoulder to what a stretched arm holds [m]."""
+        """Distance from the shoulder to the grip of a stretched arm [m]."""
         return self._size * (_UPPER_ARM + _FOREARM + _GRIP * _HAND) * _STRETCHED
 
     def hanging_hands(self) -> Float[np.ndarray, "2 3"]:
-        """Where the hands of a standing person are, in his own frame [m]."""
+        """Hand positions of a standing person, in the worker's frame [m]."""
         x, y = 0.03 * self._size, _SHOULDER_HALF * self._size + 0.02
         z = _SHOULDER_HEIGHT * self._size - 0.98 * self.arm_length
         return np.array([[x, y, z], [x, -y, z]])
@@ -217,14 +218,14 @@ class Worker:
         return self._placed(own, posture)
 
     def lean_to(self, hand: Float[np.ndarray, "3"], side: int) -> float | None:
-        """How far he has to lean for a hand to be somewhere.
+        """Smallest lean of the trunk that brings a hand to a point.
 
         Args:
-            hand: Where, in his own frame [m].
+            hand: The point, in the worker's frame [m].
             side: 0 for the left hand, 1 for the right one.
 
         Returns:
-            The least angle of the trunk [rad]; None if he cannot reach it.
+            Angle of the trunk [rad]; None if the point is out of reach.
         """
         lean = np.linspace(0.0, 1.2, 61)
         pelvis, up = self._trunk(lean, np.zeros_like(lean))
@@ -235,11 +236,11 @@ class Worker:
         return float(lean[near_enough[0]]) if len(near_enough) else None
 
     def grip(self, ends: Float[np.ndarray, "*time parts 2 3"], side: int) -> np.ndarray:
-        """Where the left (0) or right (1) hand holds things, (*time, 3) in the base frame [m].
+        """Grip of the left (0) or right (1) hand, (*time, 3) in the base frame [m].
 
         Args:
-            ends: Of the axes of the capsules [m].
-            side: Of the hand.
+            ends: Ends of the axes of the capsules [m].
+            side: 0 for the left hand, 1 for the right one.
         """
         wrist, tip = np.moveaxis(ends[..., _PAIRS["hand"][side], :, :], -2, 0)
         return wrist + _GRIP * _HAND / (_HAND - _RADII["hand"]) * (tip - wrist)
@@ -251,7 +252,9 @@ class Worker:
         return pelvis, _vector(np.sin(lean), 0.0, np.cos(lean))
 
     def _hip_height(self, stride: float | np.ndarray) -> float | np.ndarray:
-        """As high as straight legs let it be whose feet are so far before or behind it [m]."""
+        """Height of the pelvis over straight legs whose feet are this far before or behind it
+        [m].
+        """
         leg = _STRETCHED * (_THIGH + _SHANK) * self._size
         reach = np.minimum(np.abs(stride), 0.8 * leg)
         return _ANKLE_HEIGHT * self._size + np.sqrt(leg**2 - reach**2)
@@ -296,7 +299,7 @@ class Worker:
             own[..., parts, 0, :], own[..., parts, 1, :] = first, second
 
     def _placed(self, own: np.ndarray, posture: Posture) -> np.ndarray:
-        """From the worker's frame into the base frame."""
+        """Transform from the worker's frame to the base frame."""
         angle, place = posture.heading[..., None, None], posture.place[..., None, None, :]
         c, s = np.cos(angle), np.sin(angle)
         x, y = own[..., 0], own[..., 1]

@@ -1,4 +1,4 @@
-"""How far the worker truly is from arm, tool and load, as only the simulator knows."""
+"""True distance of the worker from arm, tool and load, known to the simulator only."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _FARTHEST = 100.0  # distances are measured up to here [m]
 
 
 class NearestPair(NamedTuple):
-    """Where a worker and a robot are nearest to each other."""
+    """Nearest pair of points of worker and robot."""
 
     distance: float
     """Between their surfaces; negative is how deep they overlap [m]."""
     points: Float[np.ndarray, "2 3"]
     """Nearest point on the robot or its load, and on the worker [m]."""
     arm_geom: str
-    """Of the robot, or of the load."""
+    """Geom of the robot or of its load."""
     worker_geom: str
 
 

@@ -1,4 +1,4 @@
-"""How the robot sees the worker: late, with noise, and not in every image."""
+"""A simulated person tracker: delayed, noisy, and with missed detections."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ IMAGE_RATE = 30.0
 
 @runtime_checkable
 class Seen(Protocol):
-    """Somebody's visit, as far as a tracker sees it."""
+    """A worker's visit, as seen by a tracker."""
 
     @property
     def worker(self) -> Worker:
-        """Who it is."""
+        """Body of the worker."""
         ...
 
     def ends_at(self, time: float) -> Float[np.ndarray, "parts 2 3"]:

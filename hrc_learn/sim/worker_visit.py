@@ -1,7 +1,7 @@
-"""What a worker does at the table (the paper's Experiment 3), as a function of time.
+"""A worker's visit to the table (the paper's Experiment 3), as a function of time.
 
-He walks in, puts something on the bench, reaches for markers that lie under the arm, and walks
-away. He does not look at the robot and makes no way for it.
+The worker walks in, puts an object on the bench, reaches for markers that lie under the arm,
+and walks away, without regard for the robot.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _HEAD_FROM_HIP = 0.47
 
 @dataclass(frozen=True, kw_only=True)
 class HumanSpeeds:
-    """How fast he is at most; ISO 13855 takes these of people who approach a machine."""
+    """Largest speeds of a worker; ISO 13855 assumes these for people who approach a machine."""
 
     walking: float = 1.6
-    """Of the body [m/s]."""
+    """Walking speed [m/s]."""
     reaching: float = 2.0
-    """Of a hand [m/s]."""
+    """Speed of a hand [m/s]."""
     turning: float = 2.5
     """About the vertical [rad/s]."""
 
@@ -53,7 +53,7 @@ class HumanSpeeds:
 
 
 class WorkerPose(NamedTuple):
-    """What is given of a posture at the ends of a movement."""
+    """Posture at one end of a movement."""
 
     place: np.ndarray
     heading: float
@@ -68,11 +68,11 @@ class WorkerCapsules(NamedTuple):
     """A worker's body at any number of times."""
 
     ends: Float[np.ndarray, "*time parts 2 3"]
-    """Of the axes of his capsules, in the base frame [m]."""
+    """Ends of the axes of the capsules, in the base frame [m]."""
     radius: Float[np.ndarray, " parts"]
     """[m]"""
     velocity: Float[np.ndarray, "*time parts 2 3"]
-    """Of the ends [m/s]."""
+    """Velocities of the ends [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,28 +82,28 @@ class WorkerVisit:
     worker: Worker
     """Whose body it is."""
     time: Float[np.ndarray, " poses"]
-    """When he is in each [s]; he rests before the first and after the last."""
+    """Times of the key postures [s]; the worker rests before the first and after the last."""
     poses: Float[np.ndarray, "poses 10"]
     """Place [m], heading and lean [rad], and both hands in his own frame [m]."""
     step: float
     """Length of his steps [m]."""
     side: int
-    """Of the hand that carries something for the bench: 0 left, 1 right."""
+    """Hand that carries the object for the bench: 0 left, 1 right."""
     released: float
-    """When he lets go of it there [s]."""
+    """Time at which the object is put down [s]."""
     markers: Float[np.ndarray, "markers 3"]
-    """What he reaches for [m]."""
+    """Points that the worker reaches for [m]."""
     reaches: Float[np.ndarray, "markers 2"]
-    """From when to when a hand is at each of them [s]."""
+    """Interval in which a hand is at each of them [s]."""
 
     @property
     def begin(self) -> float:
-        """When he comes in [s]."""
+        """Time of entering [s]."""
         return float(self.time[0])
 
     @property
     def end(self) -> float:
-        """When he has left [s]."""
+        """Time of having left [s]."""
         return float(self.time[-1])
 
     @cached_property
@@ -120,7 +120,7 @@ class WorkerVisit:
         return replace(self, poses=poses, markers=turned_about_base(self.markers, angle))
 
     def posture(self, time: Float[np.ndarray, "*time"]) -> Posture:
-        """How and where he stands at given times [s]."""
+        """Postures and places at given times [s]."""
         change, length, steps = self._movements
         k = np.searchsorted(self.time, time, side="right") - 1
         k = np.minimum(np.maximum(k, 0), len(change) - 1)
@@ -160,7 +160,7 @@ class WorkerVisit:
         return self.worker.ends(self.posture(np.asarray(time, dtype=float)))
 
     def capsules_at(self, time: float | Float[np.ndarray, "*time"]) -> WorkerCapsules:
-        """Where all of him is, and how fast it moves.
+        """Positions and velocities of the whole body.
 
         Args:
             time: One or several times [s].
@@ -175,11 +175,11 @@ class WorkerVisit:
     def item_at(
         self, time: float, ends: Float[np.ndarray, "parts 2 3"] | None = None
     ) -> Float[np.ndarray, "3"]:
-        """Where the thing is that he puts on the bench: in his hand, then where he left it [m].
+        """Position of the object for the bench: in the hand, then where it was put down [m].
 
         Args:
-            time: [s]
-            ends: `ends_at` that time, where they are known.
+            time: Times [s].
+            ends: `ends_at` that time, if known.
         """
         if time >= self.released:
             return self._left_there
@@ -187,11 +187,11 @@ class WorkerVisit:
 
     @cached_property
     def _left_there(self) -> np.ndarray:
-        """Where he leaves what he carries [m]."""
+        """Position where the object is put down [m]."""
         return self._in_hand(self.ends_at(self.released))
 
     def _in_hand(self, ends: np.ndarray) -> np.ndarray:
-        """Where the thing is that he holds [m]."""
+        """Position of the object in the hand [m]."""
         return self.worker.grip(ends, self.side) - np.array([0, 0, WORKER_ITEM_HALF_SIZE[2]])
 
 
@@ -246,18 +246,18 @@ def random_visit(
     """Draw a visit to the side of the bench that is opposite to the robot.
 
     Args:
-        worker: Who comes.
-        rng: Source of chance.
+        worker: Body of the worker.
+        rng: Random generator.
         bench: The table, whose far side (+y) is free.
-        under: What the arm is at work above, x and y [m]: markers lie around it.
-        begin: When he comes in, earliest and latest [s].
-        reaches: How many markers he reaches for, least and most.
-        speeds: How fast he is at most; each visit takes 50 to 95 % of it.
-        is_clear: Of postures, whether they leave alone what he sees there: he reaches for what
-            he can reach in such a way.
+        under: Point below the arm's task, x and y [m]: markers lie around it.
+        begin: Earliest and latest time of entering [s].
+        reaches: Smallest and largest number of markers to reach for.
+        speeds: Largest speeds; each visit takes 50 to 95 % of them.
+        is_clear: Predicate on postures that is true if they touch nothing at the bench; the
+            worker reaches only for what such postures reach.
 
     Raises:
-        ValueError: There is nothing under there that he can reach.
+        ValueError: No marker under the arm is within reach.
     """
     most = speeds or HumanSpeeds()
     pace = HumanSpeeds(
@@ -279,7 +279,7 @@ def random_visit(
     )
 
     def own(point: np.ndarray) -> np.ndarray:
-        """A point in the frame of the worker who stands there."""
+        """A point in the frame of a standing worker."""
         c, s = np.cos(facing), np.sin(facing)
         x, y = point[:2] - stand
         return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])
@@ -317,7 +317,9 @@ def random_visit(
     script.go(hands=ready, lean=0.05)
 
     def is_reached(target: np.ndarray, which: int, lean: float) -> bool:
-        """Whether he can go there from where he stands, and leaves alone what is there."""
+        """True if the worker can reach a posture from the present place and touches nothing
+        there.
+        """
         way = np.linspace(0.4, 1.0, 4)[:, None, None]
         leans = way[:, 0, 0] * lean
         posture = Posture(

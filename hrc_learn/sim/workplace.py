@@ -75,27 +75,27 @@ class Workplace:
     table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
     table_reach: tuple[float, float] = (0.14, 0.14)
-    """How far from there the edges of objects may be, along x and y [m]."""
+    """Largest distance of object edges from there, along x and y [m]."""
     hover_height: float = 0.17
-    """Of the tool centre point while it servoes to an object [m]."""
+    """Height of the tool centre point during visual servoing [m]."""
     hover_orientation: tuple[float, float, float, float] = tuple(gripper_down().tolist())
-    """Of the end effector above the table (wxyz)."""
+    """Orientation of the end effector above the table (wxyz)."""
     hover_q7: float = -0.1
     """Joint 7 of Franka's arms above the table [rad]."""
     hover_posture: tuple[float, ...] = ()
     """Joint positions of other arms near which they are above the table [rad]."""
     fingertip: float = 0.012
-    """How far the fingers reach beyond the tool centre point, in the middle of the pads [m]."""
+    """Length of the fingers beyond the tool centre point, in the middle of the pads [m]."""
     palm: float = 0.0374
-    """How far the palm stands back from it [m]."""
+    """Distance of the palm behind the tool centre point [m]."""
     hover_turns: tuple[float, float] = (np.deg2rad(-60.0), np.deg2rad(120.0))
     """Least and greatest turn of the end effector about the vertical there [rad]: half a turn,
     in which the forearm does not come between its marker and the camera. It begins to at -80
     degrees, by `marker_seen`; an arm that has yielded may stand less well."""
     shelf_x: float = 0.40
-    """Where along the boards objects are put [m]."""
+    """Position along the boards where objects are placed [m]."""
     shelf_depth: float = 0.10
-    """From the boards' front edge to the tool centre point [m]."""
+    """Distance from the boards' front edge to the tool centre point [m]."""
     level_at: float = 0.6
     """Distance to the right of the base at which the end effector is level [m]."""
     clearance: float = 0.007
@@ -171,7 +171,8 @@ class Workplace:
     def hover_joints(self) -> Float[Tensor, " joints"]:
         """Joint positions above the table, with the upper arm well off the vertical.
 
-        Where it is upright, the axes of joints 1 and 3 coincide, and nobody can pull the elbow.
+        With the upper arm upright, the axes of joints 1 and 3 coincide and the elbow cannot be
+        pulled.
         """
         if self.robot.is_franka:
             return self.robot.chain.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
@@ -237,7 +238,7 @@ class Workplace:
         return pose
 
     def shelf_names(self) -> tuple[str, ...]:
-        """From bottom to top."""
+        """Names of the shelves, from bottom to top."""
         shelves = self.scene.cabinet.shelves
         return tuple(sorted(shelves, key=shelves.__getitem__))
 
@@ -271,10 +272,11 @@ class Workplace:
         return Pose(position, coarse_orientation(position, self.level_at))
 
     def lowering(self, half_size: tuple[float, float, float]) -> float:
-        """How far an object may be let down until the hand itself would be near the board [m].
+        """Distance by which an object can be lowered until the gripper would be near the board
+        [m].
 
         Args:
-            half_size: Of the object, which lies on its side [m].
+            half_size: Half size of the object, which lies on its side [m].
         """
         return max(half_size[1] + self.clearance - _HAND_HALF - _OVER_BOARD, 0.0)
 
@@ -287,15 +289,16 @@ class Workplace:
 
 @dataclass(frozen=True, kw_only=True)
 class CellLayout:
-    """Where an arm works, and how."""
+    """Layout of the work cell for one arm."""
 
     workplace: Workplace
-    """With its furniture, postures, the side of the marker and the turns above the table."""
+    """Workplace with furniture, postures, side of the marker and turns above the table."""
     quality: float
     """Least room on the way, from 0, where something fails, to 1, where there is plenty."""
     seen: float
-    """Share of poses above the table, within its turns, that are reached with the marker in
-    view."""
+    """Fraction of poses above the table, within its turns, that are reached with the marker in
+    view.
+    """
 
 
 type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
@@ -359,7 +362,7 @@ def _worth(quality: float, seen: float) -> float:
 
 
 def _workplaces(robot: Arm, scale: float) -> Iterator[Workplace]:
-    """With the table at one distance, and the cabinet in several places."""
+    """Layouts with the table at one distance and the cabinet in several places."""
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))
     shifts = [(along, higher) for along in _ALONG for higher in _HIGHER]
@@ -470,7 +473,9 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
 
 
 def _way_to_shelf(workplace: Workplace, name: str) -> Float[Tensor, "points 3"]:
-    """Of the end effector from home over the edge of a board, as the expert leads it [m]."""
+    """Path of the end effector from home over the edge of a board, as the expert demonstrates
+    it [m].
+    """
     goal, front = workplace.shelf(name).position, workplace.shelf_front(name).position
     lift = _vector(0.0, 0.0, _LIFT)
     inside = goal + _INSIDE * (front - goal) + lift

@@ -1,4 +1,4 @@
-"""The workplace in motion: a MuJoCo world to reset, to advance and to ask who touches whom."""
+"""The workplace in motion: a MuJoCo world to reset, to step, and to query for contacts."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -83,7 +83,7 @@ class ContactMonitor:
 
     @property
     def watched(self) -> Bool[np.ndarray, "geoms geoms"]:
-        """Which pairs of geoms it watches."""
+        """Watched pairs of geoms."""
         return self._matters
 
     def update(self, data: mujoco.MjData) -> None:
@@ -232,8 +232,8 @@ class World:
             monitor.clear()
 
     def touched_since(self, time: float) -> tuple[str, ...]:
-        """What the arm has met since a time [s] that it should not: cabinet, table, itself or
-        the worker, in words.
+        """Unwanted contacts of the arm since a time [s]: cabinet, table, itself or the worker,
+        in words.
         """
         monitors = (
             self.cabinet_contacts,
@@ -253,7 +253,7 @@ class World:
         """Run the physics for a while, the arm following its last command [s].
 
         Raises:
-            PhysicsError: The simulation diverged, or somebody reset it without `reset`.
+            PhysicsError: The simulation diverged, or was reset without `reset`.
         """
         for _ in range(max(1, round(duration / self.model.opt.timestep))):
             self.arm.drive()
@@ -265,7 +265,7 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
 
     def _look_at_contacts(self) -> None:
-        """Of one step; none of most steps is one that any monitor watches."""
+        """Contacts of one step that a monitor watches; mostly none."""
         geoms = self.data.contact.geom
         if self._watched[geoms[:, 0], geoms[:, 1]].any():
             for monitor in self._monitors:
@@ -317,10 +317,10 @@ class World:
         self._put(name, self.arm.tcp_pose() @ _IN_HAND)
 
     def carry(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Put an object somewhere at rest, as somebody's hand does who carries it.
+        """Place an object at rest, as a person does by hand.
 
         Raises:
-            KeyError: If there is no object of that name.
+            KeyError: There is no object of that name.
         """
         self._object(name)
         self.data.joint(name).qvel[:] = 0.0
@@ -379,7 +379,7 @@ class World:
         return frame_of(self.data.body(name))
 
     def holds(self, name: str) -> bool:
-        """Whether both finger pads touch an object."""
+        """True if both finger pads touch an object."""
         return self._touched(name) >= self._pads
 
     def held(self) -> tuple[str, ...]:
@@ -387,8 +387,8 @@ class World:
         return tuple(item.name for item in self.config.objects if self.holds(item.name))
 
     def holds_flat(self, name: str) -> bool:
-        """Whether the pads press on opposite faces of an object, those that its x axis leads
-        out of: not on its edges, nor across it.
+        """True if the pads press on opposite faces of an object, normal to its x axis: not on
+        its edges, nor across it.
         """
         item, axis = self.model.geom(name).id, self.object_pose(name)[:3, 0]
         pads = {self.model.geom(pad).id: set() for pad in _PADS}
@@ -404,7 +404,7 @@ class World:
         return sorted(tuple(faces) for faces in pads.values()) == [(-1,), (1,)]
 
     def rests_on(self, name: str, board: str) -> bool:
-        """Whether an object touches a piece of furniture and nothing of the arm."""
+        """True if an object touches a piece of furniture and no part of the arm."""
         partners = self._partners(name)
         return board in partners and partners <= {box.name for box in self.config.boxes()}
 
@@ -480,7 +480,7 @@ class World:
 
 
 def _face(along: float) -> int:
-    """Which face a contact lies on, by the cosine of its normal: 1, -1, or 0 for neither."""
+    """Face that a contact lies on, by the cosine of its normal: 1, -1, or 0 for neither."""
     return 0 if abs(along) < _FLAT else int(math.copysign(1, along))
 
 

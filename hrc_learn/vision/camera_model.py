@@ -23,7 +23,7 @@ NONE: Coefficients = (0.0, 0.0, 0.0, 0.0, 0.0)
 def distort(
     normalised: Float[np.ndarray, "*batch 2"], coefficients: Coefficients
 ) -> Float[np.ndarray, "*batch 2"]:
-    """Where the lens puts points that a pinhole would put at `normalised`."""
+    """Distorted position of points that a pinhole camera images at `normalised`."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = normalised[..., 0], normalised[..., 1]
     r2 = x * x + y * y
@@ -186,7 +186,7 @@ class CameraModel:
         return undistort((pixels - self.principal) / self.focal, self.distortion)
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether points in the base frame lie in front of the camera and in the image."""
+        """True where points in the base frame lie in front of the camera and in the image."""
         p = self.to_camera(points)
         u, v = np.moveaxis(self.project(points), -1, 0)
         inside = (u >= -0.5) & (u <= self.width - 0.5) & (v >= -0.5) & (v <= self.height - 0.5)

@@ -49,11 +49,11 @@ class ImageNoise:
         return image.copy() if self.blur == 0 else image
 
     def _noise(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-        """Gaussian noise, int16. Rows are random windows of one pool of samples.
+        """Gaussian noise, int16, whose rows are random windows of one pool of samples.
 
-        Drawing every sample of a 1440x1080 frame costs 50 ms, this costs 2 ms. Rows that
-        share samples do so at random shifts, which no detector of corners can notice. Parts
-        of a frame that are smaller than the pool get samples of their own.
+        Independent samples for a 1440x1080 frame cost 50 ms, this costs 2 ms. Rows reuse
+        samples at random shifts, which no corner detector can notice. Parts of a frame smaller
+        than the pool get independent samples.
         """
         rows, row = shape[0], int(np.prod(shape[1:]))
         if rows * row <= _POOL:
@@ -129,7 +129,7 @@ class OccludingBoard:
     """A flat board in one colour, in front of everything else."""
 
     corners: Float[np.ndarray, "corners 3"]
-    """Of a convex outline, in the base frame [m]."""
+    """Corners of a convex outline, in the base frame [m]."""
     colour: tuple[float, float, float]
     """Red, green, blue, 0 to 1."""
 
@@ -171,10 +171,10 @@ class SyntheticCamera:
             noise: Blur and noise of the sensor; the defaults of `ImageNoise` when None.
             hidden: Called at each frame; ids that are occluded now.
             occluders: Called at each frame; boards held in front of the camera now.
-            background: What is seen where no marker is; a plain table top when None.
+            background: Image outside the markers; a plain table top when None.
 
         Raises:
-            ValueError: If two markers share an id, or the background has another size.
+            ValueError: Two markers have the same id, or the background has another size.
         """
         self.model = model
         self.markers = _by_id(markers)
@@ -260,7 +260,9 @@ class SyntheticCamera:
         plate_size: float,
         pixels: int,
     ) -> Float32[np.ndarray, "h w 2"]:
-        """Where on the texture, which has a border of one pixel, each ray meets the plate."""
+        """Texture coordinates where each ray meets the plate; the texture has a border of one
+        pixel.
+        """
         R = self.model.pose[:3, :3].T @ pose[:3, :3]
         t = self.model.to_camera(pose[:3, 3])
         # [R_x R_y t] takes points of the plate to rays; its inverse takes rays to the plate.
