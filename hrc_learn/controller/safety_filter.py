@@ -23,7 +23,7 @@ from hrc_learn.controller.constraint_layer import (
 from hrc_learn.controller.limit_barrier import LimitBarrier
 from hrc_learn.geometry.arrays import ArrayLike, as_tensor
 from hrc_learn.geometry.numerics import is_number
-from hrc_learn.kinematics import JointLimits
+from hrc_learn.kinematics import JointLimits, MotionLimits
 from hrc_learn.pytree import pytree
 
 
@@ -214,7 +214,7 @@ class SafetyFilter(nn.Module):
     fades in time for the velocity to arrive without overshoot, so stops and resumes are smooth.
     """
 
-    def __init__(self, limits: JointLimits | HasLimits, config: SafetyConfig | None = None):
+    def __init__(self, limits: MotionLimits | HasLimits, config: SafetyConfig | None = None):
         """Prepare the filter.
 
         Args:
@@ -222,7 +222,7 @@ class SafetyFilter(nn.Module):
             config: Margins and caps; default: the recommended ones.
         """
         super().__init__()
-        if not isinstance(limits, JointLimits):
+        if not isinstance(limits, MotionLimits):
             limits = limits.limits
         self.config = config = config or SafetyConfig()
         # A step shorter than dt needs a larger acceleration for the same change of velocity.

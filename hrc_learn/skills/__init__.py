@@ -25,9 +25,9 @@ from hrc_learn.skills.placing import PlacingSkill as PlacingSkill
 from hrc_learn.skills.placing import Plan as Plan
 from hrc_learn.skills.placing import check_plan as check_plan
 from hrc_learn.skills.placing import plan_candidates as plan_candidates
-from hrc_learn.skills.visual_servoing import ServoTarget as ServoTarget
+from hrc_learn.skills.servo_target import ServoTarget as ServoTarget
+from hrc_learn.skills.servo_target import VisualServoConfig as VisualServoConfig
 from hrc_learn.skills.visual_servoing import VisualServo as VisualServo
-from hrc_learn.skills.visual_servoing import VisualServoConfig as VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
 from hrc_learn.skills.visual_skill import VisualTarget as VisualTarget
 from hrc_learn.skills.work_cell import WorkCell as WorkCell

@@ -1,8 +1,8 @@
-"""What a person draws beside an arm that servoes, as goals of its controller.
+"""Goals of the controller from the region, target and turn that a person draws.
 
-The paper's expert draws the Cartesian region by the AR interface and adjusts the coarse
-orientation (section VII). The region is a box there (CaFun), and so it is here: the box drawn
-is the region, wall by wall.
+The paper's expert draws the Cartesian region in the AR interface and adjusts the coarse
+orientation (section VII). The region is a box there (CaFun), and here: its walls are those that
+were drawn.
 """
 
 import math
@@ -22,22 +22,23 @@ from hrc_learn.regions import PositionRegion
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnGoalsConfig:
-    """How a person's drawing acts on the goals."""
+    """Effect of a person's drawing on the goals."""
 
     rate: float = 4.0
-    """How fast the end effector returns over the walls of a region [1/s]; that of the planned
-    box. Arms that are 30 ms late follow it without overshoot."""
+    """Rate at which the end effector returns over the walls of a region [1/s], equal to that of
+    the planned box. Arms with a delay of 30 ms follow it without overshoot."""
     target_half_size: float = 0.003
-    """Half edges of the box round a marked target [m]: the flatness of the planned box."""
+    """Half edges of the box about a drawn target [m]; equal to the height of the planned
+    box."""
     wall: float = 0.02
-    """Depth behind the walls of a region over which the camera takes over [m]: the way at full
-    speed, 0.25 m/s, within 80 ms, by which images and servos are late."""
+    """Depth behind the walls of a region over which vision feedback fades in [m]: the distance
+    covered at full speed, 0.25 m/s, during the delay of images and servos, 80 ms."""
     largest_turn: float = 0.5
-    """Turn on top of the planned orientation, at most [rad]. The marker on the end effector
-    is found in images up to about twice that tilt."""
+    """Largest turn relative to the planned orientation [rad]. The marker on the end effector is
+    detected up to about twice that tilt."""
     settling: float = 0.15
-    """How long a drawing that keeps changing must be still before it leads [s]: a pointer that
-    is dragged brings another one 25 times a second, each of which would have to be checked."""
+    """Time without changes until a drawing that keeps changing is applied [s]: a dragged
+    pointer changes it 25 times a second, and each change would have to be checked."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -46,7 +47,7 @@ class DrawnGoalsConfig:
 
 
 class Drawing(NamedTuple):
-    """Where a person wants the end effector."""
+    """Region and target of the end effector drawn by a person."""
 
     region: DrawnRegion | None
     target: tuple[float, float, float] | None
@@ -56,29 +57,29 @@ class Drawing(NamedTuple):
 
     @property
     def words(self) -> str:
-        """What leads the end effector."""
+        """Name of the drawing, for messages."""
         if self.target is None:
-            return "the region drawn"
-        return "the target" if self.region is None else "the target in the region drawn"
+            return "the drawn region"
+        return "the target" if self.region is None else "the target in the drawn region"
 
 
 _NOTHING = Drawing(None, None)
-# Only keeps a division by zero out [rad].
+# Avoids a division by zero [rad].
 _TINY_TURN = 1e-9
 
 
 def drawn_position(
     drawing: Drawing, planned: PositionRegion, config: DrawnGoalsConfig
 ) -> PositionRegion:
-    """The region of the controller's position that a drawing asks for.
+    """Position region of the controller for a drawing.
 
-    A region has the upright walls of the box that was drawn, less a margin over which the
-    camera loses its share. The image tells little about height: so the box stays as flat as
-    planned, at the planned height or the nearest to it within the region. A target has a small
-    box of its own, within the region.
+    It has the vertical walls of the drawn box, less a margin over which vision feedback fades.
+    The image shows little about height, so the box stays as flat as planned, at the planned
+    height or the nearest to it within the drawn one. A target has a small box of its own,
+    within the region.
 
     Args:
-        drawing: Of a region, a target or both.
+        drawing: Drawn region, target or both.
         planned: Region without the person.
         config: Rate and sizes.
     """
@@ -103,17 +104,17 @@ def drawn_position(
     )
 
 
-def camera_share(
+def vision_scale(
     box: DrawnRegion, position: Float[Tensor, "3"], config: DrawnGoalsConfig
 ) -> float:
-    """How much the camera takes part: not at all from the upright walls of a box on outwards.
+    """Scale of vision feedback, 0 to 1: zero at the vertical walls of a box and outside.
 
-    So what it sees beyond them does not draw the end effector out of the box.
+    So a feature outside the box cannot draw the end effector out of it.
 
     Args:
-        box: As it was drawn.
-        position: Of the end effector [m].
-        config: Depth behind the walls from which on the camera has its full share.
+        box: Drawn box.
+        position: Position of the end effector [m].
+        config: Depth behind the walls at which the scale reaches 1.
     """
     middle, half = position.new_tensor(box.centre), position.new_tensor(box.half_size)
     behind = half[:2] - (position - middle)[:2].abs()
@@ -121,121 +122,146 @@ def camera_share(
 
 
 def _margin(half_size: Float[Tensor, "3"], config: DrawnGoalsConfig) -> Float[Tensor, "2"]:
-    """Between the upright walls of a box and of the controller's region in it [m]."""
-    # Half of a narrow box is left.
+    """Margin between the vertical walls of a drawn box and of the controller's region [m]."""
+    # At most half of a narrow box.
     return (half_size[:2] / 2).clamp(max=config.wall)
 
 
-def _within(planned: PositionRegion, region: PositionRegion) -> bool:
-    """Whether the middle of the planned region is in another one."""
-    away = (planned.centre - region.centre).abs()
-    return bool((away <= region.half_size).all())
+def _contains(region: PositionRegion, planned: PositionRegion) -> bool:
+    """True if a region contains the middle of the planned one."""
+    offset = (planned.centre - region.centre).abs()
+    return bool((offset <= region.half_size).all())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DrawnGoalsState:
+    """State of a person's drawing and turn."""
+
+    turn: Float[Tensor, "4"]
+    """Rotation that the person has added to the planned orientation (w, x, y, z)."""
+    drawing: Drawing = _NOTHING
+    """Newest drawing."""
+    active: Drawing = _NOTHING
+    """Drawing that replaces the planned region; empty: the plan holds."""
+    away: bool = False
+    """True if the active drawing is away from the planned region, so that the task waits."""
+    changed: float = -math.inf
+    """Time of the last change of the drawing [s]."""
+    checked: bool = True
+    """True once the newest drawing has been checked."""
 
 
 class DrawnGoals:
-    """Takes over what a person draws, where the arm can go there, and keeps what they turned.
-
-    Attributes:
-        leads: What leads the end effector now; empty where the plan does.
-        away: Whether that leads away from the planned region, so that the task waits.
-        turn: Rotation that the person has added to the planned orientation (wxyz).
-    """
+    """Applies a person's drawing where the arm can go there, and their turn."""
 
     def __init__(
-        self,
-        config: DrawnGoalsConfig,
-        refusal: Callable[[Pose], str] = lambda pose: "",
-        tell: Callable[[str], None] = lambda words: None,
+        self, config: DrawnGoalsConfig, refusal: Callable[[Pose], str] = lambda pose: ""
     ):
-        """Begin with nothing drawn.
+        """Prepare.
 
         Args:
-            config: How drawings act.
-            refusal: Why the arm cannot go to a pose; empty if it can.
-            tell: Told what happens, in words for the person.
+            config: Effect of drawings.
+            refusal: Reason why the arm cannot go to a pose; empty if it can.
         """
-        self._config, self._refusal, self._tell = config, refusal, tell
-        self.leads: Drawing
-        self.restart()
-        self.turn: Float[Tensor, "4"] = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+        self._config, self._refusal = config, refusal
 
-    def restart(self) -> None:
-        """Look anew at what is drawn: the arm begins to servo, maybe elsewhere."""
-        self._seen, self.leads, self.away = _NOTHING, _NOTHING, False
-        self._changed, self._checked = -math.inf, True
+    def initial_state(self) -> DrawnGoalsState:
+        """State without a drawing or a turn."""
+        return DrawnGoalsState(turn=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
 
-    def read(self, asked: HumanInput, planned: Goals, time: float) -> None:
-        """Take in what a person has drawn.
+    def restarted(self, state: DrawnGoalsState) -> DrawnGoalsState:
+        """State for another target: the drawing is checked again, the turn is kept."""
+        return DrawnGoalsState(turn=state.turn)
+
+    def read(
+        self, state: DrawnGoalsState, human: HumanInput, planned: Goals, time: float
+    ) -> tuple[DrawnGoalsState, str]:
+        """Take in the drawing of a person.
 
         Args:
-            asked: By the person.
+            state: State after the last step.
+            human: Input of the person.
             planned: Goals without the drawing.
-            time: Now [s].
+            time: Present time [s].
+
+        Returns:
+            The next state, and a message to the person; empty: none.
         """
-        drawing = Drawing(asked.region, asked.target)
-        if drawing != self._seen:
-            # The first of several changes leads at once, as does switching off.
-            still = time - self._changed >= self._config.settling
-            self._seen, self._changed, self._checked = drawing, time, False
-            if still or not drawing:
-                self._take(planned)
-        elif not self._checked and time - self._changed >= self._config.settling:
-            self._take(planned)
+        drawing = Drawing(human.region, human.target)
+        waited = time - state.changed >= self._config.settling
+        if drawing != state.drawing:
+            # The first of several changes is applied at once, and so is the end of a drawing.
+            state = replace(state, drawing=drawing, changed=time, checked=False)
+            if waited or not drawing:
+                return self._checked(state, planned)
+        elif not state.checked and waited:
+            return self._checked(state, planned)
+        return state, ""
 
-    def applied(self, planned: Goals, position: Float[Tensor, "3"]) -> Goals:
-        """The goals with what leads in the place of the planned region.
+    def applied(
+        self, state: DrawnGoalsState, planned: Goals, position: Float[Tensor, "3"]
+    ) -> tuple[Goals, DrawnGoalsState]:
+        """The goals with the active drawing in place of the planned region.
 
-        Within a region the camera takes part (`camera_share`); to a target the person leads
-        without it. A joint-space approach that ends elsewhere is left out.
+        Within a region, vision feedback acts (`vision_scale`); a target is approached without
+        it. A joint-space approach that ends elsewhere is left out.
 
         Args:
+            state: State after `read`.
             planned: Goals without the person.
-            position: Of the end effector [m].
+            position: Position of the end effector [m].
         """
-        self.away = False
-        if not self.leads:
-            return planned
-        box, target = self.leads
-        region = drawn_position(self.leads, planned.position, self._config)
+        if not state.active:
+            return planned, replace(state, away=False)
+        box, target = state.active
+        region = drawn_position(state.active, planned.position, self._config)
         goals = replace(planned, position=region)
-        self.away = target is not None or not _within(planned.position, region)
-        if self.away:
+        away = target is not None or not _contains(region, planned.position)
+        if away:
             goals = goals.approached_by(None)
         if target is not None or box is None:
-            return goals.with_vision(False)
-        share = camera_share(box, position, self._config)
-        vision = replace(planned.vision, stiffness=share * planned.vision.stiffness)
-        return replace(goals, vision=vision)
-
-    def _take(self, planned: Goals) -> None:
-        self._checked, before = True, self.leads
-        self.leads = self._seen
-        if not self._seen:
-            if before:
-                self._tell("The plan leads again.")
-            return
-        where = drawn_position(self._seen, planned.position, self._config).centre
-        assert planned.orientation is not None  # servoing to an object leads all of a pose
-        why = self._refusal(Pose(where, planned.orientation.goal))
-        if why:
-            self.leads = _NOTHING
-            self._tell(f"Refused {self._seen.words}: {why}.")
+            goals = goals.with_vision(False)
         else:
-            self.applied(planned, where)
-            words, waits = self._seen.words, "; the task waits" if self.away else ""
-            self._tell(f"{words[0].upper()}{words[1:]} leads the end effector{waits}.")
+            scale = vision_scale(box, position, self._config)
+            vision = replace(planned.vision, stiffness=scale * planned.vision.stiffness)
+            goals = replace(goals, vision=vision)
+        return goals, replace(state, away=away)
 
-    def turn_on(self, asked: tuple[float, float, float] | None, most: float) -> None:
-        """Turn a little further towards what a person asks for, within the largest turn.
+    def turned(
+        self,
+        state: DrawnGoalsState,
+        requested: tuple[float, float, float] | None,
+        most: float,
+    ) -> DrawnGoalsState:
+        """State turned further towards a requested rotation, within the largest turn.
 
         Args:
-            asked: Rotation vector [rad]; None: none.
-            most: By how much [rad].
+            state: State after the last step.
+            requested: Rotation vector [rad]; None: none.
+            most: Largest angle of this step [rad].
         """
-        vector = self.turn.new_tensor(asked or (0.0, 0.0, 0.0))
+        vector = state.turn.new_tensor(requested or (0.0, 0.0, 0.0))
         length = float(vector.norm())
-        share = min(1.0, self._config.largest_turn / max(length, _TINY_TURN))
-        wanted = quaternion.exp(share * vector)
-        missing = float(quaternion.angle(self.turn, wanted))
-        if missing > 0:
-            self.turn = quaternion.slerp(self.turn, wanted, min(1.0, most / missing))
+        fraction = min(1.0, self._config.largest_turn / max(length, _TINY_TURN))
+        wanted = quaternion.exp(fraction * vector)
+        missing = float(quaternion.angle(state.turn, wanted))
+        if missing == 0:
+            return state
+        turn = quaternion.slerp(state.turn, wanted, min(1.0, most / missing))
+        return replace(state, turn=turn)
+
+    def _checked(self, state: DrawnGoalsState, planned: Goals) -> tuple[DrawnGoalsState, str]:
+        """State with the newest drawing active if the arm can go there, and a message."""
+        drawing, before = state.drawing, state.active
+        state = replace(state, checked=True, active=drawing)
+        if not drawing:
+            return state, "The plan guides the end effector again." if before else ""
+        middle = drawn_position(drawing, planned.position, self._config).centre
+        assert planned.orientation is not None  # servoing to an object controls the whole pose
+        reason = self._refusal(Pose(middle, planned.orientation.goal))
+        words = drawing.words
+        if reason:
+            return replace(state, active=_NOTHING), f"Refused {words}: {reason}."
+        _, state = self.applied(state, planned, middle)
+        waits = "; the task waits" if state.away else ""
+        return state, f"{words[0].upper()}{words[1:]} guides the end effector{waits}."

@@ -1,8 +1,8 @@
-"""How a task may fail."""
+"""Failures of a task."""
 
 
 class TaskFailedError(RuntimeError):
-    """A task could not be carried out; the message says at which phase and why."""
+    """A task failed; the message says in which phase and why."""
 
 
 class MissedGraspError(TaskFailedError):
@@ -10,8 +10,8 @@ class MissedGraspError(TaskFailedError):
 
 
 class StoppedByPersonError(TaskFailedError):
-    """The person beside the arm has stopped it, or something has met it; it is at rest."""
+    """A person or a contact has stopped the arm; it is at rest."""
 
 
 class BlockedPathError(TaskFailedError):
-    """A planned motion would collide or leave the limits of the arm."""
+    """A planned motion would collide, or leave the limits of the arm."""

@@ -1,9 +1,9 @@
-"""Grasping an object with an uncalibrated camera, and recovering from failures.
+"""Grasping an object with an uncalibrated camera, with recovery from failures.
 
     detect -> servo -> grasp -> lift
 
-An object that is not detected is waited for. After a missed grasp, or servoing that timed out,
-everything starts again from home.
+The skill waits for an undetected object. After a missed grasp, or a timeout of servoing, it
+starts again from home.
 """
 
 from collections.abc import Callable
@@ -23,43 +23,38 @@ from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.failures import BlockedPathError, MissedGraspError, TaskFailedError
 from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.visual_servoing import (
-    ServoTarget,
-    VisualServo,
-    VisualServoConfig,
-    no_perspective,
-)
+from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig, no_perspective
+from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
 from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.skills.workplace import GraspObject, Workplace
 
 OPEN, CLOSED = 0.08, 0.0
-"""Widths the gripper is commanded to [m]: its full stroke; closed, it squeezes the object."""
+"""Commanded gripper widths [m]: the full stroke; and zero, which squeezes the object."""
 JOINT_SPEED = 0.6
 """Largest joint speed between postures [rad/s]: a quarter of the slowest joint's limit."""
 DESCENT_SPEED = 0.08
 """Mean speed of the last centimetres down to an object [m/s]."""
 CLOSING_TIME = 0.7
-"""For the fingers to close and for the grip to settle, at least [s]."""
+"""Shortest time for the fingers to close and the grip to settle [s]."""
 
-# For the fingers to open before the arm leaves, at least [s].
+# Shortest time for the fingers to open before the arm leaves [s].
 _OPENING_TIME = 0.3
-# Longest that fingers are waited for [s]: the Franka Hand's whole stroke at a quarter of its
-# speed, 3.2 s, and half a second to begin.
+# Timeout of a finger motion [s]: the Franka Hand's whole stroke at a quarter of its speed, 3.2
+# s, plus half a second to start.
 _LONGEST_FINGER_MOTION = 4.0
-# Fingers have moved when the opening has changed by so much [m], and are at rest when it has
-# changed by less than a tenth of that for so long [s]: of a gripper that tells it at 50 Hz.
+# Change of the opening that counts as motion [m], and time with a change below a tenth of it
+# that counts as rest [s], for a gripper that reports its opening at 50 Hz.
 _FINGERS_MOVED, _FINGERS_REST = 0.002, 0.1
-# The marker plate stands out from the arm's capsules by up to this [m].
+# Distance by which the marker plate protrudes from the arm's capsules [m].
 _PLATE_CLEARANCE = 0.06
-# Clearance is checked at one of so many samples: at JOINT_SPEED the arm moves 3 cm in between.
+# Clearance is checked at every fifth sample: at JOINT_SPEED the arm moves 3 cm in between.
 _CHECK_EVERY = 5
-# Values of joint 7 at which a pose that a person asks for is tried: each takes a millisecond.
+# Number of joint-7 values tried for a pose requested by a person: each takes a millisecond.
 _POSTURES = 9
-# Largest distance of a joint from home that still counts as at home [rad].
+# Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
-# By how much the table may be higher or lower than believed, and, once it was felt, than the
-# object before said [m].
+# Uncertainty of the table height before and after it was touched [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 
 type TargetLaw = Callable[
@@ -71,55 +66,66 @@ type TargetLaw = Callable[
     ],
     Float[np.ndarray, "2"],
 ]
-"""From the object's marker [px], the image Jacobian, the end effector's orientation, and how
-far it is to be from right above the object [m], to the target of its marker [px]."""
+"""Target of the end effector's marker [px], from the pixel of the object's marker, the image
+Jacobian, the end effector's orientation, and its offset from right above the object [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraspingConfig:
-    """How objects are grasped."""
+    """Settings of grasping."""
 
     servo: VisualServoConfig = field(default_factory=VisualServoConfig)
+    """Settings of visual servoing."""
     controller: ControllerConfig = field(
         default_factory=lambda: ControllerConfig(
             drift_compensation_rate=10.0, command_delay=0.03
         )
     )
-    """Settings of the adaptive controller; the high hold rate compensates the drift that steps
-    of 10 ms leave."""
+    """Settings of the adaptive controller; the high rate compensates the drift of 10 ms
+    steps."""
     approach: bool = True
-    """Whether the table is approached in joint space, along a path that was checked; else the
-    Cartesian regions guide from the start, as in the paper."""
+    """True: approach the table in joint space, along a checked path; False: use the Cartesian
+    regions from the start, as in the paper."""
     detection_timeout: float = 5.0
-    """How long to wait for an object that is not detected [s]."""
+    """Give up after an object is undetected for this long [s]."""
     lift: float = 0.20
-    """How far an object is lifted [m]."""
+    """Height by which an object is lifted [m]."""
     attempts: int = 3
-    """Grasps tried."""
+    """Largest number of grasps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraspResult:
-    """How an object was grasped."""
+    """Result of a grasp."""
 
     servo_time: float
-    """From the start of visual servoing until the target was reached [s]."""
+    """Time from the start of visual servoing until the target was reached [s]."""
     pixel_error: float
-    """At the start of the descent [px]."""
+    """Pixel error at the start of the descent [px]."""
     setbacks: tuple[str, ...] = ()
-    """Why earlier attempts failed."""
+    """Reasons why earlier attempts failed."""
 
     @property
     def attempts(self) -> int:
-        """Grasps tried."""
+        """Number of grasps."""
         return len(self.setbacks) + 1
 
 
+@dataclass(frozen=True)
+class _TableHeight:
+    """Height of the table, as known from touching it."""
+
+    height: float = 0.0
+    """Estimate in the base frame [m]."""
+    margin: float = _TABLE_RANGE
+    """Uncertainty [m]."""
+
+
 class Grasping:
-    """Grasps objects; `grasp` does it all, the other methods are its steps.
+    """Grasps objects: `grasp` runs the whole sequence, the other methods are its steps.
 
     Attributes:
-        servo: Runs the controller; its estimate of the image Jacobian persists between grasps.
+        servo: Visual servoing; its estimate of the image Jacobian persists between grasps.
     """
 
     def __init__(
@@ -133,19 +139,19 @@ class Grasping:
         target: TargetLaw | None = None,
         check: Callable[[Plan], None] = lambda plan: None,
     ):
-        """Prepare.
+        """Prepare grasping.
 
         Args:
             cell: Arm, gripper, camera and person.
-            workplace: The region over the table, and home. Its hover pose has the orientation
-                of the end effector; the simulator's `Workplace.approached` takes the
-                demonstrated one.
+            workplace: Region above the table, and home. Its hover pose has the orientation of
+                the end effector; the simulator's `Workplace.approached` uses the demonstrated
+                one.
             skill: Learned image Jacobian and visual target.
-            config: How objects are grasped.
-            estimator: Of the image Jacobian; None: a Kalman filter that starts from the
-                learned one, wherever the camera may have been moved since.
-            target: Where the end effector's marker should be; None: as learned.
-            check: Raises if a plan must not be executed.
+            config: Settings of grasping.
+            estimator: Estimator of the image Jacobian; None: a Kalman filter that starts from
+                the learned one, and tolerates a camera that was moved since.
+            target: Target of the end effector's marker; None: the learned one.
+            check: Function that raises if a plan must not be executed.
         """
         self._cell = cell
         self._workplace = workplace
@@ -155,25 +161,26 @@ class Grasping:
         self._depth_gradient = no_perspective if learned is None else learned.depth_gradient
         self._config = config = config or GraspingConfig()
         self._check = check
-        self._table, self._table_range = 0.0, _TABLE_RANGE
+        self._table = _TableHeight()
         controller = AdaptiveController(
             cell.chain,
             estimator or from_learned(skill.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=replace(config.controller, safety=cell.watchful(config.controller.safety)),
         )
-        self.servo = VisualServo(
-            cell, controller, workplace.tool_marker, config.servo, skill.angle, self.refusal
+        law = ServoStep(
+            controller, workplace.tool_marker, config.servo, skill.angle, self.refusal
         )
+        self.servo = VisualServo(cell, law)
 
     def grasp(self, item: GraspObject) -> GraspResult:
         """Grasp an object and lift it.
 
         Args:
-            item: What to grasp.
+            item: Object to grasp.
 
         Raises:
-            TaskFailedError: If the object is not detected, or all attempts fail.
+            TaskFailedError: The object is not detected, or all attempts fail.
         """
         self._cell.gripper.move(OPEN)
         setbacks: list[str] = []
@@ -195,13 +202,13 @@ class Grasping:
                 )
 
     def locate(self, item: GraspObject) -> ServoTarget:
-        """Detect an object while the arm is not above the table; where to servo to.
+        """Detect an object while the arm is not above the table; returns the servo target.
 
         An arm that is not at home may occlude the object: if it is not detected, the arm goes
         home first.
 
         Raises:
-            TaskFailedError: If the object's marker stays undetected.
+            TaskFailedError: The object's marker stays undetected.
         """
         detected = self._detect(item)
         away = self._cell.joints - self._workplace.home_joints()
@@ -211,7 +218,7 @@ class Grasping:
         if detected is None:
             raise TaskFailedError(
                 f"detect: the camera does not see marker {item.marker.id} of {item.name!r}. "
-                "Put it into the camera's view, and the arm out of it."
+                "Move the object into the camera's view, and the arm out of it."
             )
         pixel, angle = detected
         posture = self._posture() if self._config.approach else self._workplace.hover_joints()
@@ -224,11 +231,11 @@ class Grasping:
             lines=self._lines,
             depth_gradient=self._depth_gradient,
             angle=angle,
-            allowed=self._workplace.hover_turns,
+            turn_range=self._workplace.hover_turns,
         )
 
     def _detect(self, item: GraspObject) -> tuple[Float[np.ndarray, "2"], float] | None:
-        """Pixel and direction of an object's marker; None if it stays undetected."""
+        """Pixel and direction of an object's marker; None if it is not detected in time."""
         cell = self._cell
         cell.begin_phase("detect")
         deadline = cell.time + self._config.detection_timeout
@@ -239,10 +246,10 @@ class Grasping:
         return seen.pixels[item.marker.id], seen.angles[item.marker.id]
 
     def _posture(self) -> Float[Tensor, " joints"]:
-        """Joint positions above the table that can be reached, and home from there.
+        """Joint positions above the table with free paths from here and to home.
 
-        Where there are none, the arm goes home first. Nobody knows yet where on the table
-        objects are, so the path keeps clear of the whole region in which they may be.
+        Without such a posture the arm goes home first. The positions of objects on the table
+        are unknown so far, so the path avoids the whole region of the objects.
         """
         postures, home = self._workplace.hover_postures(), self._workplace.home_joints()
         for posture in postures:
@@ -253,20 +260,20 @@ class Grasping:
         return postures[0]
 
     def servo_to(self, target: ServoTarget) -> float:
-        """Bring the end effector above the object; the time it took [s].
+        """Bring the end effector above the object; returns the duration [s].
 
         Raises:
-            MissedGraspError: If it takes too long.
+            MissedGraspError: It takes too long.
         """
         self._cell.begin_phase("servo")
         self._cell.tracked_markers = (self._workplace.tool_marker,)
         return self.servo.servo_to(target)
 
     def refusal(self, pose: Pose) -> str:
-        """Why the end effector cannot be led to a pose from here; empty if it can.
+        """Reason why the end effector cannot go to a pose from here; empty if it can.
 
         Args:
-            pose: Where a person wants it.
+            pose: Pose requested by a person.
         """
         here = self._cell.joints
         try:
@@ -277,56 +284,56 @@ class Grasping:
             posture, *self._workplace.object_region()
         )
         if float(table) < _PLATE_CLEARANCE:
-            return "too near to what may stand on the table"
+            return "too close to objects on the table"
         try:
             self._check(joint_plan(self._cell, here, posture))
         except BlockedPathError as error:
-            return f"on the way there, {str(error).rstrip('.')}"
+            return f"on the path there, {str(error).rstrip('.')}"
         return ""
 
     def close_on(self, item: GraspObject) -> None:
         """Descend and close the fingers.
 
         Raises:
-            MissedGraspError: If there is nothing between them.
+            MissedGraspError: No object is between the fingers.
         """
         self._cell.begin_phase("grasp")
         self._cell.tracked_markers = ()
-        self._feel(item)
-        height = self._table + item.half_size[2]
+        self._touch_table(item)
+        height = self._table.height + item.half_size[2]
         self._cell.move_straight(self._at_height(height), speed=DESCENT_SPEED)
         move_fingers(self._cell, CLOSED, CLOSING_TIME)
         if not holds(self._cell, item):
-            # What was felt may not have been the table.
-            self._table, self._table_range = 0.0, _TABLE_RANGE
+            # The contact may not have been with the table.
+            self._table = _TableHeight()
             raise MissedGraspError(
-                f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
+                f"grasp: the fingers closed on nothing. Check that {item.name!r} is under its "
+                "marker."
             )
         self._cell.load = as_load(item)
 
-    def _feel(self, item: GraspObject) -> None:
-        """Feel, with the fingers about an object, how high what it stands on seems to be.
+    def _touch_table(self, item: GraspObject) -> None:
+        """Touch the table with the fingers about an object, and update its height.
 
-        An object that is taller than believed makes the table seem higher, and is grasped as
-        far below its top as it should be. What is believed remains where nothing is felt.
+        An object that is taller than expected makes the table seem higher, and is grasped at
+        the right distance below its top. Without a contact the estimate stays.
         """
-        # What is met first: the table by the fingers, or a tall object's top by the palm.
+        # First contact: the table with the fingers, or the top of a tall object with the palm.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
-        expected, margin = self._table + reach, self._table_range
+        expected, margin = self._table.height + reach, self._table.margin
         self._cell.move_straight(self._at_height(expected + margin), speed=DESCENT_SPEED)
         met = self._cell.move_until_contact(self._at_height(expected - margin))
         if met is not None:
-            self._table = float(met.position[2]) - reach
-            self._table_range = _OBJECT_RANGE
+            self._table = _TableHeight(float(met.position[2]) - reach, _OBJECT_RANGE)
 
     def _at_height(self, height: float) -> Pose:
-        """The end effector at a height [m], from here along its own direction."""
+        """Pose of the end effector at a height [m], from here along its own axis."""
         position, orientation = self._cell.pose.position, self.servo.orientation
         if orientation is None:
             orientation = self._workplace.hover().orientation
         direction = quaternion.to_matrix(orientation)[:, 2]
-        way = (height - position[2]) / direction[2]
-        return Pose(position + way * direction, orientation)
+        distance = (height - position[2]) / direction[2]
+        return Pose(position + distance * direction, orientation)
 
     def lift(self) -> None:
         """Lift the end effector straight up."""
@@ -334,15 +341,15 @@ class Grasping:
         self._cell.move_straight(raised(self._cell.pose, self._config.lift))
 
     def go_home(self) -> None:
-        """Move the joints home, via another posture where the straight path is blocked.
+        """Move the joints home, via another posture if the straight path is blocked.
 
         Raises:
-            BlockedPathError: If all paths are blocked.
+            BlockedPathError: All paths are blocked.
         """
         self._cell.begin_phase("home")
         here, home = self._cell.joints, self._workplace.home_joints()
         postures = self._workplace.hover_postures()
-        # With clearance if that is possible anywhere, then without.
+        # With clearance if any path has it, else without.
         for clearance in (_PLATE_CLEARANCE, None):
             if self._free(here, home, clearance):
                 break
@@ -362,7 +369,7 @@ class Grasping:
         goal: Float[Tensor, " joints"],
         clearance: float | None = None,
     ) -> bool:
-        """Whether a straight line in joint space is free; with a clearance to objects [m]."""
+        """True if a straight line in joint space is free, with a clearance to objects [m]."""
         plan = joint_plan(self._cell, start, goal)
         try:
             self._check(plan)
@@ -376,7 +383,7 @@ class Grasping:
         return bool((distance > clearance).all())
 
     def start_over(self) -> None:
-        """Open the fingers and go home, clear of the table and of the camera's view."""
+        """Open the fingers and go home, away from the table and out of the camera's view."""
         self._cell.tracked_markers = ()
         self._cell.load = None
         move_fingers(self._cell, OPEN, _OPENING_TIME)
@@ -388,14 +395,14 @@ class Grasping:
 def joint_plan(
     cell: WorkCell, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]
 ) -> Plan:
-    """A straight line in joint space as a plan for a work cell."""
+    """Plan of a straight line in joint space for a work cell."""
     dt = cell.config.dt
     path = joint_line(start, goal, speed=JOINT_SPEED, dt=dt)
     return Plan(goal=cell.chain.forward(goal), dt=dt, path=path.numpy(), chain=cell.chain)
 
 
 def as_load(item: GraspObject) -> GraspedBox:
-    """An object in the hand: gripped along its x, with its top towards the palm."""
+    """Load of a grasped object: gripped along its x axis, with its top towards the palm."""
     x, y, z = item.half_size
     return GraspedBox(half_size=(y, x, z))
 
@@ -403,13 +410,13 @@ def as_load(item: GraspObject) -> GraspedBox:
 def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
     """Open or close the fingers, and hold the end effector still until they are at rest.
 
-    Real grippers begin late, and some tell the opening only once they have arrived: as long as
-    it is what it was, they are waited for.
+    Real grippers start late, and some report the opening only at the end of a motion, so an
+    unchanged opening does not count as rest.
 
     Args:
         cell: Arm and gripper.
         width: Opening to reach, or to squeeze towards [m].
-        at_least: How long to hold still in any case [s].
+        at_least: Shortest time to hold still [s].
     """
     before, begun = cell.state.gripper_width, cell.time
     cell.gripper.move(width)
@@ -426,15 +433,15 @@ def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
 
 
 def holds(cell: WorkCell, item: GraspObject) -> bool:
-    """Whether the fingers are as far apart as an object between them keeps them.
+    """True if the opening of the fingers fits an object between them.
 
-    Half the object's width is the lower threshold, the middle between that width and open
-    fingers the upper one: far from a held object, and from closed and open fingers.
+    The thresholds are half the object's width, and the middle between that width and open
+    fingers: far from the opening with an object, and from closed and open fingers.
     """
     half = item.half_size[0]
     return half < cell.state.gripper_width < half + OPEN / 2
 
 
 def raised(pose: Pose, height: float) -> Pose:
-    """A pose higher up, in the same orientation [m]."""
+    """A pose moved up by a height [m], in the same orientation."""
     return Pose(pose.position + pose.position.new_tensor([0.0, 0.0, height]), pose.orientation)

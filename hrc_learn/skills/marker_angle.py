@@ -1,9 +1,10 @@
-"""How far the gripper has to turn for its marker to stand to an object's as demonstrated.
+"""Turn of the gripper that aligns its marker with an object's as demonstrated.
 
-The direction of a marker in the image changes with the tool's motion like its pixel does: by an
-image Jacobian of one row, learned from demonstrations and adapted online. Two flat markers that
-are turned alike look turned alike from any camera, but for perspective, so their difference in
-the image tells when the gripper is turned as demonstrated, without calibration.
+The direction of a marker in the image changes with the tool's motion as its pixel does: by an
+image Jacobian of one row, learned from demonstrations and adapted online. Except for
+perspective, two flat markers with equal directions appear with equal directions in any camera,
+so the difference of their directions in the image shows whether the gripper is turned as
+demonstrated, without calibration.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import copy
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,19 +28,19 @@ from hrc_learn.kinematics.tool_orientation import turn_about_vertical
 from hrc_learn.store import write_text
 
 HALF_TURN = math.pi
-"""Turns of the gripper that a parallel grasp cannot tell apart [rad]."""
+"""Period of the turn of a parallel grasp [rad]."""
 
-# How far out of the range a turn once chosen is kept [rad]: the error of its estimate before
-# the tool has turned, some 5 %, of up to half a turn.
+# Distance from the range within which a chosen turn is kept [rad]: the error of its estimate
+# before the tool has turned, about 5 % of up to half a turn.
 _KEPT = 0.15
 
-# A marker's direction is measured to some 0.1 px over 50 px of its edge [rad].
+# Noise of a marker's direction [rad]: about 0.1 px over 50 px of its edge.
 _ANGLE_NOISE = 5e-3
-# Before any demonstration: a camera that looks down sees the opposite of each turn [rad/rad].
+# Prior mean: a camera that looks down sees each turn with the opposite sign [rad/rad].
 _FROM_ABOVE = -1.0
-# By how much that may be wrong, over the metres that a radian counts for [1/m].
+# Prior standard deviation, with rotation scaled to metres [1/m].
 _PRIOR = 1.0 / 0.15
-# Pairs closer than 0.1 rad tell nothing beside the noise [m], by the same measure.
+# Pairs closer than 0.1 rad show mostly noise [m], with rotation scaled to metres.
 _STEP = 0.015
 
 
@@ -48,11 +49,11 @@ class AngleDemonstration:
     """Motion of the tool, and the directions of both markers in the image."""
 
     pose: Pose
-    """Of the tool, (time,)."""
+    """Poses of the tool, (time,)."""
     tool: Float[Tensor, " time"]
     """Direction of the tool's marker [rad]; NaN where it was not seen."""
     item: float
-    """Direction of the object's [rad]."""
+    """Direction of the object's marker [rad]."""
     final: float
     """Direction of the tool's marker at the end, above the object [rad]."""
 
@@ -62,21 +63,21 @@ class MarkerAngle:
     """Image Jacobian of the marker's direction, and its demonstrated difference."""
 
     jacobian: RBFImageJacobian
-    """One row [rad/m, rad/rad], the same everywhere."""
+    """One row [rad/m, rad/rad], equal everywhere."""
     offset: float
-    """Direction of the tool's marker less that of the object's, up to half turns [rad]."""
+    """Direction of the tool's marker less that of the object's, modulo half turns [rad]."""
     spread: float
-    """Of that among the demonstrations, root mean square [rad]."""
+    """Root mean square deviation of the offset among the demonstrations [rad]."""
 
     @classmethod
     def fit(cls, demonstrations: Sequence[AngleDemonstration]) -> MarkerAngle:
-        """Learn both.
+        """Learn image Jacobian and offset from demonstrations.
 
         Raises:
-            ValueError: If there is no demonstration.
+            ValueError: There is no demonstration.
         """
         if not demonstrations:
-            raise ValueError("a marker's angle is learned from one demonstration or more.")
+            raise ValueError("the direction of a marker needs one demonstration or more.")
         estimator = _estimator(_guess())
         state = estimator.initial_state()
         for demonstration in demonstrations:
@@ -88,7 +89,7 @@ class MarkerAngle:
         learned = _guess()
         learned.weight.data = state.weight
         differences = np.array([d.final - d.item for d in demonstrations])
-        # The mean of angles that are known up to half turns: that of their doubles.
+        # The mean of angles modulo half turns is half the mean of their doubles.
         mean = np.exp(2j * differences).mean()
         offset = float(np.angle(mean)) / 2
         off = np.array([_wrapped(d - offset) for d in differences])
@@ -102,16 +103,16 @@ class MarkerAngle:
 
     @classmethod
     def load(cls, folder: Path) -> MarkerAngle:
-        """Read what `save` wrote.
+        """Read a saved direction.
 
         Raises:
-            FileNotFoundError: If there is no such folder or file.
-            ValueError: If a file is not one of ours.
+            FileNotFoundError: There is no such folder or file.
+            ValueError: A file has an unknown version or kind.
         """
         path = folder / "angle.json"
         content = json.loads(path.read_text(encoding="utf-8"))
         if content.get("version") != 1 or "offset_rad" not in content:
-            raise ValueError(f"{path} is not an angle of a known version: fit it again.")
+            raise ValueError(f"{path} has an unknown version: fit it again.")
         return cls(
             jacobian=RBFImageJacobian.load(folder / "angle"),
             offset=content["offset_rad"],
@@ -119,68 +120,83 @@ class MarkerAngle:
         )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AngleState:
+    """State of an `AngleServo`."""
+
+    estimator: RecursiveState
+    """State of the estimator of the image Jacobian."""
+    chosen: float | None = None
+    """Chosen turn of the present motion [rad]; None: none so far."""
+
+
 class AngleServo:
-    """Turns the tool about the vertical until its marker stands to the object's as learned."""
+    """Turns the tool about the vertical until its marker is aligned with the object's."""
 
     def __init__(self, learned: MarkerAngle):
         self._offset = learned.offset
         self._estimator = _estimator(learned.jacobian)
-        self._state = self._estimator.initial_state()
-        self.restart()
 
-    def restart(self) -> None:
-        """Begin another motion: the camera may have been moved since the last."""
-        self._state = self._estimator.resumed(self._state, 0.0)
-        self._chosen: float | None = None
+    def initial_state(self) -> AngleState:
+        """State before the first image."""
+        return AngleState(estimator=self._estimator.initial_state())
 
-    def update(self, pose: Pose, angle: float, dt: float) -> None:
-        """Learn from an image.
+    def restarted(self, state: AngleState) -> AngleState:
+        """State for another motion; the camera may have been moved since the last one."""
+        return AngleState(estimator=self._estimator.resumed(state.estimator, 0.0))
+
+    def updated(self, state: AngleState, pose: Pose, angle: float, dt: float) -> AngleState:
+        """State that has learned from an image.
 
         Args:
-            pose: Of the tool when it was taken.
-            angle: Direction of the tool's marker in it [rad].
-            dt: Time since the image before [s].
+            state: State after the last image.
+            pose: Pose of the tool when the image was taken.
+            angle: Direction of the tool's marker in the image [rad].
+            dt: Time since the last image [s].
         """
         seen = torch.tensor(angle, dtype=torch.float64)
-        self._state = _updated(self._estimator, self._state, pose, seen, dt)
+        learned = _updated(self._estimator, state.estimator, pose, seen, dt)
+        return replace(state, estimator=learned)
 
     def turned(
         self,
+        state: AngleState,
         pose: Pose,
         angle: float,
         item: float,
         reference: Float[Tensor, "4"],
-        allowed: tuple[float, float],
-    ) -> Float[Tensor, "4"]:
-        """Orientation of the tool that will stand to the object as demonstrated.
+        turn_range: tuple[float, float],
+    ) -> tuple[Float[Tensor, "4"], AngleState]:
+        """Orientation of the tool that is aligned with the object, and the next state.
 
         Args:
-            pose: Of the tool when the image was taken.
-            angle: Direction of the tool's marker in it [rad].
+            state: State after `updated`.
+            pose: Pose of the tool when the image was taken.
+            angle: Direction of the tool's marker in the image [rad].
             item: Direction of the object's marker [rad].
             reference: Orientation of a tool that is not turned.
-            allowed: Least and greatest turn of the tool from there about the vertical [rad].
-                Of those that differ by half turns the nearest within is taken, and kept to
-                for as long as it is not far out of the range: near either end of it noise
-                would turn the tool to and fro.
+            turn_range: Smallest and largest turn of the tool from there about the vertical
+                [rad]. Of turns that differ by half turns, the nearest one in the range is
+                chosen, and kept while it is not far out of the range: near an end of the range,
+                noise would otherwise turn the tool back and forth.
         """
-        row = self._estimator.jacobian(self._state, pose)[0]
-        rate = float(row[5])
-        # Sign and size of a camera above; one that looks from below is not what this is for.
+        rate = float(self._estimator.jacobian(state.estimator, pose)[0, 5])
+        # Bounds for a camera that looks down; cameras that look up are not supported.
         rate = math.copysign(min(max(abs(rate), 0.5), 2.0), rate)
         now = turn_about_vertical(pose.orientation, reference)
         missing = _wrapped(item + self._offset - angle) / rate
-        self._chosen = _within(now + missing, now, allowed, self._chosen)
-        return _turned(reference, self._chosen)
+        chosen = _within(now + missing, now, turn_range, state.chosen)
+        return _turned(reference, chosen), replace(state, chosen=chosen)
 
 
 def _within(
-    turn: float, now: float, allowed: tuple[float, float], chosen: float | None
+    turn: float, now: float, turn_range: tuple[float, float], chosen: float | None
 ) -> float:
-    """The turn, by half turns into the range, as near to the present one as can be; the one
-    chosen before if it is nearly in the range.
+    """Turn in the range that equals `turn` modulo half turns.
+
+    The one nearest to the present turn; the one chosen before, if it is nearly in the range.
     """
-    low, high = allowed
+    low, high = turn_range
     candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
     if chosen is not None:
         same = min(candidates, key=lambda c: abs(c - chosen))
@@ -191,12 +207,13 @@ def _within(
 
 
 def _turned(orientation: Float[Tensor, "4"], turn: float) -> Float[Tensor, "4"]:
+    """An orientation turned about the vertical [rad]."""
     about = torch.tensor([0.0, 0.0, turn], dtype=torch.float64)
     return quaternion.multiply(quaternion.exp(about), orientation)
 
 
 def _wrapped(angle: float) -> float:
-    """An angle known up to half turns, within a quarter turn of zero [rad]."""
+    """An angle modulo half turns, within a quarter turn of zero [rad]."""
     return float((angle + HALF_TURN / 2) % HALF_TURN - HALF_TURN / 2)
 
 
@@ -226,7 +243,7 @@ def _updated(
 ) -> RecursiveState:
     """State of the estimator after an image."""
     if bool(state.key.present):
-        # Differences to the key frame are what is learned from: less than half a turn each.
+        # The estimator learns from differences to the key frame, each less than half a turn.
         before = state.key.feature[0]
         angle = before + torch.remainder(angle - before + math.pi, 2 * math.pi) - math.pi
     measured = Measurement(

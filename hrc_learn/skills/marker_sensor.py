@@ -1,8 +1,8 @@
-"""A fixed camera as a sensor of markers: detections, their delay and loss, occlusions."""
+"""A fixed camera as a sensor of markers: detection, delay, loss and occlusion."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ class MarkerSensor:
 
     @property
     def age(self) -> float:
-        """Of the newest image when it was read, as far as the camera tells [s]."""
+        """Age of the newest image when it was read [s]; 0 if the camera has no time stamps."""
         return self._camera.age if isinstance(self._camera, TimedCamera) else 0.0
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
@@ -42,13 +42,13 @@ class MarkerSensor:
         """Take an image; return the pixel (u, v) of each marker in it, by number.
 
         Args:
-            ids: Markers that matter now; None: all. Searching for one that is out of sight
-                takes ten times as long as tracking one that is seen.
+            ids: Markers to search for; None: all. Searching for an invisible marker takes ten
+                times as long as tracking a visible one.
         """
         return {id: centre(corners) for id, corners in self.corners(ids).items()}
 
     def corners(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "4 2"]]:
-        """The same with the pixels of each marker's corners, top left first and clockwise."""
+        """Take an image; return the corners of each marker in it, clockwise from top left."""
         return self._detector.detect(self.read(), ids)
 
 
@@ -57,7 +57,7 @@ class MarkerObservation:
     """Markers detected in an image."""
 
     time: float = -np.inf
-    """When the image was taken [s]."""
+    """Time at which the image was taken [s]."""
     joints: Float[Tensor, " joints"] | None = None
     """Joint positions at that time [rad]."""
     pixels: Mapping[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
@@ -71,10 +71,10 @@ class LatencyConfig:
     """Delay and loss of images between the camera and the controller."""
 
     delay: float = 0.0
-    """From an image being taken until its markers are known [s]. Markers are held back until
-    then; those of a camera that tells its images' age (`TimedCamera`) come that late."""
+    """Time from the exposure of an image until its markers are available [s]. Markers are held
+    back until then; those of a camera with time stamps (`TimedCamera`) have its own delay."""
     frame_loss: float = 0.0
-    """Fraction of the images that never arrive."""
+    """Fraction of lost images."""
 
     def __post_init__(self) -> None:
         if self.delay < 0 or not 0 <= self.frame_loss < 1:
@@ -85,14 +85,14 @@ class LatencyConfig:
 
 
 class DelayedChannel:
-    """Delivers observations late, in the order in which they were taken, and loses some."""
+    """Channel that delivers observations late, in their order, and loses some."""
 
     def __init__(self, config: LatencyConfig, rng: np.random.Generator):
         """Start with an empty channel.
 
         Args:
-            config: How late, and how many are lost.
-            rng: Decides which.
+            config: Delay and loss.
+            rng: Random generator of the losses.
         """
         self._config, self._rng = config, rng
         self._pending: deque[MarkerObservation] = deque()
@@ -103,24 +103,22 @@ class DelayedChannel:
             self._pending.append(observation)
 
     def newest(self, time: float) -> MarkerObservation | None:
-        """The newest that has arrived by a time [s] since last asked; None if none has."""
+        """Newest observation that has arrived by a time [s] since the last call; None: none."""
         arrived = None
-        # Clocks add up steps of rounded length: a nanosecond early still counts as in time.
+        # Clocks sum rounded steps, so a nanosecond early counts as in time.
         taken_by = time - self._config.delay + 1e-9
         while self._pending and self._pending[0].time <= taken_by:
             arrived = self._pending.popleft()
         return arrived
 
 
-# Images taken less than this apart are one image, whose age was read from another clock; and
-# for how long joint positions are remembered, longer than any camera's delay [s].
+# Images closer than this are one image whose age was read from another clock; and memory of
+# joint positions, longer than any camera's delay [s].
 _SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
 
 
 class DelayedDetection:
-    """Markers as a controller comes to know them: late, some never, each with the joint
-    positions of when its image was taken.
-    """
+    """Detected markers with delay and loss, each with the joint positions of its image."""
 
     def __init__(
         self,
@@ -129,13 +127,13 @@ class DelayedDetection:
         dt: float,
         rng: np.random.Generator,
     ):
-        """Begin with nothing detected.
+        """Start without detections.
 
         Args:
-            sensor: The camera with its detector; None where a task needs none.
-            latency: How late images are, and how many are lost.
+            sensor: Camera with its detector; None: no camera.
+            latency: Delay and loss of images.
             dt: Control step [s].
-            rng: Decides which images are lost.
+            rng: Random generator of the losses.
         """
         self._sensor, self._channel = sensor, DelayedChannel(latency, rng)
         self._taken = -np.inf  # the newest image [s]
@@ -146,7 +144,7 @@ class DelayedDetection:
         return None if self._sensor is None else self._sensor.read()
 
     def remember(self, time: float, joints: Float[np.ndarray, " joints"]) -> None:
-        """Where the joints are at a time [s, rad]."""
+        """Store joint positions at a time [s, rad]."""
         self._joints.append((time, joints))
 
     def detect(
@@ -155,13 +153,13 @@ class DelayedDetection:
         """Take an image, and detect markers in it.
 
         Args:
-            time: The clock [s].
-            joints: Where the joints are by then [rad].
-            ids: Markers that matter now; None: all.
+            time: Present time [s].
+            joints: Present joint positions [rad].
+            ids: Markers to search for; None: all.
         """
         found = {} if self._sensor is None else self._sensor.corners(ids)
         taken = time - (0.0 if self._sensor is None else self._sensor.age)
-        # A camera that is slower than the detection gives the same image again: no new one.
+        # A camera that is slower than the detection returns the same image again.
         if abs(taken - self._taken) > _SAME_IMAGE:
             self._taken = taken
         self._channel.send(
@@ -174,13 +172,13 @@ class DelayedDetection:
         )
 
     def newest(self, time: float) -> MarkerObservation | None:
-        """The newest that has arrived by a time [s] since last asked; None if none has."""
+        """Newest observation that has arrived by a time [s] since the last call; None: none."""
         return self._channel.newest(time)
 
     def _joints_at(
         self, time: float, now: float, joints: Float[Tensor, " joints"]
     ) -> Float[Tensor, " joints"]:
-        """Where the joints were at a time [s], as far back as is remembered [rad]."""
+        """Joint positions at a time [s], as far back as stored [rad]."""
         if time >= now or not self._joints:
             return joints
         times, passed = zip(*self._joints, (now, joints.numpy()), strict=True)
@@ -188,78 +186,88 @@ class DelayedDetection:
         return torch.tensor([np.interp(time, times, column) for column in columns])
 
 
+# Distance of the end effector from the middle of the table within which the camera should see
+# its marker [m]: the view of the camera reaches about 0.25 m to each side.
 _OVER_TABLE = 0.22
-"""Distance of the end effector from the middle of the table within which the camera should see
-its marker [m]: the camera's view reaches about 0.25 m to each side."""
 
 
 def longest_occlusion(log: StepLog, middle: Pose, since: float, chain: SerialChain) -> float:
     """Longest time without a detection while the end effector was over the table [s].
 
     Args:
-        log: Of a work cell.
-        middle: Of the end effector above the middle of the table.
-        since: Steps from this time on count [s].
-        chain: The arm.
+        log: Log of a work cell.
+        middle: Pose of the end effector above the middle of the table.
+        since: Time of the first step that counts [s].
+        chain: Kinematics of the arm.
     """
     time = log["time"]
     rows = time >= since
     position = chain.forward(torch.from_numpy(log["joint_position"][rows])).position
     over_table = ((position - middle.position).norm(dim=-1) < _OVER_TABLE).numpy()
     occluded = over_table & np.isnan(log["feature"][rows, 0])
-    # Rising and falling edges alternate: their distances are the lengths in steps.
+    # Rising and falling edges alternate; their distances are lengths in steps.
     edges = np.flatnonzero(np.diff(np.concatenate([[False], occluded, [False]]).astype(int)))
     steps = edges[1::2] - edges[::2]
     dt = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     return float(steps.max()) * dt if len(steps) else 0.0
 
 
-class HeldMarker:
-    """Tells a marker that something half hides from one that moves with the end effector.
+# Images averaged for the first pixel of a held marker: half a second.
+_AVERAGED_IMAGES = 12
 
-    Its corners are then found where the edge of what hides it is, by some pixels elsewhere.
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MarkerConsistency:
+    """Test whether a marker moves with the end effector or is half hidden.
+
+    The corners of a half-hidden marker are detected at the edge of what hides it, off by some
+    pixels. The value holds the state of the test; `updated` returns the next one.
     """
 
-    # Images that are averaged for where it is: half a second of them.
-    _IMAGES = 12
+    tolerance: float
+    """Largest deviation from the predicted pixel [px]."""
+    consistent: bool = False
+    """True if the newest image shows the marker at the predicted pixel."""
+    time: float = -np.inf
+    """Time of the newest image [s]."""
+    start: Pose | None = None
+    """Pose of the end effector at the first image; None: no image so far."""
+    pixel: Float[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
+    """Mean pixel of the first images, moved to the first pose [px]."""
+    images: int = 0
+    """Number of images in that mean."""
 
-    def __init__(self, tolerance: float):
-        self._tolerance = tolerance
-        self._before: Pose | None = None
-        self._pixel, self._images = np.zeros(2), 0
-        self._time, self._fits = -np.inf, False
-
-    def fits(
+    def updated(
         self,
         time: float,
         pixel: Float[np.ndarray, "2"],
         pose: Pose,
         jacobian: Float[np.ndarray, "2 6"],
-    ) -> bool:
-        """Whether a marker is seen where the end effector has taken it since the first image.
+    ) -> "MarkerConsistency":
+        """The test after an image; unchanged by an image seen before.
 
         Args:
-            time: When the newest image was taken [s].
-            pixel: Of the marker in it [px]; NaN if it is not seen.
-            pose: Of the end effector then.
+            time: Time at which the newest image was taken [s].
+            pixel: Pixel of the marker in it [px]; NaN if it is not detected.
+            pose: Pose of the end effector at that time.
             jacobian: Image Jacobian there [px/m, px/rad].
         """
-        if time > self._time:
-            self._time, self._fits = time, self._agrees(pixel, pose, jacobian)
-        return self._fits
-
-    def _agrees(
-        self,
-        pixel: Float[np.ndarray, "2"],
-        pose: Pose,
-        jacobian: Float[np.ndarray, "2 6"],
-    ) -> bool:
+        if time <= self.time:
+            return self
         if not np.isfinite(pixel).all():
-            return False
-        if self._before is None:
-            self._before = pose
-        rest = pixel - jacobian @ self._before.twist_to(pose).numpy()
-        if self._images < self._IMAGES:
-            self._images += 1
-            self._pixel += (rest - self._pixel) / self._images
-        return bool(np.linalg.norm(rest - self._pixel) <= self._tolerance)
+            return replace(self, time=time, consistent=False)
+        start = pose if self.start is None else self.start
+        mean, images = self.pixel, self.images
+        first = pixel - jacobian @ start.twist_to(pose).numpy()
+        if images < _AVERAGED_IMAGES:
+            images += 1
+            mean = mean + (first - mean) / images
+        consistent = bool(np.linalg.norm(first - mean) <= self.tolerance)
+        return MarkerConsistency(
+            tolerance=self.tolerance,
+            consistent=consistent,
+            time=time,
+            start=start,
+            pixel=mean,
+            images=images,
+        )

@@ -1,20 +1,19 @@
-"""Pick and place beside a person: grasp, carry to the cabinet, put on a shelf.
+"""Pick and place near a person: grasp, carry to the cabinet, put on a shelf.
 
     detect -> servo -> interact -> grasp -> home -> transfer -> release -> retreat -> over
       ^         |                    |       |         |
       +---------+--- start over -----+-------+---------+-- put back -> over
 
-In the paper's words: detect and servo are the approach and the vision-based control, interact
-is what the person needs, home to release is the placing, retreat the way back. Each phase is a
-method that does its work and names the next one. Failures are recovered from, logged and
-counted:
+Detect and servo are the paper's approach and vision-based control, interact is the time for the
+person, home to release is the placing. Each phase is a method that does its work and returns
+the next phase. Recoveries from failures are logged and counted:
 
-- the end effector's marker is occluded: the controller holds the end effector and continues
-  when the marker is detected again; after a timeout the arm goes home and starts over;
-- the object is not detected: it is waited for;
-- a missed grasp, an object dropped over the table: again, from home;
-- a blocked path: another height, via point or arm angle, then waiting; at last the object is
-  put back where it was.
+- occluded marker of the end effector: the controller holds the end effector until the marker is
+  detected again; after a timeout the arm goes home and starts over;
+- undetected object: the arm waits;
+- missed grasp, or object dropped over the table: the arm starts over from home;
+- blocked path: another height, via point or arm angle, then waiting; finally the object is put
+back.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +37,7 @@ from hrc_learn.skills.marker_sensor import longest_occlusion
 from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
 from hrc_learn.skills.receiving import Receipt, Receiving
-from hrc_learn.skills.visual_servoing import ServoTarget
+from hrc_learn.skills.servo_target import ServoTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.skills.workplace import GraspObject, Workplace
@@ -46,60 +45,64 @@ from hrc_learn.skills.workplace import GraspObject, Workplace
 Mishap = Literal[
     "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
 ]
-"""What a job recovers from."""
+"""Kinds of failures that a job recovers from."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recovery:
-    """Something went wrong, and the job went on."""
+    """A failure from which the job recovered."""
 
     time: float
-    """[s]"""
+    """Time [s]."""
     mishap: Mishap
+    """Kind of failure."""
     what: str
-    """What happened, and what was done about it."""
+    """Description of the failure and of the recovery."""
 
 
 @dataclass(kw_only=True)
 class PickPlaceJob:
-    """One object's way from the table to its shelf: what phases hand on, and the result."""
+    """Job of one object from the table to its shelf, with its results."""
 
     item: GraspObject
+    """Object to place."""
     shelf: str
+    """Name of its shelf."""
     goal: Pose
-    """Of the end effector at the release, if the object is held in the middle."""
+    """Pose of the end effector at the release, if the object is held in the middle."""
     time_for_person: float = 0.0
-    """How long to keep servoing while a person reaches under the arm [s]."""
+    """Time to keep servoing while a person reaches under the arm [s]."""
     target: ServoTarget | None = None
-    """Where the object was detected last."""
+    """Servo target of the last detection."""
     servo_time: float = float("nan")
-    """From the start of the last visual servoing until its target was reached [s]."""
+    """Duration of the last visual servoing [s]."""
     pixel_error: float = float("nan")
-    """At the start of the descent [px]."""
+    """Pixel error at the start of the descent [px]."""
     picked_up: Pose | None = None
-    """Of the end effector when it grasped the object."""
+    """Pose of the end effector at the grasp."""
     plan: Plan | None = None
-    """The path to the shelf."""
+    """Path to the shelf."""
     release: Pose | None = None
-    """Of the end effector when it released the object on the shelf."""
+    """Pose of the end effector at the release on the shelf."""
     failure: str = ""
-    """Why the job was given up."""
+    """Reason why the job was given up."""
     attempts: int = 1
-    """Times it was started."""
+    """Number of starts."""
     recoveries: list[Recovery] = field(default_factory=list)
+    """Recoveries from failures."""
     receipt: Receipt | None = None
-    """How a person handed the object over; None: it lay on the table."""
+    """Hand-over of the object by a person; None: the object lay on the table."""
     span: tuple[float, float] = (0.0, 0.0)
     """Start and end [s]."""
 
     @property
     def delivered(self) -> bool:
-        """Whether the object was released at its shelf, as the robot sees it."""
+        """True if the object was released at its shelf, as far as the robot can sense it."""
         return self.release is not None and not self.failure
 
 
 class Phase(StrEnum):
-    """What the robot is doing; the start of a phase is an event of the log."""
+    """Phase of a job; its start is an event of the log."""
 
     DETECT = "detect"
     RECEIVE = "receive"
@@ -116,53 +119,54 @@ class Phase(StrEnum):
 
 RECEIVE, INTERACT, HOME = Phase.RECEIVE, Phase.INTERACT, Phase.HOME
 TRANSFER, RELEASE = Phase.TRANSFER, Phase.RELEASE
-"""Phases that others look up in the log."""
+"""Phases that other modules look up in the log."""
 
-# Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
+# Delays and occlusions up to this do not count as a recovery [s]: a few lost images, or a
+# blink.
 _NEGLIGIBLE = 0.3
 RELEASE_TIME = 0.8
-"""For the fingers to open and for the released object to come to rest, at least [s]."""
-# Straight way back along the end effector's own axis, until nothing of the object is between
-# the fingers [m]; and its speed: at the usual one the shoulder comes near its limits [m/s].
+"""Shortest time for the fingers to open and the released object to come to rest [s]."""
+# Straight retreat along the end effector's own axis until the object is out of the fingers [m],
+# and its speed [m/s]: at the usual speed the shoulder comes near its limits.
 _CLEARANCE, _RETREAT_SPEED = 0.08, 0.08
 
 
 @dataclass(frozen=True, kw_only=True)
 class PickAndPlaceConfig:
-    """How the jobs are done."""
+    """Settings of the jobs."""
 
     grasping: GraspingConfig = field(default_factory=GraspingConfig)
-    """How objects are grasped."""
+    """Settings of grasping."""
     interaction: float = 11.0
-    """How long the robot keeps servoing while the person reaches under its arm [s]."""
+    """Time for which the robot keeps servoing while the person reaches under its arm [s]."""
     interactions: int = 1
-    """For how many objects, the first ones, the person is given that time."""
+    """Number of first objects at which the person has that time."""
     speed: float = 1.5
-    """How many times faster than demonstrated the object is carried to the shelf."""
+    """Speed of the transfer relative to the demonstration."""
     planning: PlanningSpace = "pose"
-    """Space in which the path to the shelf is planned; "joint" is the paper's, which bends the
-    path into shelves that were not demonstrated."""
+    """Space in which the path to the shelf is planned; the paper's "joint" bends the path into
+    shelves that were not demonstrated."""
     waits: int = 3
-    """How often to wait for a blocked path to become free."""
+    """Number of waits for a blocked path to become free."""
     wait: float = 2.0
-    """How long each time [s]."""
+    """Duration of each wait [s]."""
 
 
 def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> float:
-    """Carry what is in the hand along a plan, put it down and back out.
+    """Carry the grasped object along a plan, put it down and retreat.
 
     Args:
         cell: Arm, gripper and person.
-        plan: To the goal.
-        goal: Of the end effector where it begins to put down, as the arm is to read it.
-        lowering: How far to go down if nothing is met [m].
+        plan: Plan to the goal.
+        goal: Pose of the end effector where it starts to put down, in the arm's readings.
+        lowering: Distance to go down without a contact [m].
 
     Returns:
-        When it began to put down [s].
+        Time at which it started to put down [s].
     """
     cell.begin_phase(Phase.TRANSFER)
     follow_path(cell, plan.path)
-    # The arm follows late: at the end of the path it is not quite there.
+    # The arm lags behind: at the end of the path it is not quite there.
     cell.move_straight(goal)
     cell.begin_phase(Phase.RELEASE)
     begun = cell.time
@@ -174,7 +178,7 @@ def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> floa
 
 
 def _put_down(cell: WorkCell, goal: Pose, lowering: float) -> Pose:
-    """Lower what is in the hand until it stands, and let go; where that was."""
+    """Lower the grasped object until it stands, and release it; returns the pose."""
     below = Pose(goal.position.clone(), goal.orientation)
     below.position[2] -= lowering
     cell.move_until_contact(below)
@@ -188,7 +192,7 @@ class PickAndPlace:
     """Grasps objects and puts them on shelves.
 
     Attributes:
-        jobs: One for each object so far.
+        jobs: Jobs so far, one for each object.
     """
 
     def __init__(
@@ -201,17 +205,17 @@ class PickAndPlace:
         config: PickAndPlaceConfig | None = None,
         receiving: Mapping[str, Receiving] | None = None,
     ):
-        """Prepare.
+        """Prepare the jobs.
 
         Args:
             cell: Arm, gripper, camera and person.
-            workplace: The region over the table, home, and the shelves.
+            workplace: Region above the table, home, and the shelves.
             servoing: Learned image Jacobian and visual target.
             placing: Learned placing motion.
-            check: Raises if a plan must not be executed.
-            config: How the jobs are done.
-            receiving: How objects are taken from a person's hand, by their names; the others
-                lie on the table.
+            check: Function that raises if a plan must not be executed.
+            config: Settings of the jobs.
+            receiving: Skills for objects that a person hands over, by object name; the other
+                objects lie on the table.
         """
         self._receiving = dict(receiving or {})
         self.jobs: list[PickPlaceJob] = []
@@ -241,17 +245,17 @@ class PickAndPlace:
     ) -> list[PickPlaceJob]:
         """Deliver objects one after the other.
 
-        An object that cannot be delivered is left on the table, and the next one is started.
-        Only where the arm cannot go home, everything ends.
+        An object that cannot be delivered stays on the table, and the next one is started. The
+        run ends early only if the arm cannot go home.
 
         Args:
-            orders: What to grasp, and the shelf to put it on.
-            before: Called with the number of each object, from 0, before it is started.
+            orders: Objects, each with the name of its shelf.
+            before: Called with the number of each object, from 0, before its start.
 
         Raises:
-            ValueError: If there is no such shelf, or the arm cannot reach it.
+            ValueError: There is no such shelf, or the arm cannot reach it.
         """
-        # All goals are checked before anything moves.
+        # All goals are checked before the arm moves.
         for number, job in enumerate([self._new_job(*order) for order in orders]):
             before(number)
             self.jobs.append(job)
@@ -281,7 +285,7 @@ class PickAndPlace:
             job.span = start, self._cell.time
 
     def _receive(self, job: PickPlaceJob) -> Phase:
-        """Take the object from a person's hand, wherever they hand it over."""
+        """Take the object from a person's hand."""
         receiving, robot = self._receiving[job.item.name], self._workplace.robot
         job.receipt = receiving.receipt
         posture = robot.inverse(receiving.wait, near=self._workplace.hover_joints())
@@ -332,7 +336,7 @@ class PickAndPlace:
         servo = self._grasping.servo
         servo.hold(job.target, job.time_for_person)
         job.time_for_person = 0.0
-        # The person's push may leave twice the tolerance; beyond that the target is lost.
+        # A push may leave up to twice the tolerance; beyond that the target is lost.
         on_target = servo.error(job.target) < 2 * self._config.grasping.servo.tolerance
         job.target = replace(job.target, posture=None)
         return Phase.GRASP if on_target else Phase.SERVO
@@ -382,7 +386,7 @@ class PickAndPlace:
         return Phase.RELEASE
 
     def _free_plan(self, job: PickPlaceJob) -> Plan | None:
-        """The first candidate that is free, now or after a while."""
+        """The first candidate with a free path, now or after a wait."""
         for wait in range(1 + self._config.waits):
             if wait:
                 self._cell.hold_pose(self._config.wait)
@@ -412,17 +416,17 @@ class PickAndPlace:
         return Phase.RETREAT
 
     def _retreat(self, job: PickPlaceJob) -> Phase:
-        """Back out along the same path: what was free then is free now."""
+        """Retreat along the same path, which was free before."""
         assert job.plan is not None
         self._cell.begin_phase(Phase.RETREAT)
         follow_path(self._cell, job.plan.path[::-1])
         return Phase.OVER
 
     def _put_back(self, job: PickPlaceJob) -> Phase:
-        """Lay the object where it was, and go home."""
+        """Put the object back at its place, and go home."""
         assert job.picked_up is not None
         if job.receipt is not None:
-            return Phase.OVER  # it was in a hand: the arm keeps it
+            return Phase.OVER  # a received object has no place on the table: the arm keeps it
         self._cell.begin_phase(Phase.PUT_BACK)
         plan = joint_plan(self._cell, self._cell.joints, self._workplace.hover_joints())
         self._check(plan)
@@ -433,11 +437,11 @@ class PickAndPlace:
         return Phase.OVER
 
     def _start_over(self, job: PickPlaceJob, mishap: Mishap, what: str) -> Phase:
-        """From home, unless it has been tried often enough."""
+        """Start over from home, unless the number of attempts is reached."""
         self._note(job, mishap, what)
         self._grasping.start_over()
         if job.receipt is not None:
-            job.failure = what  # what a person has given lies nobody knows where
+            job.failure = what  # the place of a lost received object is unknown
             return Phase.OVER
         if job.attempts == self._config.grasping.attempts:
             job.failure = what

@@ -1,9 +1,9 @@
 """Placing an object on a shelf by a learned motion: candidate plans, checked before execution.
 
-The motion was demonstrated for one shelf. For another one there are two spaces to plan in: the
-joint-space primitive with a shifted goal, as in the paper, which bends the path into the shelf;
-and the pose primitive with the learned arm angle tracked in the null space, which keeps it
-straight.
+The motion was demonstrated for one shelf. For another shelf it is planned in one of two spaces:
+with the joint-space primitive and a shifted goal, as in the paper, which bends the path into
+the shelf; or with the pose primitive and the learned arm angle in the null space, which keeps
+the path straight.
 """
 
 from collections.abc import Iterator
@@ -44,16 +44,16 @@ _POSE_GAIN, _ANGLE_GAIN = 10.0, 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A motion of the joints, sampled at the control step."""
+    """Motion of the joints, sampled at the control step."""
 
     goal: Pose
-    """Where the end effector should end."""
+    """Pose of the end effector at the end."""
     dt: float
-    """[s]"""
+    """Time between samples [s]."""
     path: Float[np.ndarray, "steps joints"]
     """Joint positions [rad]."""
     chain: SerialChain
-    """The arm."""
+    """Kinematics of the arm."""
 
     @property
     def tool_pose(self) -> Pose:
@@ -62,27 +62,27 @@ class Plan:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration of the path [s]."""
         return self.dt * (len(self.path) - 1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlaceCorrection:
-    """How an arm's own readings differ from where places are said to be.
+    """Difference between the readings of an arm and the known pose of a place.
 
-    Errors of base, tool and encoders are nearly the same at all places in one orientation. Read
-    once at a place that is known, to which a person leads the arm, they can be taken out: what
-    remains is the arm's repeatability.
+    Errors of base, tool and encoders are nearly equal at all places in one orientation.
+    Measured once at a known place, to which a person guides the arm, they can be corrected; the
+    arm's repeatability remains.
     """
 
     shift: Float[Tensor, "3"]
-    """Of positions, base frame [m]."""
+    """Error of positions, base frame [m]."""
     turn: Float[Tensor, "4"]
-    """Of orientations, in the tool's frame."""
+    """Error of orientations, tool frame (w, x, y, z)."""
 
     @classmethod
     def of(cls, read: Pose, place: Pose) -> "PlaceCorrection":
-        """From the pose that the arm reads where its tool is at a known place."""
+        """Correction from the pose read with the tool at a known place."""
         back = quaternion.conjugate(place.orientation)
         return cls(
             shift=read.position - place.position,
@@ -90,7 +90,7 @@ class PlaceCorrection:
         )
 
     def apply(self, place: Pose) -> Pose:
-        """What the arm will read with its tool at another place."""
+        """Pose that the arm reads with its tool at another place."""
         turned = quaternion.multiply(place.orientation, self.turn)
         return Pose(place.position + self.shift, turned)
 
@@ -102,30 +102,30 @@ class PlacingSkill:
     joint: JointDMP
     """Motion of the joints."""
     pose: PoseDMP
-    """Motion of the end effector together with the arm angle, its null-space posture, of an arm
-    that has one."""
+    """Motion of the end effector with the arm angle, which describes the null-space posture of
+    arms that have one."""
     robot: Arm
-    """The arm that they are of."""
+    """Arm of the primitives."""
 
     @classmethod
     def load(cls, folder: Path, robot: Arm) -> "PlacingSkill":
-        """Read what `hrc fit` wrote.
+        """Read the primitives written by `hrc fit`.
 
         Args:
-            folder: With the primitives.
-            robot: The arm that is to do it.
+            folder: Folder of the primitives.
+            robot: Arm that executes them.
 
         Raises:
-            FileNotFoundError: If the folder holds no primitives.
-            ValueError: If they are of another arm, or hold no poses.
+            FileNotFoundError: The folder holds no primitives.
+            ValueError: They are for another arm, or hold no poses.
         """
         joint = JointDMP.load(folder / "joint").double()
         names = robot.chain.joint_names
         if joint.joint_names != names:
             raise ValueError(
                 f"{folder / 'joint'} moves the joints {joint.joint_names}, but the "
-                f"{robot.name} has {names}: fit demonstrations of this arm, or name with "
-                "--robot the one that they are of."
+                f"{robot.name} has {names}: fit demonstrations of this arm, or choose theirs "
+                "with --robot."
             )
         if not (folder / "pose").is_dir():
             raise ValueError(
@@ -144,19 +144,19 @@ class PlacingSkill:
         dt: float,
         speed: float = 1.0,
     ) -> Plan:
-        """Plan the motion from the arm's present position to a goal of the end effector.
+        """Plan the motion from the present joint positions to a goal of the end effector.
 
         Args:
-            start: Joint positions now [rad].
-            goal: Where the end effector should release the object.
-            space: Follow the primitive of the joints, or that of the pose.
+            start: Present joint positions [rad].
+            goal: Pose of the end effector at the release.
+            space: Space of the primitive: joints or pose.
             dt: Step of the plan [s].
-            speed: How many times faster than demonstrated.
+            speed: Speed relative to the demonstration.
 
         Raises:
-            UnreachableError: If no joint positions reach the goal.
+            UnreachableError: No joint positions reach the goal.
         """
-        # Of both spaces: a goal out of reach is refused before anything is planned.
+        # For both spaces: an unreachable goal is refused before planning.
         end = self.robot.inverse(goal, near=self.joint.goal)
         duration = float(self.joint.duration) / speed
         time = torch.arange(0.0, duration + dt / 2, dt, dtype=torch.float64)
@@ -194,19 +194,19 @@ def follow_pose(
     """Joint path that tracks poses of the end effector, and arm angles in the null space.
 
     u = J^+ (twist + k_e e) + N n (angle' + k_a (angle - angle(q))) - N xi_q, where
-    n turns the arm angle at unit rate and xi_q is the gradient of the joint-limit region: the
-    poses are met, the arm angle as far as the null space and the joint limits allow. Of a task
-    of fewer dimensions than a pose, J and N are those of what it leads.
+    n turns the arm angle at unit rate and xi_q is the gradient of the joint-limit region. The
+    poses are tracked exactly, the arm angle as far as null space and joint limits allow. For a
+    task with fewer dimensions than a pose, J and N are those of the controlled part.
 
     Args:
-        chain: The arm.
+        chain: Kinematics of the arm.
         start: Joint positions at the first pose [rad].
         poses: Desired poses of the end effector, (steps,).
-        twist: Its desired motion (linear [m/s], angular [rad/s]).
+        twist: Desired twists (linear [m/s], angular [rad/s]).
         angle: Desired arm angles, continuous [rad]; None: the joint limits alone move the null
             space, if there is one.
         dt: Time between samples [s].
-        task: What of the poses is followed: an arm of five joints has none for all of it.
+        task: Tracked part of the poses; an arm of five joints cannot track all of it.
     """
     limits = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
     rate = None if angle is None else torch.gradient(angle, spacing=dt)[0]
@@ -221,7 +221,7 @@ def follow_pose(
         null_velocity = -limits.gradient(q)
         if angle is not None and rate is not None:
             measured, motion = arm_angle_and_motion(chain, q, J)
-            # The shorter way around the circle.
+            # The shorter direction around the circle.
             error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
             null_velocity = motion * (rate[k] + _ANGLE_GAIN * error) + null_velocity
         if task != "pose":
@@ -234,15 +234,15 @@ def follow_pose(
 
 
 def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) -> None:
-    """Make sure that a plan keeps the arm's limits and collides with nothing.
+    """Check that a plan keeps the limits of the arm and avoids collisions.
 
     Args:
         plan: The plan.
-        world: Where it is to be executed, in its present state.
-        carried: The object in the gripper.
+        world: Scene of the execution in its present state.
+        carried: Object in the gripper.
 
     Raises:
-        BlockedPathError: Otherwise; tells what and where.
+        BlockedPathError: The plan leaves a limit or collides; the message says where.
     """
     limits, names = plan.chain.limits, plan.chain.joint_names
     path = torch.from_numpy(plan.path)
@@ -258,8 +258,8 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
     if bool(too_fast.any()):
         k, joint = (int(i) for i in too_fast.nonzero()[0])
         raise BlockedPathError(
-            f"the plan asks {names[joint]} for {float(speed[k, joint]):.2f} rad/s "
-            f"after {k * plan.dt:.1f} s, more than its {float(limits.velocity[joint]):.2f} "
+            f"the plan needs {float(speed[k, joint]):.2f} rad/s of {names[joint]} after "
+            f"{k * plan.dt:.1f} s, above its limit of {float(limits.velocity[joint]):.2f} "
             "rad/s: plan it slower."
         )
     # One sample in 40 ms: at most 2 cm of motion at the speed of a placing motion.
@@ -274,20 +274,20 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
         )
 
 
-# Offsets of via points from home [m]: around what may stand in the direct path.
+# Offsets of via points from home [m], to go around objects in the direct path.
 _VIA_POINTS = {
     "higher": (0.0, 0.0, 0.12),
     "nearer to the robot": (-0.14, 0.0, 0.06),
     "further from the robot": (0.08, 0.0, 0.10),
 }
-# Changes of joint 7 at home, which turn the elbow about the line to the wrist [rad].
+# Changes of joint 7 at home, which move the elbow about the line to the wrist [rad].
 _ARM_ANGLES = {"with the elbow further out": -0.35, "with the elbow further in": 0.35}
-# How much higher an object that sits low in the gripper is released [m].
+# Height added to the release of an object that sits low in the gripper [m].
 _RAISED = 0.008
 
 
 class CandidatePlan(NamedTuple):
-    """A plan, and how it differs from the learned one."""
+    """A plan with the name of its variation."""
 
     name: str
     plan: Plan
@@ -303,20 +303,20 @@ def plan_candidates(
     dt: float,
     speed: float,
 ) -> Iterator[CandidatePlan]:
-    """Candidate plans to a shelf, the learned one first; each is planned when asked for.
+    """Candidate plans to a shelf, the learned one first; planned on demand.
 
-    The others end a little higher, as an object that sits low in the gripper needs it, or start
-    at another via point or arm angle. The primitive returns to the learned pose and arm angle
-    as it nears its goal: the path into the shelf stays as it is.
+    The others end a little higher, for an object that sits low in the gripper, or start at
+    another via point or arm angle. The primitive returns to the learned pose and arm angle near
+    its goal, so the path into the shelf stays the same.
 
     Args:
-        goal: Of the end effector.
-        start: Joint positions now [rad].
-        skill: The learned motion.
-        workplace: Whose home the other candidates start near.
-        space: In which the motion is planned.
+        goal: Pose of the end effector at the release.
+        start: Present joint positions [rad].
+        skill: Learned motion.
+        workplace: Workplace with the home near which the other candidates start.
+        space: Space of the primitive.
         dt: Control step [s].
-        speed: How many times faster than demonstrated.
+        speed: Speed relative to the demonstration.
     """
 
     def learned(start: Tensor, goal: Pose = goal) -> Plan:
@@ -335,7 +335,7 @@ def plan_candidates(
 
 
 def _via_postures(workplace: Workplace) -> Iterator[tuple[str, Float[Tensor, " joints"]]]:
-    """Joint positions near home that can be reached."""
+    """Reachable joint positions near home, with their names."""
     for name, offset in _VIA_POINTS.items():
         with suppress(UnreachableError):
             yield name, workplace.home_joints(torch.tensor(offset, dtype=torch.float64))

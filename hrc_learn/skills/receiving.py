@@ -1,9 +1,9 @@
-"""Taking a thing from a person's hand, who is not asked for it: the motion of the hand tells.
+"""Receiving an object from a person's hand, recognised by the motion of the hand alone.
 
-A tracker sees the person. Each movement of the hand from rest is compared with those that were
-shown (`InteractionPrimitive`): as soon as it is most likely a hand-over, the end effector goes
-to where the robot's hand was then, the slower the less sure that place is, and as near to the
-person as the safety filter lets it. There it waits for the thing, and closes.
+A tracker sees the person. Each movement of the hand from rest is compared with demonstrated
+movements (`InteractionPrimitive`). As soon as it is most likely a hand-over, the end effector
+goes to the predicted meeting point, more slowly with a larger uncertainty, and as close to the
+person as the safety filter allows. There it waits for the object, and closes the fingers.
 """
 
 from collections import deque
@@ -30,101 +30,102 @@ from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.skills.workplace import GraspObject
 
 HAND_OVER = "hand over"
-"""Name of the kind of movement to answer."""
+"""Name of the kind of movement to respond to."""
 
-# Parts of a tracked body that are looked at, as `sim.worker.PARTS` names them.
+# Observed parts of a tracked body, with the names of `sim.worker.PARTS`.
 _BODY, _HAND = "pelvis", "hand_right"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReceivingConfig:
-    """How hand-overs are recognised and answered."""
+    """Recognition of hand-overs, and the response to them."""
 
     window: float = 0.3
-    """Over which a hand is compared with itself [s]: nine images."""
-    set_off: float = 0.06
-    """Way of a hand within it that is a movement, and of a body that stands [m]: four times
-    what a tracker with 1 cm of noise sees of one at rest."""
+    """Time window over which motion of a hand is detected [s]: nine images."""
+    motion_threshold: float = 0.06
+    """Displacement within the window above which a hand moves, and below which a body stands
+    [m]: four times the apparent one of a hand at rest with a tracker noise of 1 cm."""
     noise: float = 0.012
-    """Of each coordinate of the hand [m]: that of the tracker, and what people vary."""
-    sure: float = 0.95
-    """Probability from which on the robot goes."""
+    """Standard deviation of each coordinate of the hand [m]: tracker noise and human
+    variation."""
+    certainty: float = 0.95
+    """Probability of a hand-over above which the robot moves."""
     speed: float = 0.5
-    """Of the end effector towards a place that is sure [m/s]."""
+    """Speed of the end effector towards a certain meeting point [m/s]."""
     acceleration: float = 1.0
-    """[m/s^2]"""
+    """Acceleration of the end effector [m/s^2]."""
     tolerance: float = 0.06
-    """Standard deviation of the predicted place at which it goes at half of that [m]."""
+    """Standard deviation of the meeting point at which the speed is halved [m]."""
     near: float = 0.09
-    """How far the hand may be from where it was shown beside the robot's to be there [m]."""
+    """Largest distance of the hand from its demonstrated place at the end effector [m]."""
     still: float = 0.5
-    """For which it has to be there before the fingers close [s]."""
+    """Time for which the hand has to be there before the fingers close [s]."""
     attempts: int = 3
-    """How often they close on nothing."""
-    patience: float = 30.0
-    """For which the robot waits altogether [s]."""
+    """Largest number of times that the fingers close."""
+    timeout: float = 30.0
+    """Give up after this long [s]."""
 
 
 @dataclass(kw_only=True)
 class Receipt:
-    """What came of a hand-over; times are NaN until then."""
+    """Record of a hand-over; times are NaN until the event."""
 
     set_off: float = np.nan
-    """When the hand set off to hand over, as it was seen [s]."""
+    """Time of the first image of the hand's movement [s]."""
     recognised: float = np.nan
-    """When the robot was sure [s]."""
+    """Time of the recognition [s]."""
     seen: float = np.nan
-    """Time of the newest image then [s]."""
+    """Time of the newest image at the recognition [s]."""
     phase: float = np.nan
-    """How much of the movement had passed in that image, as estimated, 0 to 1."""
+    """Estimated phase of the movement in that image, 0 to 1."""
     duration: float = np.nan
-    """Of the movement, as estimated then [s]."""
+    """Estimated duration of the movement [s]."""
     probability: float = np.nan
-    """Of a hand-over then."""
+    """Probability of a hand-over at the recognition."""
     predicted: Float[np.ndarray, "3"] | None = None
-    """Where the robot's hand was to be, as predicted then [m]."""
+    """Position of the end effector at the meeting, predicted at the recognition [m]."""
     refined: Float[np.ndarray, "3"] | None = None
-    """The same when the movement was over [m]."""
+    """Prediction at the end of the movement [m]."""
     taken: float = np.nan
-    """When the fingers held the thing [s]."""
+    """Time at which the fingers held the object [s]."""
     place: Float[np.ndarray, "3"] | None = None
-    """Of the end effector then [m]."""
+    """Position of the end effector at that time [m]."""
     attempts: int = 0
-    """How often the fingers closed."""
+    """Number of times that the fingers closed."""
     passed_over: int = 0
-    """Other movements that were seen before."""
+    """Number of other movements before."""
 
 
 class MovementWatch:
-    """Cuts what a tracker sees of a hand into movements of a person who stands."""
+    """Segments the tracked hand of a standing person into movements."""
 
     def __init__(self, config: ReceivingConfig, body: int, hand: int):
-        """Begin.
+        """Start without images.
 
         Args:
-            config: What a movement is.
-            body: Number of the pelvis in a tracked body.
-            hand: Of the hand.
+            config: Window and threshold of a movement.
+            body: Index of the pelvis in a tracked body.
+            hand: Index of the hand.
         """
         self._config, self._body, self._hand = config, body, hand
         self._latest: deque[PersonObservation] = deque()
         self.times: list[float] = []
-        """Of the images of the present movement [s]; empty: the hand rests."""
+        """Times of the images of the present movement [s]; empty: the hand rests."""
         self.hand: list[Float[np.ndarray, "3"]] = []
-        """Where it was in them, middle of the capsule's axis [m]."""
+        """Positions of the hand in them, middle of the capsule's axis [m]."""
 
     def see(self, seen: PersonObservation) -> bool:
-        """Take an image in; whether it belongs to a movement."""
+        """Add an image; returns True if it belongs to a movement."""
         recent, config = self._latest, self._config
         recent.append(seen)
         while recent[-1].time - recent[0].time > config.window + 1e-6:
             recent.popleft()
         if len(recent) < 4:  # too few for two means
             return bool(self.times)
-        stands = self._moved(self._body) < config.set_off
-        moves = self._moved(self._hand) > config.set_off
+        stands = self._moved(self._body) < config.motion_threshold
+        moves = self._moved(self._hand) > config.motion_threshold
         if not stands or not moves:
-            # At rest again, or walking: whatever comes next is another movement.
+            # At rest again, or walking: the next motion is another movement.
             self.times, self.hand = [], []
             return False
         if not self.times:
@@ -136,18 +137,18 @@ class MovementWatch:
         return True
 
     def place(self, seen: PersonObservation) -> Float[np.ndarray, "3"]:
-        """Of the hand [m]."""
+        """Position of the hand [m]."""
         return seen.ends[self._hand].mean(axis=0)
 
     def _moved(self, part: int) -> float:
-        """Between the older and the newer half of the window, twice the way of their means."""
+        """Displacement within the window: twice that between the means of its halves [m]."""
         places = np.stack([one.ends[part].mean(axis=0) for one in self._latest])
         half = len(places) // 2
         return 2 * float(np.linalg.norm(places[-half:].mean(0) - places[:half].mean(0)))
 
 
 class Receiving:
-    """Waits for a hand-over and takes the thing."""
+    """Waits for a hand-over and takes the object."""
 
     def __init__(
         self,
@@ -158,15 +159,15 @@ class Receiving:
         wait: Pose,
         config: ReceivingConfig | None = None,
     ):
-        """Prepare.
+        """Prepare receiving.
 
         Args:
             cell: Arm and gripper.
-            tracker: Sees the person.
-            model: Of the hand and the end effector, positions in the base frame [m].
+            tracker: Tracker of the person.
+            model: Joint model of hand and end effector, positions in the base frame [m].
             parts: Names of the capsules of a tracked body.
-            wait: Of the end effector, where it waits.
-            config: How hand-overs are recognised.
+            wait: Pose of the end effector while it waits.
+            config: Recognition and response.
         """
         self._cell, self._tracker, self._model = cell, tracker, model
         self._config = config or ReceivingConfig()
@@ -176,17 +177,17 @@ class Receiving:
         self.receipt = Receipt()
 
     def receive(self, item: GraspObject) -> Receipt:
-        """Wait where the arm is, go and meet the person's hand, and take what is in it.
+        """Wait for a hand-over, meet the person's hand, and take the object.
 
         Raises:
-            MissedGraspError: Nobody handed anything over, or the fingers closed on nothing.
+            MissedGraspError: There was no hand-over, or the fingers closed on nothing.
         """
-        deadline = self._cell.time + self._config.patience
+        deadline = self._cell.time + self._config.timeout
         self._cell.gripper.move(OPEN)
         estimate = self._recognise(deadline)
-        beside = self._meet(estimate, deadline)
+        hand_offset = self._meet(estimate, deadline)
         while self.receipt.attempts < self._config.attempts:
-            self._await_hand(beside, deadline)
+            self._await_hand(hand_offset, deadline)
             self.receipt.attempts += 1
             move_fingers(self._cell, CLOSED, CLOSING_TIME)
             if holds(self._cell, item):
@@ -199,26 +200,26 @@ class Receiving:
 
     def _recognise(self, deadline: float) -> InteractionEstimate:
         """Hold still until a movement is most likely a hand-over."""
-        sure, wait = 0, self._cell.pose
-        still = torch.zeros(6, dtype=torch.float64)
-        other = False
+        # Number of consecutive images above the certainty, and True after one below it.
+        certain, other = 0, False
+        wait, still = self._cell.pose, torch.zeros(6, dtype=torch.float64)
         while self._cell.time < deadline:
             self._cell.track_pose(wait, still)
             if not self._look():
                 continue
             if not self._watch.times:
                 self.receipt.passed_over += other
-                sure, other = 0, False
+                certain, other = 0, False
                 continue
             estimate = self._estimate()
             k = self._model.kinds.index(HAND_OVER)
-            # Twice in a row: one image may be far off.
-            sure = sure + 1 if estimate.probability[k] > self._config.sure else 0
-            other = sure == 0
-            if sure == 2:
+            # Two in a row: a single image may be far off.
+            certain = certain + 1 if estimate.probability[k] > self._config.certainty else 0
+            other = certain == 0
+            if certain == 2:
                 self._note(estimate, float(estimate.probability[k]))
                 return estimate
-        raise MissedGraspError("receive: nobody handed anything over.")
+        raise MissedGraspError("receive: no hand-over was recognised.")
 
     def _note(self, estimate: InteractionEstimate, probability: float) -> None:
         receipt, seen = self.receipt, self._watch.times[-1]
@@ -228,7 +229,9 @@ class Receiving:
         receipt.predicted = receipt.refined = _end(estimate)[0].numpy().copy()
 
     def _meet(self, estimate: InteractionEstimate, deadline: float) -> Float[np.ndarray, "3"]:
-        """Go to where the hands met when it was shown; where the person's was beside."""
+        """Go to the predicted meeting point; returns the demonstrated offset of the hand
+        [m].
+        """
         cell, config, receipt = self._cell, self._config, self.receipt
         start, dt = cell.pose, cell.config.dt
         at, velocity = start.position.clone(), torch.zeros(3, dtype=torch.float64)
@@ -242,11 +245,11 @@ class Receiving:
                 else:
                     moving = False  # the hand has come to rest
             goal, deviation = _end(estimate)
-            share = config.tolerance**2 / (config.tolerance**2 + deviation.square().max())
-            velocity = _eased(at, velocity, goal, float(share) * config.speed, config, dt)
-            # Not ahead of an arm that people slow down.
-            ahead = float((at - cell.pose.position).norm())
-            if ahead > _AHEAD:
+            scale = config.tolerance**2 / (config.tolerance**2 + deviation.square().max())
+            velocity = _eased(at, velocity, goal, float(scale) * config.speed, config, dt)
+            # Wait for an arm that a person slows down.
+            lag = float((at - cell.pose.position).norm())
+            if lag > _LARGEST_LAG:
                 velocity = velocity * 0.0
             at = at + dt * velocity
             twist = torch.cat([velocity, torch.zeros(3, dtype=torch.float64)])
@@ -254,19 +257,19 @@ class Receiving:
             recent.append((cell.time, cell.pose.position))
             while recent[-1][0] - recent[0][0] > config.still + 1e-9:
                 recent.popleft()
-            # Encoders are too noisy to tell from one step whether an arm rests.
+            # Encoders are too noisy to detect rest within a single step.
             whole = recent[-1][0] - recent[0][0] > 0.9 * config.still
-            gone = float((recent[-1][1] - recent[0][1]).norm())
-            if whole and not moving and gone < _RESTS * config.still:
+            moved = float((recent[-1][1] - recent[0][1]).norm())
+            if whole and not moving and moved < _REST_SPEED * config.still:
                 break
         end = estimate.duration * torch.ones(1, dtype=torch.float64)
         return (estimate.person(end)[0] - estimate.robot(end)[0])[0].numpy()
 
-    def _await_hand(self, beside: Float[np.ndarray, "3"], deadline: float) -> None:
-        """Hold still until the person's hand is where a hand is that holds a thing out."""
+    def _await_hand(self, hand_offset: Float[np.ndarray, "3"], deadline: float) -> None:
+        """Hold still until the person's hand rests at its demonstrated offset [m]."""
         cell, config, wait = self._cell, self._config, self._cell.pose
         still, there = torch.zeros(6, dtype=torch.float64), deque()
-        expected = wait.position.numpy() + beside
+        expected = wait.position.numpy() + hand_offset
         while cell.time < deadline:
             cell.track_pose(wait, still)
             if not self._look() or self._newest is None:
@@ -276,14 +279,14 @@ class Receiving:
                 there.popleft()
             whole = there[-1][0] - there[0][0] > 0.8 * config.still
             places = np.stack([place for _, place in there])
-            off = np.linalg.norm(places.mean(0) - expected)
+            error = np.linalg.norm(places.mean(0) - expected)
             sway = np.linalg.norm(places - places.mean(0), axis=1).max()
-            if whole and off < config.near and sway < config.near / 2:
+            if whole and error < config.near and sway < config.near / 2:
                 return
-        raise MissedGraspError("receive: the person's hand did not come to the robot's.")
+        raise MissedGraspError("receive: the person's hand did not reach the gripper.")
 
     def wait_until_away(self, distance: float = 0.25, longest: float = 5.0) -> None:
-        """Hold still until the hand is further away [m], or for so long [s]."""
+        """Hold still until the hand is at a distance [m], at most for the longest time [s]."""
         end = self._cell.time + longest
         while self._cell.time < end:
             self._cell.hold_pose(self._cell.config.dt)
@@ -300,7 +303,7 @@ class Receiving:
         )
 
     def _look(self) -> bool:
-        """Whether the tracker has another image, which is taken in."""
+        """Read the tracker; returns True if it has a new image."""
         seen = self._tracker.read()
         if seen is None or (self._newest is not None and seen.time <= self._newest.time):
             return False
@@ -309,13 +312,13 @@ class Receiving:
         return True
 
 
-# Of the commanded place before the arm, from which it waits for it [m]; speed at which the end
-# effector rests [m/s].
-_AHEAD, _RESTS = 0.04, 0.01
+# Lag of the arm behind its command above which the command waits [m]; speed of an end effector
+# at rest [m/s].
+_LARGEST_LAG, _REST_SPEED = 0.04, 0.01
 
 
 def _end(estimate: InteractionEstimate) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Where the robot's hand is at the end, and how sure that is [m]."""
+    """Position of the end effector at the end, and its standard deviation [m]."""
     mean, deviation = estimate.robot(torch.tensor([estimate.duration], dtype=torch.float64))
     return mean[0], deviation[0]
 
@@ -328,11 +331,11 @@ def _eased(
     config: ReceivingConfig,
     dt: float,
 ) -> Float[Tensor, "3"]:
-    """Towards the goal, within a speed from which it can stop there, and an acceleration."""
-    way = goal - at
-    distance = float(way.norm())
+    """Velocity towards the goal within limits of speed and acceleration, able to stop there."""
+    offset = goal - at
+    distance = float(offset.norm())
     fastest = min(speed, (config.acceleration * distance) ** 0.5, distance / (5 * dt))
-    wanted = way * (fastest / max(distance, 1e-9))
+    wanted = offset * (fastest / max(distance, 1e-9))
     change = wanted - velocity
     most = config.acceleration * dt
     return velocity + change * min(1.0, most / max(float(change.norm()), 1e-12))

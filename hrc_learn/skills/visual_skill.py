@@ -1,16 +1,14 @@
-"""What visual servoing has learned: image Jacobian, approach direction, and visual target.
+"""Learned model of visual servoing: image Jacobian, approach direction, and visual target.
 
-The target is where in the image the end effector's marker should be, for it to be right above
-an object.
+The visual target is the pixel of the end effector's marker when the end effector is right above
+an object. The markers of end effector and object are at different heights and positions, so the
+target is not the object's pixel. With an uncalibrated camera the offset has to be learned: each
+demonstration ends with the end effector right above an object, and gives one pair of pixels.
 
-The markers of end effector and object are at different heights and places, so the target is not
-the object's pixel. With an uncalibrated camera the offset has to be learned: each demonstration
-ends with the end effector right above an object, and gives one pair of pixels.
-
-The offset is one in space, fixed to the tool that turns with the object. The image Jacobian,
-which adapts to a camera that has been moved, projects it into the image: with the perspective
-of a camera whose focal length was learned, without which the offset looks a few percent longer
-or shorter once the camera has been turned by 10 degrees.
+The offset is a vector in space, fixed to the tool, which turns with the object. The image
+Jacobian, which adapts to a camera that has been moved, projects it into the image, with the
+perspective of a camera whose focal length was learned. Without perspective the offset appears a
+few percent too long or too short once the camera has been turned by 10 degrees.
 """
 
 import copy
@@ -41,40 +39,39 @@ from hrc_learn.store import write_text
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 OBJECT_FEATURE = "observation.object_feature"
-"""Column of a dataset with the object's marker in the image."""
+"""Dataset column with the object's marker in the image."""
 OBJECT_FEATURE_NAMES = ("u", "v", "visible")
 ANGLE_FEATURE = "observation.marker_angle"
-"""Column with the directions of the end effector's and of the object's marker [rad]."""
+"""Dataset column with the directions of both markers in the image [rad]."""
 ANGLE_FEATURE_NAMES = ("tool", "object")
 UP = np.array([0.0, 0.0, 1.0])
 LONGEST_OFFSET = 0.3
-"""Of the end effector's marker from the object's [m]. From few demonstrations along a flat box
-the image Jacobian knows little about height: without this bound the least-squares offset can be
-metres long."""
+"""Longest offset of the end effector's marker from the object's [m]. A few demonstrations in a
+flat box teach the image Jacobian little about height: without this bound the least-squares
+offset can be metres long."""
 
-_MOST_NEARER = 1.5
-"""How much nearer to the camera than the object the end effector's marker may be believed, as a
-ratio: a bound for as long as the image Jacobian is not known yet."""
+# Largest ratio of the depths of both markers: a bound while the image Jacobian is uncertain.
+_MAX_DEPTH_RATIO = 1.5
 
 POSE_NOISE = 1.5e-4
-"""Standard deviation of a pose by encoders with noise of 1e-4 rad, on levers of up to 0.8 m, as
-the estimator of the image Jacobian has to expect it [m]."""
+"""Standard deviation of a pose from encoders with noise of 1e-4 rad on levers of up to 0.8 m,
+for the estimator of the image Jacobian [m]."""
 PIXEL_NOISE = 0.15
-"""The same of a marker's centre [px]: 0.08 px of the detector (docs/training.md), more in
-images that are noisy and blurred."""
+"""Standard deviation of a marker's centre [px]: 0.08 px for the detector, more in noisy and
+blurred images."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VisualTarget:
-    """Offset from the object's marker to the end effector's right above it."""
+    """Offset from the object's marker to the end effector's marker right above it."""
 
     offset: Float[np.ndarray, "3"]
-    """In the tool's frame [m]; without a focal length the one that an image without perspective
-    would show, shorter for an object further away."""
+    """Offset in the tool frame [m]. Without a focal length, it is that of an image without
+    perspective."""
     error: float
-    """Leave-one-out error, root mean square [px]; NaN from fewer than five demonstrations."""
+    """Leave-one-out error, root mean square [px]; NaN with fewer than five demonstrations."""
     focal: float | None = None
-    """Focal length of the camera [px]; None: perspective is left out."""
+    """Focal length of the camera [px]; None: no perspective."""
 
     @classmethod
     def fit(
@@ -91,20 +88,19 @@ class VisualTarget:
             objects: Pixels of the object's marker [px].
             tools: Pixels of the end effector's marker right above it [px].
             jacobians: Image Jacobians of that marker there [px/m, px/rad].
-            orientations: Of the end effector there.
-            focal: Focal length of the camera [px]; None leaves perspective out.
+            orientations: Orientations of the end effector there.
+            focal: Focal length of the camera [px]; None: no perspective.
 
         Raises:
-            ValueError: If there are fewer than three demonstrations.
+            ValueError: There are fewer than three demonstrations.
         """
         if len(objects) < 3:
             raise ValueError(
-                f"{len(objects)} demonstrations do not determine the visual target: at least "
-                "three are needed."
+                f"the visual target needs three or more demonstrations, got {len(objects)}."
             )
         apart, rows = tools - objects, jacobians[..., :3]
         if focal is not None:
-            # apart = J o / (1 - g o) is linear in the offset o as well.
+            # apart = J o / (1 - g o) is also linear in the offset o.
             rows = rows + apart[..., :, None] * _gradient(rows, tools, focal)[..., None, :]
         design = rows @ quaternion.to_matrix(orientations).numpy()
         offset, error = _solved(design.reshape(-1, 3), apart, LONGEST_OFFSET)
@@ -117,34 +113,34 @@ class VisualTarget:
         orientation: Float[Tensor, "4"],
         further: Float[np.ndarray, "3"] | None = None,
     ) -> Float[np.ndarray, "2"]:
-        """Where the end effector's marker should be for an object's marker at `pixel` [px].
+        """Target pixel of the end effector's marker for an object's marker at `pixel` [px].
 
         Args:
-            pixel: Of the object's marker [px].
-            jacobian: Estimate of the image Jacobian of the end effector's marker
-                [px/m, px/rad].
-            orientation: Of the end effector when it is there.
-            further: Way from there, base frame [m]; none when None.
+            pixel: Pixel of the object's marker [px].
+            jacobian: Estimated image Jacobian of the end effector's marker [px/m, px/rad].
+            orientation: Orientation of the end effector at the target.
+            further: Offset of the target from right above the object, base frame [m]; None:
+                none.
         """
         offset = self._in_base(orientation)
         if further is not None:
             offset = offset + further
         apart = jacobian[:, :3] @ offset
         seen = pixel + apart
-        # Depth changes with where it is seen, a little: twice is within a tenth of a pixel.
+        # Depth depends slightly on the pixel: two iterations are within a tenth of a pixel.
         for _ in range(2):
             nearer = 1 - float(self.depth_gradient(jacobian, seen) @ offset)
-            seen = pixel + apart / min(max(nearer, 1 / _MOST_NEARER), _MOST_NEARER)
+            seen = pixel + apart / min(max(nearer, 1 / _MAX_DEPTH_RATIO), _MAX_DEPTH_RATIO)
         return seen
 
     def depth_gradient(
         self, jacobian: Float[np.ndarray, "2 6"], pixel: Float[np.ndarray, "2"]
     ) -> Float[np.ndarray, "3"]:
-        """Relative change of the marker's depth with its place [1/m]; 0 without a focal length.
+        """Relative change of the marker's depth with its position [1/m]; 0 without perspective.
 
         Args:
             jacobian: Image Jacobian of the end effector's marker [px/m, px/rad].
-            pixel: Where it is seen [px].
+            pixel: Pixel of that marker [px].
         """
         if self.focal is None:
             return np.zeros(3)
@@ -153,8 +149,8 @@ class VisualTarget:
     def line(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
         """Direction from the object's marker to the end effector's above it, base frame.
 
-        Straight up for an offset that is flatter than 30 degrees, which few demonstrations
-        cannot tell from noise.
+        Straight up for an offset flatter than 30 degrees, which a few demonstrations do not
+        distinguish from noise.
         """
         offset = self._in_base(orientation)
         length = np.linalg.norm(offset)
@@ -164,7 +160,7 @@ class VisualTarget:
         return quaternion.rotate(orientation, torch.from_numpy(self.offset)).numpy()
 
     def save(self, path: Path) -> None:
-        """Write to a JSON file, whole or not at all."""
+        """Write a JSON file, atomically."""
         error = None if np.isnan(self.error) else self.error
         content = {
             "version": 2,
@@ -176,15 +172,15 @@ class VisualTarget:
 
     @classmethod
     def load(cls, path: Path) -> "VisualTarget":
-        """Read what `save` wrote.
+        """Read a saved target.
 
         Raises:
-            FileNotFoundError: If there is no such file.
-            ValueError: If it is not one of ours.
+            FileNotFoundError: There is no such file.
+            ValueError: The file has an unknown version.
         """
         content = json.loads(path.read_text(encoding="utf-8"))
         if content.get("version") != 2 or "offset_m" not in content:
-            raise ValueError(f"{path} is not a visual target of a known version: fit it again.")
+            raise ValueError(f"{path} has an unknown version: fit the visual target again.")
         error = content["error_px"]
         return cls(
             offset=np.array(content["offset_m"]),
@@ -198,7 +194,7 @@ def _gradient(
     pixel: Float[np.ndarray, "*batch 2"],
     focal: float,
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Relative change of depth with place [1/m] of a camera that looks through its middle."""
+    """Relative change of depth with position [1/m], principal point in the image's middle."""
     return depth_gradient(jacobian, pixel, focal, np.array(IMAGE_SIZE) / 2)
 
 
@@ -207,16 +203,17 @@ def _solved(
     pixels: Float[np.ndarray, "demos 2"],
     longest: float = np.inf,
 ) -> tuple[Float[np.ndarray, " unknowns"], float]:
-    """Least squares on pixels, two equations a demonstration, and their leave-one-out error.
+    """Least-squares solution for pixels, two equations a demonstration, and leave-one-out
+    error.
 
-    A solution longer than `longest` is shortened by the ridge penalty that takes.
+    A solution longer than `longest` is shortened by the smallest sufficient ridge penalty.
     """
     inverse = _ridge_inverse(design, pixels.ravel(), longest)
     solution = inverse @ pixels.ravel()
     if len(pixels) < 5:
         return solution, float("nan")
     residuals = pixels - (design @ solution).reshape(-1, 2)
-    # By blocks of the hat matrix, one for each demonstration (Allen 1974, PRESS).
+    # From blocks of the hat matrix, one for each demonstration (Allen 1974, PRESS).
     hat = (design @ inverse).reshape(len(pixels), 2, len(pixels), 2)
     own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
     press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
@@ -228,9 +225,9 @@ def _ridge_inverse(
     values: Float[np.ndarray, " equations"],
     longest: float,
 ) -> Float[np.ndarray, "unknowns equations"]:
-    """Pseudo-inverse, damped just enough to keep the solution as short as asked for."""
+    """Pseudo-inverse, damped just enough to keep the solution within a length."""
     u, s, vt = np.linalg.svd(design, full_matrices=False)
-    # Rank deficient designs: the factor keeps the divisions below finite.
+    # The factor keeps the divisions below finite for rank-deficient designs.
     s = np.maximum(s, 1e-12 * s[0])
     along = u.T @ values
 
@@ -249,22 +246,23 @@ def _ridge_inverse(
 
 @dataclass(frozen=True, kw_only=True)
 class VisualServoSkill:
-    """What was learned from demonstrations of visual servoing."""
+    """Skill learned from demonstrations of visual servoing."""
 
     jacobian: RBFImageJacobian
+    """Image Jacobian of the end effector's marker."""
     target: VisualTarget | None
-    """None where no object was observed."""
+    """Visual target; None if the demonstrations show no object."""
     approach: Approach | None = None
-    """None where no object was observed."""
+    """Approach direction; None if the demonstrations show no object."""
     angle: MarkerAngle | None = None
-    """None where no directions of markers were recorded: the gripper is not turned."""
+    """Marker direction; None if it was not recorded: the gripper does not turn."""
     learned: EvidenceResult | None = None
-    """How RBF centres, noise and prior were learned; None where they were given."""
+    """Learning of RBF centres, noise and prior; None if they were given."""
     cells: CellErrors | None = None
-    """Held-out errors by cell of a grid; None of a skill that was loaded."""
+    """Held-out errors by cell of a grid; None for a loaded skill."""
 
     def save(self, folder: Path) -> None:
-        """Write `folder/jacobian`, `folder/visual_target.json`, `folder/approach.json`."""
+        """Write `jacobian`, `visual_target.json`, `approach.json` and `angle` in a folder."""
         self.jacobian.save(folder / "jacobian")
         if self.target is not None:
             self.target.save(folder / "visual_target.json")
@@ -275,11 +273,11 @@ class VisualServoSkill:
 
     @classmethod
     def load(cls, folder: Path) -> "VisualServoSkill":
-        """Read what `training/fit_image_jacobian.py` wrote.
+        """Read a saved skill.
 
         Raises:
-            FileNotFoundError: If there is no such folder or file.
-            ValueError: If a file is not one of ours.
+            FileNotFoundError: There is no such folder or file.
+            ValueError: A file has an unknown version or kind.
         """
         target, approach = folder / "visual_target.json", folder / "approach.json"
         return cls(
@@ -296,33 +294,26 @@ class VisualServoSkill:
         orientation: Float[Tensor, "4"],
         further: Float[np.ndarray, "3"] | None = None,
     ) -> Float[np.ndarray, "2"]:
-        """Where the marker should be for the end effector to be above an object at a pixel.
-
-        Args:
-            pixel: Of the object's marker [px].
-            jacobian: Estimate of the image Jacobian of the end effector's marker
-                [px/m, px/rad].
-            orientation: Of the end effector there.
-            further: Way from there, base frame [m]; none when None.
+        """Target pixel of the end effector's marker; arguments as for `VisualTarget`.
 
         Raises:
-            ValueError: If no object was observed in the demonstrations.
+            ValueError: The demonstrations show no object.
         """
         if self.target is None:
             raise ValueError(
-                f"the skill knows no visual target: its demonstrations lack {OBJECT_FEATURE}."
+                f"the skill has no visual target: its demonstrations lack {OBJECT_FEATURE}."
             )
         return self.target(pixel, jacobian, orientation, further)
 
     def metrics(self) -> dict[str, float]:
-        """How well image motion and visual targets are predicted.
+        """Prediction errors of image motion and visual targets, by name.
 
         Raises:
-            ValueError: If the skill was loaded; its metrics are in metrics.json.
+            ValueError: The skill was loaded; its metrics are in metrics.json.
         """
         report = self.jacobian.report
         if report is None or self.cells is None:
-            raise ValueError("only a skill just fitted has metrics; see its metrics.json.")
+            raise ValueError("a loaded skill has no metrics; see its metrics.json.")
         known = self.cells.relative[self.cells.pairs > 0]
         values = {
             "pairs": float(report.pairs),
@@ -353,10 +344,10 @@ class VisualServoSkill:
 
 
 def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
-    """A Kalman filter that starts from the learned Jacobian, but does not rely on it.
+    """Kalman filter that starts from the learned Jacobian with the wide prior of a guess.
 
-    The camera may have been moved since it was learned, about which the covariance of the fit
-    knows nothing; the wide prior of a guess takes its place.
+    The camera may have been moved since the fit, which the covariance of the fit does not
+    cover.
     """
     network = copy.deepcopy(learned).double()
     network.covariance = None
@@ -367,6 +358,6 @@ def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
 
 
 def guessed_network() -> RBFImageJacobian:
-    """The paper's initial image Jacobian, the same everywhere."""
+    """The paper's initial image Jacobian, equal everywhere."""
     guess = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
     return RBFImageJacobian.from_jacobian(guess, paper_grid(), 0.1)

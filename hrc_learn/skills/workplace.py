@@ -1,4 +1,4 @@
-"""What skills ask of the place they work in, whether simulated or real."""
+"""Interfaces of the workplace of a skill, simulated or real."""
 
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
@@ -48,67 +48,67 @@ class Workplace(Protocol):
 
     @property
     def hover_height(self) -> float:
-        """Height of the tool centre point while it servoes to an object [m]."""
+        """Height of the tool centre point during visual servoing [m]."""
         ...
 
     @property
     def fingertip(self) -> float:
-        """How far the fingers reach beyond the tool centre point [m]."""
+        """Distance of the fingertips beyond the tool centre point [m]."""
         ...
 
     @property
     def palm(self) -> float:
-        """How far the palm stands back from the tool centre point [m]."""
+        """Distance of the palm behind the tool centre point [m]."""
         ...
 
     def lowering(self, half_size: tuple[float, float, float]) -> float:
-        """How far an object of a size [m] may be let down from where it is released [m].
+        """Largest distance that an object of a half size [m] may be lowered at its release [m].
 
-        Further, the hand itself would meet the board.
+        Beyond it, the gripper itself would touch the shelf.
         """
         ...
 
     @property
     def hover_turns(self) -> tuple[float, float]:
-        """Least and greatest turn of the end effector about the vertical there [rad]."""
+        """Smallest and largest turn of the end effector about the vertical there [rad]."""
         ...
 
     def hover(self) -> Pose:
-        """End effector above the middle of the table."""
+        """Pose of the end effector above the middle of the table."""
         ...
 
     def hover_joints(self) -> Float[Tensor, " joints"]:
-        """Joint positions there [rad]."""
+        """Preferred joint positions at the hover pose [rad]."""
         ...
 
     def hover_postures(self) -> Sequence[Float[Tensor, " joints"]]:
-        """Several joint positions there, the preferred ones first [rad]."""
+        """Several joint positions at the hover pose, the preferred ones first [rad]."""
         ...
 
     def home_joints(
         self, offset: Float[Tensor, "3"] | None = None, q7_offset: float = 0.0
     ) -> Float[Tensor, " joints"]:
-        """Joint positions at home, where a placing motion starts [rad].
+        """Joint positions at home, the start of a placing motion [rad].
 
         Args:
-            offset: Of the end effector from home [m].
+            offset: Offset of the end effector from home [m].
             q7_offset: Change of joint 7, which moves the elbow about the line to the wrist
                 [rad].
 
         Raises:
-            UnreachableError: If no joint positions reach it.
+            UnreachableError: No joint positions reach the pose.
         """
         ...
 
     def object_region(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Box in which objects may be on the table: centre and half edges [m]."""
+        """Box of the objects on the table: centre and half edges [m]."""
         ...
 
     def shelf(self, name: str, half_size: tuple[float, float, float] | None = None) -> Pose:
-        """End effector where it releases an object of a size [m] on a shelf.
+        """Pose of the end effector at the release of an object of a half size [m] on a shelf.
 
         Raises:
-            ValueError: If there is no such shelf.
+            ValueError: There is no such shelf.
         """
         ...
 
@@ -119,17 +119,17 @@ class Collision(Protocol):
 
     @property
     def first(self) -> str:
-        """What moves."""
+        """Name of the moving body."""
         ...
 
     @property
     def second(self) -> str:
-        """What it meets."""
+        """Name of the body that it touches."""
         ...
 
     @property
     def start(self) -> float:
-        """Number of the first sample of the path in contact."""
+        """Index of the first sample of the path in contact."""
         ...
 
     @property
@@ -147,6 +147,3 @@ class CollisionChecker(Protocol):
     ) -> Sequence[Collision]:
         """Contacts along a path of joint positions [rad], with an object carried along."""
         ...
-
-
-# The control loop.

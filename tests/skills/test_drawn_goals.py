@@ -17,10 +17,10 @@ from hrc_learn.skills.drawn_goals import (
     Drawing,
     DrawnGoals,
     DrawnGoalsConfig,
-    camera_share,
     drawn_position,
+    vision_scale,
 )
-from hrc_learn.skills.visual_servoing import VisualServoConfig
+from hrc_learn.skills.servo_target import VisualServoConfig
 
 CONFIG = DrawnGoalsConfig()
 DT = 0.02
@@ -48,7 +48,7 @@ def test_the_camera_has_no_share_from_the_walls_on_outwards(beyond):
     box = ELSEWHERE
     at = torch.tensor(box.centre, dtype=DOUBLE)
     at[0] += box.half_size[0] + beyond * CONFIG.wall
-    assert camera_share(box, at, CONFIG) == pytest.approx(min(max(-beyond, 0.0), 1.0))
+    assert vision_scale(box, at, CONFIG) == pytest.approx(min(max(-beyond, 0.0), 1.0))
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -78,7 +78,8 @@ class Loop:
         controller, self.camera = grasping(rng=generator())
         self.controller, self.q, self.time = controller, POSTURE.clone(), 0.0
         self.state, self.said = controller.initial_state(self.q), []
-        self.drawn = DrawnGoals(config, refusal, self.said.append)
+        self.law = DrawnGoals(config, refusal)
+        self.drawn = self.law.initial_state()
         self.velocity, self.potential = [torch.zeros(7, dtype=DOUBLE)], []
         self.visible = camera is not None
         target = controller.goals.vision.target
@@ -91,11 +92,12 @@ class Loop:
     def run(self, seconds, **asked):
         wish = HumanInput(**asked)
         for _ in range(round(seconds / DT)):
-            self.drawn.turn_on(wish.turn, 0.8 * DT)
+            self.drawn = self.law.turned(self.drawn, wish.turn, 0.8 * DT)
             turned = quaternion.multiply(self.drawn.turn, DOWN)
             planned = self.planned.turned_to(turned)
-            self.drawn.read(wish, planned, self.time)
-            goals = self.drawn.applied(planned, self.pose.position)
+            self.drawn, remark = self.law.read(self.drawn, wish, planned, self.time)
+            self.said += [remark] if remark else []
+            goals, self.drawn = self.law.applied(self.drawn, planned, self.pose.position)
             feature, _ = self.camera.project(self.pose)
             observation = observe(
                 self.q,
@@ -135,8 +137,8 @@ def test_a_drawing_leads_the_end_effector_and_what_was_planned_does_so_again_aft
     assert (np.abs(back - CENTRE.numpy())[:2] < 0.16).all()
     assert np.abs(led - CENTRE.numpy()).max() > 0.2
     assert loop.said == [
-        "The target in the region drawn leads the end effector; the task waits.",
-        "The plan leads again.",
+        "The target in the drawn region guides the end effector; the task waits.",
+        "The plan guides the end effector again.",
     ]
     assert not loop.drawn.away
 
@@ -145,7 +147,7 @@ def test_between_changes_the_potential_only_falls():
     loop = Loop()
     for asked in ({}, {"region": ELSEWHERE, "target": TARGET}, {"region": ELSEWHERE}, {}):
         loop.potential.clear()
-        loop.run(3.0, **asked)
+        loop.run(2.0, **asked)
         # An arm that changes its direction first has to brake, by 7.5 rad/s^2 at least.
         braked = loop.potential[12:]
         assert np.diff(braked).max() <= 1e-9 + 1e-6 * braked[0]
@@ -186,7 +188,7 @@ def test_in_a_region_over_the_planned_place_the_task_goes_on():
     assert float((pixel - loop.planned.vision.target).norm()) < 2
     assert inside(loop.pose.position.numpy(), box)
     assert not loop.drawn.away
-    assert loop.said == ["The region drawn leads the end effector."]
+    assert loop.said == ["The drawn region guides the end effector."]
 
 
 @pytest.mark.parametrize("turn", [(0.3, 0.0, 0.0), (0.0, -0.2, 0.2), (0.0, 1.5, 0.0)])
@@ -209,10 +211,11 @@ def test_the_turn_comes_on_top_of_the_planned_orientation(turn):
 
 
 def test_the_turn_goes_no_faster_than_told():
-    drawn = DrawnGoals(CONFIG)
+    law = DrawnGoals(CONFIG)
+    drawn = law.initial_state()
     turns = [drawn.turn]
     for _ in range(60):
-        drawn.turn_on((0.0, 0.0, 0.3), 0.008)
+        drawn = law.turned(drawn, (0.0, 0.0, 0.3), 0.008)
         turns.append(drawn.turn)
     steps = quaternion.angle(torch.stack(turns[1:]), torch.stack(turns[:-1]))
     assert float(steps.max()) <= 0.008 + 1e-12
@@ -233,13 +236,13 @@ def test_a_drawing_that_is_refused_leaves_the_plan_in_the_lead():
     (pose,) = asked  # once a change
     np.testing.assert_allclose(pose.position, TARGET)
     loop.run(1.0, target=(0.3, 0.4, 0.4))
-    assert loop.said[-1] == "The target leads the end effector; the task waits."
+    assert loop.said[-1] == "The target guides the end effector; the task waits."
 
 
 def test_what_is_dragged_leads_at_once_and_again_when_it_is_still():
     """A pointer brings another target with each step: not each of them is looked into."""
-    loop, asked = Loop(), []
-    loop.drawn._refusal = lambda pose: asked.append(pose.position[0].item()) or ""
+    asked = []
+    loop = Loop(refusal=lambda pose: asked.append(pose.position[0].item()) or "")
     for k in range(50):
         loop.run(DT, target=(0.3 + 0.002 * k, 0.3, 0.4))
     assert asked == [0.3]

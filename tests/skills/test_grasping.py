@@ -39,7 +39,7 @@ from hrc_learn.skills import MissedGraspError, grasping
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig
 from hrc_learn.skills.placing import check_plan
-from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig
+from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
@@ -361,7 +361,7 @@ def unled_cell(world: World, **settings: Any) -> WorkCell:
         ((0.1, -0.15, 0.1), ""),
         ((0.6, 0.5, 0.4), "does not reach"),
         ((0.0, 0.0, -0.08), "on the table"),
-        ((0.2, -1.1, 0.15), "on the way there"),
+        ((0.2, -1.1, 0.15), "on the path there"),
     ],
 )
 def test_a_person_is_told_where_the_arm_cannot_be_led(skill, place, said):

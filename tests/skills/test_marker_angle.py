@@ -79,10 +79,11 @@ def learned(noise=0.0):
 def converged(skill, made, yaw, start=0.3, images=6):
     """Turn of a tool that goes where each image tells it to."""
     servo, pose = AngleServo(skill), Pose(ABOVE, turned(start))
+    state, item = servo.initial_state(), of_object(made, yaw)
     for _ in range(images):
         direction = of_tool(made, pose)
-        servo.update(pose, direction, 0.04)
-        goal = servo.turned(pose, direction, of_object(made, yaw), gripper_down(), ALLOWED)
+        state = servo.updated(state, pose, direction, 0.04)
+        goal, state = servo.turned(state, pose, direction, item, gripper_down(), ALLOWED)
         pose = Pose(ABOVE, goal)
     return turn_about_vertical(pose.orientation, gripper_down())
 
@@ -93,15 +94,18 @@ def test_near_an_end_of_the_range_the_tool_is_not_turned_to_and_fro(end):
     made, rng, goals = camera(), np.random.default_rng(end), []
     servo, pose = AngleServo(learned()), Pose(ABOVE, turned(0.3))
     direction, item = of_tool(made, pose), of_object(made, ALLOWED[end])
+    state = servo.initial_state()
     for noise in rng.normal(0, 0.03, 30):
-        goal = servo.turned(pose, direction, item + noise, gripper_down(), ALLOWED)
+        goal, state = servo.turned(
+            state, pose, direction, item + noise, gripper_down(), ALLOWED
+        )
         goals.append(turn_about_vertical(goal, gripper_down()))
     assert np.ptp(goals) < 0.3
     # Another motion may choose anew, and far out of the range nothing is kept.
     beyond = item + (
         -0.4 if goals[-1] > 0 else 0.4
     )  # the image shows turns the other way round
-    far = servo.turned(pose, direction, beyond, gripper_down(), ALLOWED)
+    far, _ = servo.turned(state, pose, direction, beyond, gripper_down(), ALLOWED)
     assert ALLOWED[0] < turn_about_vertical(far, gripper_down()) < ALLOWED[1]
     assert abs(turn_about_vertical(far, gripper_down()) - goals[-1]) > 1.0
 

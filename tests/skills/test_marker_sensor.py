@@ -8,8 +8,8 @@ from hrc_learn.log import StepLog
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
-    HeldMarker,
     LatencyConfig,
+    MarkerConsistency,
     MarkerObservation,
     longest_occlusion,
 )
@@ -82,11 +82,11 @@ def test_a_log_of_one_step_tells_of_no_occlusion():
 
 
 def seen_held(pixels, poses, jacobian, tolerance=1.5):
-    held = HeldMarker(tolerance)
-    return [
-        held.fits(0.04 * k, pixel, pose, jacobian)
-        for k, (pixel, pose) in enumerate(zip(pixels, poses, strict=True))
-    ]
+    held, fits = MarkerConsistency(tolerance=tolerance), []
+    for k, (pixel, pose) in enumerate(zip(pixels, poses, strict=True)):
+        held = held.updated(0.04 * k, pixel, pose, jacobian)
+        fits.append(held.consistent)
+    return fits
 
 
 def test_a_marker_that_moves_with_the_end_effector_is_believed_a_half_hidden_one_not():
@@ -111,8 +111,10 @@ def test_a_marker_that_moves_with_the_end_effector_is_believed_a_half_hidden_one
 
 
 def test_an_image_is_judged_once():
-    held = HeldMarker(1.5)
+    held = MarkerConsistency(tolerance=1.5)
     pose, jacobian = panda.forward(panda.ready), np.zeros((2, 6))
-    assert held.fits(0.0, np.array([5.0, 5.0]), pose, jacobian)
-    assert held.fits(0.0, np.array([50.0, 50.0]), pose, jacobian)
-    assert not held.fits(0.1, np.array([50.0, 50.0]), pose, jacobian)
+    held = held.updated(0.0, np.array([5.0, 5.0]), pose, jacobian)
+    assert held.consistent
+    held = held.updated(0.0, np.array([50.0, 50.0]), pose, jacobian)
+    assert held.consistent
+    assert not held.updated(0.1, np.array([50.0, 50.0]), pose, jacobian).consistent

@@ -148,8 +148,8 @@ def test_closes_on_nothing_as_often_as_told(model):
 @shapes_unchecked()
 def test_nobody_hands_anything_over(model):
     cell = Cell([(1.0, 1.0, ELSEWHERE)], brings=False)
-    with pytest.raises(MissedGraspError, match="nobody handed"):
-        receiving(cell, model, patience=4.0).receive(ITEM)
+    with pytest.raises(MissedGraspError, match="no hand-over"):
+        receiving(cell, model, timeout=4.0).receive(ITEM)
     assert cell.time == pytest.approx(4.0, abs=0.05)
     assert torch.equal(cell.pose.position, START)
     assert cell.closed == []
@@ -160,7 +160,7 @@ def test_waits_no_longer_than_it_is_told_for_the_hand(model):
     met = np.array([0.2, 0.5, 0.25])
     cell = Cell([(1.0, 1.0, met + BESIDE), (2.5, 1.0, REST)], brings=False)
     with pytest.raises(MissedGraspError, match="did not come"):
-        receiving(cell, model, patience=8.0).receive(ITEM)
+        receiving(cell, model, timeout=8.0).receive(ITEM)
     assert np.linalg.norm(cell.pose.position.numpy() - met) < 0.05
 
 

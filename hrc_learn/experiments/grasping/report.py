@@ -18,7 +18,7 @@ from hrc_learn.experiments.grasping.trial import VARIANTS, GraspingRun, Simulate
 from hrc_learn.experiments.run_recording import record
 from hrc_learn.geometry import Box
 from hrc_learn.log import CameraRecording, RunRecording
-from hrc_learn.skills.visual_servoing import VisualServoConfig
+from hrc_learn.skills.servo_target import VisualServoConfig
 from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import STYLE, WIDTH, draw_box, frame_space, near, needed, space
 from hrc_learn.viz.figures import image_jacobian_figure, joints_figure
