@@ -1,36 +1,30 @@
-"""Features of a task parameter: what primitives are regressed on."""
+"""Primitives as a function of a task parameter, by ridge regression."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp._arguments import (
-    FitReport,
-    Mask,
-    Points,
-    Times,
-    Vectors,
-    check_samples,
-    to_tensor,
-)
+from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, to_tensor
+from hrc_learn.dmp.fitting.motion_fit import FitOptions
+from hrc_learn.dmp.fitting.samples import FitReport, check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.probabilistic_dmp import mean_primitive
 from hrc_learn.model_files import SavedModel, write_model
 
 type FeatureMap = Callable[[Tensor], Tensor]
-"""Maps contexts (*batch, C) to features (*batch, F); a constant one is not needed."""
+"""Map from contexts (*batch, C) to features (*batch, F), without a constant."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PolynomialFeatures:
-    """All products of up to `degree` coordinates of the context; 1: the context itself."""
+    """Products of up to `degree` coordinates of the context; 1: the context itself."""
 
     degree: int = 1
 
@@ -39,7 +33,7 @@ class PolynomialFeatures:
             raise ValueError(f"degree must be at least 1, got {self.degree}")
 
     def __call__(self, context: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch F"]:
-        """Features of a context."""
+        """Features of contexts (*batch, C)."""
         columns = context.unbind(-1)
         products = [
             torch.stack(factors).prod(0)
@@ -50,21 +44,21 @@ class PolynomialFeatures:
 
 
 CONSTANT = 1e-12
-"""Features that vary by less than this share of their size do not vary: it is rounding of the
-mean that was taken off."""
+"""Standard deviation relative to the size below which a feature counts as constant: what is
+left after the mean is subtracted is rounding."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RidgeFit:
-    """y = a + B (x - mean) / scale, fitted to n samples."""
+    """Linear map y = a + B (x - mean) / scale, fitted to n samples."""
 
     mean: Float[Tensor, "F"]
     scale: Float[Tensor, "F"]
-    """Standard deviation of each feature; one where it never changes, or by request."""
+    """Standard deviation of each feature; one if it is constant or not standardised."""
     coefficients: Float[Tensor, "F_and_1 K"]
-    """First row a, the others B transposed."""
+    """a in the first row, B transposed in the others."""
     held_out: Float[Tensor, "n K"]
-    """What each sample differs by from its prediction by a fit to all others."""
+    """Difference of each sample to its prediction from all others."""
 
 
 def fit_ridge(
@@ -76,17 +70,17 @@ def fit_ridge(
 ) -> RidgeFit:
     """Minimise |Y - A X|^2 + n regularization |B|^2, A = [1, (features - mean) / scale].
 
-    The constant is free, so that a strong penalty leads to the mean of the targets. With
-    the hat matrix H = A (A'A + P)^-1 A', the residual of a fit without sample i, at the same
-    penalty P, is e_i / (1 - H_ii) (PRESS; Allen 1974, "The relationship between variable
-    selection and data augmentation").
+    The constant is not penalised, so that a strong penalty leads to the mean of the targets.
+    With the hat matrix H = A (A'A + P)^-1 A', the residual of sample i in a fit without it, at
+    the same penalty P, is e_i / (1 - H_ii) (PRESS; Allen 1974, "The relationship between
+    variable selection and data augmentation").
 
     Args:
-        features: n >= 2.
-        targets: Fitted alike, column by column.
-        regularization: Positive; 1 weighs the penalty as much as the data.
-        standardize: Divide features by their standard deviation; False: scale is one, for
-            features in one scale, of which those that hardly vary are to stay small.
+        features: Features of n >= 2 samples.
+        targets: Targets of the samples.
+        regularization: Positive; 1 gives penalty and data equal weight.
+        standardize: True to divide features by their standard deviation. False suits
+            features on one scale, where those that hardly vary should have little effect.
 
     Raises:
         ValueError: Fewer than 2 samples, or a regularization that is not positive.
@@ -97,7 +91,7 @@ def fit_ridge(
     if not 0 < regularization < torch.inf:
         raise ValueError(f"regularization must be positive, got {regularization}")
     mean, deviation = features.mean(0), features.std(0, correction=0)
-    # What is left of a constant in rounding is no deviation.
+    # A constant feature has a deviation by rounding only.
     varies = standardize & (deviation > CONSTANT * features.abs().amax(0))
     scale = torch.where(varies, deviation, 1.0)
     A = torch.cat([torch.ones_like(features[:, :1]), (features - mean) / scale], dim=1)
@@ -128,17 +122,17 @@ class ContextualDMP(nn.Module):
     a and B by ridge regression from one demonstration per context (after Forte et al. 2012,
     "On-line motion synthesis and adaptation using a trajectory database", and Ude et al.
     2010, "Task-specific generalization of discrete and periodic dynamic movement
-    primitives", here global instead of local). As the constant is free, x(c) mixes those of
-    the demonstrations in shares that sum to one, and so does the motion, which is linear in
-    all but the duration.
+    primitives", here global instead of local). As the constant is not penalised, x(c) is an
+    affine combination of the demonstrations, and so is the motion, which is linear in all
+    coordinates but the duration.
     """
 
     feature_mean: Tensor
     feature_scale: Tensor
     held_out_duration: Tensor
-    """Duration of each demonstration over its prediction by the others (n)."""
+    """Ratio of the duration of each demonstration to its prediction from the others, (n)."""
     held_out: FitReport
-    """Each demonstration, (n), against its prediction by the others, at the same s."""
+    """Residuals of each demonstration, (n), to its prediction from the others, at equal s."""
 
     def __init__(
         self,
@@ -151,16 +145,16 @@ class ContextualDMP(nn.Module):
         held_out_duration: Float[Tensor, "n"],
         features: FeatureMap,
     ):
-        """Put one together; `fit` is the usual way.
+        """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
-            mean: Primitive without batch dimensions, whose basis, gains and names all have.
+            mean: Single primitive with the common basis, gains and names.
             coefficients: a and B transposed; K = D (N + 3) + 1.
-            feature_mean: Of the demonstrations.
-            feature_scale: Of the demonstrations.
-            held_out: Kept for the reader.
-            held_out_duration: Kept for the reader.
-            features: phi.
+            feature_mean: Mean features of the demonstrations.
+            feature_scale: Scale of the features.
+            held_out: Residuals of leave-one-out predictions.
+            held_out_duration: Ratios of durations to leave-one-out predictions.
+            features: Feature map phi.
 
         Raises:
             ValueError: Coefficients that do not fit the primitive or the features.
@@ -191,28 +185,30 @@ class ContextualDMP(nn.Module):
         *,
         features: FeatureMap | None = None,
         regularization: float = 1e-6,
-        **fit_arguments: Any,
+        joint_names: Sequence[str] | None = None,
+        units: str = "rad",
+        **options: Unpack[FitOptions],
     ) -> "ContextualDMP":
-        """Learn from one demonstration for each of several contexts.
+        """Learn from one demonstration per context.
 
         Args:
             time: Timestamps [s], (T,) or (n, T).
             position: (n, T, D), n >= 2.
             context: (n, C), or (n,) for C = 1.
             n_basis: N.
-            mask: (n, T), false where a sample does not count.
-            features: phi; affine in the context unless given.
+            mask: (n, T), false at samples to ignore.
+            features: Feature map phi; by default the context itself.
             regularization: Ridge over standardised features, positive. The default hardly
-                smoothes; `held_out` tells what suits noisy demonstrations.
-            fit_arguments: Others of `JointDMP.fit`, such as `approach` or `joint_names`.
+                smooths; compare `held_out` for noisy demonstrations.
+            joint_names: D names, stored with the primitive.
+            units: Units of the coordinates.
+            options: Options of the fit; see `FitOptions`.
 
         Raises:
-            ValueError: Bad samples (says which), contexts that do not fit them, or a
-                scaling other than `"none"`, in which motions are not linear.
+            ValueError: Bad samples (the message names them), or contexts that do not match.
         """
-        each = JointDMP.fit(time, position, n_basis, mask=mask, **fit_arguments)
-        if each.scaling != "none":
-            raise ValueError(f"scaling {each.scaling!r} is not linear: fit with 'none'")
+        names = {"joint_names": joint_names, "units": units}
+        each = JointDMP.fit(time, position, n_basis, mask=mask, **names, **options)
         if each.weights.ndim != 3:
             raise ValueError(f"position must be (n, T, D), got {_shape(position)}")
         samples = check_samples(time, position, mask=mask)
@@ -222,22 +218,22 @@ class ContextualDMP(nn.Module):
         ridge = fit_ridge(phi, x, regularization)
         predicted = _primitive(each, x - ridge.held_out)
         with torch.no_grad():
-            motion = predicted.rollout().position.mT.reshape(samples.position.shape)
+            held_out = samples.compare(predicted.rollout().position)
         dtype = each.weights.dtype
         return cls(
             mean=mean_primitive(each),
             coefficients=ridge.coefficients.to(dtype),
             feature_mean=ridge.mean.to(dtype),
             feature_scale=ridge.scale.to(dtype),
-            held_out=samples.compare(motion),
+            held_out=held_out,
             held_out_duration=ridge.held_out[:, -1].exp().to(dtype),
             features=features,
         )
 
     def at(self, context: Vectors) -> JointDMP:
-        """Primitives for contexts (*batch, C); gradients flow to them and to the coefficients.
+        """Primitives for contexts (*batch, C); gradients flow to contexts and coefficients.
 
-        What is learned here are the coefficients: the weights of the result are a buffer.
+        The weights of the result are a buffer, because the coefficients are the parameters.
         """
         like = self.coefficients
         phi = self.features(to_tensor(context, dtype=like.dtype, device=like.device))
@@ -253,8 +249,8 @@ class ContextualDMP(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save.
 
-        A feature map other than `PolynomialFeatures` is code, which is not written: `load`
-        has to be given the same one.
+        A feature map other than `PolynomialFeatures` is code and is not saved: pass the same
+        one to `load`.
         """
         phi = self.features
         features = {"degree": phi.degree} if isinstance(phi, PolynomialFeatures) else None
@@ -265,15 +261,15 @@ class ContextualDMP(nn.Module):
 
     @classmethod
     def load(cls, folder: str | Path, features: FeatureMap | None = None) -> "ContextualDMP":
-        """Read what `save` wrote.
+        """Read a primitive that `save` wrote.
 
         Args:
-            folder: Where.
-            features: The feature map it was fitted with, unless that was a polynomial.
+            folder: Folder of the saved primitive.
+            features: Feature map of the fit, unless it was a polynomial.
 
         Raises:
-            FileNotFoundError: No saved primitive there.
-            ValueError: Names the file and the field that is wrong.
+            FileNotFoundError: The folder holds no saved primitive.
+            ValueError: A wrong field; the message names the file and the field.
         """
         saved = SavedModel(folder, cls.__name__)
         own = {name: saved.tensor(name) for name in OWN_TENSORS}
@@ -291,13 +287,13 @@ class ContextualDMP(nn.Module):
 
 
 def _coordinates(primitives: JointDMP) -> Float[Tensor, "n K"]:
-    """X of each (float64)."""
+    """Coordinates x of each primitive (float64)."""
     x = primitives.coordinates().detach().flatten(1)
     return torch.cat([x, primitives.duration.log()[:, None]], dim=-1).double()
 
 
 def _primitive(like: JointDMP, x: Float[Tensor, "*batch K"]) -> JointDMP:
-    """The primitives with these coordinates, else like `like`."""
+    """Primitives with these coordinates, and the parts of `like`."""
     D = like.weights.shape[-2]
     return like.with_coordinates(x[..., :-1].unflatten(-1, (D, -1)), x[..., -1].exp())
 
@@ -325,7 +321,7 @@ def _saved_features(saved: SavedModel, given: FeatureMap | None) -> FeatureMap:
     if given is not None:
         return given
     if fields is None:
-        raise saved.invalid_field("features", "fitted with a map of its own, give it to load")
+        raise saved.invalid_field("features", "fitted with a custom map: pass it to load")
     try:
         return PolynomialFeatures(**fields)
     except (TypeError, ValueError) as error:

@@ -1,43 +1,43 @@
-"""Coupling terms: what a robot, its surroundings and a second arm add to a motion.
+"""Coupling terms: effects of the robot, its surroundings and a second arm on a motion.
 
-`step` takes their results as `phase_stopping` or as `coupling`. Obstacles are points on their
-surfaces, the nearest of each, so that the terms know no shapes: see `nearest_on_sphere` and
-`nearest_on_box`.
+`step` takes their results as `phase_stopping` or as `coupling`. Obstacles are given by points
+on their surfaces, the nearest of each, so that the terms need no shapes: see
+`nearest_on_sphere` and `nearest_on_box`.
 
-Forces and the distance to a second arm act at the level of velocities (Gams et al. 2014,
-"Coupling movement primitives: interaction with the environment and bimanual tasks"). Where a
-push on the acceleration has the spring against it, a term C added to the velocity moves the
-primitive as a whole:
+Forces and the distance to a second arm act on the velocity (Gams et al. 2014, "Coupling
+movement primitives: interaction with the environment and bimanual tasks"). The spring opposes a
+push on the acceleration; a term C added to the velocity moves the primitive as a whole:
 
     tau z_dot = alpha (beta (g - y) - z) + f + lead tau C_dot,   tau y_dot = z + C
 
-C = tau gain error, the error one of force or of distance. A goal that disagrees with what is
-wanted still pulls: at rest, feedback alone leaves 1 / (1 + K gain) of the error, K = k tau /
-beta on a contact of stiffness k, 2 tau / beta between two arms. `learn` takes the rest away
-over repetitions. Held over each step as all coupling is: first order in its length.
+C = tau gain error, with an error of force or of distance. A goal that contradicts the wanted
+force still pulls: at rest, feedback alone leaves 1 / (1 + K gain) of the error, K = k tau /
+beta on a contact of stiffness k, 2 tau / beta between two arms. `learn_feed_forward` removes
+the rest over repetitions. A coupling is constant over each step, which is of first order in its
+length.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._system.closed_forms import SpringDamper
+from hrc_learn.dmp._system.spring import SpringDamper
 
 TOUCH = 1e-3
-"""Nearer than this [m], repulsion grows no further: it has no bound at contact."""
+"""Distance [m] below which repulsion stays constant, because it has no bound at contact."""
 
 
 def phase_stopping(
     planned: Float[Tensor, "*#batch D"], measured: Float[Tensor, "*#batch D"], gain: float
 ) -> Float[Tensor, "*batch"]:
-    """Slow-down that waits for a robot that is held back: gain |planned - measured|^2.
+    """Slow-down for a robot that is held back: gain |planned - measured|^2.
 
     (Ijspeert et al. 2013, "Dynamical movement primitives", section 2.5; here it slows the
-    whole system, not the phase alone, so that the motion waits on its path.)
+    whole system instead of the phase alone, so that the motion waits on its path.)
 
     Args:
-        planned: Position of the primitive.
-        measured: Position of the robot.
+        planned: Position of the primitive [rad] or [m].
+        measured: Position of the robot, in the same units.
         gain: 1 / [rad^2] or 1 / [m^2]; the clock runs at half speed at 1 / sqrt(gain).
     """
     return gain * (planned - measured).square().sum(-1)
@@ -56,22 +56,22 @@ def steering(
 
     gamma R v phi exp(-beta phi), phi the angle between velocity and obstacle, R a quarter
     turn away from it (Hoffmann et al. 2009, "Biologically-inspired dynamical systems for
-    movement generation", eq. 9). It bends the path and neither drives nor brakes. An obstacle
-    straight ahead has no side to pass on, and turns nothing.
+    movement generation", eq. 9). It bends the path without changing the speed. An obstacle
+    straight ahead has no effect, because neither side is nearer.
 
     Args:
         position: [m].
         velocity: [m/s].
         obstacles: Points to avoid [m].
         gain: gamma [1/s].
-        sharpness: beta [1/rad]; the larger, the narrower the cone ahead that matters.
-        reach: Distance [m] over which the effect fades to 1 / e; None, as published: never.
+        sharpness: beta [1/rad]; larger values narrow the cone ahead in which obstacles act.
+        reach: Distance [m] over which the effect fades to 1 / e; None: no fading, as published.
     """
     towards = obstacles - position[..., None, :]
     v = velocity[..., None, :].expand(towards.shape)
     normal = torch.linalg.cross(towards, v)
     sine, cosine = normal.norm(dim=-1, keepdim=True), (towards * v).sum(-1, keepdim=True)
-    # Straight ahead there is no axis: zero over tiny is zero.
+    # Straight ahead there is no axis: zero divided by a tiny number stays zero.
     axis = normal / sine.clamp_min(torch.finfo(sine.dtype).tiny)
     angle = torch.atan2(sine, cosine)
     term = gain * torch.linalg.cross(axis, v) * angle * torch.exp(-sharpness * angle)
@@ -87,15 +87,15 @@ def repulsion(
     reach: float,
     gain: float = 1e-3,
 ) -> Float[Tensor, "*batch 3"]:
-    """Acceleration away from obstacles nearer than `reach` [m/s^2].
+    """Acceleration away from obstacles closer than `reach` [m/s^2].
 
     Minus the gradient of U = gain / 2 (1 / d - 1 / reach)^2, d the distance (Khatib 1986,
     "Real-time obstacle avoidance for manipulators and mobile robots").
 
     Args:
         position: [m].
-        obstacles: Nearest points of them [m].
-        reach: [m].
+        obstacles: Nearest point of each obstacle [m].
+        reach: Distance below which obstacles act [m].
         gain: [m^4/s^2].
     """
     away = position[..., None, :] - obstacles
@@ -111,11 +111,11 @@ def nearest_on_sphere(
     centre: Float[Tensor, "*#batch 3"],
     radius: Float[Tensor, "*#batch"] | float,
 ) -> Float[Tensor, "*batch 3"]:
-    """Point of a solid sphere nearest to `position` [m]; `position` itself inside."""
+    """Point of a solid sphere nearest to `position` [m]; inside, `position` itself."""
     offset = position - centre
     distance = offset.norm(dim=-1, keepdim=True)
     limit = radius[..., None] if isinstance(radius, Tensor) else radius
-    # The centre itself has no direction: it stays where it is, inside.
+    # The centre has no direction; it is inside and stays in place.
     inwards = (limit / distance.clamp_min(torch.finfo(distance.dtype).tiny)).clamp_max(1)
     return centre + offset * inwards
 
@@ -125,7 +125,7 @@ def nearest_on_box(
     centre: Float[Tensor, "*#batch 3"],
     half_size: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Point of a solid box along the axes nearest to `position` [m]; itself inside."""
+    """Nearest point of a solid axis-aligned box [m]; inside, `position` itself."""
     return torch.minimum(torch.maximum(position, centre - half_size), centre + half_size)
 
 
@@ -137,17 +137,18 @@ def velocity_coupling(
     duration: Float[Tensor, "*#batch"],
     lead: float = 0.0,
 ) -> Float[Tensor, "*batch D"]:
-    """The `coupling` for `step` that acts as C added to the velocity.
+    """Coupling for `step` that acts as a term C added to the velocity.
 
-    Eliminating z leaves alpha / tau V + (1 + lead) V_dot, V = C / tau: from an error, a
-    proportional and a derivative term.
+    Eliminating z gives alpha / tau V + (1 + lead) V_dot, V = C / tau: a proportional and a
+    derivative term of the error.
 
     Args:
         velocity: V, such as gain * (wanted - measured force) [m/s].
         acceleration: V_dot, such as -gain * (rate of the measured force) [m/s^2].
-        spring: Of the primitive.
+        spring: Gains of the primitive.
         duration: tau of the motion [s], `state.duration`.
-        lead: Weight of C_dot on the acceleration as well, c_2 / tau there: more damping.
+        lead: Additional weight of C_dot on the acceleration (c_2 / tau in the source), for more
+            damping.
     """
     return spring.alpha / duration[..., None] * velocity + (1 + lead) * acceleration
 
@@ -159,16 +160,16 @@ def offset_error(
     other_velocity: Float[Tensor, "*#batch D"],
     wanted: Float[Tensor, "*#batch D"],
 ) -> tuple[Float[Tensor, "*batch D"], Float[Tensor, "*batch D"]]:
-    """Wanted minus actual offset other - position, and its rate.
+    """Wanted minus actual offset, other - position, and its rate.
 
-    Two arms keep their offset as one is coupled to gain * error and the other to minus
-    that; an arm that follows takes all of it and the leader nothing.
+    Two arms keep their offset if one is coupled to minus gain * error and the other to plus
+    that; to follow a leader, one arm takes the whole error.
 
     Args:
-        position: Of the one arm [m].
-        velocity: Its rate [m/s].
-        other: Of the other arm, which is moved by plus the error.
-        other_velocity: Its rate.
+        position: Position of the first arm [m].
+        velocity: Velocity of the first arm [m/s].
+        other: Position of the second arm [m], which plus the error moves.
+        other_velocity: Velocity of the second arm [m/s].
         wanted: Offset to keep.
     """
     return wanted - (other - position), velocity - other_velocity
@@ -181,15 +182,15 @@ def distance_error(
     other_velocity: Float[Tensor, "*#batch D"],
     wanted: Float[Tensor, "*#batch"] | float,
 ) -> tuple[Float[Tensor, "*batch D"], Float[Tensor, "*batch D"]]:
-    """As `offset_error` for the distance alone, along the line from one arm to the other.
+    """Wanted minus actual distance along the line from one arm to the other, and its rate.
 
-    The pair may turn. Where both are at one point there is no line: the error is zero.
+    Unlike `offset_error` it lets the pair turn. If both are at one point, the error is zero.
 
     Args:
-        position: Of the one arm [m].
-        velocity: Its rate [m/s].
-        other: Of the other arm, which is moved by plus the error.
-        other_velocity: Its rate.
+        position: Position of the first arm [m].
+        velocity: Velocity of the first arm [m/s].
+        other: Position of the second arm [m], which plus the error moves.
+        other_velocity: Velocity of the second arm [m/s].
         wanted: Distance to keep [m].
     """
     offset, rate = other - position, other_velocity - velocity
@@ -204,7 +205,7 @@ def distance_error(
     return stretch * offset, stretch * rate - bend / square * offset
 
 
-def learn(
+def learn_feed_forward(
     learned: Float[Tensor, "*batch T D"],
     error: Float[Tensor, "*batch T D"],
     *,
@@ -212,19 +213,19 @@ def learn(
     rate: float = 1.0,
     retention: float = 0.99,
 ) -> Float[Tensor, "*batch T D"]:
-    """Feed-forward velocity for the next repetition, from the error of this one.
+    """Feed-forward velocity for the next repetition, from the error of this one [m/s].
 
     V_i = learned_i + gain e_i,   learned_(i+1) = Q (learned_i + L gain e_i)
 
-    (iterative learning control with the current iteration in the loop). With L = Q = 1
-    what was fed back is fed forward, and at rest each repetition shrinks the error by the
-    factor by which feedback alone does.
+    (iterative learning control with the current iteration in the loop). With L = Q = 1, the
+    feedback of one repetition is the feed-forward of the next, and at rest each repetition
+    reduces the error by the same factor as feedback alone.
 
     Args:
-        learned: Of this repetition, at its T steps; zeros at first [m/s].
-        error: Met at these steps.
-        gain: Of the feedback; [m/s] per unit of the error.
+        learned: Feed-forward velocity at the T steps of this repetition; zeros at first [m/s].
+        error: Error measured at these steps.
+        gain: Feedback gain, [m/s] per unit of the error.
         rate: L.
-        retention: Q, up to 1; the smaller, the more robust, and the more error stays.
+        retention: Q, up to 1; smaller values are more robust and leave more error.
     """
     return retention * (learned + rate * gain * error)

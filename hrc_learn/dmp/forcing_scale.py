@@ -1,13 +1,13 @@
-"""How the forcing term scales with start and goal, as a part by name.
+"""Scalings of the forcing term with start and goal, selected by name.
 
-- `"none"`: not at all. Weights are accelerations; a moved goal shifts the motion smoothly.
+- `"none"`: no scaling. Weights are accelerations; a new goal shifts the motion smoothly.
   Defined for every start and goal, hence the default.
-- `"paper"`: by g - y_0, as the paper prints it. The motion grows with the distance to the
-  goal; undefined for g = y_0 and mirrored when the goal lies on the other side.
-- `"amplitude"`: by the range each coordinate covers in the demonstration. Weights are
-  dimensionless, so a scaled demonstration has the same ones; survives g = y_0.
-- `"rotation"`: turned and dilated with the way from start to goal, for positions in space; see
-  `RotationScaling`.
+- `"paper"`: g - y_0, as the paper prints it. The motion grows with the distance to the goal;
+  undefined for g = y_0, and mirrored if the goal lies on the other side.
+- `"amplitude"`: the range of each coordinate in the demonstration. Weights are dimensionless,
+  so scaled demonstrations have the same ones; defined for g = y_0.
+- `"rotation"`: rotation and dilation with the displacement from start to goal, for positions in
+  space; see `RotationScaling`.
 """
 
 from abc import ABC, abstractmethod
@@ -19,48 +19,48 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import demo_label
+from hrc_learn.dmp.fitting.samples import demo_label
 
-MINIMUM_WAY = 1e-3
-"""Smallest |g - y_0|, as a share of the range covered, that can be divided by: weights would be
-a thousand times the forces they stand for."""
+MINIMUM_DISPLACEMENT = 1e-3
+"""Smallest |g - y_0| to divide by, relative to the range: weights would be a thousand times the
+forces they stand for."""
 HALF_TURN = 1e-3
-"""How close to half a turn [rad] the way may turn before it is taken for one."""
-NO_WAY = 1e-24
-"""Square of the share of the demonstrated way below which a way has no direction: 1e-12 of it,
-where start and goal agree to rounding."""
+"""Angle [rad] to half a turn below which a rotation counts as half a turn."""
+NO_DIRECTION = 1e-24
+"""Squared displacement, relative to the demonstrated one, below which it has no direction:
+start and goal agree to rounding, 1e-12."""
 
 
 @dataclass(frozen=True, eq=False)
 class Demonstrated:
-    """What a demonstration gives a scaling to go by: (*batch, D) each, tensors or arrays."""
+    """Start, goal and range of a demonstration, (*batch, D) each, as tensors or arrays."""
 
     start: Any
     goal: Any
     amplitude: Any
-    """Range covered by each coordinate."""
+    """Range of each coordinate."""
 
     def leading(self, columns: int | None) -> "Demonstrated":
-        """The same of the first coordinates; None: of all."""
+        """The first coordinates only; None: all."""
         return Demonstrated(**{k: values[..., :columns] for k, values in vars(self).items()})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scaling(ABC):
-    """A linear map of the forcing term, made from start and goal.
+    """Linear map of the forcing term, determined by start and goal.
 
-    It takes tensors, or arrays with `xp=numpy`, so that all of fitting, rollouts, steps and
-    the `Stepper` share one definition.
+    It accepts tensors, or arrays with `xp=numpy`, so that fits, rollouts, steps and the
+    `Stepper` use one definition.
     """
 
     columns: int | None = None
-    """How many of the coordinates it is for, the first ones; None: all."""
+    """Number of leading coordinates that are scaled; None: all."""
     name: ClassVar[str]
-    follows_ends: ClassVar[bool] = False
-    """Whether a new start or goal changes it; a motion is not linear in them then."""
+    depends_on_boundary: ClassVar[bool] = False
+    """True if a new start or goal changes the map; the motion is not linear in them then."""
     turns: ClassVar[bool] = False
-    """Whether the motion turns with its way: weights are in the demonstration's own frame, and
-    its start velocity is scaled along."""
+    """True if the map rotates: weights are in the frame of the demonstration, and the start
+    velocity is scaled too."""
 
     def scale(
         self,
@@ -70,7 +70,7 @@ class Scaling(ABC):
         reference: Demonstrated,
         xp: ModuleType = torch,
     ) -> Any:
-        """Scale weights, forces or what they cause.
+        """Scale weights, forces or the states that they cause.
 
         Args:
             values: (*batch, K, D).
@@ -89,20 +89,20 @@ class Scaling(ABC):
         return xp.concatenate([scaled, others], -1)
 
     def unscale(self, values: Tensor, reference: Demonstrated) -> Tensor:
-        """What `scale` makes `values` of, between the demonstration's own ends."""
-        # There every scaling is a factor on each coordinate.
+        """Inverse of `scale` for the start and goal of the demonstration."""
+        # There every scaling is a factor per coordinate.
         ones = torch.ones_like(values[..., :1, :])
         return values / self.scale(ones, reference.start, reference.goal, reference)
 
     def check(  # noqa: B027  any motion will do unless a scaling says otherwise
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
     ) -> None:
-        """See whether demonstrations, on a flat batch, can be scaled so.
+        """Check that demonstrations, on a flat batch, can be scaled.
 
         Args:
             reference: (B, D) each.
-            batch: The shape that was flattened to B.
-            names: Of the coordinates, for the complaint.
+            batch: Batch shape that was flattened to B.
+            names: Names of the coordinates, for error messages.
 
         Raises:
             ValueError: A demonstration ends too close to its start for this scaling.
@@ -112,7 +112,7 @@ class Scaling(ABC):
     def _scale(
         self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
     ) -> Any:
-        """`scale`, for all coordinates there are."""
+        """Scale all given coordinates."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ class NoScaling(Scaling):
     name: ClassVar[str] = "none"
 
     def unscale(self, values: Tensor, reference: Demonstrated) -> Tensor:
-        """The values."""
+        """Return the values unchanged."""
         return values
 
     def _scale(
@@ -133,7 +133,7 @@ class NoScaling(Scaling):
 
 @dataclass(frozen=True, kw_only=True)
 class AmplitudeScaling(Scaling):
-    """By the range that each coordinate covers."""
+    """Scaling by the range of each coordinate."""
 
     name: ClassVar[str] = "amplitude"
 
@@ -145,24 +145,25 @@ class AmplitudeScaling(Scaling):
 
 @dataclass(frozen=True, kw_only=True)
 class PaperScaling(Scaling):
-    """By g - y_0, coordinate by coordinate (paper eq. (eq_tf))."""
+    """Scaling by g - y_0, coordinate by coordinate (paper eq. (eq_tf))."""
 
     name: ClassVar[str] = "paper"
-    follows_ends: ClassVar[bool] = True
+    depends_on_boundary: ClassVar[bool] = True
 
     def check(
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
     ) -> None:
-        """Refuse a coordinate that ends where it started."""
+        """Raise ValueError for a coordinate that ends where it started."""
         shown = reference.leading(self.columns)
-        way = shown.goal - shown.start
-        singular = way.abs() < MINIMUM_WAY * shown.amplitude
+        displacement = shown.goal - shown.start
+        singular = displacement.abs() < MINIMUM_DISPLACEMENT * shown.amplitude
         if singular.any():
             i, j = singular.nonzero()[0].tolist()
             name = f"column {j}" if names is None else names[j]
             raise ValueError(
                 f"{demo_label(i, batch)}scaling 'paper' divides by goal - start, which is "
-                f"{way[i, j].item():.2g} for {name}. Use scaling='none' or 'amplitude'."
+                f"{displacement[i, j].item():.2g} for {name}. Use scaling='none' or "
+                "'amplitude'."
             )
 
     def _scale(
@@ -173,36 +174,38 @@ class PaperScaling(Scaling):
 
 @dataclass(frozen=True, kw_only=True)
 class RotationScaling(Scaling):
-    """By the turn and the growth of the way from start to goal, in two dimensions or more.
+    """Rotation and dilation with the displacement from start to goal, in 2 dimensions or more.
 
-    c R, with c = |g - y_0| / |g_0 - y_0| and R the rotation that takes a, the direction of
-    the demonstrated way g_0 - y_0, to that of the new one, b, and turns nothing else (as
-    Hoffmann et al. 2009 have it in space): R = H(a + b) H(a), H(x) v = v - 2 x (x'v) / x'x.
-    The start velocity goes along, so that the whole motion turns and grows as its ends do.
+    c R, with c = |g - y_0| / |g_0 - y_0| and R the rotation from a, the direction of the
+    demonstrated displacement g_0 - y_0, to b, that of the new one, in their common plane (as
+    in space by Hoffmann et al. 2009): R = H(a + b) H(a), H(x) v = v - 2 x (x'v) / x'x.
+    The start velocity is scaled too, so that the whole motion turns and grows with its ends.
 
-    Half a turn has no such rotation: nearer to it than `HALF_TURN`, R turns in the plane of a
-    and the axis of the coordinates most square to it. R jumps there, depending on the side it
-    is approached from, and its derivative grows as 1 / |a + b| on the way; both stay finite.
+    No such rotation exists for half a turn. Within `HALF_TURN` of it, R turns in the plane of a
+    and the coordinate axis most orthogonal to it. R jumps there, depending on the side from
+    which it is approached, and its derivative grows as 1 / |a + b| on the way; both stay
+    finite.
     """
 
     name: ClassVar[str] = "rotation"
-    follows_ends: ClassVar[bool] = True
+    depends_on_boundary: ClassVar[bool] = True
     turns: ClassVar[bool] = True
 
     def check(
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
     ) -> None:
-        """Refuse a motion that ends where it started, and one along a line."""
+        """Raise ValueError for a motion that ends where it started, or has one coordinate."""
         shown = reference.leading(self.columns)
-        way = shown.goal - shown.start
-        if way.shape[-1] < 2:
+        displacement = shown.goal - shown.start
+        if displacement.shape[-1] < 2:
             raise ValueError("scaling 'rotation' needs 2 coordinates or more: one cannot turn")
-        singular = way.norm(dim=-1) < MINIMUM_WAY * shown.amplitude.amax(-1)
+        distance = displacement.norm(dim=-1)
+        singular = distance < MINIMUM_DISPLACEMENT * shown.amplitude.amax(-1)
         if singular.any():
             i = int(singular.nonzero()[0])
             raise ValueError(
                 f"{demo_label(i, batch)}scaling 'rotation' divides by the distance from start "
-                f"to goal, which is {way[i].norm().item():.2g}. Use scaling='none' or "
+                f"to goal, which is {distance[i].item():.2g}. Use scaling='none' or "
                 "'amplitude'."
             )
 
@@ -211,25 +214,25 @@ class RotationScaling(Scaling):
     ) -> Any:
         shown = reference.goal - reference.start
         length = _squared(shown) ** 0.5
-        a, way = shown / length, (goal - start) / length
-        growth = _squared(way).clip(min=NO_WAY) ** 0.5
-        # Two reflections are the rotation by twice the angle between their normals.
-        turned = _reflected(_reflected(values, a), _half_way(a, way / growth, xp))
+        a, displacement = shown / length, (goal - start) / length
+        growth = _squared(displacement).clip(min=NO_DIRECTION) ** 0.5
+        # Two reflections make a rotation by twice the angle between their normals.
+        turned = _reflected(_reflected(values, a), _bisector(a, displacement / growth, xp))
         return turned * growth[..., None, :]
 
 
-def _half_way(a: Any, b: Any, xp: ModuleType) -> Any:
-    """Unit vector along a + b, or square to a where that vanishes."""
+def _bisector(a: Any, b: Any, xp: ModuleType) -> Any:
+    """Unit vector along a + b, or orthogonal to a where that vanishes."""
     axis = xp.arange(a.shape[-1], device=a.device) == abs(a).argmin(-1)[..., None]
-    other = -a * (a * axis).sum(-1)[..., None] + axis
+    orthogonal = -a * (a * axis).sum(-1)[..., None] + axis
     middle = a + b
     opposite = _squared(middle) < HALF_TURN**2
-    middle = xp.where(opposite, other, middle)
+    middle = xp.where(opposite, orthogonal, middle)
     return middle / _squared(middle) ** 0.5
 
 
 def _reflected(values: Any, normal: Any) -> Any:
-    """Row vectors (*batch, K, D), mirrored in the plane square to a unit normal."""
+    """Row vectors (*batch, K, D), reflected in the plane orthogonal to a unit normal."""
     return values - 2 * (values @ normal[..., None]) * normal[..., None, :]
 
 
@@ -244,13 +247,13 @@ SCALINGS: dict[str, type[Scaling]] = {
 
 
 def find_scaling(scaling: str | Scaling, columns: int | None = None) -> Scaling:
-    """The scaling of that name, for the first `columns` coordinates; a part is kept as it is.
+    """Scaling with this name, for the first `columns` coordinates; an instance is returned.
 
     Raises:
-        ValueError: No such scaling.
+        ValueError: Unknown scaling.
     """
     if isinstance(scaling, Scaling):
         return scaling
     if scaling not in SCALINGS:
-        raise ValueError(f"unknown scaling {scaling!r}; there are {', '.join(SCALINGS)}")
+        raise ValueError(f"unknown scaling {scaling!r}; choose from {', '.join(SCALINGS)}")
     return SCALINGS[scaling](columns=columns)

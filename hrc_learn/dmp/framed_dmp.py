@@ -1,11 +1,11 @@
-"""A motion seen from several frames: of the object that is left, of the place that is reached.
+"""Motions relative to several frames, such as those of an object and of its destination.
 
-Demonstrations are looked at from each frame, in which they agree where that frame matters. For
-frames elsewhere the Gaussians of all of them are brought there and multiplied, as in
-task-parameterised models (Calinon 2016, "A tutorial on task-parameterized movement learning
-and retrieval", eqs. 5 and 6), here over the coordinates of a primitive, that is over whole
-motions, instead of moment by moment: what deviates at the start goes on to deviate. What comes
-out is a primitive like any other.
+Each demonstration is seen from every frame; the demonstrations agree in a frame where it
+determines the motion. For frames at new places, the Gaussians of all frames are transformed
+there and multiplied, as in task-parameterised models (Calinon 2016, "A tutorial on
+task-parameterized movement learning and retrieval", eqs. 5 and 6). Here the Gaussians are over
+the coordinates of a primitive, that is over whole motions instead of single moments: a motion
+that deviates at its start keeps deviating. The result is an ordinary primitive.
 """
 
 import math
@@ -17,29 +17,31 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Mask, Points, Times, check_samples, padded
-from hrc_learn.dmp._fitting import REGULARIZATION, FitOptions, fit_samples
+from hrc_learn.dmp._arguments import Mask, Points, Times
+from hrc_learn.dmp.fitting.motion_fit import FitOptions
+from hrc_learn.dmp.fitting.samples import check_samples, padded
+from hrc_learn.dmp.fitting.solvers import REGULARIZATION, fit_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.motion_primitive import FINE
+from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES
 from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, mean_primitive
 from hrc_learn.geometry import Pose, quaternion
 
 PERSISTENCE = 0.3
-"""Share of a motion along which deviations that no demonstration showed persist; of made-up
-ones (see docs/dmp.md) 0.1 leads to more than twice the error."""
+"""Fraction of a motion over which deviations persist that no demonstration showed; with 0.1 the
+error on synthetic motions is twice as large (benchmarks/bench_frames.py)."""
 MODES = 12
-"""Of such deviations: the next one has 1e-6 of the variance."""
+"""Modes of such deviations: the next one has 1e-6 of the variance."""
 FREEDOM = 1e-3
-"""Of each coordinate, independent of all others, in its standard deviations over all frames: so
-that whatever frames agree on can be inverted. Weights that free move nothing visibly."""
+"""Independent standard deviation of each coordinate, relative to that over all frames. It makes
+the covariance invertible where frames agree; motions do not visibly change."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """F frames that a motion may belong to: y = A y_in_frame + b.
+    """F frames of a motion, y = A y_in_frame + b.
 
-    A may be any invertible matrix. Columns that belong to no place, such as an opening, have a
-    one on its diagonal and zero in b.
+    A is any invertible matrix. A column that belongs to no place, such as a gripper opening,
+    has a one on the diagonal of A and zero in b.
     """
 
     A: Float[Tensor, "*batch F D D"]
@@ -54,35 +56,35 @@ class Frames:
 
     @staticmethod
     def of(*poses: Pose) -> "Frames":
-        """Frames of positions in space, from poses of (*batch) each."""
+        """Frames for positions in space, from poses of (*batch) each."""
         A = torch.stack([quaternion.to_matrix(pose.orientation) for pose in poses], dim=-3)
         return Frames(A, torch.stack([pose.position for pose in poses], dim=-2))
 
     def inwards(self, x: Float[Tensor, "*batch D M"]) -> Float[Tensor, "*batch F D M"]:
-        """Coordinates of primitives as seen from each frame."""
+        """Coordinates of primitives relative to each frame."""
         x = x[..., None, :, :].to(self.A)
-        return torch.linalg.solve(self.A, x - self._placed(x.shape[-1]))
+        return torch.linalg.solve(self.A, x - self._offset(x.shape[-1]))
 
     def outwards(self, x: Float[Tensor, "F D M"]) -> Float[Tensor, "*batch F D M"]:
-        """The inverse: those of a primitive in each frame, where the frames are."""
-        return self.A @ x + self._placed(x.shape[-1])
+        """Coordinates in the base frame of primitives relative to each frame."""
+        return self.A @ x + self._offset(x.shape[-1])
 
-    def _placed(self, M: int) -> Float[Tensor, "*batch F D M"]:
-        """What b adds to: start and goal, the last two coordinates."""
+    def _offset(self, M: int) -> Float[Tensor, "*batch F D M"]:
+        """Offset b for start and goal, the last two coordinates; zero for the others."""
         return torch.nn.functional.pad(self.b[..., None].expand(*self.b.shape, 2), (M - 2, 0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FramedDMP:
-    """A Gaussian over the coordinates of a primitive as seen from each of F frames (float64).
+    """Gaussians over the coordinates of a primitive relative to each of F frames (float64).
 
-    x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`. Its covariance is that
-    of n demonstrations, and that of smooth deviations in any direction, as large as those seen,
-    which counts for one more.
+    x = (weights, start velocity, start, goal) as in `ProbabilisticDMP`. The covariance is that
+    of n demonstrations plus that of smooth deviations in any direction, as large as those
+    observed, with the weight of one more demonstration.
     """
 
     primitive: JointDMP
-    """Its spring, basis, duration and names serve all."""
+    """Primitive with the common spring, basis, duration and names."""
     mean: Float[Tensor, "F D M"]
     precision: Float[Tensor, "F DM DM"]
     """Inverse covariance."""
@@ -101,19 +103,19 @@ class FramedDMP:
         units: str = "m",
         **options: Unpack[FitOptions],
     ) -> "FramedDMP":
-        """Learn from demonstrations between frames that are elsewhere in each.
+        """Learn from demonstrations whose frames differ.
 
         Args:
             time: [s], (T,), (n, T) or a list of (T_i,).
             position: (n, T, D) or a list of (T_i, D).
-            frames: Of each demonstration, (n, F).
-            n_basis: As in `JointDMP.fit`, like all that is not told here.
-            mask: (n, T).
-            tolerance: Standard deviation, in the units of the motion, that demonstrations are
-                taken to have at least in every frame. None: 0.1 % of the largest range.
+            frames: Frames of each demonstration, (n, F).
+            n_basis: N, as in `JointDMP.fit`.
+            mask: (n, T), false at samples to ignore.
+            tolerance: Smallest standard deviation of the demonstrations in every frame, in the
+                units of the motion. None: 0.1 % of the largest range.
             joint_names: D names.
-            units: Of the coordinates.
-            options: How to fit; see `FitOptions`.
+            units: Units of the coordinates.
+            options: Options of the fit; see `FitOptions`.
 
         Raises:
             ValueError: Fewer than two demonstrations, or frames of another number or size.
@@ -126,7 +128,7 @@ class FramedDMP:
         if x.ndim != 3 or len(x) < 2:
             raise ValueError("frames need a batch of 2 demonstrations or more")
         if dmps.basis.periodic:
-            raise ValueError("a rhythm leads from no place to another: frames are for motions")
+            raise ValueError("a rhythm has no start and goal: frames are for discrete motions")
         n, D, _ = x.shape
         if frames.b.ndim != 3 or frames.b.shape[::2] != (n, D):
             raise ValueError(
@@ -138,20 +140,13 @@ class FramedDMP:
         off = seen - mean
         least = dmps.amplitude.max().item() / 1000 if tolerance is None else tolerance
         smooth = _smooth_deviations(dmps, off, least)
-        # The smooth ones count for one more demonstration.
+        # The smooth deviations have the weight of one more demonstration.
         shown = off.permute(1, 2, 3, 0) * math.sqrt(n / (n + 1) / (n - 1))
-        root = torch.cat([shown, smooth], dim=-1)
-        # In units of each weight and end, alike for all columns: turned, they stay so.
-        unit = root.square().sum(-1).mean((0, 1)).sqrt()
-        root = (root / unit[:, None]).flatten(1, 2)
-        eye = torch.eye(root.shape[1]).to(root)
-        unit = unit.repeat(D)
-        precision = torch.linalg.inv(root @ root.mT + FREEDOM**2 * eye)
-        precision = precision / unit / unit[:, None]
+        precision = _precision(torch.cat([shown, smooth], dim=-1))
         return cls(primitive=mean_primitive(dmps), mean=mean, precision=precision)
 
     def at(self, frames: Frames) -> JointDMP:
-        """The most likely primitive between frames, (*batch, F); gradients flow to them.
+        """Most likely primitive for frames, (*batch, F); gradients flow to them.
 
         Raises:
             ValueError: Frames of another number or size.
@@ -160,14 +155,14 @@ class FramedDMP:
         return self.primitive.with_coordinates(mean)
 
     def distribution(self, frames: Frames) -> ProbabilisticDMP[JointDMP]:
-        """What is known of the motion between frames, (F,): to condition and to sample.
+        """Gaussian over the motion for frames, (F,), to condition and to sample.
 
         Raises:
-            ValueError: Frames of another number or size, or of a batch.
+            ValueError: Frames of another number or size, or a batch.
         """
         mean, factor = self._product(frames)
         if mean.ndim != 2:
-            raise ValueError(f"a distribution is of one place, got {tuple(mean.shape[:-2])}")
+            raise ValueError(f"frames must be (F,), without a batch {tuple(mean.shape[:-2])}")
         # (L L')^-1 = L^-T L^-1: L^-T is a square root of the covariance.
         eye = torch.eye(len(factor)).to(factor)
         spread = torch.linalg.solve_triangular(factor.mT, eye, upper=True)
@@ -177,7 +172,7 @@ class FramedDMP:
     def _product(
         self, frames: Frames
     ) -> tuple[Float[Tensor, "*batch D M"], Float[Tensor, "*batch DM DM"]]:
-        """Mean, and the precision's Cholesky factor: precisions add up, means count by them."""
+        """Mean, and Cholesky factor of the precision, of the product of all Gaussians."""
         F, D, M = self.mean.shape
         if frames.b.shape[-2:] != (F, D):
             raise ValueError(
@@ -195,20 +190,31 @@ class FramedDMP:
         return mean[..., 0].unflatten(-1, (D, M)), factor
 
 
+def _precision(root: Float[Tensor, "F D M columns"]) -> Float[Tensor, "F DM DM"]:
+    """Inverse covariance from a square root of the covariance, with some freedom added."""
+    D = root.shape[1]
+    # One unit per weight and end for all columns: it is invariant to rotations.
+    unit = root.square().sum(-1).mean((0, 1)).sqrt()
+    root = (root / unit[:, None]).flatten(1, 2)
+    eye = torch.eye(root.shape[1]).to(root)
+    unit = unit.repeat(D)
+    return torch.linalg.inv(root @ root.mT + FREEDOM**2 * eye) / unit / unit[:, None]
+
+
 def _smooth_deviations(
     dmps: JointDMP, off: Float[Tensor, "n F D M"], least: float
 ) -> Float[Tensor, "F D M columns"]:
-    """Square root of the covariance of deviations in any direction, of the size of those seen.
+    """Square root of the covariance of smooth deviations in any direction.
 
     Args:
-        dmps: Of the demonstrations.
+        dmps: Primitives of the demonstrations.
         off: Deviations of their coordinates from the mean in each frame.
-        least: Standard deviation of a motion at any time.
+        least: Smallest standard deviation of a motion at any time.
     """
     n, F, D, _ = off.shape
-    s = torch.linspace(0, 1, FINE * dmps.basis.count + 1).to(off)
+    s = torch.linspace(0, 1, REFIT_SAMPLES * dmps.basis.count + 1).to(off)
     rows = dmps.response.evaluate(s)[:, 0]
-    # Along the motion, over all directions.
+    # Variance along the motion, the mean over all directions.
     variance = (off @ rows.mT).square().sum(0).mean(-2) / (n - 1)
     size = (variance / (n + 1) + least**2).sqrt()
     # Modes of a Gaussian process with squared exponential covariance.

@@ -1,10 +1,10 @@
-"""What a person is about to do, and what the robot does then, from how they began.
+"""Prediction of a person's motion, and the matching robot motion, from its beginning.
 
 Interaction primitives (Ben Amor et al. 2014; Maeda et al. 2017, "Probabilistic movement
 primitives for coordination of multiple human-robot collaborative tasks"): the motions of both
-are Gaussian together, so that those of the robot follow from what has been seen of the
-person's. Of which kind of interaction that is the beginning, and how long it is going to take,
-is inferred along: each kind and duration has a likelihood in closed form.
+are jointly Gaussian, so that the robot's motion follows from the observed part of the person's.
+The kind of interaction and its duration are inferred too: each combination has a likelihood in
+closed form.
 """
 
 import math
@@ -15,31 +15,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Points, Times, padded, positive, to_tensor
+from hrc_learn.dmp._arguments import Points, Times, positive, to_tensor
+from hrc_learn.dmp.fitting.samples import padded
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP
 
 DURATIONS = 31
-"""Compared for each kind, three standard deviations either way: a fifth of one apart, below
-which likelihoods of a few samples hardly differ."""
-LEAST_SPREAD = 0.05
-"""Of the logarithm of durations: people repeat themselves to about five percent at best, and a
-few demonstrations may by chance agree better."""
+"""Durations compared for each kind, over three standard deviations to either side: a fifth of
+one apart, below which the likelihoods of a few samples hardly differ."""
+MINIMUM_SPREAD = 0.05
+"""Standard deviation of the logarithm of durations: people repeat a motion to about five
+percent at best, and a few demonstrations may agree better by chance."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InteractionPrimitive:
-    """Gaussians over motions of a person and a robot together, one for each kind."""
+    """Joint Gaussians over the motions of a person and a robot, one for each kind."""
 
     kinds: tuple[str, ...]
     models: tuple[ProbabilisticDMP[JointDMP], ...]
-    """Of all columns, those of the person first."""
+    """Gaussian over all columns of each kind, those of the person first."""
     prior: Float[Tensor, "K"]
-    """Share of the demonstrations of each kind."""
+    """Fraction of the demonstrations of each kind."""
     log_duration: Float[Tensor, "K 2"]
     """Mean and standard deviation of the logarithm of durations [s]."""
     observed: int
-    """How many columns are the person's."""
+    """Number of columns of the person."""
 
     @classmethod
     def fit(
@@ -52,15 +53,16 @@ class InteractionPrimitive:
         n_basis: int = 15,
         slack: float = 0.0,
     ) -> "InteractionPrimitive":
-        """Learn from demonstrations in which both move.
+        """Learn from demonstrations of a person and a robot.
 
         Args:
-            time: [s], (T,), (B, T) or a list of (T_i,), shared by both.
-            person: What is seen of the person, (B, T, H) or a list of (T_i, H).
-            robot: (B, T, R) or a list.
-            kinds: Name of the kind that each demonstration is of; all of one if None.
-            n_basis: Of each column.
-            slack: Freedom beyond what the demonstrations vary; see `ProbabilisticDMP.fit`.
+            time: [s], (T,), (B, T) or a list of (T_i,), the same for both.
+            person: Observed columns of the person, (B, T, H) or a list of (T_i, H).
+            robot: (B, T, R) or a list of (T_i, R).
+            kinds: Kind of each demonstration; None: all are of one kind.
+            n_basis: Number of basis functions of each column.
+            slack: Freedom beyond the variation of the demonstrations; see
+                `ProbabilisticDMP.fit`.
 
         Raises:
             ValueError: Fewer than two demonstrations of a kind, or lengths that differ.
@@ -69,7 +71,7 @@ class InteractionPrimitive:
         person, robot = (to_tensor(x, torch.float64) for x in (person, robot))
         if person.ndim != 3 or robot.shape[:2] != person.shape[:2]:
             raise ValueError(
-                "person and robot must be (B, T, columns) of the same B and T, got "
+                "person and robot must be (B, T, columns) with equal B and T, got "
                 f"{tuple(person.shape)} and {tuple(robot.shape)}"
             )
         kinds = ["interaction"] * len(person) if kinds is None else list(kinds)
@@ -79,12 +81,12 @@ class InteractionPrimitive:
         both = JointDMP.fit(time, torch.cat([person, robot], -1), n_basis, mask=mask)
         models, durations = [], []
         for name in names:
-            those = [i for i, kind in enumerate(kinds) if kind == name]
-            if len(those) < 2:
+            members = [i for i, kind in enumerate(kinds) if kind == name]
+            if len(members) < 2:
                 raise ValueError(f"kind {name!r} has one demonstration: it needs two or more")
-            models.append(ProbabilisticDMP.fit(both[those], slack))
-            logarithm = both.duration[those].double().log()
-            spread = logarithm.std().clamp(min=LEAST_SPREAD)
+            models.append(ProbabilisticDMP.fit(both[members], slack))
+            logarithm = both.duration[members].double().log()
+            spread = logarithm.std().clamp(min=MINIMUM_SPREAD)
             durations.append(torch.stack([logarithm.mean(), spread]))
         counts = torch.tensor([kinds.count(name) for name in names], dtype=torch.float64)
         return cls(
@@ -96,16 +98,16 @@ class InteractionPrimitive:
         )
 
     def observe(self, time: Times, person: Points, noise: float) -> "InteractionEstimate":
-        """What has been seen of the person so far says about the rest.
+        """Estimate of the interaction from the observed part of the person's motion.
 
         Args:
-            time: [s] since the person set off, (n,), increasing.
-            person: (n, H); NaN where nothing was seen.
-            noise: Standard deviation of each value, of the sensor and of what people vary from
+            time: Time since the person started [s], (n,), increasing.
+            person: (n, H); NaN where nothing was observed.
+            noise: Standard deviation of each value: the sensor's, and a person's variation from
                 sample to sample.
 
         Raises:
-            ValueError: Other shapes, or nothing seen at all.
+            ValueError: Wrong shapes, or no observation at all.
         """
         seen_at = to_tensor(time, torch.float64)
         values = to_tensor(person, torch.float64)
@@ -115,7 +117,7 @@ class InteractionPrimitive:
                 f"{tuple(seen_at.shape)} and {tuple(values.shape)}"
             )
         if values.isnan().all():
-            raise ValueError("nothing was seen of the person")
+            raise ValueError("no value of the person was observed")
         positive("noise", noise, values)
         steps = torch.linspace(-3, 3, DURATIONS, dtype=torch.float64)
         duration = (self.log_duration[:, :1] + self.log_duration[:, 1:] * steps).exp()
@@ -129,7 +131,7 @@ class InteractionPrimitive:
         posterior = torch.softmax(score.flatten(), 0).view_as(score)
         probability = posterior.sum(-1)
         kind = int(probability.argmax())
-        # One duration of a skewed distribution: the mean of its logarithm.
+        # Durations are log-normal: the mean of the logarithm is their centre.
         within = posterior[kind] / probability[kind]
         expected = (within * duration[kind].log()).sum().exp()
         model = self.models[kind]
@@ -152,14 +154,14 @@ class InteractionPrimitive:
         values: Float[Tensor, "n H"],
         noise: float,
     ) -> Float[Tensor, "G"]:
-        """Log density of what was seen, at other normalised times for each duration."""
+        """Log density of the observation for the normalised times of each duration."""
         rows = model.primitive.response.evaluate(s)[:, :, 0]
         mean = rows @ model.mean[: self.observed].mT
         spread = model.spread.view(*model.mean.shape, -1)[: self.observed]
         seen = ~values.isnan().flatten()
         root = torch.einsum("gnm,hmr->gnhr", rows, spread).flatten(1, 2)[:, seen] / noise
         z = ((values - mean).flatten(1)[:, seen] / noise)[..., None]
-        # By Woodbury, less what all kinds and durations have in common.
+        # By Woodbury's identity, without the terms common to all kinds and durations.
         factor = torch.linalg.cholesky(root.mT @ root + torch.eye(root.shape[-1]).to(root))
         part = torch.linalg.solve_triangular(factor, root.mT @ z, upper=False)
         square = z.square().sum((-2, -1)) - part.square().sum((-2, -1))
@@ -168,36 +170,36 @@ class InteractionPrimitive:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InteractionEstimate:
-    """What a person seems to be about, and the motion of the robot that goes with it."""
+    """Estimated interaction, and the predicted motion of person and robot."""
 
     kind: str
-    """The most likely one."""
+    """Most likely kind."""
     probability: Float[Tensor, "K"]
-    """Of each kind, over all durations."""
+    """Probability of each kind, summed over durations."""
     duration: float
-    """Expected [s]."""
+    """Expected duration [s]."""
     phase: float
-    """How much of it has passed, 0 to 1."""
+    """Elapsed fraction of the duration, 0 to 1."""
     motion: ProbabilisticDMP[JointDMP]
-    """Of both, given what was seen; in the time of its primitive's duration."""
+    """Motion of both, given the observation, on the time scale of its primitive."""
     observed: int
-    """How many columns are the person's."""
+    """Number of columns of the person."""
 
     def robot(self, time: Times) -> tuple[Float[Tensor, "T R"], Float[Tensor, "T R"]]:
-        """Mean and standard deviation of the robot at times [s] since the person set off."""
+        """Mean and standard deviation of the robot at times [s] since the person started."""
         mean, deviation = self._both(time)
         return mean[:, self.observed :], deviation[:, self.observed :]
 
     def person(self, time: Times) -> tuple[Float[Tensor, "T H"], Float[Tensor, "T H"]]:
-        """Likewise of the person, who is expected there."""
+        """Mean and standard deviation of the person at times [s] since the person started."""
         mean, deviation = self._both(time)
         return mean[:, : self.observed], deviation[:, : self.observed]
 
     def stiffness(self, time: Times, largest: float, tolerance: float) -> Float[Tensor, "T R"]:
-        """How firmly to follow the mean: less where the person may still lead elsewhere.
+        """Stiffness for tracking the mean, lower where the prediction is uncertain.
 
-        largest tolerance^2 / (tolerance^2 + variance), the share of a Gaussian of that standard
-        deviation in its product with the prediction.
+        largest tolerance^2 / (tolerance^2 + variance): the weight of the prediction in its
+        product with a Gaussian of standard deviation `tolerance`.
         """
         variance = self.robot(time)[1].square()
         return largest * tolerance**2 / (tolerance**2 + variance)

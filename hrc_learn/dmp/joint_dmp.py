@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Unpack
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import (
@@ -15,45 +15,57 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
-    check_samples,
-    padded,
+    broadcast_shapes,
     positive,
     to_tensor,
 )
-from hrc_learn.dmp._closed_loop_step import DMPState
-from hrc_learn.dmp._fitting import FitOptions, fit_motion
-from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
+from hrc_learn.dmp._system.trajectory import Trajectory
+from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.fitting.motion_fit import FitOptions, fit_motion
+from hrc_learn.dmp.fitting.samples import check_samples, padded
 from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
-from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive, check_names
-from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
+from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive, check_names
+from hrc_learn.dmp.motion_primitive import (
+    ColumnPoints,
+    CoordinateAdapter,
+    MotionPrimitive,
+    Retargeted,
+)
 from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel
 
+LIMIT_SAMPLES = 2001
+"""Times at which limits are checked: 40 per basis function, between which a peak is higher by
+less than 1e-3."""
+TOLERANCE = 1.05
+"""Ratio to the smallest held-out error that still counts as equal to it."""
+
 
 class JointCoordinates(CoordinateAdapter[Vectors, Trajectory, DMPState]):
-    """Joints are columns as they are; there is no frame."""
+    """Identity: joints are columns, without a frame."""
 
-    def ends(self, motion: LinearPrimitive, given: Ends, duration: Tensor) -> tuple[Ends, None]:
-        """As given."""
+    def boundary(
+        self, motion: LinearPrimitive, given: Boundary, duration: Tensor
+    ) -> tuple[Boundary, None]:
+        """The given boundary."""
         return given, None
 
     def trajectory(self, columns: Trajectory, frame: None) -> Trajectory:
-        """Of the columns."""
+        """The motion of the columns."""
         return columns
 
     def state(self, columns: DMPState, frame: None) -> DMPState:
-        """The columns."""
+        """The state of the columns."""
         return columns
 
     def columns(self, state: DMPState) -> tuple[DMPState, None]:
-        """The state."""
+        """The state itself."""
         return state, None
 
     def retarget(
         self, motion: LinearPrimitive, columns: DMPState, frame: None, goal: Vectors | None
     ) -> Retargeted:
-        """The goal as given."""
+        """The given goal."""
         return Retargeted(columns, None, goal)
 
     def via_points(
@@ -63,28 +75,28 @@ class JointCoordinates(CoordinateAdapter[Vectors, Trajectory, DMPState]):
         value: Points | None,
         velocity: Points | None,
     ) -> ColumnPoints:
-        """As given."""
-        return points_as_given(now, value, velocity)
+        """The given via points."""
+        return via_columns(now, value, velocity)
 
 
 JOINTS = JointCoordinates()
 
 
-class JointDMP(AdaptedPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive):
+class JointDMP(MotionPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive):
     """Discrete movement primitive of D coordinates under one phase.
 
-    It is a `LinearPrimitive` whose columns are the coordinates: values are (*batch, D) in the
-    units of the demonstration, velocities the same per second, couplings per s^2.
+    A `LinearPrimitive` whose columns are the coordinates: values are (*batch, D) in the units
+    of the demonstration, velocities the same per second, couplings per s^2.
     """
 
     @property
     def motion(self) -> "JointDMP":  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Itself: joints are columns."""
+        """The primitive itself, because joints are columns."""
         return self
 
     @property
     def adapter(self) -> JointCoordinates:
-        """Joints are columns as they are."""
+        """Identity."""
         return JOINTS
 
     @classmethod
@@ -101,25 +113,28 @@ class JointDMP(AdaptedPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive)
         units: str = "rad",
         **options: Unpack[FitOptions],
     ) -> "JointDMP":
-        """Learn one primitive from each demonstration.
+        """Fit one primitive to each demonstration.
 
         Args:
-            time: Timestamps [s], (T,) or (*B, T); any origin, any spacing.
-            position: (T, D) or (*B, T, D); of the shape of `time`, it is taken as D = 1. Or a
-                list of (T_i, D) with a list of (T_i,), for demonstrations of any lengths. Its
-                floating dtype is the primitive's; the fit itself runs in float64.
-            n_basis: N, unless `basis` is given. None: 50, of samples that noise was taken off;
+            time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
+            position: (T, D) or (*B, T, D); D = 1 if its shape is that of `time`. Or a list of
+                (T_i, D) with a list of (T_i,), for demonstrations of different lengths. Its
+                floating-point dtype is that of the primitive; the fit runs in float64.
+            n_basis: N, unless `basis` is given. None: 50, and noise is removed from the
+            samples;
                 see `FitOptions.smooth`.
             velocity: Recorded velocity per second, like `position`. Without it, the default
-                method fits the start velocity along and the others differentiate positions.
-            mask: (*B, T), false where a sample does not count (padding, dropouts).
-            scaling: Of the forcing term: `"none"`, `"paper"`, `"amplitude"` or `"rotation"`.
-            joint_names: D names, kept with the primitive.
-            units: Of the coordinates.
-            options: How to fit; see `FitOptions`.
+                method also fits the start velocity, and the others differentiate positions.
+            mask: (*B, T), false at samples to ignore, such as padding and dropouts.
+            scaling: Scaling of the forcing term: `"none"`, `"paper"`, `"amplitude"` or
+                `"rotation"`.
+            joint_names: D names, stored with the primitive.
+            units: Units of the coordinates.
+            options: Options of the fit; see `FitOptions`.
 
         Raises:
-            ValueError: Bad samples (says which), or a scaling that the motion forbids.
+            ValueError: Bad samples (the message names them), or a motion for which the scaling
+                is singular.
         """
         scaling = find_scaling(scaling)
         time, mask, (position, velocity) = padded(time, mask, position, velocity)
@@ -140,32 +155,32 @@ class JointDMP(AdaptedPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive)
         start: Vectors | None = None,
         goal: Vectors | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """The shortest duration [s] in which the path keeps limits: put it into `rollout`.
+        """Shortest duration [s] in which the path keeps limits, for use in `rollout`.
 
-        Slowed down, a motion keeps its path, its start velocity going along: velocities fall
-        as 1 / duration and accelerations as its square.
+        A slower motion keeps its path if its start velocity is scaled too: velocities fall as
+        1 / duration and accelerations as its square.
 
         Args:
-            velocity: Largest of each coordinate, per s, (D,) or one for all; None: any.
-            acceleration: Per s^2, likewise.
-            start: Of the motion; the demonstrated one, as the goal, unless given.
-            goal: Of the motion.
+            velocity: Limit of each coordinate [1/s], (D,) or one for all; None: no limit.
+            acceleration: Limit of each coordinate [1/s^2], (D,) or one for all.
+            start: Start of the motion; by default the demonstrated one, like the goal.
+            goal: Goal of the motion.
         """
         fine = torch.linspace(
             0, 1, LIMIT_SAMPLES, dtype=torch.float64, device=self.start.device
         )
         motion = self.rollout(fine * self.duration[..., None].double(), start, goal)
         factors = [torch.zeros_like(self.duration)]
-        for order, (made, limit) in enumerate(
+        for order, (values, limit) in enumerate(
             ((motion.velocity, velocity), (motion.acceleration, acceleration)), start=1
         ):
             if limit is not None:
-                share = made.abs().amax(-2) / positive("a limit", limit, made)
-                factors.append(share.amax(-1) ** (1 / order))
+                ratio = values.abs().amax(-2) / positive("a limit", limit, values)
+                factors.append(ratio.amax(-1) ** (1 / order))
         return self.duration * torch.stack(torch.broadcast_tensors(*factors)).amax(0)
 
     def with_motion[S: "JointDMP"](self: S, motion: Any, frame: None = None) -> S:
-        """The motion itself."""
+        """The given motion."""
         return motion
 
     @classmethod
@@ -173,24 +188,30 @@ class JointDMP(AdaptedPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive)
         return cls.restore(saved)
 
 
-def points_as_given(
+def via_columns(
     now: ColumnPoints, value: Points | None, velocity: Points | None
 ) -> ColumnPoints:
-    """Via points of columns that are values as they are."""
-    position = given_points(value, now.position)
-    return ColumnPoints(position, given_points(velocity, now.velocity, "velocity"))
+    """Via points of values that are columns themselves."""
+    position = via_values(value, now.position)
+    return ColumnPoints(position, via_values(velocity, now.velocity, "velocity"))
 
 
-def given_points(
+def via_values(
     value: Any, like: Tensor, name: str = "value", columns: int | None = None
-) -> Tensor:
-    """Via values (*batch, n, D) in float64 as they were given; NaN if nothing was.
+) -> Float[Tensor, "*batch n D"]:
+    """Via values as a float64 tensor; NaN if None was given.
+
+    Args:
+        value: Values from the caller.
+        like: Tensor with the expected shape.
+        name: Name of the value in error messages.
+        columns: Number of columns D, if not that of `like`.
 
     Raises:
-        ValueError: Not of the shape that `like` has, with `columns` for D if given.
+        ValueError: Another shape, or a `Pose`.
     """
     if isinstance(value, Pose):
-        raise ValueError("a Pose is no value for joints or an orientation")
+        raise ValueError(f"{name} of joints or an orientation must be an array, got a Pose")
     shape = (*like.shape[:-1], like.shape[-1] if columns is None else columns)
     if value is None:
         return torch.full(shape, torch.nan).to(like)
@@ -200,22 +221,15 @@ def given_points(
     return tensor.expand(broadcast_shapes(tensor.shape, shape))
 
 
-LIMIT_SAMPLES = 2001
-"""Times at which limits are looked at: 40 for a basis function, between which a peak is higher
-by less than 1e-3."""
-TOLERANCE = 1.05
-"""A held-out error this close to the smallest, by ratio, is as good."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class BasisSelection:
-    """Held-out error over basis counts."""
+    """Held-out error over the number of basis functions."""
 
     count: int
-    """The smallest count whose error is within 5 % of the best."""
+    """Smallest number whose error is within 5 % of the best."""
     candidates: tuple[int, ...]
     error: Float[Tensor, "candidates"]
-    """RMSE on samples not fitted, relative to the largest range, over all demonstrations."""
+    """RMSE on held-out samples, relative to the largest range, over all demonstrations."""
 
 
 def select_basis_count(
@@ -224,27 +238,30 @@ def select_basis_count(
     candidates: Sequence[int] = (10, 15, 20, 30, 40, 50, 70, 100),
     *,
     n_folds: int = 5,
-    **fit_arguments: Any,
+    mask: Mask | None = None,
+    scaling: str | Scaling = "none",
+    **options: Unpack[FitOptions],
 ) -> BasisSelection:
     """Choose the number of basis functions by the error on held-out samples.
 
-    Every `n_folds`-th sample is held out in turn. First and last samples stay, as they are
-    the start and the goal.
+    Every `n_folds`-th sample is held out in turn. The first and last samples are always fitted,
+    because they are the start and the goal.
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).
         position: (T,), (T, D) or (*B, T, D).
-        candidates: Counts to try.
-        n_folds: Fits per candidate.
-        fit_arguments: For `JointDMP.fit`, such as `mask`, `method` or `scaling`.
+        candidates: Numbers to try.
+        n_folds: Number of fits per candidate.
+        mask: (*B, T), false at samples to ignore.
+        scaling: Scaling of the forcing term.
+        options: Options of the fit; see `FitOptions`.
 
     Raises:
-        ValueError: Bad samples or arguments; says which.
+        ValueError: Bad samples or arguments; the message names them.
     """
-    mask = fit_arguments.pop("mask", None)
     samples = check_samples(time, position, mask=mask)
     if not candidates or n_folds < 2:
-        raise ValueError(f"needs candidates and 2 folds or more, got {candidates}, {n_folds}")
+        raise ValueError(f"needs candidates and at least 2 folds, got {candidates}, {n_folds}")
     folds = [_held_out(samples.mask, fold, n_folds) for fold in range(n_folds)]
     elapsed = (samples.s * samples.duration[:, None]).reshape(*samples.batch, -1)
     errors = []
@@ -253,14 +270,14 @@ def select_basis_count(
         for held in folds:
             kept = (samples.mask & ~held).reshape(*samples.batch, -1)
             with warnings.catch_warnings():
-                # Too many functions for the samples: that is what is to be found out.
+                # More functions than samples show in the held-out error; no warning is needed.
                 warnings.simplefilter("ignore", UserWarning)
-                dmp = JointDMP.fit(time, position, count, mask=kept, **fit_arguments)
+                dmp = JointDMP.fit(time, position, count, mask=kept, scaling=scaling, **options)
             with torch.no_grad():
                 reproduction = dmp.rollout(elapsed).position.mT.reshape(samples.position.shape)
-                miss = (reproduction - samples.position).double() / samples.span.amax()
-            square = square + miss.mT[held].square().sum()
-            weight += int(held.sum()) * miss.shape[1]
+                error = (reproduction - samples.position).double() / samples.span.amax()
+            square = square + error.mT[held].square().sum()
+            weight += int(held.sum()) * error.shape[1]
         errors.append((square / weight).sqrt())
     error = torch.stack(errors)
     good = error <= TOLERANCE * error.min()
@@ -268,8 +285,8 @@ def select_basis_count(
     return BasisSelection(count=count, candidates=tuple(candidates), error=error)
 
 
-def _held_out(mask: Tensor, fold: int, n_folds: int) -> Tensor:
-    """Every n-th of the samples that count, ends excepted."""
+def _held_out(mask: Bool[Tensor, "B T"], fold: int, n_folds: int) -> Bool[Tensor, "B T"]:
+    """Every n-th valid sample, except the first and the last."""
     order = mask.long().cumsum(-1)
     inner = (order > 1) & (order < order[..., -1:])
     return mask & inner & (order % n_folds == fold)

@@ -1,7 +1,7 @@
-"""The linear implementation that all kinds of primitive share, in columns that add up.
+"""The linear implementation behind all kinds of primitive.
 
-Joints, the error of an orientation, positions, coordinates without bounds: a coordinate adapter
-makes columns of them (`coordinate_adapter.py`), and from here on they are all alike.
+Joints, orientation errors and positions are columns that add up; a coordinate adapter makes
+columns of the values of a kind (see `motion_primitive.py`). Everything here is about columns.
 """
 
 import math
@@ -14,52 +14,53 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp import _closed_loop_step as closed_loop_step
+from hrc_learn.dmp import closed_loop_step
 from hrc_learn.dmp._arguments import (
-    FitReport,
     Scalars,
     Times,
     Vectors,
-    check_precision,
+    broadcast_shapes,
+    checked_vector,
     fits_numpy,
     normalised_time,
     positive,
     to_tensor,
 )
-from hrc_learn.dmp._arguments import vector as checked_vector
-from hrc_learn.dmp._closed_loop_step import DMPState
-from hrc_learn.dmp._serialization import TENSORS, basis_config, linear_arguments
 from hrc_learn.dmp._system.bases import Basis
-from hrc_learn.dmp._system.closed_forms import SpringDamper
-from hrc_learn.dmp._system.response import Response, Trajectory, broadcast_shapes, response_of
+from hrc_learn.dmp._system.response import Response, response_of
+from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp._system.trajectory import Trajectory
+from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.fitting.samples import FitReport, check_precision
 from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_scaling
+from hrc_learn.dmp.saved_primitive import TENSORS, basis_config, linear_arguments
 from hrc_learn.model_files import SavedModel
 
 
-class Ends(NamedTuple):
-    """Ends of a motion, in columns (*batch, D) or as a caller gives them.
+class Boundary(NamedTuple):
+    """Boundary conditions of a motion, as columns (*batch, D) or as a caller gives them.
 
-    None: those of the demonstration.
+    None stands for those of the demonstration.
     """
 
     start: Any = None
     goal: Any = None
-    velocity: Any = None
-    """At the start, per second."""
+    start_velocity: Any = None
+    """Velocity at the start, per second."""
 
 
 class LinearPrimitive(nn.Module):
-    """D columns under one phase, whose motion is a linear map of weights and ends.
+    """D columns under one phase, whose motion is a linear map of weights and boundary.
 
     y'' = alpha (beta (g - y) - y') + scale * sum_i phi_i(s) w_i,   s = t / duration
 
-    (paper eqs. (eq_tf), (eq_cs)), primes by s. Left alone, the motion is a linear map of
-    weights, start, start velocity and goal, computed exactly; see `Response`. Any number of
-    leading batch dimensions: one primitive each.
+    (paper eqs. (eq_tf), (eq_cs)), primes are derivatives by s. Without coupling, the motion is
+    a linear map of weights, start, start velocity and goal, computed exactly; see `Response`.
+    Leading batch dimensions hold one primitive each.
     """
 
     weights: Tensor
-    """A parameter, or a buffer where they were computed from what gradients flow to."""
+    """Weights of the forcing term: a parameter, or a buffer if gradients flow through."""
     start: Tensor
     goal: Tensor
     start_velocity: Tensor
@@ -70,13 +71,13 @@ class LinearPrimitive(nn.Module):
     spring: SpringDamper
     response: Response
     forcing_scale: Scaling
-    """What start and goal make of the forcing term."""
+    """Scaling of the forcing term with start and goal."""
     joint_names: tuple[str, ...] | None
     """Names of the D columns."""
     units: str
-    """Of the columns."""
+    """Units of the columns."""
     fit_report: FitReport | None
-    """How well the fit reproduces its demonstrations."""
+    """Residuals of the fit."""
 
     def __init__(
         self,
@@ -96,23 +97,23 @@ class LinearPrimitive(nn.Module):
         units: str = "rad",
         fit_report: FitReport | None = None,
     ):
-        """Put a primitive together; `fit` is the usual way to one.
+        """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
-            weights: Of the scaled forcing term.
-            start: y_0, where the demonstration starts.
-            goal: g, where it ends.
-            start_velocity: Per second, at `duration`.
+            weights: Weights of the scaled forcing term.
+            start: y_0, start of the demonstration.
+            goal: g, end of the demonstration.
+            start_velocity: Velocity at the start [1/s], for the given `duration`.
             duration: tau [s].
-            amplitude: Range covered by each column.
-            timestamps: Normalised times at which a rollout repeats the demonstration.
-            basis: Shape of the forcing term.
-            spring: The unforced dynamics.
-            scaling: Of the forcing term; see `forcing_scale.py`.
-            approach: Share of the motion along which a new goal is taken up; 0: at once.
+            amplitude: Range of each column.
+            timestamps: Normalised times of the default rollout.
+            basis: Basis of the forcing term.
+            spring: Gains of the unforced dynamics.
+            scaling: Scaling of the forcing term; see `forcing_scale.py`.
+            approach: Fraction of the motion over which it moves to a new goal; 0: at once.
             joint_names: D names.
-            units: Of the columns.
-            fit_report: Kept for the reader.
+            units: Units of the columns.
+            fit_report: Residuals of the fit.
         """
         super().__init__()
         check_names(joint_names, weights.shape[-2])
@@ -124,7 +125,7 @@ class LinearPrimitive(nn.Module):
                 weights if isinstance(weights, nn.Parameter) else nn.Parameter(weights)
             )
         else:
-            # A parameter is a leaf of its own, which no gradient passes.
+            # A parameter is a leaf, through which no gradient would flow on.
             self.register_buffer("weights", weights)
         buffers = (start, goal, start_velocity, duration, amplitude, timestamps)
         for name, value in zip(TENSORS[1:], buffers, strict=True):
@@ -138,7 +139,7 @@ class LinearPrimitive(nn.Module):
         self.response = response_of(spring, basis, approach)
 
     def extra_repr(self) -> str:
-        """What it moves, for how long, of how many functions, and how well it fits."""
+        """Columns, basis, duration, scaling and residual."""
         *batch, D, N = self.weights.shape
         names = "" if self.joint_names is None else f" ({', '.join(self.joint_names)})"
         low, high = (f"{x.item():.4g}" for x in self.duration.detach().aminmax())
@@ -154,12 +155,12 @@ class LinearPrimitive(nn.Module):
         return ", ".join(parts)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
-        # Before anything is changed: what `half` has made of a module stays so.
+        # Checked before any tensor changes, because `half` could not be undone.
         check_precision(fn(self.weights.detach().reshape(-1)[:1]).dtype)
         return super()._apply(fn, recurse)
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *arguments: Any) -> None:
-        # As many samples as the other was fitted to; all else has to be alike.
+        # The number of timestamps may differ; all other shapes must agree.
         timestamps = state_dict.get(f"{prefix}timestamps")
         if timestamps is not None and timestamps.shape != self.timestamps.shape:
             self.timestamps = self.timestamps.new_empty(timestamps.shape)
@@ -171,9 +172,9 @@ class LinearPrimitive(nn.Module):
         return self.forcing_scale.name
 
     def coordinates(self) -> Float[Tensor, "*batch D M"]:
-        """What the response maps to the demonstrated motion: weights, dy/ds, start, goal.
+        """Weights of the scaled forcing term, start velocity dy/ds, start and goal.
 
-        Weights are those of the scaled forcing term.
+        The response maps them to the demonstrated motion.
         """
         rate = self.start_velocity * self.duration[..., None]
         ends = torch.stack([rate, self.start, self.goal], dim=-1)
@@ -187,16 +188,16 @@ class LinearPrimitive(nn.Module):
         amplitude: Float[Tensor, "*#batch D"] | None = None,
         timestamps: Float[Tensor, "*#batch T"] | None = None,
     ) -> S:
-        """Primitives like this one that move otherwise; gradients flow to the arguments.
+        """Primitives with other coordinates; gradients flow to the arguments.
 
         Args:
-            coordinates: As `coordinates` gives them; their batch is that of the result.
-            duration: [s]; this one's, like all that follow, if None.
-            amplitude: Range covered by each column.
-            timestamps: Normalised times of a rollout without arguments.
+            coordinates: As from `coordinates`; their batch is that of the result.
+            duration: [s]; None keeps that of this primitive, as for all that follow.
+            amplitude: Range of each column.
+            timestamps: Normalised times of the default rollout.
 
         Returns:
-            A primitive of its own memory, with the same parts and names and no fit report.
+            A primitive with memory of its own, the same parts and names, and no fit report.
         """
         x = coordinates.to(self.weights)
         batch = x.shape[:-2]
@@ -219,67 +220,67 @@ class LinearPrimitive(nn.Module):
             units=self.units,
         )
 
-    def roll(
+    def rollout_columns(
         self,
-        ends: Ends,
+        boundary: Boundary,
         duration: Float[Tensor, "*#batch"],
         time: Times | None = None,
         forcing_gain: Scalars | None = None,
     ) -> Trajectory:
-        """Motion of the columns between `ends`; without ends and times, the demonstrated one.
+        """Motion of the columns; with empty boundary and times, the demonstrated one.
 
         Args:
-            ends: Of the motion.
+            boundary: Start, goal and start velocity, in columns.
             duration: [s].
-            time: Since the start [s], (T,) or (*batch, T).
+            time: Time since the start [s], (T,) or (*batch, T).
             forcing_gain: Factor on the forcing term, (*batch).
         """
         x = None
         if forcing_gain is None and not torch.is_grad_enabled():
-            x = self._coordinates_alone(ends, duration)
+            x = self._numpy_coordinates(boundary, duration)
         if x is None:
-            x = self._coordinates_between(ends, duration, forcing_gain)
+            x = self._motion_coordinates(boundary, duration, forcing_gain)
         s = self.timestamps if time is None else normalised_time(time, duration)
         return Trajectory(coordinates=x, s=s, duration=duration, response=self.response)
 
-    def _coordinates_between(
-        self, ends: Ends, duration: Tensor, forcing_gain: Scalars | None
+    def _motion_coordinates(
+        self, boundary: Boundary, duration: Tensor, forcing_gain: Scalars | None
     ) -> Float[Tensor, "*batch D M"]:
-        """What the response maps to the motion between `ends`."""
-        start, goal, rate = self.boundary(ends, duration)
+        """Coordinates of the motion with this boundary."""
+        start, goal, rate = self.resolve_boundary(boundary, duration)
         weights = self._scaled_weights(start, goal)
         if forcing_gain is not None:
             weights = weights * self._as_tensor(forcing_gain)[..., None, None]
         shape = weights.shape[:-1]
         if not rate.shape == start.shape == goal.shape == shape or duration.shape != shape[:-1]:
-            self._motion_shape(rate=rate, start=start, goal=goal, duration=duration)
+            self._check_batches(rate=rate, start=start, goal=goal, duration=duration)
             shape = broadcast_shapes(shape, rate.shape, start.shape, goal.shape)
             weights = weights.expand(*shape, -1)
             rate, start, goal = (x.expand(shape) for x in (rate, start, goal))
         return torch.cat([weights, torch.stack([rate, start, goal], dim=-1)], dim=-1)
 
-    def _coordinates_alone(
-        self, ends: Ends, duration: Tensor
+    def _numpy_coordinates(
+        self, boundary: Boundary, duration: Tensor
     ) -> Float[np.ndarray, "D M"] | None:
-        """`_coordinates_between` for one motion, in NumPy: a third of the time.
+        """`_motion_coordinates` of one motion in NumPy: a third of the time.
 
         Returns:
-            None where it does not apply, or where an end is wrong, which is said elsewhere.
+            None where NumPy does not apply, or for a wrong value, which the other path reports.
         """
         weights = self.weights
         if weights.ndim != 2 or duration.ndim or not isinstance(self.forcing_scale, NoScaling):
             return None
-        # A module takes three times as long for attributes. None: it is a parameter by now.
+        # Attribute access on a module takes three times as long.
         own: Any = self._buffers.get
-        start, goal, velocity = ends
+        start, goal, velocity = boundary
         dtype, device = weights.dtype, weights.device
         start = own("start") if start is None else to_tensor(start, dtype, device)
         goal = own("goal") if goal is None else to_tensor(goal, dtype, device)
         if velocity is None:
-            velocity, lasting = own("start_velocity"), own("duration")
+            velocity, per = own("start_velocity"), own("duration")
         else:
-            velocity, lasting = to_tensor(velocity, dtype, device), duration
-        if not fits_numpy(weights, start, goal, velocity, lasting):
+            velocity, per = to_tensor(velocity, dtype, device), duration
+        if not fits_numpy(weights, start, goal, velocity, per):
             return None
         start, goal, velocity = start.numpy(), goal.numpy(), velocity.numpy()
         D, N = weights.shape
@@ -287,22 +288,26 @@ class LinearPrimitive(nn.Module):
             return None
         x = np.empty((D, N + 3), start.dtype)
         x[:, :N] = weights.detach().numpy()
-        np.multiply(velocity, lasting.item(), out=x[:, N])
+        np.multiply(velocity, per.item(), out=x[:, N])
         x[:, N + 1] = start
         x[:, N + 2] = goal
-        for given, value in zip(ends, (start, goal, velocity), strict=True):
-            # Of so few numbers Python's sum takes the least time.
+        for given, value in zip(boundary, (start, goal, velocity), strict=True):
+            # For so few numbers Python's sum is fastest.
             if given is not None and not math.isfinite(sum(value.tolist())):
                 return None
         return x
 
-    def begin(self, ends: Ends, duration: Float[Tensor, "*#batch"]) -> DMPState:
-        """State at the start of a motion [s], for `advance`."""
-        start, goal, rate = self.boundary(ends, duration)
-        self._motion_shape(rate=rate, start=start, goal=goal, duration=duration)
-        return closed_loop_step.begin(self.response, self.weights, start, goal, rate, duration)
+    def initial_columns(
+        self, boundary: Boundary, duration: Float[Tensor, "*#batch"]
+    ) -> DMPState:
+        """State at the start of a motion with this duration [s], for `step_columns`."""
+        start, goal, rate = self.resolve_boundary(boundary, duration)
+        self._check_batches(rate=rate, start=start, goal=goal, duration=duration)
+        return closed_loop_step.initial_state(
+            self.response, self.weights, start, goal, rate, duration
+        )
 
-    def advance(
+    def step_columns(
         self,
         state: DMPState,
         dt: Scalars,
@@ -313,10 +318,10 @@ class LinearPrimitive(nn.Module):
         phase_stopping: Scalars | None = None,
         forcing_gain: Scalars | None = None,
     ) -> DMPState:
-        """Advance by `dt` [s], exactly for whatever is constant over the step.
+        """Advance by `dt` [s], exactly for terms that are constant over the step.
 
-        Arguments are those of `AdaptedPrimitive.step`, in columns: `external_acceleration` is
-        added to the motion, per s^2, (*batch, D).
+        Arguments are those of `MotionPrimitive.step`, in columns: `external_acceleration`
+        [1/s^2], (*batch, D), is added to the motion.
         """
         if (
             isinstance(dt, float)
@@ -324,13 +329,13 @@ class LinearPrimitive(nn.Module):
             and phase_stopping is forcing_gain is None
             and isinstance(self.forcing_scale, NoScaling)
         ):
-            alone = closed_loop_step.advance_alone(state, dt, self.response, self.weights)
-            if alone is not None:
-                return alone
+            fast = closed_loop_step.uncoupled_step(state, dt, self.response, self.weights)
+            if fast is not None:
+                return fast
         target = state.target
         if goal is not None:
             target = checked_vector("goal", goal, state.goal).expand_as(state.goal)
-        # How long the motion takes at the pace of this step.
+        # Duration of the motion at the pace of this step.
         duration, pace = state.duration, torch.ones_like(state.pace)
         if phase_stopping is not None:
             slower = 1 + self._as_tensor(phase_stopping)
@@ -339,24 +344,24 @@ class LinearPrimitive(nn.Module):
         if external_acceleration is not None:
             # Second derivatives by s are tau^2 times those by t.
             push = self._as_tensor(external_acceleration) * state.duration[..., None] ** 2
-        aim = target if goal_filter is None else state.goal
-        return closed_loop_step.advance(
+        attractor = target if goal_filter is None else state.goal
+        return closed_loop_step.step(
             state,
-            self._step_length(dt, duration),
+            self._normalised_step(dt, duration),
             response=self.response,
             weights=self.weights,
-            scale=self._scale_between(state.start, aim, forcing_gain),
+            scale=self._scaling_between(state.start, attractor, forcing_gain),
             target=target,
             goal_filter=goal_filter,
             push=push,
             pace=pace,
         )
 
-    def boundary(
-        self, ends: Ends, duration: Float[Tensor, "*#batch"]
+    def resolve_boundary(
+        self, boundary: Boundary, duration: Float[Tensor, "*#batch"]
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Start, goal and dy/ds at the start, of a motion that lasts `duration` [s]."""
-        start, goal, velocity = ends
+        """Start, goal and dy/ds at the start, of a motion with this duration [s]."""
+        start, goal, velocity = boundary
         start = self.start if start is None else checked_vector("start", start, self.start)
         goal = self.goal if goal is None else checked_vector("goal", goal, self.goal)
         if velocity is None:
@@ -364,18 +369,14 @@ class LinearPrimitive(nn.Module):
         velocity = checked_vector("start_velocity", velocity, self.start_velocity)
         return start, goal, velocity * duration[..., None]
 
-    def _motion_shape(self, **ends: Tensor) -> tuple[int, ...]:
-        """Of (*batch, D), for primitives and ends together.
-
-        Raises:
-            ValueError: They do not go together; says which.
-        """
+    def _check_batches(self, **boundary: Tensor) -> None:
+        """Raise ValueError unless the primitives and their boundary broadcast."""
         shapes = {
             name: (*x.shape, self.weights.shape[-2]) if name == "duration" else x.shape
-            for name, x in ends.items()
+            for name, x in boundary.items()
         }
         try:
-            return broadcast_shapes(self.weights.shape[:-1], *shapes.values())
+            broadcast_shapes(self.weights.shape[:-1], *shapes.values())
         except (ValueError, RuntimeError):
             batches = ", ".join(f"{name} {tuple(x[:-1])}" for name, x in shapes.items())
             raise ValueError(
@@ -383,29 +384,30 @@ class LinearPrimitive(nn.Module):
                 f"{batches}"
             ) from None
 
-    def curvature(self, state: DMPState) -> Float[Tensor, "*batch D"]:
-        """d^2 y / ds^2 at a state that nothing couples to."""
-        scale = self._scale_between(state.start, state.goal, None)
+    def second_derivative(self, state: DMPState) -> Float[Tensor, "*batch D"]:
+        """Second derivative d^2 y / ds^2 at a state without coupling."""
+        scale = self._scaling_between(state.start, state.goal, None)
         return closed_loop_step.second_derivative(state, self.response, self.weights, scale)
 
     def start_rate(
         self, start: Float[Tensor, "*#batch D"], goal: Float[Tensor, "*#batch D"]
     ) -> Float[Tensor, "*#batch D"]:
-        """Dy/ds that a motion between these starts with, unless told otherwise."""
+        """Default start velocity dy/ds of a motion from `start` to `goal`."""
         duration = self.duration
         rate = self.start_velocity * (duration[..., None] if duration.ndim else duration)
         if not self.forcing_scale.turns:
             return rate
         return self._scaled(rate[..., None, :], start, goal)[..., 0, :]
 
-    def resting_point(
-        self, state: DMPState, curvature: Float[Tensor, "*batch D"]
+    def equilibrium_goal(
+        self, state: DMPState, second_derivative: Float[Tensor, "*batch D"]
     ) -> Float[Tensor, "*batch D"]:
-        """The goal with which the state would have this d^2 y / ds^2 (unscaled forcing)."""
-        return state.goal + (curvature - self.curvature(state)) / self.spring.stiffness
+        """Goal with which the state has this d^2 y / ds^2 (for unscaled forcing)."""
+        change = second_derivative - self.second_derivative(state)
+        return state.goal + change / self.spring.stiffness
 
     def resolve_duration(self, duration: Scalars | None, speed: Scalars | None) -> Tensor:
-        """Duration [s] that either argument of a rollout asks for."""
+        """Duration [s] from the arguments of a rollout, of which at most one is given."""
         if duration is not None and speed is not None:
             raise ValueError("give a duration or a speed, not both")
         if duration is not None:
@@ -414,16 +416,8 @@ class LinearPrimitive(nn.Module):
             return self.duration / positive("speed", speed, self.duration)
         return self.duration
 
-    def normalised_time(
-        self, time: Times | None, duration: Float[Tensor, "*#batch"]
-    ) -> Float[Tensor, "*#batch T"]:
-        """Times [s] of a rollout over its duration; of None, the demonstration's timestamps."""
-        if time is None:
-            return self.timestamps
-        return normalised_time(time, duration)
-
     def config(self) -> dict[str, Any]:
-        """What a saved primitive needs besides its tensors, as JSON values."""
+        """Contents of a saved primitive besides its tensors, as JSON values."""
         return {
             "joint_names": self.joint_names,
             "units": {"coordinates": self.units, "time": "s"},
@@ -435,16 +429,16 @@ class LinearPrimitive(nn.Module):
         }
 
     def tensors(self) -> dict[str, Tensor]:
-        """Learned numbers and residuals, by the names they are saved under."""
+        """Tensors of a saved primitive, by the names used in the file."""
         report = {} if self.fit_report is None else self.fit_report.tensors()
         return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
 
     @classmethod
     def restore[S: "LinearPrimitive"](cls: type[S], saved: SavedModel) -> S:
-        """The primitive inside a saved one.
+        """Linear primitive inside a saved one.
 
         Raises:
-            ValueError: Names the file and the field that is wrong.
+            ValueError: A wrong field; the message names the file and the field.
         """
         arguments = linear_arguments(saved)
         try:
@@ -452,10 +446,10 @@ class LinearPrimitive(nn.Module):
         except ValueError as error:
             raise saved.invalid(error) from None
 
-    def _scale_between(
+    def _scaling_between(
         self, start: Tensor, goal: Tensor, forcing_gain: Scalars | None
     ) -> Callable[[Tensor], Tensor]:
-        """What becomes of (*batch, K, D) that the forcing term causes, between these ends."""
+        """Scaling, for this start and goal, of states (*batch, K, D) caused by the forcing."""
 
         def scale(values: Tensor) -> Tensor:
             values = self._scaled(values, start, goal)
@@ -467,17 +461,20 @@ class LinearPrimitive(nn.Module):
 
     def _scaled(self, values: Tensor, start: Tensor, goal: Tensor) -> Tensor:
         if isinstance(self.forcing_scale, NoScaling):
-            return values  # before the look-ups, which take as long as a step's arithmetic
-        shown = Demonstrated(start=self.start, goal=self.goal, amplitude=self.amplitude)
-        return self.forcing_scale.scale(values, start, goal, shown)
+            return values  # before the attribute look-ups, which take as long as a step
+        return self.forcing_scale.scale(values, start, goal, self.demonstrated())
+
+    def demonstrated(self) -> Demonstrated:
+        """Start, goal and range of the demonstration, as the scaling needs them."""
+        return Demonstrated(start=self.start, goal=self.goal, amplitude=self.amplitude)
 
     def _scaled_weights(self, start: Tensor, goal: Tensor) -> Tensor:
         if isinstance(self.forcing_scale, NoScaling):
             return self.weights
         return self._scaled(self.weights.mT, start, goal).mT
 
-    def _step_length(self, dt: Scalars, duration: Tensor) -> Tensor | float:
-        """Ds in float64; a number where it may be one, which takes a tenth of the time."""
+    def _normalised_step(self, dt: Scalars, duration: Tensor) -> Tensor | float:
+        """Step ds in float64; a plain number if possible, which takes a tenth of the time."""
         if isinstance(dt, float):
             (known,) = closed_loop_step.host_values(duration)
             if isinstance(known, float):
@@ -491,6 +488,6 @@ class LinearPrimitive(nn.Module):
 
 
 def check_names(joint_names: Sequence[str] | None, D: int) -> None:
-    """Raise ValueError unless there is a name for each of D columns, or none at all."""
+    """Raise ValueError unless there are D names, or none."""
     if joint_names is not None and len(joint_names) != D:
         raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")

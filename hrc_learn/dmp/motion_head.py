@@ -1,10 +1,10 @@
-"""The last layer of a network that plans motions: parameters in, trajectories out.
+"""The last layer of a network that plans motions: it maps parameters to trajectories.
 
-A head needs no demonstration. Its parameters are whitened: of independent unit normal ones,
-motions deviate by a stated amount from the straight minimum-jerk way to the goal, in smooth
-modes in front and finer ones behind, so that networks and searches see alike-sized numbers. The
-motion is linear in all of them but duration and delay. So a Gaussian over parameters is a
-Gaussian over motions: its density, divergence and samples are closed form (Li et al. 2023,
+A head needs no demonstration. Its parameters are whitened: for independent unit normal ones,
+motions deviate by a given amplitude from the straight minimum-jerk path to the goal, in
+orthogonal modes, the smoothest first. Networks and searches thus see numbers of similar size.
+The motion is linear in all parameters but duration and delay, so a Gaussian over parameters is
+a Gaussian over motions, with density, divergence and samples in closed form (Li et al. 2023,
 "ProDMP: A unified perspective on dynamic and probabilistic movement primitives").
 """
 
@@ -21,43 +21,45 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
+    checked_vector,
     finite,
     positive,
     readable,
+    seconds,
     to_tensor,
 )
-from hrc_learn.dmp._arguments import vector as checked_vector
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
-from hrc_learn.dmp._system.closed_forms import SpringDamper
-from hrc_learn.dmp._system.own_times import spring_rows
-from hrc_learn.dmp._system.response import Response, Trajectory, response_of
+from hrc_learn.dmp._system.ragged_times import spring_rows
+from hrc_learn.dmp._system.response import Response, response_of
+from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp._system.trajectory import Trajectory, output
 from hrc_learn.dmp.joint_dmp import JointDMP
 
-WATCHED = 20
-"""Samples a basis function at which the modes of a motion are told apart."""
-NOISE = 1e-4
-"""Of samples that are encoded, as a share of the amplitude: far below what motions differ."""
+SAMPLES_PER_FUNCTION = 20
+"""Samples per basis function at which the modes of a motion are computed."""
+ENCODING_NOISE = 1e-4
+"""Noise of encoded samples relative to the amplitude: far below the differences of motions."""
 
 
 class MotionHead(nn.Module):
-    """Parameters of a network to a motion of D columns, from any state that it starts in.
+    """Map from network parameters to a motion of D columns from any initial state.
 
-    Of P = D (N + 1) + timing parameters, the first are those of each column in turn: N whitened
-    weights and the goal. Those of timing follow: the duration if it has a range, the delay if
-    there may be one. All zero, they mean the minimum-jerk motion to the centre of the goals, of
-    the geometric mean of durations.
+    The P = D (N + 1) + timing parameters are, for each column in turn, N whitened weights and
+    the goal; then those of timing: the duration if it has a range, and the delay if it is
+    allowed. All zero, they give the minimum-jerk motion to the centre of the goals with the
+    geometric mean of the durations.
 
-    Differentiable in everything it is called with; any number of leading batch axes.
+    Differentiable in all arguments, with any number of leading batch axes.
     """
 
     amplitude: Tensor
-    """Root mean square by which unit normal parameters move each column, (D,)."""
+    """Root mean square deviation of each column for unit normal parameters, (D,)."""
     goal_scale: Tensor
-    """Standard deviation of the goals likewise, (D,)."""
+    """Standard deviation of the goal for unit normal parameters, (D,)."""
     goal_centre: Tensor | None
-    """Of the goals, (D,); None: the start."""
+    """Centre of the goals, (D,); None: the start."""
     modes: Tensor
-    """Weights of the motions that the whitened ones stand for, smoothest first, (N, N)."""
+    """Weights of the mode of each whitened parameter, smoothest first, (N, N)."""
 
     def __init__(
         self,
@@ -74,27 +76,27 @@ class MotionHead(nn.Module):
         basis: Basis | None = None,
         spring: SpringDamper | None = None,
     ):
-        """Prepare the modes.
+        """Compute the modes.
 
         Args:
-            columns: D, of the motion.
+            columns: D.
             n_basis: N, unless `basis` is given.
-            duration: Of motions [s]; of a range, the network says which, in ratios.
-            delay: The longest wait before a motion [s]; 0: there is none to choose.
-            amplitude: Deviation, root mean square over a motion, that unit normal weights
-                make, in the units of the columns; (D,) or one for all.
-            goal_scale: Standard deviation of the goal that a unit normal parameter makes;
-                `amplitude` if None.
-            goal_centre: What goals lie around, (D,); None: the start of each motion.
-            smoothness: Exponent of the singular values of the modes: 1, finer ones are as small
-                as white forcing makes them; 0, all of one size, which a regression learns at
-                one rate and a search makes rough.
-            approach: Share of the motion along which the goal is taken up, smoothly.
-            basis: Of the forcing term, not periodic.
+            duration: Duration [s], or a range in which a parameter selects it, geometrically.
+            delay: Longest delay before a motion [s]; 0: no parameter for it.
+            amplitude: Root mean square deviation over a motion for unit normal weights, in the
+                units of the columns; (D,) or one for all.
+            goal_scale: Standard deviation of the goal for a unit normal parameter; `amplitude`
+                by default.
+            goal_centre: Centre of the goals, (D,); None: the start of each motion.
+            smoothness: Exponent of the singular values of the modes. 1: finer modes are as
+                small as white forcing makes them. 0: all have one size, so that a regression
+                learns them at one rate and a search becomes rough.
+            approach: Fraction of the motion over which it moves smoothly to the goal.
+            basis: Basis of the forcing term, not periodic.
             spring: Gains.
 
         Raises:
-            ValueError: Numbers of the wrong sign or count, or a periodic basis.
+            ValueError: Numbers with the wrong sign or count, or a periodic basis.
         """
         super().__init__()
         basis = basis or GaussianBasis(count=n_basis)
@@ -103,7 +105,7 @@ class MotionHead(nn.Module):
         low, high = duration if isinstance(duration, tuple) else (duration, duration)
         if not (0 < low <= high < math.inf and 0 <= delay < math.inf):
             raise ValueError(
-                "duration must be positive, its range in order, and delay not negative; got "
+                "duration must be positive, with an ordered range, and delay not negative; got "
                 f"{duration} and {delay}"
             )
         self.columns = columns
@@ -122,7 +124,7 @@ class MotionHead(nn.Module):
         self.register_buffer("modes", modes, persistent=False)
 
     def extra_repr(self) -> str:
-        """Columns, functions, and what the parameters are."""
+        """Columns, functions and parameters."""
         return (
             f"{self.columns} columns, {self.modes.shape[0]} functions, "
             f"{self.n_parameters} parameters, of which {self.n_timing} of timing"
@@ -130,17 +132,17 @@ class MotionHead(nn.Module):
 
     @property
     def n_linear(self) -> int:
-        """D (N + 1): parameters that the motion is linear in."""
+        """D (N + 1), the number of parameters in which the motion is linear."""
         return self.columns * (self.modes.shape[0] + 1)
 
     @property
     def n_timing(self) -> int:
-        """Parameters of duration and delay: 0, 1 or 2."""
+        """Number of parameters of duration and delay: 0, 1 or 2."""
         return (self.longest > self.shortest) + (self.latest > 0)
 
     @property
     def n_parameters(self) -> int:
-        """P: what a network has to put out."""
+        """P, the number of outputs of a network."""
         return self.n_linear + self.n_timing
 
     def forward(
@@ -153,22 +155,21 @@ class MotionHead(nn.Module):
         since: Scalars | None = None,
         origin: Vectors | None = None,
     ) -> "PlannedTrajectory":
-        """The motion from a state; positions, velocities and so on when asked for.
+        """Motion from a given state.
 
-        To plan again in the middle of a motion, call it with new parameters and the state that
-        has been reached: a new motion begins. Or with `since` as well: then the motion goes on
-        from there, at the phase that it has reached, to end when the first one would have.
+        To plan again during a motion, call it with new parameters and the current state: a new
+        motion begins. With `since` as well, the motion continues from there at its current
+        phase, and ends when the first one would have.
 
         Args:
-            parameters: Of a network.
-            time: [s] since the start of the motion, (T,) or (*batch, T). Until the delay has
-                passed, the motion stands at its start.
-            start: Where it starts, or has got to, (*batch, D).
-            start_velocity: Per second, (*batch, D); none unless given.
-            since: Time [s] at which the motion is in that state, (*batch); times are not before
-                it.
-            origin: Where the way to the goal started, (*batch, D); `start` if None. Only with
-                `since`.
+            parameters: Parameters from a network.
+            time: Time since the start [s], (T,) or (*batch, T). During the delay, the motion
+                rests at its start.
+            start: Start, or current position, (*batch, D).
+            start_velocity: Velocity there [1/s], (*batch, D); zero by default.
+            since: Time [s] of that state, (*batch); no time may be before it.
+            origin: Start of the path to the goal, (*batch, D), only with `since`; `start` by
+                default.
 
         Raises:
             ValueError: Another number of parameters or columns, or bad times.
@@ -185,13 +186,13 @@ class MotionHead(nn.Module):
         *,
         samples: int = 101,
     ) -> JointDMP:
-        """The motion after its delay as a primitive: for steps, via points, files and export.
+        """Motion after its delay as a primitive, for steps, via points, files and export.
 
         Args:
-            parameters: Of a network.
+            parameters: Parameters from a network.
             start: (*batch, D).
             start_velocity: Per second, (*batch, D).
-            samples: Of its rollout without times.
+            samples: Number of samples of its default rollout.
         """
         plan = self._plan(parameters, start, start_velocity, None, None)
         x, batch = plan.coordinates, plan.coordinates.shape[:-2]
@@ -222,23 +223,24 @@ class MotionHead(nn.Module):
         """Gaussian over motions; arguments as in `forward`.
 
         Args:
-            parameters: The mean.
+            parameters: Mean of the parameters.
             scale_tril: Cholesky factor of the covariance of the first L = D (N + 1) parameters.
-                Duration and delay are certain.
-            start: (*batch, D), certain too.
+                Duration and delay are
+                certain.
+            start: (*batch, D), certain.
             start_velocity: Per second, (*batch, D).
             since: Time [s], (*batch).
             origin: (*batch, D).
 
         Raises:
-            ValueError: A factor of another size.
+            ValueError: A factor of the wrong size.
         """
         if scale_tril.shape[-2:] != (self.n_linear, self.n_linear):
             raise ValueError(
                 f"scale_tril must have shape (..., {self.n_linear}, {self.n_linear}), got "
                 f"{tuple(scale_tril.shape)}"
             )
-        self._plan(parameters, start, start_velocity, since, origin)  # refuses what is wrong
+        self._plan(parameters, start, start_velocity, since, origin)  # raises for bad arguments
         state = {"start": start, "start_velocity": start_velocity}
         state |= {"since": since, "origin": origin}
         return MotionDistribution(self, parameters, scale_tril, state)
@@ -246,10 +248,10 @@ class MotionHead(nn.Module):
     def timing(
         self, duration: Scalars | None = None, delay: Scalars | None = None
     ) -> Float[Tensor, "*batch n"]:
-        """The timing parameters of durations and delays [s], which lie within their ranges.
+        """Timing parameters for durations and delays [s] within their ranges.
 
         Raises:
-            ValueError: One that was not asked for, or is missing or out of its range.
+            ValueError: A value without a range, a missing value, or one out of its range.
         """
         found = []
         for name, value, low, high in (
@@ -257,15 +259,16 @@ class MotionHead(nn.Module):
             ("delay", delay, 0.0, self.latest),
         ):
             if (value is not None) != (high > low):
-                there = "no range" if value is not None else "a range"
-                raise ValueError(f"{name} has {there} in this head")
+                if value is None:
+                    raise ValueError(f"{name} has a range in this head: give a value")
+                raise ValueError(f"{name} has no range in this head: leave it out")
             if value is None:
                 continue
             x = to_tensor(value, self.amplitude.dtype, self.amplitude.device)
             if readable(x) and not ((x > low) & (x < high)).all():
                 raise ValueError(f"{name} must lie between {low} and {high}")
-            share = (x / low).log() / math.log(high / low) if low else x / high
-            found.append(share.logit())
+            fraction = (x / low).log() / math.log(high / low) if low else x / high
+            found.append(fraction.logit())
         if not found:
             return self.amplitude.new_empty(0)
         return torch.stack(torch.broadcast_tensors(*found), -1)
@@ -277,17 +280,17 @@ class MotionHead(nn.Module):
         start_velocity: Vectors | None = None,
         *,
         timing: Float[Tensor, "*batch n"] | None = None,
-        noise: float = NOISE,
+        noise: float = ENCODING_NOISE,
     ) -> Float[Tensor, "*batch P"]:
-        """The most likely parameters of recorded motions, as targets of a regression.
+        """Most likely parameters of recorded motions, as targets of a regression.
 
         Args:
-            time: [s] since the start, (T,) or (*batch, T).
-            position: (*batch, T, D); the first one is the start.
+            time: Time since the start [s], (T,) or (*batch, T).
+            position: (*batch, T, D), from the start on.
             start_velocity: Per second, (*batch, D).
-            timing: As `timing` gives it; zeros if None.
-            noise: Standard deviation of the samples over the amplitude. Parameters that they
-                tell nothing of stay zero, as unit normal ones do.
+            timing: Timing parameters as from `timing`; zeros by default.
+            noise: Standard deviation of the samples relative to the amplitude. Parameters that
+                the samples do not determine stay zero, the mean of their prior.
         """
         y = to_tensor(position, self.amplitude.dtype, self.amplitude.device)
         zeros = y.new_zeros(*y.shape[:-2], self.n_parameters)
@@ -300,7 +303,7 @@ class MotionHead(nn.Module):
         s, waiting = self._normalised(time, plan)
         missing = y - PlannedTrajectory(plan, s, waiting, self.response).position
         rows = self._rows(s, plan)[..., None, :, :] * self._scales()[:, None, :].double()
-        # Of each column in units of its own noise; the prior is of unit covariance.
+        # Each column in units of its noise; the prior has unit covariance.
         rows = rows / (noise * self.amplitude.double())[:, None, None]
         missing = missing.mT.double() / (noise * self.amplitude.double())[:, None]
         normal = rows.mT @ rows + torch.eye(rows.shape[-1]).to(rows)
@@ -332,7 +335,7 @@ class MotionHead(nn.Module):
         first = start
         if origin is not None:
             if since is None:
-                raise ValueError("an origin is of a motion that goes on: give since")
+                raise ValueError("origin belongs to a motion that continues: give since too")
             first = checked_vector("origin", origin, like)
         scaled = linear * self._scales().to(linear)
         centre = first if self.goal_centre is None else self.goal_centre.to(linear)
@@ -346,7 +349,7 @@ class MotionHead(nn.Module):
             return _Plan(x, duration, delay)
         now = to_tensor(since, torch.float64, x.device)
         if readable(now) and not ((now >= 0) & (now < math.inf)).all():
-            raise ValueError("since must be seconds since the start, none negative")
+            raise ValueError("since must be finite, non-negative seconds since the start")
         s = ((now - delay.double()) / duration.double()).clamp(min=0)
         reached = Trajectory(
             coordinates=x, s=s[..., None], duration=duration, response=self.response
@@ -356,42 +359,40 @@ class MotionHead(nn.Module):
         return _Plan(x, duration, delay, s, torch.stack([off, off_rate], -1))
 
     def _timing(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Duration and delay [s], of the batch or without an axis where they are fixed."""
-        share = parameters[..., self.n_linear :].sigmoid()
+        """Duration and delay [s], without a batch axis if they are fixed."""
+        fraction = parameters[..., self.n_linear :].sigmoid()
         duration = delay = None
         if self.longest > self.shortest:
             ratio = math.log(self.longest / self.shortest)
-            duration = self.shortest * (ratio * share[..., 0]).exp()
+            duration = self.shortest * (ratio * fraction[..., 0]).exp()
         if self.latest > 0:
-            delay = self.latest * share[..., -1]
+            delay = self.latest * fraction[..., -1]
         fixed = parameters.new_tensor([self.shortest, 0.0])
         return fixed[0] if duration is None else duration, fixed[1] if delay is None else delay
 
     def _scales(self) -> Float[Tensor, "D M"]:
-        """What whitened weights and goal of each column are multiplied by."""
+        """Scale of the whitened weights and the goal of each column."""
         N = self.modes.shape[0]
         weights = self.amplitude[:, None].expand(-1, N)
         return torch.cat([weights, self.goal_scale[:, None]], -1)
 
     def _normalised(self, time: Times, plan: "_Plan") -> tuple[Tensor, Tensor | None]:
-        """Times over the duration, from the end of the delay; and where it has not passed."""
-        time = to_tensor(time, torch.float64, plan.duration.device)
-        if time.ndim == 0 or (readable(time) and not ((time >= 0) & (time < math.inf)).all()):
-            raise ValueError("time must be an array of seconds since the start, none negative")
+        """Normalised times since the end of the delay, and a mask of times before it."""
+        time = seconds(time, plan.duration.device)
         s = (time - plan.delay.double()[..., None]) / plan.duration.double()[..., None]
         waiting = s < 0 if self.latest > 0 else None
         s = s if waiting is None else s.clamp(min=0)
         since = plan.since
         if since is not None and readable(s, since) and (s < since[..., None] - 1e-9).any():
-            raise ValueError("the motion goes on at `since`: no time may be before it")
+            raise ValueError("the motion continues at `since`: no time may be before it")
         return s, waiting
 
     def _rows(self, s: Tensor, plan: "_Plan") -> Float[Tensor, "*batch T M"]:
-        """What each whitened parameter of a column does to it at times `s` (float64)."""
+        """Motion per unit of each whitened parameter of a column at times `s` (float64)."""
         H = self._by_mode(self.response.evaluate(s)[..., 0, :])
         if plan.since is None:
             return H
-        # From a state that is certain the motions of all parameters start at rest.
+        # The state is certain, so the motions of all parameters start at rest there.
         there = self._by_mode(self.response.evaluate(plan.since)[..., :2, :])
         back = spring_rows(self.response, s - plan.since[..., None], 0)
         return H - back @ there
@@ -403,19 +404,19 @@ class MotionHead(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """What parameters and a state come to."""
+    """Motion determined by parameters and a state."""
 
     coordinates: Float[Tensor, "*batch D M"]
     duration: Float[Tensor, "*#batch"]
     delay: Float[Tensor, "*#batch"]
     since: Float[Tensor, "*#batch"] | None = None
-    """Normalised time of the state."""
+    """Normalised time of the state; None at the start."""
     deviation: Float[Tensor, "*batch D 2"] | None = None
-    """There, from the motion of the coordinates: in y and dy/ds."""
+    """Difference of the state, in y and dy/ds, to the motion of the coordinates."""
 
 
 class PlannedTrajectory(Trajectory):
-    """A motion that may wait before it begins, or begin where another one has got to."""
+    """Motion that may have a delay, or continue from the state of another one."""
 
     def __init__(
         self,
@@ -424,22 +425,22 @@ class PlannedTrajectory(Trajectory):
         waiting: Tensor | None,
         response: Response,
     ):
-        """Describe the motion of a plan, at rest where it waits."""
+        """Describe the motion of a plan, at rest while `waiting`."""
         super().__init__(
             coordinates=plan.coordinates, s=s, duration=plan.duration, response=response
         )
         self.delay = plan.delay
-        """Before the motion begins [s]."""
+        """Delay before the motion begins [s]."""
         self._plan, self._waiting = plan, waiting
 
-    @property
-    def time(self) -> Float[Tensor, "*batch T"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Since the start [s]; where the motion waits, the end of its delay."""
+    @output
+    def time(self) -> Float[Tensor, "*batch T"]:
+        """Time since the start [s]; during the delay, the end of the delay."""
         time = self.s * self.duration[..., None] + self.delay[..., None]
         return time.to(self._coordinates.dtype).expand(*self._batch, -1)
 
-    def _output(self, order: int) -> Float[Tensor, "*batch T D"]:
-        y = super()._output(order)
+    def _derivative(self, order: int) -> Float[Tensor, "*batch T D"]:
+        y = super()._derivative(order)
         plan = self._plan
         if plan.deviation is not None:
             assert plan.since is not None
@@ -453,27 +454,27 @@ class PlannedTrajectory(Trajectory):
 
 @dataclass(frozen=True, eq=False)
 class MotionDistribution:
-    """Gaussian over the motions of a head: its parameters are Gaussian, the state certain."""
+    """Gaussian over the motions of a head, from Gaussian parameters and a certain state."""
 
     head: MotionHead
     parameters: Float[Tensor, "*batch P"]
-    """The mean."""
+    """Mean of the parameters."""
     scale_tril: Float[Tensor, "*#batch L L"]
-    """Of the linear parameters."""
+    """Cholesky factor of the covariance of the linear parameters."""
     state: dict[str, Any]
-    """Start, its velocity, since when, and origin, as in `MotionHead.forward`."""
+    """State arguments of `MotionHead.forward`, by name."""
 
     def mean(self, time: Times) -> PlannedTrajectory:
-        """The mean motion at times [s]."""
+        """Mean motion at times [s]."""
         return self.head(self.parameters, time, **self.state)
 
     def rsample(
         self, shape: tuple[int, ...] = (), generator: torch.Generator | None = None
     ) -> Float[Tensor, "*shape_batch P"]:
-        """Parameters drawn at random, for `MotionHead.forward`; differentiable in both."""
+        """Random parameters for `MotionHead.forward`; differentiable in mean and factor."""
         batch = torch.broadcast_shapes(self.parameters.shape[:-1], self.scale_tril.shape[:-2])
         L, like = self.head.n_linear, self.parameters
-        # Drawn where the generator is: a network may be elsewhere.
+        # Drawn on the device of the generator, which may differ from that of the network.
         device = like.device if generator is None else generator.device
         noise = torch.randn(
             *shape, *batch, L, 1, generator=generator, dtype=like.dtype, device=device
@@ -484,7 +485,7 @@ class MotionDistribution:
     def parameter_log_prob(
         self, parameters: Float[Tensor, "*other P"]
     ) -> Float[Tensor, "*other"]:
-        """Log density of linear parameters, as of an action."""
+        """Log density of linear parameters, as needed for a policy gradient."""
         L = self.head.n_linear
         off = (parameters - self.parameters)[..., :L, None]
         factor = self.scale_tril.expand(*off.shape[:-2], L, L)
@@ -493,17 +494,17 @@ class MotionDistribution:
         return -size / 2 - _log_diagonal(self.scale_tril)
 
     def log_prob(self, time: Times, position: Points, noise: float) -> Float[Tensor, "*batch"]:
-        """Log density of positions at times [s], of one motion seen with noise.
+        """Log density of the positions of one motion observed with noise.
 
         Args:
-            time: (T,) or (*batch, T).
+            time: [s], (T,) or (*batch, T).
             position: (*batch, T, D).
-            noise: Standard deviation of each, independent of the others.
+            noise: Standard deviation of each value, independent of the others.
         """
         mean, root = self._moments(time)
         y = to_tensor(position, mean.dtype, mean.device)
         deviation = positive("noise", noise, mean)
-        # By Woodbury in the whitened parameters, in units of the noise.
+        # By Woodbury's identity in the whitened parameters, in units of the noise.
         z = (y - mean).flatten(-2)[..., None] / deviation
         root = root.flatten(-3, -2) / deviation
         factor = torch.linalg.cholesky(root.mT @ root + torch.eye(root.shape[-1]).to(root))
@@ -518,9 +519,9 @@ class MotionDistribution:
         return mean, root.norm(dim=-1)
 
     def kl(self, other: "MotionDistribution") -> Float[Tensor, "*batch"]:
-        """KL(self || other) of motions from one state, of one timing.
+        """KL divergence KL(self || other) of motions with equal state and timing.
 
-        Motions are an injective linear map of the linear parameters, so it is that of those.
+        Motions are an injective linear map of the linear parameters, so it equals theirs.
         """
         L = self.head.n_linear
         off = (other.parameters - self.parameters)[..., :L, None]
@@ -534,7 +535,7 @@ class MotionDistribution:
         return size / 2 + _log_diagonal(other.scale_tril) - _log_diagonal(self.scale_tril)
 
     def _moments(self, time: Times) -> tuple[Tensor, Tensor]:
-        """Mean (*batch T D) and a root (*batch T D L) of the covariance of positions."""
+        """Mean (*batch T D) and square root (*batch T D L) of the covariance of positions."""
         head = self.head
         plan = head._plan(self.parameters, **self.state)
         s, waiting = head._normalised(time, plan)
@@ -550,7 +551,7 @@ def _log_diagonal(factor: Float[Tensor, "*batch L L"]) -> Float[Tensor, "*batch"
 
 
 def _each_column(name: str, value: Any, columns: int) -> Float[Tensor, "D"]:
-    """A positive number for each column."""
+    """Positive number for each column."""
     dtype = value.dtype if isinstance(value, Tensor) else torch.get_default_dtype()
     values = positive(name, to_tensor(value, dtype), torch.empty(0, dtype=dtype))
     if values.ndim > 1 or (values.ndim and len(values) != columns):
@@ -559,14 +560,14 @@ def _each_column(name: str, value: Any, columns: int) -> Float[Tensor, "D"]:
 
 
 def _modes(response: Response, smoothness: float) -> Float[Tensor, "N N"]:
-    """Weights of orthogonal motions, smoothest first, whose squares add up to a mean of one."""
+    """Weights of orthogonal motions, smoothest first, with a mean square of one in total."""
     N = response.basis.count
-    s = torch.linspace(0, 1, WATCHED * N + 1, dtype=torch.float64)
+    s = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)
     H = response.evaluate(s)[:, 0]
     unit = balanced_units(response.basis, H, 0)
     _, sigma, Vh = torch.linalg.svd(H[:, :N] * unit, full_matrices=False)
     size = (sigma / sigma[0]) ** smoothness
     size = size * (len(s) / size.square().sum()).sqrt()
     modes = unit[:, None] * Vh.mT * (size / sigma)
-    # A mode and its negative are one: take that which sets off upwards.
+    # The sign of a mode is arbitrary: take the one with a positive mean.
     return modes * torch.where((H[:, :N] @ modes).sum(0) < 0, -1.0, 1.0)

@@ -1,143 +1,219 @@
-"""What every movement primitive can do, and the one implementation of it.
+"""The interface of all movement primitives, and their one implementation.
 
-`MotionPrimitive` is what a caller may rely on, of joints, orientations, poses, rhythms, limited
-joints, two arms and moving goals alike. `AdaptedPrimitive` does it for all of them: the linear
-primitive moves columns, the adapter of a kind says what they mean.
+Every kind of primitive is a coordinate adapter around a linear primitive. The linear primitive
+moves columns; the adapter maps the values of a kind to columns and back: joints are columns
+themselves, an orientation becomes its error to a reference, a pose is position, orientation
+error and body, and a moving goal is the frame in which joints are seen.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from functools import singledispatch
 from pathlib import Path as FilePath
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp._arguments import (
-    FitReport,
     Points,
     Scalars,
     Times,
-    check_samples,
+    Vectors,
     regular_times,
+    seconds,
     to_tensor,
 )
-from hrc_learn.dmp._fitting import REGULARIZATION, fit_samples
-from hrc_learn.dmp._via_points import ViaPoints, through_via_points
 from hrc_learn.dmp.batching import select
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter
+from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.fitting.samples import FitReport, check_samples
+from hrc_learn.dmp.fitting.solvers import REGULARIZATION, fit_samples
 from hrc_learn.dmp.forcing_scale import Demonstrated
-from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
+from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.via_points import ViaPoints, through_via_points
 from hrc_learn.model_files import SavedModel, write_model
 
-FINE = 20
-"""Samples for each basis function of a motion that is fitted anew: more change no digit."""
+REFIT_SAMPLES = 20
+"""Samples per basis function when a motion is fitted again: more do not change the result."""
 
 
-@runtime_checkable
-class MotionPrimitive(Protocol):
-    """A learned motion that start, goal, duration and via points reshape.
+class ColumnPoints(NamedTuple):
+    """Columns at the times of via points, (*batch, n, D); NaN leaves a value free."""
 
-    Kinds differ in what a value is (joints, a quaternion, a `Pose`) and in the arguments they
-    add; each documents its own.
+    position: Tensor
+    velocity: Tensor
+    """Velocity, per second."""
+
+
+class Retargeted(NamedTuple):
+    """State of a motion that received a new goal under way."""
+
+    columns: DMPState
+    frame: Any
+    target: Any = None
+    """New goal in columns; None keeps that of `columns`."""
+
+
+class CoordinateAdapter[Value, Path, State](ABC):
+    """Map from values to columns and back.
+
+    `Value` is the type of starts and goals, `Path` that of a rollout, `State` that of the
+    closed loop. The frame is what columns are relative to and may differ between motions: the
+    reference of an orientation error, the velocity of a moving goal; None where there is none.
+    The argument `motion` is always the linear primitive that the columns belong to.
     """
 
-    @classmethod
-    def fit(cls, time: Times, *demonstration: Any, **options: Any) -> Any:
-        """Learn one primitive from each demonstration, (*B, T) samples each."""
-        ...
+    linear: ClassVar[bool] = True
+    """True if the columns move as a linear primitive does."""
+    error_columns: ClassVar[slice | None] = None
+    """Columns with the error of an orientation, if any."""
+    options: ClassVar[frozenset[str]] = frozenset()
+    """Arguments of this kind beyond start, goal and start velocity."""
 
-    def rollout(self, time: Times | None = None, /) -> Any:
-        """The whole motion; without arguments, the demonstrated one."""
-        ...
+    @abstractmethod
+    def boundary(
+        self, motion: LinearPrimitive, given: Boundary, duration: Tensor, **options: Any
+    ) -> tuple[Boundary, Any]:
+        """Boundary of a motion in columns, and its frame.
 
-    def initial_state(self) -> Any:
-        """State at the start of a motion, a pytree, for `step`."""
-        ...
+        Args:
+            motion: Supplies what is None.
+            given: Start, goal and start velocity from the caller.
+            duration: [s].
+            options: Arguments of this kind.
+        """
 
-    def step(self, state: Any, dt: Scalars) -> Any:
-        """The state `dt` seconds later."""
-        ...
+    @abstractmethod
+    def trajectory(self, columns: Any, frame: Any) -> Path:
+        """Result of a rollout."""
 
-    def condition(self, time: Times, value: Any = None, velocity: Any = None) -> Any:
-        """The primitive, changed so that it passes via points exactly."""
-        ...
+    @abstractmethod
+    def state(self, columns: DMPState, frame: Any) -> State:
+        """State in closed loop."""
 
-    def save(self, folder: str | FilePath) -> None:
-        """Write the primitive into a folder of its own."""
-        ...
+    @abstractmethod
+    def columns(self, state: State) -> tuple[DMPState, Any]:
+        """Columns and frame of a state; the inverse of `state`."""
 
-    @classmethod
-    def load(cls, folder: str | FilePath) -> Any:
-        """Read what `save` wrote."""
-        ...
+    @abstractmethod
+    def retarget(
+        self,
+        motion: LinearPrimitive,
+        columns: DMPState,
+        frame: Any,
+        goal: Value | None,
+        **options: Any,
+    ) -> Retargeted:
+        """Columns and frame with a new goal, for the same value and velocity.
 
-    def export(self, *, goal_filter: float | None = None) -> Any:
-        """The step for other programs, as an `ExportedDMP`."""
-        ...
+        Args:
+            motion: Linear primitive of the columns.
+            columns: Current state.
+            frame: Current frame.
+            goal: New goal; None if only `options` are new.
+            options: Goals of this kind.
+        """
+
+    @abstractmethod
+    def via_points(
+        self,
+        motion: LinearPrimitive,
+        now: ColumnPoints,
+        value: Any,
+        velocity: Any,
+        **options: Any,
+    ) -> ColumnPoints:
+        """Via points as columns in the frame of the primitive.
+
+        Args:
+            motion: Linear primitive of the columns.
+            now: Columns of the unchanged motion at these times.
+            value: Values from the caller; None or NaN leaves them free.
+            velocity: Velocities from the caller, per second; None or NaN leaves them free.
+            options: Values of this kind.
+        """
+
+    def external_acceleration(
+        self, motion: LinearPrimitive, columns: DMPState, frame: Any, coupling: Any
+    ) -> Any:
+        """Second derivatives of the columns [1/s^2] for a coupling term."""
+        return coupling
+
+    def rollout(
+        self,
+        motion: LinearPrimitive,
+        boundary: Boundary,
+        duration: Tensor,
+        time: Times | None,
+        forcing_gain: Scalars | None,
+    ) -> Any:
+        """Motion of the columns."""
+        return motion.rollout_columns(boundary, duration, time, forcing_gain)
+
+    def step(
+        self, motion: LinearPrimitive, columns: DMPState, dt: Scalars, **inputs: Any
+    ) -> DMPState:
+        """State of the columns after `dt` [s]; inputs as in `LinearPrimitive.step_columns`."""
+        return motion.step_columns(columns, dt, **inputs)
 
 
-@singledispatch
-def export_primitive(primitive: Any, *, goal_filter: float | None = None) -> Any:
-    """An `ExportedDMP` of a primitive. Exporters register for the types that they take."""
-    raise TypeError(f"no exporter is registered for {type(primitive).__name__}")
+class MotionPrimitive[Value, Path, State](nn.Module, ABC):
+    """Learned motion that start, goal, duration and via points reshape.
 
-
-class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
-    """A linear primitive behind a coordinate adapter: all that kinds have in common."""
+    Kinds differ in their values: joints, a quaternion, a `Pose`. The class of each kind
+    documents its values, velocities and couplings.
+    """
 
     motion: LinearPrimitive
-    """Of the columns."""
+    """Linear primitive of the columns."""
     duration: Any
-    """Of the demonstration [s], (*batch)."""
+    """Duration of the demonstration [s], (*batch)."""
 
     @property
     @abstractmethod
     def adapter(self) -> CoordinateAdapter[Value, Path, State]:
-        """What the columns mean."""
+        """Map from values to columns."""
 
     @abstractmethod
-    def with_motion[S: "AdaptedPrimitive"](self: S, motion: Any, frame: Any = None) -> S:
-        """A primitive of the same kind around another linear one.
+    def with_motion[S: "MotionPrimitive"](self: S, motion: Any, frame: Any = None) -> S:
+        """Primitive of the same kind around another linear one.
 
         Args:
-            motion: Takes the place of its own.
-            frame: What columns are now relative to; as in this one if None.
+            motion: Replaces the linear primitive.
+            frame: Frame of the columns; None keeps that of this primitive.
         """
 
     @classmethod
     @abstractmethod
-    def _restored[S: "AdaptedPrimitive"](cls: type[S], saved: SavedModel) -> S:
-        """The primitive that `save` wrote."""
+    def _restored[S: "MotionPrimitive"](cls: type[S], saved: SavedModel) -> S:
+        """Primitive from a saved model."""
 
     def _own_config(self) -> dict[str, Any]:
-        """What a saved primitive needs besides that of its motion, as JSON values."""
+        """Contents of a saved primitive besides those of its motion, as JSON values."""
         return {}
 
     def _own_tensors(self) -> dict[str, Tensor]:
-        """Likewise, by the names they are saved under."""
+        """Tensors of a saved primitive besides those of its motion, by name."""
         return {}
 
     def __len__(self) -> int:
-        """Primitives along the first batch axis.
+        """Number of primitives along the first batch axis.
 
         Raises:
-            TypeError: It is a single one.
+            TypeError: The primitive is not a batch.
         """
         if not self.duration.ndim:
-            raise TypeError("a single primitive has no length: it is no batch")
+            raise TypeError("a single primitive has no length: it is not a batch")
         return self.duration.shape[0]
 
     def __bool__(self) -> bool:
-        """There is one, or a batch: never what its length says."""
+        """Return True, also for an empty batch: a primitive is not a container of truth."""
         return True
 
-    def __getitem__[S: "AdaptedPrimitive"](self: S, index: Any) -> S:
-        """Some of a batch, by what indexes a tensor's first axes; with memory of their own."""
+    def __getitem__[S: "MotionPrimitive"](self: S, index: Any) -> S:
+        """Part of a batch, indexed like the first axes of a tensor, with memory of its own."""
         if not self.duration.ndim:
-            raise TypeError("a single primitive cannot be indexed: it is no batch")
+            raise TypeError("a single primitive cannot be indexed: it is not a batch")
         return select(self, index)
 
     def rollout(
@@ -151,39 +227,45 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         speed: Scalars | None = None,
         dt: float | int | None = None,
         forcing_gain: Scalars | None = None,
-        **ends: Any,
+        start_body: Vectors | None = None,
+        goal_body: Vectors | None = None,
+        end_velocity: Vectors | None = None,
     ) -> Path:
-        """Motion from start to goal; without arguments, the demonstrated one.
+        """Compute the whole motion from start to goal; by default, the demonstrated one.
 
-        All arguments broadcast over the batch, and gradients flow to each of them. What values
-        and velocities are, and which `ends` there are besides, the kind says.
+        All arguments broadcast over the batch, and gradients flow to each of them. Outputs of
+        the result can be plotted as they are.
 
         Args:
-            time: Since the start of the motion [s], (T,) or (*batch, T), not negative; by
+            time: Time since the start of the motion [s], (T,) or (*batch, T), not negative; by
                 default the timestamps of the demonstration, stretched to the duration. After
-                the duration the motion settles at its goal.
+                the duration, the motion settles at its goal.
             start: (*batch).
             goal: (*batch).
             duration: [s], (*batch).
-            start_velocity: Per second, (*batch). By default the demonstrated one, changed with
-                the duration so that the path stays the same, and turned and dilated with the
-                way if the scaling is `"rotation"`.
-            speed: Instead of a duration, how many times faster than the demonstration.
-            dt: Instead of times, the interval [s] from one to the next; they go from zero to
-                the end of the longest motion, or the first one past it.
-            forcing_gain: Factor on the forcing term, (*batch): how wide a rhythm swings.
-            ends: Others that the kind has.
+            start_velocity: Per second, (*batch). By default the demonstrated one, adapted to
+                the duration so that the path stays the same, and turned and scaled with the
+                displacement if the scaling is `"rotation"`.
+            speed: Speed relative to the demonstration, instead of a duration.
+            dt: Sampling interval [s], instead of times: from zero to the end of the longest
+                motion, or the first sample past it.
+            forcing_gain: Factor on the forcing term, (*batch): the amplitude of a rhythm.
+            start_body: Body at the start, (*batch, K); poses only.
+            goal_body: Body at the goal, (*batch, K); poses only.
+            end_velocity: Velocity at the end [1/s], (*batch, D); moving goals only.
         """
         motion, adapter = self.motion, self.adapter
-        given = Ends(start, goal, start_velocity)
-        columns, tau, frame = self._columns(given, duration, speed, ends)
+        given = Boundary(start, goal, start_velocity)
+        options = {"start_body": start_body, "goal_body": goal_body}
+        columns, tau, frame = self._boundary(
+            given, duration, speed, **options, end_velocity=end_velocity
+        )
         if dt is not None:
             if time is not None:
                 raise ValueError("give times or an interval dt, not both")
             time = regular_times(dt, tau)
-        times = None if time is None else adapter.times(time)
-        rolled = adapter.roll(motion, columns, tau, times, adapter.each(forcing_gain))
-        return adapter.trajectory(rolled, frame)
+        motion_columns = adapter.rollout(motion, columns, tau, time, forcing_gain)
+        return adapter.trajectory(motion_columns, frame)
 
     def initial_state(
         self,
@@ -193,13 +275,21 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         start_velocity: Any = None,
         *,
         speed: Scalars | None = None,
-        **ends: Any,
+        start_body: Vectors | None = None,
+        goal_body: Vectors | None = None,
+        end_velocity: Vectors | None = None,
     ) -> State:
         """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        given = Ends(start, goal, start_velocity)
-        columns, tau, frame = self._columns(given, duration, speed, ends)
-        begun = self.adapter.begin(self.motion.begin(columns, tau), frame)
-        return self.adapter.state(*begun)
+        given = Boundary(start, goal, start_velocity)
+        options = {"start_body": start_body, "goal_body": goal_body}
+        boundary, tau, frame = self._boundary(
+            given, duration, speed, **options, end_velocity=end_velocity
+        )
+        columns = self.motion.initial_columns(boundary, tau)
+        if frame is not None:
+            # A copy for each element: an export takes one tensor in two places for one input.
+            frame = frame.expand(*columns.position.shape[:-1], frame.shape[-1]).clone()
+        return self.adapter.state(columns, frame)
 
     def step(
         self,
@@ -211,65 +301,62 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         coupling: Any = None,
         phase_stopping: Scalars | None = None,
         forcing_gain: Scalars | None = None,
-        **goals: Any,
+        goal_body: Vectors | None = None,
     ) -> State:
-        """Advance by `dt`, exactly for whatever is constant over the step.
+        """Advance by `dt`, exactly for terms that are constant over the step.
 
         Uncoupled steps of any length end where the rollout does. A coupling that depends on
-        the state is taken as it is at the start of the step: of first order in `dt`, and so
-        is a filtered goal with the scaling `"paper"`, whose forcing it scales. A new goal
-        changes neither values nor velocities of the moment.
+        the state is evaluated at the start of the step, which is of first order in `dt`; so is
+        a filtered goal with the scaling `"paper"`, whose forcing it scales. A new goal changes
+        neither the current value nor its velocity.
 
         Args:
             state: From `initial_state` or the last step.
             dt: [s], (*batch).
-            goal: New goal from here on, (*batch).
-            goal_filter: Rate, per duration, at which the goal moves to where it was last
-                told to be: the acceleration has no jump then. None: it is there at once.
-            coupling: External acceleration added to the motion, per s^2, (*batch).
-            phase_stopping: The clock of the whole system, phase and spring, runs 1 + this
-                times slower, (*batch), >= 0. Slows along the path without leaving it.
+            goal: New goal from now on, (*batch).
+            goal_filter: Rate, per duration, at which the goal moves to the commanded one, which
+                avoids a jump of the acceleration. None: it jumps.
+            coupling: External acceleration added to the motion [1/s^2], (*batch).
+            phase_stopping: The clock of the whole system, phase and spring, runs slower by the
+                factor 1 + this, (*batch), >= 0. The motion slows down on its path.
             forcing_gain: Factor on the forcing term, (*batch).
-            goals: Others that the kind has.
+            goal_body: New goal of the body, (*batch, K); poses only.
         """
-        motion, adapter, target = self.motion, self.adapter, None
-        columns, frame = adapter.columns(state)
-        if goal is not None or goals:
-            columns, frame, target = adapter.retarget(motion, columns, frame, goal, **goals)
-        columns = adapter.advance(
-            motion,
+        adapter = self.adapter
+        columns, frame, target = self._retargeted(state, goal, goal_body)
+        columns = adapter.step(
+            self.motion,
             columns,
-            adapter.each(dt),
+            dt,
             goal=target,
             goal_filter=goal_filter,
             external_acceleration=adapter.external_acceleration(
-                motion, columns, frame, coupling
+                self.motion, columns, frame, coupling
             ),
-            phase_stopping=adapter.each(phase_stopping),
-            forcing_gain=adapter.each(forcing_gain),
+            phase_stopping=phase_stopping,
+            forcing_gain=forcing_gain,
         )
         return adapter.state(columns, frame)
 
-    def retarget(self, state: State, goal: Value | None = None, **goals: Any) -> State:
-        """The same values, velocities and accelerations, with a new goal to go to.
+    def retarget(
+        self, state: State, goal: Value | None = None, *, goal_body: Vectors | None = None
+    ) -> State:
+        """State with a new goal, and the same value, velocity and acceleration.
 
-        The accelerations last if the next steps have a `goal_filter`.
+        The acceleration is continuous in the next steps if they have a `goal_filter`.
 
         Args:
-            state: Of a motion.
+            state: Current state.
             goal: (*batch).
-            goals: Others that the kind has.
+            goal_body: Goal of the body, (*batch, K); poses only.
         """
-        columns, frame = self.adapter.columns(state)
-        columns, frame, target = self.adapter.retarget(
-            self.motion, columns, frame, goal, **goals
-        )
+        columns, frame, target = self._retargeted(state, goal, goal_body)
         if target is not None:
             target = to_tensor(target, columns.target.dtype, columns.target.device)
             columns = replace(columns, target=target.expand_as(columns.target))
         return self.adapter.state(columns, frame)
 
-    def condition[S: "AdaptedPrimitive"](
+    def condition[S: "MotionPrimitive"](
         self: S,
         time: Times,
         value: Any = None,
@@ -279,19 +366,19 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         body_velocity: Points | None = None,
         within: tuple[float | int, float | int] | None = None,
     ) -> S:
-        """The primitive, changed so that it passes through via points exactly.
+        """Primitive that passes exactly through via points.
 
-        Start and goal stay, with the velocities there; so does any column that no via point
-        asks for, and with `within` all of the motion outside of that time. It holds for the
-        primitive's own start, goal and duration: put others in beforehand, with `with_ends`.
+        Start and goal stay, with their velocities, and so does any column without a via point.
+        With `within`, so does the motion outside of that time. Via points hold for the
+        primitive's own start, goal and duration: set others before, with `with_boundary`.
         Gradients flow to times, values and velocities.
 
         Args:
-            time: Of the via points [s], (*batch, n).
-            value: As for `via_points`, like all that follow; NaN is free.
-            velocity: There. None or NaN keeps the primitive's own where a value is given.
-            body: Of a pose.
-            body_velocity: Of a pose.
+            time: Times of the via points [s], (*batch, n).
+            value: Values as for `via_points`, like all that follow; NaN leaves them free.
+            velocity: Velocities. None or NaN keeps that of the motion if a value is given.
+            body: Body of a pose.
+            body_velocity: Velocity of the body of a pose.
             within: Times [s] between which the motion may change; None: from start to end.
 
         Raises:
@@ -310,42 +397,35 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         body: Points | None = None,
         body_velocity: Points | None = None,
     ) -> ViaPoints:
-        """Via points as a caller gives them, as columns (float64).
+        """Via points as columns (float64).
 
-        An orientation becomes the error on the branch nearest to the primitive's motion there,
-        so that both signs mean the same. An angular velocity becomes the rate of the error at
-        that orientation, or, where none is given, at the primitive's.
+        An orientation becomes the error on the branch nearest to the motion there, so that both
+        signs mean the same. An angular velocity becomes the rate of the error at the given
+        orientation, or at that of the motion.
 
         Args:
             time: [s], (*batch, n).
             value: Joints (*batch, n, D); unit quaternions (*batch, n, 4); or a `Pose` of
-                (*batch, n). NaN leaves a coordinate free, in a quaternion all of the
-                orientation.
+                (*batch, n). NaN leaves a coordinate free; in a quaternion, the orientation.
             velocity: Of joints (*batch, n, D); angular [rad/s], (*batch, n, 3); or a twist
-                (*batch, n, 6). NaN as above.
-            body: Of a pose, (*batch, n, K).
-            body_velocity: Of a pose, (*batch, n, K).
+                (*batch, n, 6). NaN leaves it free.
+            body: Body of a pose, (*batch, n, K).
+            body_velocity: Velocity of the body of a pose, (*batch, n, K).
 
         Raises:
             ValueError: Negative times, or shapes that do not fit.
         """
         motion, adapter = self.linear_motion(), self.adapter
-        moment = to_tensor(time, torch.float64, motion.start.device)
-        if moment.ndim == 0 or not (moment >= 0).all():
-            raise ValueError(f"time must be (..., n) seconds, none negative, got {time}")
-        moment = to_tensor(adapter.times(moment))
-        others = {"body": body, "body_velocity": body_velocity}
-        others = {name: x for name, x in others.items() if x is not None}
-        if others and not adapter.has_body:
-            raise ValueError("only a pose has a body")
+        time = seconds(time, motion.start.device)
+        options = _given(adapter, body=body, body_velocity=body_velocity)
         duration = motion.duration.double()[..., None]
-        now = motion.roll(Ends(), motion.duration, moment.detach())
+        now = motion.rollout_columns(Boundary(), motion.duration, time.detach())
         now = ColumnPoints(*(x.detach().double() for x in (now.position, now.velocity)))
-        via = adapter.via_points(motion, now, value, velocity, **others)
+        via = adapter.via_points(motion, now, value, velocity, **options)
         rate = via.velocity * duration[..., None]
-        return ViaPoints(s=moment / duration, position=via.position, rate=rate)
+        return ViaPoints(s=time / duration, position=via.position, rate=rate)
 
-    def with_ends[S: "AdaptedPrimitive"](
+    def with_boundary[S: "MotionPrimitive"](
         self: S,
         start: Value | None = None,
         goal: Value | None = None,
@@ -353,54 +433,59 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         start_velocity: Any = None,
         *,
         speed: Scalars | None = None,
-        **ends: Any,
+        start_body: Vectors | None = None,
+        goal_body: Vectors | None = None,
     ) -> S:
-        """The primitive whose own motion has these ends; arguments as in `rollout`.
+        """Primitive whose default motion has this boundary; arguments as in `rollout`.
 
         Raises:
-            ValueError: A scaling that means other weights for other ends.
+            ValueError: The scaling depends on the boundary, so the weights would differ.
         """
         motion = self.linear_motion()
-        if motion.forcing_scale.follows_ends:
+        if motion.forcing_scale.depends_on_boundary:
             raise ValueError(
-                f"scaling {motion.scaling!r} changes with the ends: fit with 'none'"
+                f"scaling {motion.scaling!r} depends on start and goal: fit with 'none'"
             )
-        given = Ends(start, goal, start_velocity)
-        columns, tau, frame = self._columns(given, duration, speed, ends)
-        moved = motion.begin(columns, tau)
-        rest = torch.stack([moved.rate, moved.position, moved.goal], dim=-1)
-        weights = motion.weights.expand(*rest.shape[:-1], -1)
-        x = torch.cat([weights, rest], dim=-1)
+        given = Boundary(start, goal, start_velocity)
+        boundary, tau, frame = self._boundary(
+            given, duration, speed, start_body=start_body, goal_body=goal_body
+        )
+        moved = motion.initial_columns(boundary, tau)
+        ends = torch.stack([moved.rate, moved.position, moved.goal], dim=-1)
+        weights = motion.weights.expand(*ends.shape[:-1], -1)
+        x = torch.cat([weights, ends], dim=-1)
         return self.with_motion(motion.with_coordinates(x, moved.duration), frame)
 
-    def reversed[S: "AdaptedPrimitive"](self: S) -> S:
-        """The primitive that goes the same way back, from the goal to the start.
+    def reversed[S: "MotionPrimitive"](self: S) -> S:
+        """Primitive that moves the same path backwards, from the goal to the start.
 
-        Its motion is this one's at duration - t, as closely as its functions can follow, and
-        takes new starts and goals like any other.
+        Its motion is that of this primitive at duration - t, fitted with the same basis. It
+        accepts new starts and goals like any other.
 
         Raises:
-            ValueError: A rhythm, which has no end to begin at.
+            ValueError: A rhythm, which has no end to start from.
         """
         motion = self.linear_motion()
         if motion.basis.periodic:
-            raise ValueError("a rhythm goes on: it has no end from which to go back")
-        s = torch.linspace(0, 1, FINE * motion.basis.count + 1, dtype=torch.float64)
+            raise ValueError("a rhythm cannot be reversed: it has no end to start from")
+        s = torch.linspace(0, 1, REFIT_SAMPLES * motion.basis.count + 1, dtype=torch.float64)
         s = s.to(motion.start.device)
         with torch.no_grad():
-            shown = motion.roll(Ends(), motion.duration, s * motion.duration[..., None])
+            time = s * motion.duration[..., None]
+            shown = motion.rollout_columns(Boundary(), motion.duration, time)
             samples = check_samples(s, shown.position.double().flip(-2))
             weights, rate = fit_samples("trajectory", motion.response, samples, REGULARIZATION)
             first, last = samples.first, samples.last
-            made = Demonstrated(first, last, motion.amplitude.reshape(first.shape).double())
-            weights = motion.forcing_scale.unscale(weights.mT, made).mT
+            amplitude = motion.amplitude.reshape(first.shape).double()
+            backwards = Demonstrated(first, last, amplitude)
+            weights = motion.forcing_scale.unscale(weights.mT, backwards).mT
             x = torch.cat([weights, torch.stack([rate, first, last], dim=-1)], dim=-1)
         x = x.view(*motion.weights.shape[:-1], -1)
-        back = 1 - motion.timestamps.flip(-1)
-        return self.with_motion(motion.with_coordinates(x, timestamps=back))
+        timestamps = 1 - motion.timestamps.flip(-1)
+        return self.with_motion(motion.with_coordinates(x, timestamps=timestamps))
 
     def linear_motion(self) -> LinearPrimitive:
-        """The linear primitive inside.
+        """Linear primitive of the columns.
 
         Raises:
             ValueError: The columns do not move linearly, as in the formulation of Ude et al.
@@ -419,45 +504,55 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         write_model(folder, type(self).__name__, config, tensors)
 
     @classmethod
-    def load[S: "AdaptedPrimitive"](cls: type[S], folder: str | FilePath) -> S:
-        """Read what `save` wrote.
+    def load[S: "MotionPrimitive"](cls: type[S], folder: str | FilePath) -> S:
+        """Read a primitive that `save` wrote.
 
         Raises:
-            FileNotFoundError: No saved primitive there.
-            ValueError: Names the file and the field that is wrong.
+            FileNotFoundError: The folder holds no saved primitive.
+            ValueError: A wrong field; the message names the file and the field.
         """
         return cls._restored(SavedModel(folder, cls.__name__))
 
-    def export(self, *, goal_filter: float | None = None) -> Any:
-        """An `ExportedDMP`: NumPy stepper, and the step as a `torch.export` program.
-
-        Args:
-            goal_filter: Of the program, as in `step`.
-
-        Raises:
-            ValueError: The primitive is a batch.
-        """
-        return export_primitive(self, goal_filter=goal_filter)
-
-    def _columns(
-        self, given: Ends, duration: Scalars | None, speed: Scalars | None, ends: dict[str, Any]
-    ) -> tuple[Ends, Tensor, Any]:
-        """Ends of a motion in columns, its duration, and their frame."""
-        each = self.adapter.each
-        tau = self.motion.resolve_duration(each(duration), each(speed))
-        columns, frame = self.adapter.ends(self.motion, given, tau, **ends)
+    def _boundary(
+        self, given: Boundary, duration: Scalars | None, speed: Scalars | None, **options: Any
+    ) -> tuple[Boundary, Tensor, Any]:
+        """Boundary of a motion in columns, its duration [s], and its frame."""
+        tau = self.motion.resolve_duration(duration, speed)
+        options = _given(self.adapter, **options)
+        columns, frame = self.adapter.boundary(self.motion, given, tau, **options)
         return columns, tau, frame
 
+    def _retargeted(
+        self, state: State, goal: Value | None, goal_body: Vectors | None
+    ) -> Retargeted:
+        columns, frame = self.adapter.columns(state)
+        if goal is None and goal_body is None:
+            return Retargeted(columns, frame)
+        options = _given(self.adapter, goal_body=goal_body)
+        return self.adapter.retarget(self.motion, columns, frame, goal, **options)
 
-class WrappedPrimitive[Value, Path, State](AdaptedPrimitive[Value, Path, State]):
-    """A primitive around a linear one of its own."""
+
+class WrappedPrimitive[Value, Path, State](MotionPrimitive[Value, Path, State]):
+    """Primitive with a linear one as a module of its own."""
 
     @property
     def duration(self) -> Float[Tensor, "*batch"]:
-        """Of the demonstration [s]."""
+        """Duration of the demonstration [s]."""
         return self.motion.duration
 
     @property
     def fit_report(self) -> FitReport | None:
-        """Residuals by column."""
+        """Residuals of the columns."""
         return self.motion.fit_report
+
+
+def _given(adapter: CoordinateAdapter, **options: Any) -> dict[str, Any]:
+    """Arguments that are not None.
+
+    Raises:
+        ValueError: The kind of primitive does not have one of them.
+    """
+    options = {name: value for name, value in options.items() if value is not None}
+    if unknown := options.keys() - adapter.options:
+        raise ValueError(f"this kind of primitive has no {', '.join(sorted(unknown))}")
+    return options

@@ -1,81 +1,86 @@
-"""A goal that moves at constant velocity, so that a motion ends as fast as is wanted.
+"""A goal that moves at constant velocity, for a motion with a given velocity at its end.
 
 y'' = alpha (beta (g + (s - 1) v - y) + v - y') + f,   s = t / tau
 
 (Kober et al. 2010, "Movement templates for learning of hitting and batting", with the goal's
-velocity in the damping term). The goal passes g at s = 1 with velocity v. Seen from it,
+velocity in the damping term). The goal passes g at s = 1 with velocity v. Relative to it,
 x = y - (s - 1) v, this is the equation of a goal at rest: rollouts and steps stay exact.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from typing import ClassVar, Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
-from hrc_learn.dmp._closed_loop_step import DMPState
-from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
-from hrc_learn.dmp.joint_dmp import JointDMP, points_as_given
-from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
-from hrc_learn.dmp.motion_primitive import WrappedPrimitive
+from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, to_tensor
+from hrc_learn.dmp._system.trajectory import ArrayOutputs, Trajectory, output
+from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.fitting.motion_fit import FitOptions
+from hrc_learn.dmp.joint_dmp import JointDMP, via_columns
+from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.motion_primitive import (
+    ColumnPoints,
+    CoordinateAdapter,
+    Retargeted,
+    WrappedPrimitive,
+)
 from hrc_learn.model_files import SavedModel
 
 
 class MovingTrajectory(ArrayOutputs):
-    """A motion to a moving goal, each output computed when first asked for."""
+    """Motion to a moving goal; each output is computed on first access."""
 
     outputs = Trajectory.outputs
 
-    def __init__(self, seen: Trajectory, velocity: Float[Tensor, "*#batch D"]):
-        """Add the motion of the goal (its `velocity` per second) to what is seen from it."""
-        self._seen = seen
+    def __init__(self, relative: Trajectory, velocity: Float[Tensor, "*#batch D"]):
+        """Add the motion of the goal at this velocity [1/s] to the motion relative to it."""
+        self._relative = relative
         self._velocity = velocity[..., None, :]
 
     @property
     def time(self) -> Float[Tensor, "*batch T"]:
-        """Since the start of the motion [s]."""
-        return self._seen.time
+        """Time since the start of the motion [s]."""
+        return self._relative.time
 
-    @cached_property
+    @output
     def position(self) -> Float[Tensor, "*batch T D"]:
-        """In the units of the demonstration."""
-        s = self._seen.s.to(self._velocity)
-        remaining = (s[..., None] - 1) * self._seen.duration[..., None, None]
-        return self._seen.position + remaining * self._velocity
+        """Position in the units of the demonstration."""
+        s = self._relative.s.to(self._velocity)
+        remaining = (s[..., None] - 1) * self._relative.duration[..., None, None]
+        return self._relative.position + remaining * self._velocity
 
-    @cached_property
+    @output
     def velocity(self) -> Float[Tensor, "*batch T D"]:
-        """The same per second."""
-        return self._seen.velocity + self._velocity
+        """Velocity, position units per second."""
+        return self._relative.velocity + self._velocity
 
     @property
     def acceleration(self) -> Float[Tensor, "*batch T D"]:
-        """The same per second squared."""
-        return self._seen.acceleration
+        """Acceleration, position units per second squared."""
+        return self._relative.acceleration
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MovingGoalState:
-    """Where a primitive on its way to a moving goal is; a pytree."""
+    """State of a primitive with a moving goal in closed loop; a pytree."""
 
     motion: DMPState
-    """Seen from the goal."""
+    """State relative to the goal."""
     goal_velocity: Float[Tensor, "*batch D"]
-    """Per second, when nothing slows the clock."""
+    """Velocity of the goal if nothing slows the clock [1/s]."""
 
     @property
     def position(self) -> Float[Tensor, "*batch D"]:
-        """In the units of the demonstration."""
+        """Position in the units of the demonstration."""
         remaining = (self.motion.s - 1).to(self.goal_velocity) * self.motion.duration
         return self.motion.position + remaining[..., None] * self.goal_velocity
 
     @property
     def velocity(self) -> Float[Tensor, "*batch D"]:
-        """Per second."""
+        """Velocity, position units per second."""
         return self.motion.velocity + self.motion.pace[..., None] * self.goal_velocity
 
 
@@ -86,55 +91,54 @@ torch.export.register_dataclass(
 
 @dataclass(frozen=True, eq=False)
 class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingGoalState]):
-    """Joints as seen from the moving goal; the frame is the goal's velocity per second."""
+    """Joints relative to the moving goal; the frame is the goal's velocity [1/s]."""
 
-    def ends(
+    options: ClassVar[frozenset[str]] = frozenset({"end_velocity"})
+
+    def boundary(
         self,
         motion: LinearPrimitive,
-        given: Ends,
+        given: Boundary,
         duration: Tensor,
         end_velocity: Vectors | None = None,
-    ) -> tuple[Ends, Tensor]:
-        """Start and rate as seen from a goal that moves so that `end_velocity` is met."""
+    ) -> tuple[Boundary, Tensor]:
+        """Start and rate relative to the goal whose motion leads to `end_velocity`."""
 
-        def known(value: Vectors | None, otherwise: Tensor) -> Tensor:
+        def value_or(value: Vectors | None, default: Tensor) -> Tensor:
             if value is None:
-                return otherwise
-            return to_tensor(value, otherwise.dtype, otherwise.device)
+                return default
+            return to_tensor(value, default.dtype, default.device)
 
         demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
-        start, goal = known(given.start, motion.start), known(given.goal, motion.goal)
-        rate = known(given.velocity, demonstrated)
+        start, goal = value_or(given.start, motion.start), value_or(given.goal, motion.goal)
+        rate = value_or(given.start_velocity, demonstrated)
         end = duration[..., None]
-        still = motion.roll(Ends(start, goal, rate), duration, end).velocity[..., 0, :]
-        # Per unit of v the start is seen shifted by v, its rate by -v.
+        at_rest = motion.rollout_columns(Boundary(start, goal, rate), duration, end)
+        at_rest = at_rest.velocity[..., 0, :]
+        # A unit of v shifts the start by v and its rate by -v. Columns -2 and -3 of the
+        # response are the start and its rate; the goal's own velocity is one.
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
-        # Columns -2 and -3 of the response are the start and its rate; the goal's own is one.
         gain = 1 + at_end[-2] - at_end[-3]
-        # Linear in v: one evaluation finds what makes up the difference.
-        v = (known(end_velocity, still) - still) / gain.to(still)
-        return Ends(start + v * end, goal, rate - v), v
+        # The end velocity is linear in v, so the difference gives v directly.
+        v = (value_or(end_velocity, at_rest) - at_rest) / gain.to(at_rest)
+        return Boundary(start + v * end, goal, rate - v), v
 
     def trajectory(self, columns: Trajectory, frame: Tensor) -> MovingTrajectory:
-        """What is seen from the goal, and the goal's motion."""
+        """Motion relative to the goal plus that of the goal."""
         return MovingTrajectory(columns, frame)
 
-    def begin(self, columns: DMPState, frame: Tensor) -> tuple[DMPState, Tensor]:
-        """A velocity of the goal for each of the batch."""
-        return columns, frame.expand_as(columns.position).clone()
-
     def state(self, columns: DMPState, frame: Tensor) -> MovingGoalState:
-        """The columns with the goal's velocity."""
+        """State relative to the goal, and the goal's velocity."""
         return MovingGoalState(motion=columns, goal_velocity=frame)
 
     def columns(self, state: MovingGoalState) -> tuple[DMPState, Tensor]:
-        """The columns and the goal's velocity."""
+        """State relative to the goal, and the goal's velocity."""
         return state.motion, state.goal_velocity
 
     def retarget(
         self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, goal: Vectors | None
     ) -> Retargeted:
-        """A goal as it is at the end; its velocity stays."""
+        """The goal at the end of the motion; its velocity stays."""
         return Retargeted(columns, frame, goal)
 
     def via_points(
@@ -144,29 +148,28 @@ class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingG
         value: Points | None,
         velocity: Points | None,
     ) -> ColumnPoints:
-        """As given: with the demonstrated end velocity the goal is at rest."""
-        return points_as_given(now, value, velocity)
+        """The given via points, because the goal rests for the demonstrated end velocity."""
+        return via_columns(now, value, velocity)
 
 
 class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]):
-    """A joint primitive that passes its goal with a velocity of the caller's choice.
+    """Joint primitive that passes its goal with a given velocity.
 
     Values are (*batch, D) in the units of the demonstration, velocities the same per second.
-    `rollout` and `initial_state` take the wanted velocity at the end of the duration first,
-    and meet it exactly; None is the demonstrated one. The goal is where the moving goal is at
-    the end.
+    `rollout` and `initial_state` meet the `end_velocity` exactly at the end of the duration; by
+    default it is the demonstrated one. The goal is the place of the moving goal at the end.
     """
 
     motion: JointDMP
 
     def __init__(self, motion: JointDMP):
-        """Take a primitive along.
+        """Wrap a joint primitive.
 
         Raises:
-            ValueError: Its forcing follows start and goal, which the moving frame changes.
+            ValueError: Its scaling depends on start and goal, which the moving frame changes.
         """
         super().__init__()
-        if motion.forcing_scale.follows_ends:
+        if motion.forcing_scale.depends_on_boundary:
             raise ValueError("a moving goal needs a scaling that does not depend on start")
         self.motion = motion
 
@@ -175,60 +178,41 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         cls,
         time: Times,
         position: Points,
-        *arguments: Any,
-        **options: Any,
+        n_basis: int | None = None,
+        velocity: Points | None = None,
+        mask: Mask | None = None,
+        *,
+        scaling: str = "none",
+        joint_names: Sequence[str] | None = None,
+        units: str = "rad",
+        **options: Unpack[FitOptions],
     ) -> "MovingGoalDMP":
-        """Learn one primitive from each demonstration; arguments as in `JointDMP.fit`."""
-        return cls(JointDMP.fit(time, position, *arguments, **options))
+        """Fit one primitive to each demonstration; arguments as in `JointDMP.fit`."""
+        names = {"joint_names": joint_names, "units": units}
+        motion = JointDMP.fit(
+            time, position, n_basis, velocity, mask, scaling=scaling, **names, **options
+        )
+        return cls(motion)
 
     @property
     def adapter(self) -> MovingGoalCoordinates:
-        """Joints as seen from the goal."""
+        """Joints relative to the goal."""
         return MovingGoalCoordinates()
 
     @property
     def start(self) -> Float[Tensor, "*batch D"]:
-        """Where the demonstration starts."""
+        """Start of the demonstration."""
         return self.motion.start
 
     @property
     def goal(self) -> Float[Tensor, "*batch D"]:
-        """Where it ends."""
+        """End of the demonstration."""
         return self.motion.goal
-
-    def rollout(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-        end_velocity: Vectors | None = None,
-        time: Times | None = None,
-        *arguments: Any,
-        **ends: Any,
-    ) -> MovingTrajectory:
-        """Motion that has `end_velocity` at the end of its duration, exactly.
-
-        Args:
-            end_velocity: Per second, (*batch, D); None: the demonstrated one.
-            time: As in `AdaptedPrimitive.rollout`, like all that follow.
-            arguments: start, goal, duration, start_velocity.
-            ends: By name.
-        """
-        return super().rollout(time, *arguments, end_velocity=end_velocity, **ends)
-
-    def initial_state(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self, end_velocity: Vectors | None = None, *arguments: Any, **ends: Any
-    ) -> MovingGoalState:
-        """State at the start of a motion; arguments as in `rollout`, without times."""
-        return super().initial_state(*arguments, end_velocity=end_velocity, **ends)
 
     def with_motion[S: "MovingGoalDMP"](
         self: S, motion: JointDMP, frame: Tensor | None = None
     ) -> S:
-        """Around another motion, whose own end velocity is the demonstrated one.
-
-        Raises:
-            ValueError: Ends with a velocity of their own, which only a rollout can have.
-        """
-        if frame is not None and (frame != 0).any():
-            raise ValueError("an end velocity is given to rollout, not kept by a primitive")
+        """Primitive with another motion, whose own end velocity is the demonstrated one."""
         return type(self)(motion)
 
     @classmethod

@@ -2,84 +2,53 @@
 
 e = log(g * conj(q)), a rotation vector [rad] in the base frame, so that q = exp(-e) * g
 (Koutras and Doulgeri 2019, "A correct formulation for the orientation dynamic movement
-primitives for robot control in the Cartesian space"; their logarithm is half of ours). The
-goal is e = 0. Moving start and goal alike by a rotation of the tool frame leaves e as it is.
+primitives for robot control in the Cartesian space"; their logarithm is half of ours). At the
+goal, e = 0. A rotation of the tool frame that moves start and goal alike leaves e unchanged.
 """
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, broadcast_tensors
 
-from hrc_learn.dmp._arguments import (
-    Mask,
-    Quaternions,
-    Times,
-    Vectors,
-    check_samples,
-    demo_label,
-    readable,
-    to_tensor,
-)
+from hrc_learn.dmp._arguments import Mask, Quaternions, Times, Vectors, readable, to_tensor
+from hrc_learn.dmp.fitting.samples import check_samples, demo_label
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 _NO_AXIS = 1e-9
-"""Rotation vectors shorter than this [rad] have no direction of their own."""
-
-
-def demonstrated_error(
-    orientation: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
-) -> tuple[Float[Tensor, "*batch T 3"], Float[Tensor, "*batch 4"]]:
-    """Errors to the last sample that counts, continuous past any number of turns.
-
-    Where `mask` is false an orientation may be anything. The error of a demonstration is
-    followed backwards from its end, so that 720 degrees are learned as two turns.
-
-    Returns:
-        Errors [rad], and the goal.
-    """
-    q = held(orientation, mask)
-    goal = q[..., -1, :]
-    backwards = to_error(q, goal[..., None, :]).flip(-2)
-    return quaternion.unwrap_log(backwards).flip(-2), goal
-
-
-def held(
-    orientation: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
-) -> Float[Tensor, "*batch T 4"]:
-    """Orientations along time, where `mask` is false the last before that counts."""
-    # Each sample points to the last one that counts; those before the first, to that.
-    index = torch.arange(mask.shape[-1], device=mask.device).expand(mask.shape)
-    first = mask.long().argmax(-1, keepdim=True)
-    seen = torch.where(mask, index, first).cummax(-1).values
-    return torch.take_along_dim(orientation, seen[..., None], dim=-2)
+"""Length [rad] below which a rotation vector has no direction."""
+MEAN_ITERATIONS = 10
+"""Iterations of a mean. Each leaves a small fraction of the distance, or of its cube where all
+orientations are close."""
+NORM_TOLERANCE = 1e-2
+"""Deviation from one up to which the norm of a recorded quaternion is corrected."""
 
 
 def to_error(
     q: Float[Tensor, "*#batch 4"], goal: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Shortest error of an orientation to the goal."""
+    """Shortest error [rad] of an orientation to the goal."""
     return quaternion.log(quaternion.multiply(goal, quaternion.conjugate(q)))
 
 
 def to_orientation(
     error: Float[Tensor, "*#batch 3"], goal: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
-    """Orientation that differs from the goal by this error."""
+    """Orientation with this error to the goal, exp(-e) * g."""
     return quaternion.multiply(quaternion.exp(-error), goal)
 
 
 def reference_of(
     error: Float[Tensor, "*#batch 3"], q: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
-    """What orientation has this error: exp(e) * q."""
+    """Reference to which an orientation has this error, exp(e) * q."""
     return quaternion.multiply(quaternion.exp(error), q)
 
 
 def to_orientations(
     error: Float[Tensor, "*#batch T 3"], goal: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch T 4"]:
-    """Orientations along time that differ from one goal by these errors."""
+    """Orientations over time with these errors to one goal."""
     # One 4x4 product each: row i of the matrix is the unit quaternion i times the goal.
     unit = torch.eye(4, dtype=goal.dtype, device=goal.device)
     return quaternion.exp(-error) @ quaternion.multiply(unit, goal[..., None, :])
@@ -88,26 +57,26 @@ def to_orientations(
 def angular_velocity(
     error: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Angular velocity of q = exp(-e) * g in the base frame [rad/s], from de/dt."""
+    """Angular velocity of q = exp(-e) * g in the base frame [rad/s], from e and de/dt."""
     return -drift_free_rate(error, rate)
 
 
 def angular_acceleration(
     error: Float[Tensor, "*batch 3"],
     rate: Float[Tensor, "*batch 3"],
-    curvature: Float[Tensor, "*batch 3"],
+    second: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Angular acceleration [rad/s^2], from e and its first two derivatives by time."""
-    return -drift_free_slope(error, rate, curvature)
+    """Angular acceleration [rad/s^2], from e and its first and second derivative by time."""
+    return -drift_free_slope(error, rate, second)
 
 
 def error_rate(
     error: Float[Tensor, "*#batch 3"], velocity: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """de/dt of an angular velocity [rad/s]; the inverse of `angular_velocity`.
+    """Rate de/dt for an angular velocity [rad/s]; the inverse of `angular_velocity`.
 
-    Whole turns away from the goal the error has a rate about its own axis only: what the
-    velocity holds across it is lost there.
+    Whole turns away from the goal, the error can only change along its own axis: the part of
+    the velocity across it is lost there.
     """
     error, velocity = torch.broadcast_tensors(error, velocity)
     return -velocity - axis_drift(error, velocity)
@@ -118,13 +87,13 @@ def nearest_turn(
 ) -> Float[Tensor, "*batch 3"]:
     """The same rotation as `error`, with the whole turns that bring it closest to `reference`.
 
-    A start or goal that is new takes its way round from the demonstration.
+    A new start or goal is thereby reached in the sense of rotation of the demonstration.
     """
     error, reference = torch.broadcast_tensors(error, reference)
     own = error.norm(dim=-1, keepdim=True) > _NO_AXIS
     axis = torch.where(own, error, reference).detach()
     axis = axis / axis.norm(dim=-1, keepdim=True).clamp_min(_NO_AXIS)
-    # How many turns is a choice, which has no derivative.
+    # The number of turns is an integer, which has no derivative.
     along = ((reference - error) * axis).sum(-1, keepdim=True).detach()
     return error + 2 * torch.pi * torch.round(along / (2 * torch.pi)) * axis
 
@@ -132,33 +101,37 @@ def nearest_turn(
 def retarget(
     error: Float[Tensor, "*batch 3"],
     rate: Float[Tensor, "*batch 3"],
-    curvature: Float[Tensor, "*batch 3"],
+    second: Float[Tensor, "*batch 3"],
     old_goal: Float[Tensor, "*batch 4"],
     goal: Float[Tensor, "*#batch 4"],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Error to a new goal and its derivatives, for the same motion of the orientation."""
+    """Error to a new goal and its two derivatives, for the same motion of the orientation."""
     q = to_orientation(error, old_goal)
     new = nearest_turn(to_error(q, goal), error)
     omega = angular_velocity(error, rate)
-    omega_rate = angular_acceleration(error, rate, curvature)
+    omega_rate = angular_acceleration(error, rate, second)
     new_rate = error_rate(new, omega)
-    # The angular acceleration is linear in the curvature; the rest stems from turning itself.
+    # The angular acceleration is linear in the second derivative, plus a bias from the turning.
     bias = angular_acceleration(new, new_rate, torch.zeros_like(new))
     return new, new_rate, error_rate(new, omega_rate - bias)
 
 
 def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4"]:
-    """A quaternion given by the caller, normalised; dtype and device of `like`."""
+    """Normalised quaternion in the dtype and on the device of `like`.
+
+    Raises:
+        ValueError: The value is not a quaternion (w, x, y, z).
+    """
     q = to_tensor(value, dtype=like.dtype, device=like.device)
     shaped = q.ndim > 0 and q.shape[-1] == 4
-    # A tracer cannot look at values.
-    # Not a tolerance on units: it tells a quaternion from zeros and from three Euler angles.
+    # Far from one on purpose: it tells quaternions from zeros and from Euler angles. A tracer
+    # cannot look at values.
     if not (shaped and (not readable(q) or (q.norm(dim=-1) > 0.5).all())):
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
     return quaternion.normalize(q)
 
 
-def error_ends(
+def error_boundary(
     error: Float[Tensor, "*#batch 3"],
     rate: Float[Tensor, "*#batch 3"],
     goal_error: Float[Tensor, "*#batch 3"],
@@ -167,16 +140,16 @@ def error_ends(
     goal: Quaternions | None,
     velocity: Vectors | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Error at the start of a motion, its rate [rad/s], and the reference it is taken to.
+    """Error at the start of a motion, its rate [rad/s], and the reference of the error.
 
     Args:
-        error: At the start of the demonstration.
-        rate: Of that, when the motion takes as long as it shall.
-        goal_error: Error of the goal: zero where that is the reference.
-        demonstrated_goal: Where the demonstration ends.
-        start: New start; the demonstrated one is kept if None, as with all that follow.
+        error: Error at the start of the demonstration.
+        rate: Its rate, for the duration of the motion.
+        goal_error: Error at the goal; zero if the goal is the reference.
+        demonstrated_goal: Orientation at the end of the demonstration.
+        start: New start; None keeps the demonstrated one, as for all that follow.
         goal: New goal.
-        velocity: New angular velocity [rad/s].
+        velocity: New angular velocity at the start [rad/s].
     """
     if start is None and goal is None and velocity is None:
         return error, rate, reference_of(goal_error, demonstrated_goal)
@@ -186,8 +159,7 @@ def error_ends(
     else:
         omega = to_tensor(velocity, dtype=error.dtype, device=error.device)
     if start is None:
-        reference = reference_of(goal_error, demonstrated_goal)
-        q = to_orientation(error, reference)
+        q = to_orientation(error, reference_of(goal_error, demonstrated_goal))
     else:
         q = unit_quaternion(start, error)
     goal = demonstrated_goal if goal is None else unit_quaternion(goal, error)
@@ -196,86 +168,88 @@ def error_ends(
     return error, error_rate(error, omega), reference
 
 
-ITERATIONS = 10
-"""Each leaves a small share of the distance, or of its cube where all are close."""
-
-
 def intrinsic_mean(
     q: Float[Tensor, "*batch n 4"], mask: Bool[Tensor, "*batch n"] | None = None
 ) -> Float[Tensor, "*batch 4"]:
-    """The orientation from which the rotation vectors to all others sum up to zero.
+    """Orientation from which the rotation vectors to all others sum to zero.
 
-    (Moakher 2002, "Means and averaging in the group of rotations".) Fixed-point iteration
-    from the extrinsic mean, the first eigenvector of sum q q^T, which knows no signs.
+    (Moakher 2002, "Means and averaging in the group of rotations".) Fixed-point iteration from
+    the extrinsic mean, the first eigenvector of sum q q^T, which does not depend on signs.
 
     Args:
         q: Unit quaternions, of either sign.
-        mask: False where one does not count.
+        mask: False at orientations to ignore.
     """
-    weight = _shares(q, mask)
-    return _settled(torch.linalg.eigh((weight * q).mT @ q).eigenvectors[..., -1], q, weight)
+    weight = _mean_weights(q, mask)
+    return _refined(torch.linalg.eigh((weight * q).mT @ q).eigenvectors[..., -1], q, weight)
 
 
 def mean_along(
     q: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
 ) -> Float[Tensor, "*batch 4"]:
-    """Intrinsic mean of a motion, on the side that the motion keeps to.
+    """Intrinsic mean of a motion, on the branch of the motion.
 
-    One that swings by 170 degrees either way spends most of its time about the orientation
-    opposite to its centre: the iteration starts from the mean of the way it took instead.
+    A motion that swings by 170 degrees to either side spends most of its time near the
+    orientation opposite to its centre. The iteration therefore starts from the mean of the
+    unwrapped rotation vectors.
 
     Args:
-        q: Unit quaternions along time, neighbours less than half a turn apart.
-        mask: False where one does not count.
+        q: Unit quaternions over time, neighbours less than half a turn apart.
+        mask: False at samples to ignore.
     """
-    weight = _shares(q, mask)
+    weight = _mean_weights(q, mask)
     first = q[..., :1, :]
-    way = quaternion.log(quaternion.multiply(q, quaternion.conjugate(first)))
-    way = (weight * quaternion.unwrap_log(way)).sum(-2)
-    return _settled(quaternion.multiply(quaternion.exp(way), first[..., 0, :]), q, weight)
+    vector = quaternion.log(quaternion.multiply(q, quaternion.conjugate(first)))
+    vector = (weight * quaternion.unwrap_log(vector)).sum(-2)
+    return _refined(quaternion.multiply(quaternion.exp(vector), first[..., 0, :]), q, weight)
 
 
-def _shares(q: Tensor, mask: Tensor | None) -> Float[Tensor, "*batch n 1"]:
+def _mean_weights(q: Tensor, mask: Tensor | None) -> Float[Tensor, "*batch n 1"]:
     weight = torch.ones_like(q[..., 0]) if mask is None else mask.to(q)
     return (weight / weight.sum(-1, keepdim=True))[..., None]
 
 
-def _settled(
+def _refined(
     mean: Float[Tensor, "*batch 4"],
     q: Float[Tensor, "*batch n 4"],
     weight: Float[Tensor, "*batch n 1"],
 ) -> Float[Tensor, "*batch 4"]:
-    for _ in range(ITERATIONS):
-        away = quaternion.log(quaternion.multiply(q, quaternion.conjugate(mean)[..., None, :]))
-        mean = quaternion.multiply(quaternion.exp((weight * away).sum(-2)), mean)
+    for _ in range(MEAN_ITERATIONS):
+        offset = quaternion.log(
+            quaternion.multiply(q, quaternion.conjugate(mean)[..., None, :])
+        )
+        mean = quaternion.multiply(quaternion.exp((weight * offset).sum(-2)), mean)
     return quaternion.normalize(mean)
-
-
-NORM_TOLERANCE = 1e-2
-"""How far from one the norm of a recorded quaternion may be before it is called broken."""
 
 
 def fitted_error(
     time: Times, orientation: Quaternions, mask: Mask | None
 ) -> tuple[Float[Tensor, "*B T 3"], Float[Tensor, "*B 4"]]:
-    """Errors and goals of demonstrations that end."""
-    return demonstrated_error(*_checked(time, orientation, mask))
+    """Errors [rad] to the last valid orientation, and that orientation.
+
+    The error is followed backwards from the end, continuously past any number of turns, so that
+    720 degrees are learned as two turns. Masked orientations may hold anything.
+    """
+    q = _without_gaps(*_checked(time, orientation, mask))
+    goal = q[..., -1, :]
+    backwards = to_error(q, goal[..., None, :]).flip(-2)
+    return quaternion.unwrap_log(backwards).flip(-2), goal
 
 
 def centred_error(
     time: Times, orientation: Quaternions, mask: Mask | None
 ) -> tuple[Float[Tensor, "*B T 3"], Float[Tensor, "*B 4"]]:
-    """Errors of demonstrations to their mean orientation, and that.
+    """Errors [rad] of demonstrations to their mean orientation, and the mean.
 
     Raises:
-        ValueError: Bad samples, or some half a turn or more from the mean.
+        ValueError: Bad samples, or samples half a turn or more from the mean.
     """
     q, mask = _checked(time, orientation, mask)
-    q = held(q, mask)
+    q = _without_gaps(q, mask)
     centre = mean_along(q, mask)
     error = to_error(q, centre[..., None, :])
-    # Past half a turn the logarithm jumps to the other side, which unwrapping undoes.
-    # A jump is 2 pi long: any threshold well between rounding and that will do.
+    # Past half a turn the logarithm jumps to the other side, which unwrapping would undo.
+    # The jump has length 2 pi: any threshold well between rounding and that will do.
     far = (quaternion.unwrap_log(error) - error).norm(dim=-1) > 1
     if far.any():
         i, k = far.reshape(-1, far.shape[-1]).nonzero()[0].tolist()
@@ -286,10 +260,21 @@ def centred_error(
     return error, centre
 
 
+def _without_gaps(
+    orientation: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
+) -> Float[Tensor, "*batch T 4"]:
+    """Orientations with masked samples replaced by the last valid one before them."""
+    # Samples before the first valid one take that.
+    index = torch.arange(mask.shape[-1], device=mask.device).expand(mask.shape)
+    first = mask.long().argmax(-1, keepdim=True)
+    latest = torch.where(mask, index, first).cummax(-1).values
+    return torch.take_along_dim(orientation, latest[..., None], dim=-2)
+
+
 def _checked(
     time: Times, orientation: Quaternions, mask: Mask | None
 ) -> tuple[Float[Tensor, "*B T 4"], Bool[Tensor, "*B T"]]:
-    """Unit quaternions and which of them count."""
+    """Unit quaternions, and a mask of the valid ones."""
     samples = check_samples(time, orientation, mask=mask, name="orientation")
     if samples.position.shape[-2] != 4:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Movement primitive of a pose, and of the arm's body along with it."""
+"""Movement primitive of a pose, and of body coordinates such as an arm angle along with it."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,22 +15,26 @@ from hrc_learn.dmp._arguments import (
     Quaternions,
     Times,
     Vectors,
-    check_samples,
+    broadcast_shapes,
     finite,
-    padded,
     to_tensor,
 )
-from hrc_learn.dmp._closed_loop_step import DMPState
-from hrc_learn.dmp._fitting import FitOptions
-from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory, broadcast_shapes
-from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Retargeted
+from hrc_learn.dmp._system.trajectory import ArrayOutputs, Trajectory
+from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.fitting.motion_fit import FitOptions
+from hrc_learn.dmp.fitting.samples import check_samples, padded
 from hrc_learn.dmp.forcing_scale import find_scaling
-from hrc_learn.dmp.joint_dmp import JointDMP, given_points
-from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
-from hrc_learn.dmp.motion_primitive import WrappedPrimitive
+from hrc_learn.dmp.joint_dmp import JointDMP, via_values
+from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.motion_primitive import (
+    ColumnPoints,
+    CoordinateAdapter,
+    Retargeted,
+    WrappedPrimitive,
+)
 from hrc_learn.dmp.orientation_dmp import OrientationTrajectory, via_errors
 from hrc_learn.dmp.orientation_error import (
-    error_ends,
+    error_boundary,
     fitted_error,
     reference_of,
     to_orientation,
@@ -40,11 +44,11 @@ from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel
 
 POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
-"""Columns of a pose: position [m], orientation error [rad], and what moves along."""
+"""Columns of a pose: position [m], orientation error [rad], and body coordinates."""
 
 
 class PoseTrajectory(ArrayOutputs):
-    """A pose over time, each output computed when first asked for."""
+    """Pose over time; each output is computed on first access."""
 
     outputs = (
         *("time", "position", "orientation", "velocity", "angular_velocity"),
@@ -57,12 +61,12 @@ class PoseTrajectory(ArrayOutputs):
 
     @property
     def time(self) -> Float[Tensor, "*batch T"]:
-        """Since the start of the motion [s]."""
+        """Time since the start of the motion [s]."""
         return self._motion.time
 
     @property
     def position(self) -> Float[Tensor, "*batch T 3"]:
-        """[m]."""
+        """Position [m]."""
         return self._motion.position[..., POSITION]
 
     @property
@@ -77,48 +81,48 @@ class PoseTrajectory(ArrayOutputs):
 
     @property
     def velocity(self) -> Float[Tensor, "*batch T 3"]:
-        """Linear [m/s]."""
+        """Linear velocity [m/s]."""
         return self._motion.velocity[..., POSITION]
 
     @property
     def angular_velocity(self) -> Float[Tensor, "*batch T 3"]:
-        """In the base frame [rad/s]."""
+        """Angular velocity in the base frame [rad/s]."""
         return self._rotation.angular_velocity
 
     @cached_property
     def twist(self) -> Float[Tensor, "*batch T 6"]:
-        """(linear [m/s], angular [rad/s]) in the base frame."""
+        """Twist (linear [m/s], angular [rad/s]) in the base frame."""
         return torch.cat([self.velocity, self.angular_velocity], dim=-1)
 
     @property
     def acceleration(self) -> Float[Tensor, "*batch T 3"]:
-        """Linear [m/s^2]."""
+        """Linear acceleration [m/s^2]."""
         return self._motion.acceleration[..., POSITION]
 
     @property
     def angular_acceleration(self) -> Float[Tensor, "*batch T 3"]:
-        """In the base frame [rad/s^2]."""
+        """Angular acceleration in the base frame [rad/s^2]."""
         return self._rotation.angular_acceleration
 
     @property
     def body(self) -> Float[Tensor, "*batch T K"]:
-        """Coordinates learned along; K = 0 without any."""
+        """Body coordinates; K = 0 if none were learned."""
         return self._motion.position[..., BODY]
 
     @property
     def body_velocity(self) -> Float[Tensor, "*batch T K"]:
-        """The same per second."""
+        """Velocity of the body coordinates, per second."""
         return self._motion.velocity[..., BODY]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PoseState:
-    """Where a pose primitive is while it is stepped."""
+    """State of a pose primitive in closed loop."""
 
     motion: DMPState
-    """Of position, error to the reference, and body."""
+    """State of position, error to the reference, and body."""
     reference: Float[Tensor, "*batch 4"]
-    """The goal's orientation, unless the primitive says otherwise."""
+    """Reference of the error; the goal's orientation by default."""
 
     @property
     def pose(self) -> Pose:
@@ -129,14 +133,14 @@ class PoseState:
 
     @property
     def twist(self) -> Float[Tensor, "*batch 6"]:
-        """(linear [m/s], angular [rad/s]) in the base frame."""
+        """Twist (linear [m/s], angular [rad/s]) in the base frame."""
         columns, velocity = self.motion.position, self.motion.velocity
         angular = orientation_error.angular_velocity(columns[..., ERROR], velocity[..., ERROR])
         return torch.cat([velocity[..., POSITION], angular], dim=-1)
 
     @property
     def body(self) -> Float[Tensor, "*batch K"]:
-        """Coordinates learned along."""
+        """Body coordinates."""
         return self.motion.position[..., BODY]
 
 
@@ -145,32 +149,34 @@ torch.export.register_dataclass(PoseState, serialized_type_name="hrc_learn.dmp.P
 
 @dataclass(frozen=True, eq=False)
 class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
-    """Position, orientation error and body side by side; the frame is the error's reference."""
+    """Position, orientation error and body as columns; the frame is the error's reference."""
 
     goal_orientation: Tensor
-    """Unit quaternion at which the demonstration ends, (*batch, 4)."""
+    """Unit quaternion at the end of the demonstration, (*batch, 4)."""
     error_columns: ClassVar[slice] = ERROR
-    has_body: ClassVar[bool] = True
+    options: ClassVar[frozenset[str]] = frozenset(
+        {"start_body", "goal_body", "body", "body_velocity"}
+    )
 
     def reference(self, motion: LinearPrimitive) -> Float[Tensor, "*batch 4"]:
-        """What the demonstrated error is taken to."""
+        """Reference of the demonstrated error."""
         return reference_of(motion.goal[..., ERROR], self.goal_orientation)
 
-    def ends(
+    def boundary(
         self,
         motion: LinearPrimitive,
-        given: Ends,
+        given: Boundary,
         duration: Tensor,
         start_body: Vectors | None = None,
         goal_body: Vectors | None = None,
-    ) -> tuple[Ends, Tensor]:
-        """A new orientation moves the start's error or the reference, the rest its columns."""
+    ) -> tuple[Boundary, Tensor]:
+        """Columns of start and goal; a goal orientation moves the reference of the error."""
         like, (start, goal, velocity) = motion.start, given
         check_pose("start", start)
         check_pose("goal", goal)
         demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
         twist = None if velocity is None else to_tensor(velocity, like.dtype, like.device)
-        error, rate, reference = error_ends(
+        error, rate, reference = error_boundary(
             like[..., ERROR],
             demonstrated[..., ERROR],
             motion.goal[..., ERROR],
@@ -179,42 +185,38 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
             None if goal is None else goal.orientation,
             None if twist is None else twist[..., 3:],
         )
-        start_columns = joined(
+        start_columns = _join(
             like[..., POSITION] if start is None else start.position,
             error,
             like[..., BODY] if start_body is None else start_body,
             like,
         )
-        goal_columns = joined(
+        goal_columns = _join(
             motion.goal[..., POSITION] if goal is None else goal.position,
             motion.goal[..., ERROR],
             motion.goal[..., BODY] if goal_body is None else goal_body,
             like,
         )
         if twist is None:
-            # Turned and dilated with the way, if the scaling has it so.
+            # The scaling may rotate and scale the start velocity.
             per_s = motion.start_rate(start_columns, goal_columns)
             linear = (per_s / duration[..., None])[..., POSITION]
         else:
             linear = twist[..., :3]
-        # The body goes on as demonstrated: a twist says nothing of it.
-        velocity_columns = joined(linear, rate, demonstrated[..., BODY], like)
-        return Ends(start_columns, goal_columns, velocity_columns), reference
+        # A twist does not include the body, which starts as demonstrated.
+        velocity_columns = _join(linear, rate, demonstrated[..., BODY], like)
+        return Boundary(start_columns, goal_columns, velocity_columns), reference
 
     def trajectory(self, columns: Trajectory, frame: Tensor) -> PoseTrajectory:
-        """Poses along the columns."""
+        """Poses of the columns."""
         return PoseTrajectory(columns, frame)
 
-    def begin(self, columns: DMPState, frame: Tensor) -> tuple[DMPState, Tensor]:
-        """A reference for each of the batch."""
-        return columns, frame.expand(*columns.position.shape[:-1], 4)
-
     def state(self, columns: DMPState, frame: Tensor) -> PoseState:
-        """The columns with their reference."""
+        """Columns and reference."""
         return PoseState(motion=columns, reference=frame)
 
     def columns(self, state: PoseState) -> tuple[DMPState, Tensor]:
-        """The columns and their reference."""
+        """Columns and reference."""
         return state.motion, state.reference
 
     def retarget(
@@ -225,40 +227,33 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
         goal: Pose | None,
         goal_body: Vectors | None = None,
     ) -> Retargeted:
-        """The same pose, twist and acceleration, as the error to a new reference."""
+        """Columns with the error to a new reference; pose, twist and acceleration stay."""
         target = columns.target
         if goal is not None:
             check_pose("goal", goal)
             rotation = unit_quaternion(goal.orientation, frame)
             new = reference_of(motion.goal[..., ERROR], rotation).expand_as(frame)
-            values = columns.position, columns.rate, motion.curvature(columns)
-            error, error_rate, error_curvature = (x[..., ERROR] for x in values)
-            turned = orientation_error.retarget(error, error_rate, error_curvature, frame, new)
-            position, rate, curvature = (
-                replaced(x, ERROR, part) for x, part in zip(values, turned, strict=True)
-            )
-            target = replaced(target, POSITION, goal.position)
-            columns = replace(columns, position=position, rate=rate)
-            columns = replace(columns, goal=motion.resting_point(columns, curvature))
+            columns = self._to_reference(motion, columns, frame, new)
+            target = _with_columns(target, POSITION, goal.position)
             frame = new
         if goal_body is not None:
-            target = replaced(target, BODY, goal_body)
+            target = _with_columns(target, BODY, goal_body)
         return Retargeted(columns, frame, target)
 
     def external_acceleration(
         self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, coupling: Any
     ) -> Tensor | None:
-        """Of the position [m/s^2], (3), or of the pose, (6), in the base frame."""
+        """Second derivative of the columns for a linear, (3), or spatial acceleration, (6)."""
         if coupling is None:
             return None
         values = columns.position
         coupling = to_tensor(coupling, values.dtype, values.device)
-        push = replaced(torch.zeros_like(values), POSITION, coupling[..., :3])
+        push = _with_columns(torch.zeros_like(values), POSITION, coupling[..., :3])
         if coupling.shape[-1] == 3:
             return push
         # The second derivative of the error is linear in the angular acceleration.
         rate = orientation_error.error_rate(values[..., ERROR], coupling[..., 3:])
-        return replaced(push, ERROR, rate)
+        return _with_columns(push, ERROR, rate)
 
     def via_points(
         self,
@@ -269,54 +264,70 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
         body: Points | None = None,
         body_velocity: Points | None = None,
     ) -> ColumnPoints:
-        """Each part of a pose on its own; NaN leaves it free."""
+        """Via points of position, orientation and body; NaN leaves a part free."""
         if value is not None and not isinstance(value, Pose):
             raise ValueError(
                 "the value of a pose's via points is a Pose; NaN leaves parts free"
             )
-        place = None if value is None else value.position
-        rotation = None if value is None else value.orientation
         position = now.position
-        twist = given_points(velocity, now.velocity, "velocity", columns=6)
+        twist = via_values(velocity, now.velocity, "velocity", columns=6)
         error, error_rate = via_errors(
-            self.reference(motion), position[..., ERROR], rotation, twist[..., 3:]
+            self.reference(motion),
+            position[..., ERROR],
+            None if value is None else value.orientation,
+            twist[..., 3:],
         )
-        place = given_points(place, position[..., POSITION])
-        body = given_points(body, position[..., BODY], "body")
-        body_rate = given_points(body_velocity, now.velocity[..., BODY], "body_velocity")
+        place = None if value is None else value.position
+        place = via_values(place, position[..., POSITION])
+        body = via_values(body, position[..., BODY], "body")
+        body_rate = via_values(body_velocity, now.velocity[..., BODY], "body_velocity")
         return ColumnPoints(
             torch.cat([place, error, body], dim=-1),
             torch.cat([twist[..., :3], error_rate, body_rate], dim=-1),
         )
 
+    def _to_reference(
+        self, motion: LinearPrimitive, columns: DMPState, old: Tensor, new: Tensor
+    ) -> DMPState:
+        """Columns with the error to another reference, for the same motion of the pose."""
+        values = columns.position, columns.rate, motion.second_derivative(columns)
+        errors = (x[..., ERROR] for x in values)
+        turned = orientation_error.retarget(*errors, old, new)
+        position, rate, second = (
+            _with_columns(x, ERROR, part) for x, part in zip(values, turned, strict=True)
+        )
+        columns = replace(columns, position=position, rate=rate)
+        return replace(columns, goal=motion.equilibrium_goal(columns, second))
+
 
 class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
     """Discrete movement primitive of a pose under one phase.
 
-    Position, orientation error (see `orientation_error`) and, if given, K coordinates of the
-    arm's body shape are columns of one linear primitive. The body, such as a redundant joint
-    or an arm angle, keeps its demonstrated shape when the pose is sent to another goal.
+    Position, orientation error (see `orientation_error`) and, if given, K body coordinates are
+    columns of one linear primitive. The body, such as a redundant joint or an arm angle, keeps
+    its demonstrated shape when the pose moves to another goal.
 
-    Values are `Pose`s, velocities twists (linear [m/s], angular [rad/s]), (*batch, 6),
-    couplings accelerations of the position [m/s^2], (*batch, 3), or of the pose, (*batch, 6),
-    the angular part in the base frame. `rollout`, `initial_state` and `with_ends` also take
-    `start_body` and `goal_body`, (*batch, K), and so does `step` take `goal_body`.
+    Values are `Pose`s; velocities are twists (linear [m/s], angular [rad/s]), (*batch, 6);
+    couplings are accelerations of the position [m/s^2], (*batch, 3), or of the pose,
+    (*batch, 6), with the angular part in the base frame. `rollout`, `initial_state` and
+    `with_boundary` also take `start_body` and `goal_body`, (*batch, K); `step` takes
+    `goal_body`.
 
     The fit report has residuals by column: position [m], orientation error [rad], body. Those
-    of the error's components bound those of the angle. The largest range, which `nrmse`
-    divides by, mixes units: prefer `select` and read one kind at a time.
+    of the components of the error bound those of the angle. The largest range, by which
+    `nrmse` divides, mixes units: use `select` to read one kind at a time.
     """
 
     goal_orientation: Tensor
     motion: JointDMP
 
     def __init__(self, motion: JointDMP, goal_orientation: Float[Tensor, "*batch 4"]):
-        """Put a primitive together; `fit` is the usual way to one.
+        """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
-            motion: Of position (3), orientation error (3) and body (K).
-            goal_orientation: Unit quaternion (w, x, y, z) at which it ends; the error is taken
-                to a reference as in `OrientationDMP`.
+            motion: Motion of position (3), orientation error (3) and body (K).
+            goal_orientation: Unit quaternion (w, x, y, z) at the end; the reference of the
+                error follows from it as in `OrientationDMP`.
         """
         super().__init__()
         self.motion = motion
@@ -335,37 +346,38 @@ class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
         scaling: str = "none",
         **options: Unpack[FitOptions],
     ) -> "PoseDMP":
-        """Learn one primitive from each demonstration.
+        """Fit one primitive to each demonstration.
 
         Args:
             time: Timestamps [s], (T,) or (*B, T).
-            position: (*B, T, 3) [m]. Its floating dtype is the primitive's.
+            position: (*B, T, 3) [m]. Its floating-point dtype is that of the primitive.
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4); signs may flip.
             n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
-            body: Coordinates learned along, (*B, T, K), or (T,) for one.
-            mask: (*B, T), false where a sample does not count.
-            scaling: Of the forcing term of the position, as for `JointDMP.fit`; `"rotation"`
-                turns and dilates its path with the way from start to goal.
-            options: How to fit; see `FitOptions`.
+            body: Body coordinates, (*B, T, K), or (T,) for one.
+            mask: (*B, T), false at samples to ignore.
+            scaling: Scaling of the position's forcing term, as for `JointDMP.fit`;
+                `"rotation"` turns and scales the path with the displacement.
+            options: Options of the fit; see `FitOptions`.
 
         Raises:
-            ValueError: Bad samples (says which), or a scaling that the motion forbids.
+            ValueError: Bad samples (the message names them), or a motion for which the scaling
+                is singular.
         """
         time, mask, (position, orientation, body) = padded(
             time, mask, position, orientation, body
         )
         error, goal = fitted_error(time, orientation, mask)
-        coordinates = demonstrated_columns(time, position, error, body, mask)
+        columns = pose_columns(time, position, error, body, mask)
         motion = JointDMP.fit(
             time,
-            coordinates,
+            columns,
             n_basis,
             mask=mask,
             units="m, rad, body",
             scaling=find_scaling(scaling, columns=POSITION.stop),
             **options,
         )
-        return cls(motion, goal.to(coordinates))
+        return cls(motion, goal.to(columns))
 
     @property
     def adapter(self) -> PoseCoordinates:
@@ -374,22 +386,22 @@ class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
 
     @property
     def start(self) -> Pose:
-        """Where the demonstration starts."""
+        """Pose at the start of the demonstration."""
         rotation = to_orientation(self.motion.start[..., ERROR], self.reference)
         return Pose(self.motion.start[..., POSITION], rotation)
 
     @property
     def goal(self) -> Pose:
-        """Where the demonstration ends."""
+        """Pose at the end of the demonstration."""
         return Pose(self.motion.goal[..., POSITION], self.goal_orientation)
 
     @property
     def reference(self) -> Float[Tensor, "*batch 4"]:
-        """What the orientation error is taken to."""
-        return reference_of(self.motion.goal[..., ERROR], self.goal_orientation)
+        """Reference of the orientation error."""
+        return self.adapter.reference(self.motion)
 
     def with_motion[S: "PoseDMP"](self: S, motion: JointDMP, frame: Tensor | None = None) -> S:
-        """Around another motion of the columns, to this reference or another."""
+        """Primitive with another motion of the columns, to this reference or another."""
         reference = self.reference if frame is None else frame
         return type(self)(motion, to_orientation(motion.goal[..., ERROR], reference))
 
@@ -402,7 +414,7 @@ class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
 
 
 def check_pose(name: str, value: Any) -> None:
-    """Raise ValueError unless a value is None or a finite `Pose`."""
+    """Raise ValueError unless the value is None or a finite `Pose`."""
     if value is None:
         return
     if not isinstance(value, Pose):
@@ -414,17 +426,17 @@ def check_pose(name: str, value: Any) -> None:
     finite(f"orientation of {name}", value.orientation)
 
 
-def demonstrated_columns(
+def pose_columns(
     time: Times,
     position: Points,
     error: Tensor,
     body: Points | None,
     mask: Mask | None,
-) -> Tensor:
-    """Checked samples (*B, T, 6 + K), in the dtype of the position.
+) -> Float[Tensor, "*B T columns"]:
+    """Checked samples of position, error and body in one tensor, in the dtype of the position.
 
     Raises:
-        ValueError: Bad samples; says which.
+        ValueError: Bad samples; the message names them.
     """
     checked = check_samples(time, position, mask=mask)
     if checked.position.shape[-2] != 3:
@@ -439,15 +451,17 @@ def demonstrated_columns(
         raise ValueError(f"position, orientation error and body differ: {shapes}") from None
 
 
-def joined(position: Tensor, error: Tensor, body: Vectors, like: Tensor) -> Tensor:
-    """The columns of a linear primitive, broadcast and side by side."""
+def _join(
+    position: Tensor, error: Tensor, body: Vectors, like: Tensor
+) -> Float[Tensor, "*batch columns"]:
+    """Columns of a linear primitive, broadcast and concatenated."""
     columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
     batch = broadcast_shapes(*(column.shape[:-1] for column in columns))
     return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
 
 
-def replaced(values: Tensor, columns: slice, new: Vectors) -> Tensor:
-    """`values` with some columns exchanged; differentiable in both."""
+def _with_columns(values: Tensor, columns: slice, new: Vectors) -> Float[Tensor, "*batch D"]:
+    """Values with some columns replaced; differentiable in both."""
     new = to_tensor(new, values.dtype, values.device)
     stop = values.shape[-1] if columns.stop is None else columns.stop
     new = new.expand(*values.shape[:-1], stop - columns.start)

@@ -1,7 +1,7 @@
-"""Primitives from several demonstrations of one motion: their mean, and a Gaussian over them.
+"""Gaussians over primitives, from several demonstrations of one motion, and their mean.
 
-Orientations, poses and limited joints move linearly in columns of their own: what is true of
-linear primitives is worked out once, on their `motion`.
+Orientations and poses move linearly in columns, so everything is computed on the columns of
+their `motion`.
 """
 
 from dataclasses import dataclass, replace
@@ -11,70 +11,65 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Points, Scalars, Times, Vectors, to_tensor
-from hrc_learn.dmp._via_points import ViaPoints
+from hrc_learn.dmp._arguments import Points, Scalars, Times, Vectors, seconds, to_tensor
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
-from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
+from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.orientation_error import (
     intrinsic_mean,
     nearest_turn,
     reference_of,
     to_error,
 )
+from hrc_learn.dmp.via_points import ViaPoints
 from hrc_learn.geometry import Pose
 
-SAME = 1e-9
-"""Orientations closer than this [rad] are one: well above rounding, well below any sensor."""
+SAME_ORIENTATION = 1e-9
+"""Angle [rad] below which orientations count as equal: above rounding, below any sensor."""
 
 
-via_point_primitive = AdaptedPrimitive.condition
-"""The method as a function of the primitive, and of what the method takes."""
-with_ends = AdaptedPrimitive.with_ends
-"""Likewise."""
+def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
+    """Mean over all batch dimensions of a primitive.
 
-
-def mean_primitive[P: AdaptedPrimitive](primitives: P) -> P:
-    """The mean over all batch dimensions of a primitive.
-
-    A rollout is linear in weights, start, goal and start velocity. So for one duration, and
-    forcing that does not scale with start and goal, its mean is the rollout of the means.
+    A rollout is linear in weights, start, goal and start velocity. For one duration, and a
+    scaling that does not depend on start and goal, its mean is the rollout of the means.
 
     Args:
-        primitives: Fitted to several demonstrations of one motion.
+        primitives: Primitives fitted to several demonstrations of one motion.
 
     Returns:
-        A primitive without batch dimensions, and without a fit report.
+        A primitive without batch dimensions and without a fit report.
 
     Raises:
-        ValueError: Primitives whose scaling turns them, each with the way of its own.
+        ValueError: The scaling is `"rotation"`, with weights in a frame per demonstration.
     """
     motion, columns = _mean_motion(primitives.motion), primitives.adapter.error_columns
     if columns is None:
         return primitives.with_motion(motion)
-    goal = _mean_goal(_goal_orientation(primitives))
+    goal: Any = primitives.goal
+    goal = _mean_quaternion(goal.orientation if isinstance(goal, Pose) else goal)
     return primitives.with_motion(motion, reference_of(motion.goal[..., columns], goal))
 
 
-def alike[P: AdaptedPrimitive](primitives: P) -> P:
-    """A batch of primitives in columns that mean the same for all of them.
+def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
+    """Batch of primitives whose columns mean the same for all of them.
 
-    Orientations with goals of their own are taken as errors to the mean of those. That is
-    not linear, so the errors are fitted anew.
+    Orientations with different goals become errors to the mean of their references. The map is
+    not linear, so the errors are fitted again.
     """
     columns = primitives.adapter.error_columns
     if columns is None:
         return primitives
-    own = reference(primitives)
+    own: Any = primitives.reference
     middle = intrinsic_mean(own.reshape(-1, 4))
     motion = primitives.linear_motion()
-    if (to_error(own, middle).abs() < SAME).all():
+    if (to_error(own, middle).abs() < SAME_ORIENTATION).all():
         return primitives
     if motion.basis.periodic:
         raise ValueError("rhythms about different centres have no distribution")
     with torch.no_grad():
         shown: Any = primitives.rollout()
-        errors = shown_columns(motion)[..., columns]
+        errors = motion.rollout_columns(Boundary(), motion.duration).position[..., columns]
     fitted = JointDMP.fit(
         shown.time,
         nearest_turn(to_error(shown.orientation, middle), errors),
@@ -88,26 +83,11 @@ def alike[P: AdaptedPrimitive](primitives: P) -> P:
     return primitives.with_motion(motion, middle.expand_as(own))
 
 
-def reference(primitive: Any) -> Float[Tensor, "*batch 4"]:
-    """What orientation errors of a primitive that has them are taken to."""
-    return primitive.reference
-
-
-def shown_columns(motion: LinearPrimitive) -> Float[Tensor, "*batch T D"]:
-    """Columns along the demonstration."""
-    return motion.roll(Ends(), motion.duration).position
-
-
-def _goal_orientation(primitives: Any) -> Float[Tensor, "*batch 4"]:
-    goal = primitives.goal
-    return goal if isinstance(goal, Tensor) else goal.orientation
-
-
-def _mean_goal(goals: Float[Tensor, "*batch 4"]) -> Float[Tensor, "4"]:
-    goals = goals.reshape(-1, 4)
-    # Both signs are the same orientation: bring all to the side of the first.
-    goals = goals * torch.where((goals @ goals[0])[:, None] < 0, -1.0, 1.0).to(goals)
-    return torch.nn.functional.normalize(goals.mean(dim=0), dim=-1)
+def _mean_quaternion(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "4"]:
+    q = q.reshape(-1, 4)
+    # Both signs are the same orientation: take the sign closest to the first.
+    q = q * torch.where((q @ q[0])[:, None] < 0, -1.0, 1.0).to(q)
+    return torch.nn.functional.normalize(q.mean(dim=0), dim=-1)
 
 
 def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
@@ -131,46 +111,46 @@ def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ProbabilisticDMP[P: AdaptedPrimitive]:
+class ProbabilisticDMP[P: MotionPrimitive]:
     """Gaussian over the coordinates x = (weights, start velocity, start, goal) of a primitive.
 
-    A motion is linear in its coordinates, y(s) = H(s) x, so it is Gaussian too: means,
-    likelihoods and conditioning on via points are closed form. Coordinates of all joints
-    vary together, in float64. Any kind of primitive will do: of orientations and poses it is
-    the error to one reference that is Gaussian.
+    A motion is linear in its coordinates, y(s) = H(s) x, and therefore Gaussian too: means,
+    likelihoods and conditioning on via points are closed form. All joints vary together, in
+    float64. Any kind of primitive is accepted; for orientations and poses the error to one
+    reference is Gaussian.
     """
 
     primitive: P
-    """Its spring, basis, duration and names serve all, and its reference."""
+    """Primitive with the common spring, basis, duration, names and reference."""
     mean: Float[Tensor, "D M"]
     spread: Float[Tensor, "DM rank"]
-    """Square root of the covariance, which has the rank of the demonstrations."""
+    """Square root of the covariance, with the rank of the demonstrations."""
 
     @classmethod
     def fit(cls, primitives: P, slack: float = 0.0) -> "ProbabilisticDMP[P]":
-        """Mean and covariance of a batch of primitives.
+        """Compute mean and covariance of a batch of primitives.
 
         Args:
-            primitives: Of one motion, fitted with `scaling="none"`.
-            slack: Freedom beyond what the demonstrations vary, as in `around`. Without, a via
-                point that none of their mixtures passes is approached, not reached.
+            primitives: Primitives of one motion, fitted with `scaling="none"`.
+            slack: Freedom beyond the variation of the demonstrations, as in `around`. Without
+                it, a via point that no mixture of them passes is approached but not reached.
 
         Raises:
-            ValueError: Fewer than two, or scaled primitives, whose motion is not linear.
+            ValueError: Fewer than two primitives, or a scaling, which is not linear.
         """
         motion = primitives.linear_motion()
         batch = motion.weights.shape[:-2]
         if batch.numel() < 2 or not batch:
             raise ValueError("a distribution needs a batch of at least 2 primitives")
-        _coordinates(motion)
-        primitives = alike(primitives)
+        _linear_coordinates(motion)
+        primitives = with_common_reference(primitives)
         motion = primitives.linear_motion()
-        x = _coordinates(motion).flatten(0, -3)
+        x = _linear_coordinates(motion).flatten(0, -3)
         mean, middle = x.mean(0), mean_primitive(primitives).motion
         reference = getattr(primitives, "reference", None)
         if reference is not None:
             reference = reference.reshape(-1, 4)[0]
-        # n - 1: the mean is taken from the same primitives.
+        # n - 1, because the mean is taken from the same primitives.
         spread = (x - mean).flatten(1).mT / (len(x) - 1) ** 0.5
         if slack:
             spread = torch.cat([spread, _free_forcing(middle, slack)], dim=1)
@@ -180,27 +160,27 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
 
     @classmethod
     def around(cls, primitive: P, slack: float = 1.0) -> "ProbabilisticDMP[P]":
-        """One primitive whose forcing may change, for via points without other examples.
+        """Gaussian around one primitive whose forcing may vary, for via points.
 
         Start, start velocity and goal are certain.
 
         Args:
-            primitive: Without batch dimensions, fitted with `scaling="none"`.
-            slack: Standard deviation of the forcing term, alike at all times, in units of the
-                force that holds a coordinate away from its goal by the range it covers.
+            primitive: A single primitive, fitted with `scaling="none"`.
+            slack: Standard deviation of the forcing term, equal at all times, in units of the
+                force that holds a coordinate at a distance of its range from the goal.
         """
         motion = primitive.linear_motion()
-        certain = _coordinates(motion)
+        certain = _linear_coordinates(motion)
         if certain.ndim != 2:
             raise ValueError(f"needs one primitive, got a batch {tuple(certain.shape[:-2])}")
         return cls(primitive=primitive, mean=certain, spread=_free_forcing(motion, slack))
 
     def mean_primitive(self) -> P:
-        """The most likely primitive."""
+        """Most likely primitive."""
         return self._with_coordinates(self.mean)
 
     def sample(self, n: int, generator: torch.Generator | None = None) -> P:
-        """A batch of n primitives drawn at random."""
+        """Batch of n random primitives."""
         rank = self.spread.shape[1]
         z = torch.randn(n, rank, generator=generator, dtype=torch.float64).to(self.spread)
         return self._with_coordinates(
@@ -208,15 +188,15 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         )
 
     def position(self, time: Times) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T D"]]:
-        """Mean and standard deviation of the motion at times [s].
+        """Mean and standard deviation of the columns at times [s].
 
-        Of the coordinates that move linearly: joints, position, error to the primitive's
-        reference, body. `mean_primitive().rollout` has orientations.
+        Columns are joints, position, error to the primitive's reference, or body. For
+        orientations, use `mean_primitive().rollout`.
         """
         motion = self.primitive.linear_motion()
-        time = to_tensor(time, torch.float64, motion.start.device)
-        if time.ndim != 1 or not (time >= 0).all():
-            raise ValueError("time must be (n,), none negative")
+        time = seconds(time, motion.start.device)
+        if time.ndim != 1:
+            raise ValueError(f"time must be (n,), got {tuple(time.shape)}")
         rows = motion.response.evaluate(time / motion.duration.double())[:, 0]
         mean, root = self._observe(rows)
         shape = (len(time), self.mean.shape[0])
@@ -232,20 +212,20 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         body_velocity: Points | None = None,
         noise: Scalars | Vectors = 1e-6,
     ) -> "ProbabilisticDMP[P]":
-        """The distribution, given where the motion passes at some times, and how fast.
+        """Gaussian conditioned on values and velocities at some times.
 
         Gradients flow to times, values, velocities, mean and spread.
 
         Args:
-            time: Of the via points [s], (n,).
+            time: Times of the via points [s], (n,).
             value: Joints (n, D), unit quaternions (n, 4) or a `Pose` of (n). NaN leaves a
-                coordinate free, in a quaternion all of the orientation.
-            velocity: Of joints (n, D), angular (n, 3) or a twist (n, 6), per second. An
-                angular one without an orientation is taken at that of the mean motion.
-            body: Of a pose, (n, K).
-            body_velocity: Of a pose, (n, K).
-            noise: Standard deviation of each value, in the units of its coordinate (of an
-                orientation [rad]), or per second; of all alike, or (D,) or (n, D).
+                coordinate free; in a quaternion, the orientation.
+            velocity: Of joints (n, D), angular (n, 3) or a twist (n, 6), per second. An angular
+                one without an orientation is taken at that of the mean motion.
+            body: Body of a pose, (n, K).
+            body_velocity: Velocity of the body of a pose, (n, K).
+            noise: Standard deviation of each value in the units of its coordinate ([rad] for an
+                orientation), or of each velocity per second; one number, (D,) or (n, D).
         """
         via = self._via(time, value, velocity, body, body_velocity)
         motion = self.primitive.linear_motion()
@@ -255,18 +235,18 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         given = ~wanted.isnan()
         deviation = to_tensor(noise, mean.dtype, mean.device).expand_as(via.position)
         deviation = deviation.repeat(2, 1).reshape(-1)[given]
-        # In units of the noise, and in the coordinates z of the spread, where the Gaussian is
-        # a unit one beforehand.
+        # In units of the noise, and in coordinates z of the spread, whose prior is a unit
+        # Gaussian.
         root = root[given] / deviation[:, None]
         residual = (wanted[given] - mean[given]) / deviation
-        # The unit covariance keeps it positive definite, however many via points agree.
+        # The unit covariance keeps it positive definite for any number of equal via points.
         precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
         factor = torch.linalg.cholesky(precision)
         z = torch.cholesky_solve((root.mT @ residual)[:, None], factor)[:, 0]
-        # precision^-1 = L^-T L^-1: L^-T is a square root of what variance is left.
-        left = torch.linalg.solve_triangular(factor, self.spread.mT, upper=False).mT
+        # precision^-1 = L^-T L^-1: L^-T is a square root of the remaining variance.
+        remaining = torch.linalg.solve_triangular(factor, self.spread.mT, upper=False).mT
         moved = self.mean + (self.spread @ z).view(self.mean.shape)
-        return replace(self, mean=moved, spread=left)
+        return replace(self, mean=moved, spread=remaining)
 
     def log_prob(
         self,
@@ -276,10 +256,10 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         body: Points | None = None,
         noise: float,
     ) -> Float[Tensor, ""]:
-        """Log density of what was observed at times (n,), with that sensor noise.
+        """Log density of values observed at times (n,) with this sensor noise.
 
-        Of orientations it is the density of the error to the primitive's reference. NaN was
-        not observed.
+        For orientations it is the density of the error to the primitive's reference. NaN marks
+        values that were not observed.
         """
         via = self._via(time, value, None, body, None)
         motion = self.primitive.linear_motion()
@@ -307,7 +287,7 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         return via
 
     def _observe(self, rows: Float[Tensor, "T M"]) -> tuple[Tensor, Tensor]:
-        """Mean (T D) of all joints at all times, and a square root of their covariance."""
+        """Mean (T D) of all columns at all times, and a square root of their covariance."""
         spread = self.spread.view(*self.mean.shape, -1)
         root = torch.einsum("tm,dmr->tdr", rows, spread)
         return (rows @ self.mean.mT).reshape(-1), root.flatten(0, 1)
@@ -317,18 +297,18 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         return self.primitive.with_motion(motion.with_coordinates(x))
 
 
-def _coordinates(primitives: LinearPrimitive) -> Float[Tensor, "*batch D M"]:
+def _linear_coordinates(primitives: LinearPrimitive) -> Float[Tensor, "*batch D M"]:
     if primitives.scaling != "none":
         raise ValueError(f"scaling {primitives.scaling!r} is not linear: fit with 'none'")
     return primitives.coordinates().detach().double()
 
 
 def _free_forcing(primitive: LinearPrimitive, slack: float) -> Float[Tensor, "DM DN"]:
-    """Spread of weights that are independent and make the forcing vary alike at all times."""
+    """Spread of independent weights with which the forcing varies equally at all times."""
     basis, amplitude = primitive.basis, primitive.amplitude.detach().double()
     D, N = len(amplitude), basis.count
-    share = 1 / basis.phase(basis.centre_times().to(amplitude))
-    deviation = slack * primitive.spring.stiffness * amplitude[:, None] * share
+    unit = 1 / basis.phase(basis.centre_times().to(amplitude))
+    deviation = slack * primitive.spring.stiffness * amplitude[:, None] * unit
     spread = torch.zeros(D, N + 3, D, N).to(amplitude)
     spread[:, :N] = torch.diag_embed(deviation.flatten()).view(D, N, D, N)
     return spread.flatten(0, 1).flatten(1)

@@ -1,4 +1,4 @@
-"""Rhythmic movement primitives: motions of joints, orientations and poses that repeat."""
+"""Rhythmic movement primitives: periodic motions of joints, orientations and poses."""
 
 from collections.abc import Sequence
 
@@ -6,26 +6,27 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Mask, Points, Quaternions, Times, check_samples
-from hrc_learn.dmp._fitting import ridge_inverse
+from hrc_learn.dmp._arguments import Mask, Points, Quaternions, Times
 from hrc_learn.dmp._system.bases import PeriodicBasis
-from hrc_learn.dmp._system.closed_forms import SpringDamper
 from hrc_learn.dmp._system.response import Response, response_of
+from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp.fitting.samples import check_samples
+from hrc_learn.dmp.fitting.solvers import REGULARIZATION, ridge_inverse
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import centred_error, to_orientation
-from hrc_learn.dmp.pose_dmp import ERROR, PoseDMP, demonstrated_columns
+from hrc_learn.dmp.pose_dmp import ERROR, PoseDMP, pose_columns
 
-SEARCH = 0.1
-"""How far from the autocorrelation's estimate a period is looked for, as a share of it."""
-ALIKE = 0.9
-"""Share of the highest peak of the autocorrelation that counts as high."""
+SEARCH_RANGE = 0.1
+"""Relative range around the autocorrelation's estimate in which a period is searched."""
+HIGH_PEAK = 0.9
+"""Height of a peak of the autocorrelation, relative to the highest, that counts as high."""
 GOLDEN = (5**0.5 - 1) / 2
-"""Share of an interval that a golden section keeps: one of its two points serves again."""
+"""Fraction of an interval that a golden-section search keeps; it reuses one of two points."""
 SEARCH_RIDGE = 1e-6
-"""Ridge while a period is searched: stronger than the fit's, for a smooth misfit."""
+"""Ridge during the search for a period: larger than that of the fit, for a smooth misfit."""
 PERIOD_ERROR = 1e-6
-"""Relative error at which the search ends: far below what the samples tell of a period."""
+"""Relative error at which the search ends: far below what samples resolve."""
 
 
 def fit_rhythmic(
@@ -38,27 +39,27 @@ def fit_rhythmic(
     joint_names: Sequence[str] | None = None,
     units: str = "rad",
     spring: SpringDamper | None = None,
-    regularization: float = 1e-7,
+    regularization: float = REGULARIZATION,
 ) -> JointDMP:
-    """Learn a rhythm from each demonstration of one cycle or more.
+    """Fit a rhythm to each demonstration of at least one cycle.
 
     The result is a `JointDMP` on a `PeriodicBasis`: its duration is the period, its goal the
-    centre of the oscillation. From any start its motion goes over to the limit cycle, as the
-    demonstration's does; `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
+    centre of the oscillation. From any start, its motion converges to the limit cycle;
+    `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).
         position: (T, D) or (*B, T, D).
-        n_basis: Basis functions a period.
-        period: [s]; found from the positions unless given.
-        mask: (*B, T), false where a sample does not count.
-        joint_names: D names, kept with the primitive.
-        units: Of the coordinates.
-        spring: Gains; alpha = 25 per period, critically damped, unless given.
+        n_basis: Number of basis functions per period.
+        period: [s]; by default estimated from the positions.
+        mask: (*B, T), false at samples to ignore.
+        joint_names: D names, stored with the primitive.
+        units: Units of the coordinates.
+        spring: Gains; by default alpha = 25 per period, critically damped.
         regularization: Ridge, relative to the largest singular value.
 
     Raises:
-        ValueError: Bad samples (says which), or less than one period of them.
+        ValueError: Bad samples (the message names them), or less than one period of them.
     """
     samples = check_samples(time, position, mask=mask)
     spring, basis = spring or SpringDamper(), PeriodicBasis(count=n_basis)
@@ -85,7 +86,7 @@ def fit_rhythmic(
         goal=batched(centre),
         start_velocity=batched(rate / tau[:, None]),
         duration=batched(tau),
-        amplitude=batched(torch.where(samples.span > 0, samples.span, 1.0)),
+        amplitude=batched(samples.amplitude),
         timestamps=(samples.s * (samples.duration / tau)[:, None]).reshape(*samples.batch, -1),
         basis=basis,
         spring=spring,
@@ -93,8 +94,7 @@ def fit_rhythmic(
         units=units,
     )
     with torch.no_grad():
-        reproduction = dmp.rollout().position.mT.reshape(samples.position.shape)
-    dmp.fit_report = samples.compare(reproduction)
+        dmp.fit_report = samples.compare(dmp.rollout().position)
     return dmp
 
 
@@ -103,11 +103,11 @@ def find_period(
 ) -> Float[Tensor, ""]:
     """Period [s] of an oscillation: the highest peak of the autocorrelation, refined.
 
-    The refinement is the period whose rhythm fits the samples best, by golden sections.
+    The refined period is the one whose rhythm fits the samples best, by golden sections.
     """
     span = elapsed[-1]
     rough = _autocorrelation_peak(elapsed, y)
-    low, high = rough * (1 - SEARCH), torch.minimum(rough * (1 + SEARCH), span)
+    low, high = rough * (1 - SEARCH_RANGE), torch.minimum(rough * (1 + SEARCH_RANGE), span)
 
     def misfit(tau: Tensor) -> Tensor:
         s = elapsed / tau
@@ -130,23 +130,23 @@ def find_period(
 
 
 def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
-    """First lag [s] at which the motion is as like itself as ever, after a zero crossing."""
+    """First lag [s] of a high peak of the autocorrelation, after a zero crossing."""
     T = len(elapsed)
     even = torch.linspace(0, 1, T, dtype=elapsed.dtype, device=elapsed.device) * elapsed[-1]
     after = torch.searchsorted(elapsed, even).clamp(1, T - 1)
-    share = (even - elapsed[after - 1]) / (elapsed[after] - elapsed[after - 1])
-    even_y = y[after - 1] + share[:, None] * (y[after] - y[after - 1])
-    # Padded to twice the length, so that the end does not meet the start.
+    fraction = (even - elapsed[after - 1]) / (elapsed[after] - elapsed[after - 1])
+    even_y = y[after - 1] + fraction[:, None] * (y[after] - y[after - 1])
+    # Padded to twice the length, so that the end does not overlap the start.
     power = torch.fft.rfft(even_y - even_y.mean(0), n=2 * T, dim=0).abs().square()
     similar = torch.fft.irfft(power, n=2 * T, dim=0)[:T].sum(-1)
-    # Late lags overlap little, and their sums are small for that: compare means, of enough.
+    # Late lags overlap little, which makes their sums small: compare means, and drop the last.
     similar = similar[: T * 3 // 4] / torch.arange(T, T - T * 3 // 4, -1).to(y)
     crossed = (similar < 0).cummax(0).values
     peak = (similar[1:-1] >= similar[:-2]) & (similar[1:-1] >= similar[2:]) & crossed[1:-1]
     if not peak.any():
-        raise ValueError("found no period in these positions: give one, or record more cycles")
-    # Every multiple of the period peaks alike: the first of the high ones is it.
-    high = peak & (similar[1:-1] >= ALIKE * similar[1:-1][peak].max())
+        raise ValueError("no period found in these positions: give one, or record more cycles")
+    # Every multiple of the period has a peak of equal height: take the first high one.
+    high = peak & (similar[1:-1] >= HIGH_PEAK * similar[1:-1][peak].max())
     return even[1 + high.long().argmax()]
 
 
@@ -154,9 +154,9 @@ def _solve(
     response: Response, s: Tensor, y: Float[Tensor, "T D"], regularization: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Weights (D, N), start velocity by s, start and centre (D,) of the closest rhythm."""
-    centre = _mean_of_last_cycles(s, y)
+    centre = _mean_of_whole_cycles(s, y)
     H = response.state(s)[:, 0]
-    # Units in which the ridge weighs all columns alike.
+    # Units in which the ridge penalises all columns alike.
     A = H[:, :-1]
     size = A.norm(dim=0)
     residual = y - H[:, -1:] * centre
@@ -164,8 +164,8 @@ def _solve(
     return x[:-2].mT, x[-2], x[-1], centre
 
 
-def _mean_of_last_cycles(s: Tensor, y: Tensor) -> Tensor:
-    """Average over as many whole cycles as there are, the last ones."""
+def _mean_of_whole_cycles(s: Tensor, y: Tensor) -> Tensor:
+    """Average over the largest number of whole cycles, counted from the end."""
     whole = s[-1] - s[-1].floor().clamp(min=1)
     inside = s >= whole
     return torch.trapezoid(y[inside].mT, s[inside]) / (s[-1] - s[inside][0])
@@ -179,26 +179,26 @@ def fit_rhythmic_orientation(
     mask: Mask | None = None,
     *,
     spring: SpringDamper | None = None,
-    regularization: float = 1e-7,
+    regularization: float = REGULARIZATION,
 ) -> OrientationDMP:
-    """Learn a rhythm of an orientation from each demonstration of one cycle or more.
+    """Fit a rhythm of an orientation to each demonstration of at least one cycle.
 
-    The error to the mean orientation swings as a `fit_rhythmic` primitive; the goal of the
-    result is the centre of that. `duration` (or `speed`) and `forcing_gain` modulate it.
+    The error to the mean orientation oscillates as a `fit_rhythmic` primitive; the goal of the
+    result is its centre. `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
 
     Args:
         time: Timestamps [s], (T,) or (*B, T).
         orientation: Unit quaternions (w, x, y, z), (*B, T, 4), within half a turn of their
             mean; signs may flip.
-        n_basis: Basis functions a period.
-        period: [s]; found from the motion unless given.
-        mask: (*B, T), false where a sample does not count.
-        spring: Gains; alpha = 25 per period, critically damped, unless given.
+        n_basis: Number of basis functions per period.
+        period: [s]; by default estimated from the motion.
+        mask: (*B, T), false at samples to ignore.
+        spring: Gains; by default alpha = 25 per period, critically damped.
         regularization: Ridge, relative to the largest singular value.
 
     Raises:
-        ValueError: Bad samples (says which), less than one period of them, or a motion that
-            passes half a turn from its mean.
+        ValueError: Bad samples (the message names them), less than one period of them, or a
+            motion that passes half a turn from its mean.
     """
     error, reference = centred_error(time, orientation, mask)
     motion = fit_rhythmic(
@@ -217,14 +217,14 @@ def fit_rhythmic_pose(
     mask: Mask | None = None,
     *,
     spring: SpringDamper | None = None,
-    regularization: float = 1e-7,
+    regularization: float = REGULARIZATION,
 ) -> PoseDMP:
-    """Learn a rhythm of a pose; arguments as for `PoseDMP.fit` and `fit_rhythmic`.
+    """Fit a rhythm of a pose; arguments as for `PoseDMP.fit` and `fit_rhythmic`.
 
-    All coordinates share one period, found from all of them unless it is given.
+    All coordinates have the same period, by default estimated from all of them.
     """
     error, reference = centred_error(time, orientation, mask)
-    columns = demonstrated_columns(time, position, error, body, mask)
+    columns = pose_columns(time, position, error, body, mask)
     motion = fit_rhythmic(
         time,
         columns,

@@ -82,13 +82,13 @@ def polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     return value
 
 
-def minimum_jerk(x: float) -> tuple[float, float]:
+def minimum_jerk[T: (float, Tensor)](x: T) -> tuple[T, T]:
     """Progress 0 to 1 of a minimum-jerk motion and its slope (Flash and Hogan 1985).
 
     Args:
         x: Fraction of the duration. Outside 0 to 1 the motion rests at the start or the end.
     """
-    x = min(max(x, 0.0), 1.0)
+    x = x.clamp(0.0, 1.0) if isinstance(x, Tensor) else min(max(x, 0.0), 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2
 
 

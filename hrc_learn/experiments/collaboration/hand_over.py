@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.dmp import InteractionPrimitive
-from hrc_learn.dmp._system.closed_forms import quintic
 from hrc_learn.geometry import Pose
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import ObjectConfig, Worker, WorkerConfig, WorkerSensor, World
@@ -171,7 +170,7 @@ def _movements(
         if len(times) >= _FEWEST and times[-1] > reach.begin:
             u = (np.array(times) - times[0]) / (times[-1] - times[0])
             met = plan.place if reach.kind == HAND_OVER else home
-            robot = home + quintic(u)[0][:, None] * (met - home)
+            robot = home + minimum_jerk(u)[0][:, None] * (met - home)
             found.append((np.array(times) - times[0], np.stack(hand), robot, reach.kind))
     return found
 

@@ -1,4 +1,4 @@
-"""Bases and phases as JSON values, and saved linear primitives read back."""
+"""Files of primitives: bases and phases as JSON values, and saved primitives read back."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -8,34 +8,33 @@ from typing import Any
 
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import FitReport
 from hrc_learn.dmp._system.bases import (
     Basis,
+    ExponentialPhase,
     GaussianBasis,
-    LearnedGaussianBasis,
     PeriodicBasis,
+    SigmoidPhase,
     SplineBasis,
 )
-from hrc_learn.dmp._system.closed_forms import ExponentialPhase, SigmoidPhase, SpringDamper
+from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp.fitting.samples import FitReport
 from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
 from hrc_learn.model_files import SavedModel
 
 BASES: dict[str, type[Any]] = {
-    basis.__name__: basis
-    for basis in (GaussianBasis, PeriodicBasis, LearnedGaussianBasis, SplineBasis)
+    basis.__name__: basis for basis in (GaussianBasis, PeriodicBasis, SplineBasis)
 }
-RENAMED = {"PlacedBasis": "LearnedGaussianBasis"}
-"""Types that older files have another name for."""
 PHASES: dict[str, type[Any]] = {
     phase.__name__: phase for phase in (ExponentialPhase, SigmoidPhase)
 }
+TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "timestamps")
 
 
 def basis_config(basis: Basis) -> dict[str, Any]:
-    """What `restore_basis` makes the same basis of.
+    """Description of a basis from which `restore_basis` makes it again.
 
     Raises:
-        ValueError: A basis or phase of the caller's own, which no file could name.
+        ValueError: The basis or its phase is not one of this package.
     """
     fields = _config(basis, BASES)
     if "phase" in fields:
@@ -44,16 +43,16 @@ def basis_config(basis: Basis) -> dict[str, Any]:
 
 
 def restore_basis(config: Mapping[str, Any]) -> Basis:
-    """The basis that `basis_config` described.
+    """Basis that `basis_config` described.
 
     Raises:
-        ValueError: A type that no file can name, or values that it refuses.
-        TypeError: Fields that it does not have.
-        KeyError: There is no type.
+        ValueError: Unknown type, or values that it refuses.
+        TypeError: Fields that the type does not have.
+        KeyError: The type is missing.
     """
     fields = dict(config)
     if "phase" in fields:
-        # Older files name no phase: there was one only.
+        # Older files name no phase type, because there was only one.
         fields["phase"] = _restore({"type": "ExponentialPhase", **fields["phase"]}, PHASES)
     return _restore(fields, BASES)
 
@@ -66,25 +65,18 @@ def _config(part: Any, known: Mapping[str, type[Any]]) -> dict[str, Any]:
 
 
 def _restore(fields: Mapping[str, Any], known: Mapping[str, type[Any]]) -> Any:
-    # Tuples are lists in a file, and lists cannot be hashed.
-    arguments = {
-        k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if k != "type"
-    }
+    arguments = {k: v for k, v in fields.items() if k != "type"}
     kind: str = fields["type"]
-    kind = RENAMED.get(kind, kind)
     if kind not in known:
-        raise ValueError(f"unknown type {kind!r}; there are {', '.join(known)}")
+        raise ValueError(f"unknown type {kind!r}; choose from {', '.join(known)}")
     return known[kind](**arguments)
 
 
-TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "timestamps")
-
-
 def linear_arguments(saved: SavedModel) -> dict[str, Any]:
-    """Arguments of `LinearPrimitive`.
+    """Arguments of `LinearPrimitive` from a saved primitive.
 
     Raises:
-        ValueError: Names the file and the field that is wrong.
+        ValueError: A wrong field; the message names the file and the field.
     """
     older = {"timestamps": "stamps"} if "stamps" in saved.tensors else {}
     tensors = {name: saved.tensor(older.get(name, name)) for name in TENSORS}
@@ -111,7 +103,7 @@ def linear_arguments(saved: SavedModel) -> dict[str, Any]:
 
 def _scaling(saved: SavedModel) -> Scaling:
     name = saved.get("scaling", str)
-    # Older files say nothing of columns: all were scaled.
+    # Older files have no columns, because all were scaled.
     columns = saved.config.get("scaled_columns")
     if columns is not None:
         columns = saved.get("scaled_columns", int)
@@ -122,7 +114,7 @@ def _scaling(saved: SavedModel) -> Scaling:
 
 
 def _check_shapes(saved: SavedModel, tensors: dict[str, Tensor]) -> None:
-    """All but the timestamps follow from the shape of the weights."""
+    """Check all tensors but the timestamps against the shape of the weights."""
     weights = tensors["weights"]
     for name in TENSORS[1:-1]:
         shape = weights.shape[:-2] if name == "duration" else weights.shape[:-1]

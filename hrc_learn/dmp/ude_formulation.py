@@ -7,10 +7,11 @@ the logarithm here the full angle). With the error e = log(g conj q) and v = -et
 
     v' = alpha (beta (0 - e) - v) - f,   e' = v + n(e, v),   n = e x v / 2 + c e x (e x v)
 
-which is the linear primitive but for n, zero while the axis of the turn stays. So the linear
-part is solved exactly, as ever, and n is integrated by Runge and Kutta's method of order 4 on
-what is left (Lawson 1967, "Generalized Runge-Kutta processes for stable systems"): a step is
-stable at any length and exact about one axis. The logarithm is followed continuously.
+which is the linear primitive except for n, zero while the axis of rotation is constant. The
+linear part is solved exactly, and n is integrated by the Runge-Kutta method of order 4 in the
+frame of the linear motion (Lawson 1967, "Generalized Runge-Kutta processes for stable
+systems"): a step is stable at any length and exact about one axis. The logarithm is followed
+continuously.
 """
 
 from dataclasses import dataclass, replace
@@ -22,43 +23,48 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp import orientation_error
-from hrc_learn.dmp._arguments import Samples, Scalars, Times, to_tensor
-from hrc_learn.dmp._closed_loop_step import DMPState
-from hrc_learn.dmp._fitting import ridge_inverse
-from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
-from hrc_learn.dmp.linear_primitive import Ends, LinearPrimitive
+from hrc_learn.dmp._arguments import (
+    Scalars,
+    Times,
+    broadcast_shapes,
+    normalised_time,
+    to_tensor,
+)
+from hrc_learn.dmp._system.trajectory import Trajectory, output
+from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.fitting.samples import Samples
+from hrc_learn.dmp.fitting.solvers import REGULARIZATION, ridge_inverse
+from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.orientation_dmp import FORMULATIONS, OrientationCoordinates
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
-LONGEST = 1 / 200
-"""Longest step of a rollout, in s; the fourth power of it is what the rollout is off by."""
-
-SAMPLES = 10
-"""Times per basis function at which the force of a demonstration is read."""
-
-RIDGE = 1e-7
-"""Of the regression of that force, relative to its largest singular value: as in `fit`."""
+MAXIMUM_STEP = 1 / 200
+"""Longest integration step of a rollout, in s; the error is of fourth order in it."""
+SAMPLES_PER_FUNCTION = 10
+"""Times per basis function at which the force of a demonstration is evaluated."""
 
 
 @dataclass(frozen=True, eq=False)
 class UdeCoordinates(OrientationCoordinates):
-    """The error as ever, but what moves linearly is (e, v), up to the drift of its axis."""
+    """Error columns in which (e, v) moves linearly except for the drift of the axis."""
 
     linear: ClassVar[bool] = False
 
     @staticmethod
-    def follow(motion: LinearPrimitive, errors: Samples) -> None:
-        """Add to fitted weights what the other state takes to follow the same path.
+    def refit(motion: LinearPrimitive, errors: Samples) -> None:
+        """Add to fitted weights the force that this state needs to follow the same path.
 
         Raises:
             ValueError: The demonstration passes a whole turn from its goal, where e' has no
                 bound.
         """
-        count = SAMPLES * motion.basis.count
+        count = SAMPLES_PER_FUNCTION * motion.basis.count
         s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
+        start_rate = motion.start_velocity * motion.duration[..., None]
         with torch.no_grad():
-            linear = motion.roll(Ends(velocity=_per_s(motion)), _one(motion), s)
-            e, rate, curvature = (
+            boundary = Boundary(start_velocity=start_rate)
+            linear = motion.rollout_columns(boundary, _unit_duration(motion), s)
+            e, rate, second = (
                 x.double() for x in (linear.position, linear.velocity, linear.acceleration)
             )
             if (e.norm(dim=-1) >= 2 * torch.pi).any():
@@ -66,46 +72,46 @@ class UdeCoordinates(OrientationCoordinates):
                     "orientation is a whole turn or more from its end: formulation 'ude' "
                     "cannot follow that, use 'log'"
                 )
-            v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, curvature)
-            force = slope - curvature + motion.spring.alpha * (v - rate)
-            change = (ridge_inverse(motion.basis.forcing(s), RIDGE) @ force).mT
+            v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, second)
+            force = slope - second + motion.spring.alpha * (v - rate)
+            change = (ridge_inverse(motion.basis.forcing(s), REGULARIZATION) @ force).mT
             motion.weights += change.to(motion.weights)
             ends = motion.start, motion.duration, motion.start_velocity
-            reproduction = UdeMotion(motion, motion.timestamps, *ends, None).position.mT
-        motion.fit_report = errors.compare(reproduction.reshape(errors.position.shape))
+            reproduction = UdeMotion(motion, motion.timestamps, *ends, None).position
+        motion.fit_report = errors.compare(reproduction)
 
-    def roll(
+    def rollout(
         self,
         motion: LinearPrimitive,
-        ends: Ends,
+        boundary: Boundary,
         duration: Tensor,
         time: Times | None,
         forcing_gain: Scalars | None,
     ) -> "UdeMotion":
-        """Of order 4 in `LONGEST`."""
-        s = motion.normalised_time(time, duration)
-        start, velocity = to_tensor(ends.start), to_tensor(ends.velocity)  # pyright: ignore[reportArgumentType]
-        return UdeMotion(motion, s, start, duration, velocity, forcing_gain)
+        """Motion of the error, of order 4 in `MAXIMUM_STEP`."""
+        s = motion.timestamps if time is None else normalised_time(time, duration)
+        start, rate = boundary.start, boundary.start_velocity
+        return UdeMotion(motion, s, start, duration, rate, forcing_gain)
 
-    def advance(
-        self, motion: LinearPrimitive, columns: DMPState, dt: Any, **step: Any
+    def step(
+        self, motion: LinearPrimitive, columns: DMPState, dt: Scalars, **inputs: Any
     ) -> DMPState:
-        """Of order 4 in `dt`."""
+        """State of the error after `dt` [s], of order 4 in it."""
         v = drift_free_rate(columns.position, columns.rate)
         begin = replace(columns, rate=v)
         half = to_tensor(dt, v.dtype, v.device) / 2
-        middle = motion.advance(begin, half, **step)
-        end = motion.advance(middle, half, **step)
+        middle = motion.step_columns(begin, half, **inputs)
+        end = motion.step_columns(middle, half, **inputs)
         linear = [torch.stack([x.position, x.rate], dim=-2) for x in (begin, middle, end)]
         h = end.s - columns.s
-        left = deviation(torch.zeros_like(linear[0]), h, motion, linear)
-        e, v = (linear[2] + left).unbind(-2)
+        change = deviation(torch.zeros_like(linear[0]), h, motion, linear)
+        e, v = (linear[2] + change).unbind(-2)
         return replace(end, position=e, rate=v + axis_drift(e, v))
 
     def external_acceleration(
         self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, coupling: Any
     ) -> Tensor | None:
-        """On v, which is minus the angular velocity."""
+        """Minus the angular acceleration, because v is minus the angular velocity."""
         if coupling is None:
             return None
         return -to_tensor(coupling, frame.dtype, frame.device)
@@ -113,12 +119,11 @@ class UdeCoordinates(OrientationCoordinates):
     def _to_reference(
         self, motion: LinearPrimitive, columns: DMPState, old: Tensor, new: Tensor
     ) -> DMPState:
-        """With a goal filter the angular acceleration goes on as it was."""
         q = orientation_error.to_orientation(columns.position, old)
         error = orientation_error.to_error(q, new)
         error = orientation_error.nearest_turn(error, columns.position)
         v = drift_free_rate(columns.position, columns.rate)
-        # The pull is alpha beta (e - goal): it stays when both move alike.
+        # The spring force alpha beta (e - goal) is unchanged if both move alike.
         return replace(
             columns,
             position=error,
@@ -128,7 +133,7 @@ class UdeCoordinates(OrientationCoordinates):
 
 
 class UdeMotion:
-    """The error over time: linear motion plus deviation, integrated once on a fixed grid."""
+    """Error over time: linear motion plus deviation, integrated once on a fixed grid."""
 
     def __init__(
         self,
@@ -139,14 +144,14 @@ class UdeMotion:
         rate: Float[Tensor, "*#batch 3"],
         forcing_gain: Scalars | None,
     ):
-        """Describe the motion.
+        """Describe a motion.
 
         Args:
             motion: Weights and gains.
             s: Normalised times.
-            start: Error [rad].
+            start: Error at the start [rad].
             duration: [s].
-            rate: Of the error [rad/s].
+            rate: Rate of the error at the start [rad/s].
             forcing_gain: Factor on the forcing term.
         """
         start, per_s = torch.broadcast_tensors(start, rate * duration[..., None])
@@ -160,28 +165,29 @@ class UdeMotion:
             motion.weights.shape[:-2], start.shape[:-1], duration.shape, s.shape[:-1]
         )
 
-    @cached_property
+    @output
     def time(self) -> Float[Tensor, "*batch T"]:
-        """Since the start of the motion [s]."""
+        """Time since the start of the motion [s]."""
         return (self._s * self._duration[..., 0]).to(self._start).expand(*self._batch, -1)
 
     @cached_property
     def position(self) -> Float[Tensor, "*batch T 3"]:
-        """[rad]."""
+        """Error [rad]."""
         return self._state[..., 0, :]
 
     @cached_property
     def velocity(self) -> Float[Tensor, "*batch T 3"]:
-        """[rad/s]."""
+        """Rate of the error [rad/s]."""
         return self._rate / self._duration
 
     @cached_property
     def acceleration(self) -> Float[Tensor, "*batch T 3"]:
-        """[rad/s^2]."""
+        """Second derivative of the error [rad/s^2]."""
         e, v = self._state.unbind(-2)
-        linear = self._linear(self._s)
-        z = self._state - linear
-        slope = self._curvature + self._motion.spring.acceleration(z[..., 0, :], z[..., 1, :])
+        linear = self._rolled_out(self._s)
+        z = self._state - torch.stack([linear.position, linear.velocity], dim=-2)
+        free = self._motion.spring.acceleration(z[..., 0, :], z[..., 1, :])
+        slope = linear.acceleration + free
         drift = torch.func.jvp(axis_drift, (e, v), (self._rate, slope))[1]
         return (slope + drift) / self._duration**2
 
@@ -192,9 +198,9 @@ class UdeMotion:
 
     @cached_property
     def _state(self) -> Float[Tensor, "*batch T 2 3"]:
-        """(e, v) at the times asked for: from the knot before each, by one step."""
-        # No longer than what the forcing changes smoothly over.
-        size = min(LONGEST, self._motion.response.forced.interval / 2)
+        """State (e, v) at the requested times: one step from the knot before each."""
+        # No longer than the interval on which the forcing is smooth.
+        size = min(MAXIMUM_STEP, self._motion.response.forced.interval / 2)
         s = self._s.expand(*self._batch, -1) if self._s.ndim > 1 else self._s
         knot = (s.detach() / size).floor()
         z = self._deviations(int(knot.max()), size)
@@ -205,7 +211,7 @@ class UdeMotion:
         return linear[2] + deviation(z, h, self._motion, linear)
 
     def _deviations(self, count: int, size: float) -> Float[Tensor, "*batch K 2 3"]:
-        """At the knots, `size` apart, from the start to number `count`."""
+        """Deviations at the knots 0 to `count`, which are `size` apart."""
         halves = size / 2 * torch.arange(2 * count + 1, dtype=torch.float64)
         linear = self._linear(halves.to(self._s.device)).unbind(-3)
         z = [torch.zeros_like(linear[0])]
@@ -215,18 +221,16 @@ class UdeMotion:
         return torch.stack(z, dim=-3)
 
     def _linear(self, s: Tensor) -> Float[Tensor, "*#batch T 2 3"]:
-        """(e, v) without the deviation."""
-        motion = self._rolled(s)
+        """State (e, v) without the deviation."""
+        motion = self._rolled_out(s)
         return torch.stack([motion.position, motion.velocity], dim=-2)
 
-    @property
-    def _curvature(self) -> Tensor:
-        return self._rolled(self._s).acceleration
-
-    def _rolled(self, s: Tensor) -> Trajectory:
-        # A duration of one: times are s, velocities per s.
-        ends = Ends(self._start, None, self._first)
-        return self._motion.roll(ends, _one(self._motion), s, self._forcing_gain)
+    def _rolled_out(self, s: Tensor) -> Trajectory:
+        boundary, duration = (
+            Boundary(self._start, None, self._first),
+            _unit_duration(self._motion),
+        )
+        return self._motion.rollout_columns(boundary, duration, s, self._forcing_gain)
 
 
 def deviation(
@@ -235,18 +239,18 @@ def deviation(
     motion: LinearPrimitive,
     linear: list[Tensor] | tuple[Tensor, ...],
 ) -> Float[Tensor, "*batch 2 3"]:
-    """What z = (e, v) - linear, z' = A z + (n, 0), becomes over a step of `h`.
+    """Deviation z = (e, v) - linear after a step of `h`, with z' = A z + (n, 0).
 
     Args:
-        z: At the beginning.
+        z: Deviation before the step.
         h: Step in normalised time.
-        motion: Whose spring A is.
-        linear: The linear (e, v) at the beginning, the middle and the end of the step.
+        motion: Primitive with the spring of A.
+        linear: Linear (e, v) at the beginning, the middle and the end of the step.
     """
     begin, middle, end = linear
     E = motion.spring.propagator(h.double() / 2).to(z)
     h = h.to(z)[..., None, None]
-    # Slopes are carried along by the spring, by half a step each.
+    # The spring propagates each slope by half a step.
     k1 = _slope(begin + z)
     free = E @ z
     k2 = _slope(middle + free + E @ k1 * (h / 2))
@@ -256,20 +260,15 @@ def deviation(
 
 
 def _slope(x: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch 2 3"]:
-    """(n, 0)."""
+    """Nonlinear part (n, 0) of the derivative."""
     drift = axis_drift(x[..., 0, :], x[..., 1, :])
     return torch.stack([drift, torch.zeros_like(drift)], dim=-2)
 
 
-def _per_s(motion: LinearPrimitive) -> Tensor:
-    """Demonstrated start velocity, per s."""
-    return motion.start_velocity * motion.duration[..., None]
-
-
-def _one(motion: LinearPrimitive) -> Tensor:
-    """The duration of a motion whose times are s."""
+def _unit_duration(motion: LinearPrimitive) -> Tensor:
+    """Duration of one, for which times are s and velocities derivatives by s."""
     return motion.resolve_duration(1.0, None)
 
 
-# Where `OrientationDMP` finds it: nothing below this module has to know of it.
+# Registered here, so that no module below has to know this one.
 FORMULATIONS["ude"] = UdeCoordinates

@@ -1,8 +1,8 @@
-"""A primitive in closed loop: its state, one exact step, and a motion from under way on.
+"""State of a primitive in closed loop, its exact step, and motions continued under way.
 
-What moves a primitive is linear: each coupling term has a motion of its own that solves the
-equation alone, known at both ends of the step. What the state differs from the sum of those
-dies out as the unforced spring has it. So no step is too long, whatever its length.
+The equation is linear, so each coupling term has a particular motion that solves it alone and
+is known at both ends of a step. The difference between the state and the sum of these motions
+decays as the unforced spring does. Steps of any length are therefore exact.
 """
 
 import math
@@ -11,21 +11,26 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import fits_numpy, readable
-from hrc_learn.dmp._system.closed_forms import SpringDamper, approach_state
-from hrc_learn.dmp._system.response import Response, broadcast_shapes
+from hrc_learn.dmp._arguments import broadcast_shapes, fits_numpy, readable
+from hrc_learn.dmp._system.response import Response
+from hrc_learn.dmp._system.spring import SpringDamper, approach_state
+
+RESONANCE = 1e-3
+"""Smallest distance of a goal filter from a mode of the spring, relative to the stiffness. The
+particular motion grows as its inverse, and as many digits are lost."""
+_FULL_PACE = torch.ones((), dtype=torch.float64)
+"""Pace of an undisturbed motion, made once because making a tensor takes longer than a sum."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DMPState:
-    """Where a primitive is while it is stepped; every step makes a new one.
+    """State of a primitive in closed loop; every step returns a new one.
 
-    A pytree: goes through `torch.func` and `torch.export` as it is.
-
-    To follow a robot that was pushed, replace the position by the measured one.
+    A pytree that passes through `torch.func` and `torch.export`. To follow a robot that was
+    pushed, replace the position by the measured one.
     """
 
     position: Float[Tensor, "*batch D"]
@@ -33,35 +38,30 @@ class DMPState:
     """dy/ds, the velocity times the duration."""
     start: Float[Tensor, "*batch D"]
     goal: Float[Tensor, "*batch D"]
-    """What attracts the motion now."""
-    way: Float[Tensor, "*batch D"]
-    """Goal minus start, as the motion began."""
+    """Current attractor of the motion."""
+    displacement: Float[Tensor, "*batch D"]
+    """Goal minus start at the beginning of the motion."""
     target: Float[Tensor, "*batch D"]
-    """Where the goal was last told to be; a filtered goal takes a while to get there."""
+    """Commanded goal, which a filtered goal approaches gradually."""
     duration: Float[Tensor, "*batch"]
-    """[s] that the motion takes when nothing slows it."""
+    """Duration of the motion if nothing slows it [s]."""
     pace: Float[Tensor, "*batch"]
-    """Speed of the last step: 1 undisturbed, towards 0 the more it was slowed."""
+    """Speed of the clock in the last step, 1 undisturbed and towards 0 when slowed."""
     s: Float[Tensor, "*batch"]
-    """Normalised time, 1 at the end of the motion. Float64: a thousand additions show."""
+    """Normalised time, 1 at the end of the motion. Float64, as rounding adds up over steps."""
     forced: Float[Tensor, "*batch 2 D"]
-    """(y, dy/ds) that the unscaled forcing term alone has caused by `s`."""
+    """State (y, dy/ds) caused so far by the unscaled forcing term alone."""
 
     @property
     def velocity(self) -> Float[Tensor, "*batch D"]:
-        """Per second."""
+        """Velocity, position units per second."""
         return self.rate * (self.pace / self.duration)[..., None]
 
 
 torch.export.register_dataclass(DMPState, serialized_type_name="hrc_learn.dmp.DMPState")
 
 
-RESONANCE = 1e-3
-"""How close to a mode of the spring a goal filter may come, relative to the stiffness: the
-particular motion grows as its inverse, and digits are lost by as much."""
-
-
-def begin(
+def initial_state(
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
     start: Float[Tensor, "*#batch D"],
@@ -69,15 +69,15 @@ def begin(
     rate: Float[Tensor, "*#batch D"],
     duration: Float[Tensor, "*#batch"],
 ) -> DMPState:
-    """Where a motion starts.
+    """State at the start of a motion.
 
     Args:
-        response: Of the primitive.
-        weights: Of the unscaled forcing term.
+        response: Response of the primitive.
+        weights: Weights of the unscaled forcing term.
         start: y_0.
         goal: g.
         rate: dy/ds.
-        duration: [s].
+        duration: Duration [s].
     """
     batch = broadcast_shapes(
         weights.shape[:-2], *(x.shape[:-1] for x in (start, goal, rate)), duration.shape
@@ -85,13 +85,13 @@ def begin(
     start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
     duration = duration.expand(batch)
     s = torch.zeros_like(duration, dtype=torch.float64)
-    # Copies: an export takes one tensor in two places for one input.
+    # Copies, because an export takes one tensor in two fields for one input.
     return DMPState(
         position=start.clone(),
         rate=rate,
         start=start,
         goal=goal,
-        way=goal - start,
+        displacement=goal - start,
         target=goal.clone(),
         duration=duration,
         pace=torch.ones_like(duration),
@@ -100,7 +100,7 @@ def begin(
     )
 
 
-def advance(
+def step(
     state: DMPState,
     ds: Float[Tensor, "*#batch"] | float,
     *,
@@ -112,39 +112,43 @@ def advance(
     push: Float[Tensor, "*#batch D"] | None,
     pace: Float[Tensor, "*batch"],
 ) -> DMPState:
-    """Advance by `ds`, all coupling terms as given for the whole step.
+    """Advance by `ds`, with all coupling terms constant over the step.
 
     Args:
-        state: Where the primitive is.
-        ds: Step in normalised time (float64); a number where nothing traces or derives it.
-        response: Of the primitive.
-        weights: Of the unscaled forcing term.
-        scale: What the ends make of (*batch, K, D) that the forcing term causes.
-        target: Where the goal shall be.
-        goal_filter: Rate dg/ds = -rate (g - target); None: the goal is there at once.
-        push: Constant second derivative added to the motion, by s.
-        pace: Kept in the state for its velocity.
+        state: Current state.
+        ds: Step in normalised time (float64); a number if nothing traces or differentiates it.
+        response: Response of the primitive.
+        weights: Weights of the unscaled forcing term.
+        scale: Scaling of states (*batch, K, D) that the forcing term causes.
+        target: Commanded goal.
+        goal_filter: Rate in dg/ds = -rate (g - target); None: the goal jumps to its target.
+        push: Constant second derivative by s added to the motion.
+        pace: Speed of the clock, stored for the velocity.
     """
     spring, s = response.spring, state.s + ds
     (now,) = host_values(s)
-    if isinstance(ds, float) and isinstance(now, Tensor):
-        ds = torch.full_like(s, ds)
-    E, coast = _transitions(spring, ds, response.coasting(now))
-    forced = response.forced.to(s.device)(now).to(target) @ weights.mT
+    if isinstance(now, float):
+        forced = torch.from_numpy(response.forced.at(now))
+    else:
+        ds = ds if isinstance(ds, Tensor) else torch.full_like(s, ds)
+        forced = response.forced.to(s.device)(now)
+    E, coast = _propagators(spring, ds, response.coasting(now))
+    forced = forced.to(target) @ weights.mT
     if coast is not None:
         forced = coast.to(target) @ forced
-    # What the forcing causes is known at both ends of the step; the difference dies out.
+    # Motion caused by the forcing at both ends of the step; the difference to it decays.
     before, after = scale(state.forced), scale(forced)
     if response.approach:
-        # Along the curve of an approach start and goal act beside the weights, unscaled.
-        share, way = response.approach, state.way[..., None, :]
-        before = before + approach_state(state.s, share).to(way)[..., None] * way
-        after = after + approach_state(s, share).to(way)[..., None] * way
+        # Along the curve of an approach, start and goal act unscaled, next to the weights.
+        fraction, displacement = response.approach, state.displacement[..., None, :]
+        curve = approach_state(torch.stack([state.s, s]), fraction).to(displacement)
+        before = before + curve[0][..., None] * displacement
+        after = after + curve[1][..., None] * displacement
     goal = target
     if goal_filter is not None:
-        goal, behind, ahead = _lagging(state.goal, target, ds, goal_filter, spring)
-        before, after = before + behind, after + ahead
-    # Seen from where it would rest: there the spring balances a push.
+        goal, lag_before, lag_after = _filtered(state.goal, target, ds, goal_filter, spring)
+        before, after = before + lag_before, after + lag_after
+    # Relative to the equilibrium, at which the spring balances a push.
     rest = target if push is None else target + push / spring.stiffness
     y = torch.stack([state.position - rest, state.rate], dim=-2)
     offset, velocity = _product_plus(E.to(target), y - before, after).unbind(dim=-2)
@@ -153,7 +157,7 @@ def advance(
         rate=velocity,
         start=state.start,
         goal=goal,
-        way=state.way,
+        displacement=state.displacement,
         target=target,
         duration=state.duration,
         pace=pace,
@@ -162,15 +166,39 @@ def advance(
     )
 
 
-def advance_alone(
+def numpy_step(
+    E: Float64[np.ndarray, "2 2"],
+    y: Float64[np.ndarray, "2 D"],
+    before: Float64[np.ndarray, "2 D"],
+    after: Float64[np.ndarray, "2 D"],
+    rest: Float64[np.ndarray, "D"],
+) -> Float64[np.ndarray, "2 D"]:
+    """State (y, dy/ds) after a step of one motion, as in `step`.
+
+    Args:
+        E: Transition matrix of the spring over the step.
+        y: State before the step.
+        before: State caused by the forcing before the step.
+        after: State caused by the forcing after the step.
+        rest: Equilibrium of the spring.
+    """
+    offset = y - before
+    offset[0] -= rest
+    y = E.dot(offset)
+    y += after
+    y[0] += rest
+    return y
+
+
+def uncoupled_step(
     state: DMPState, dt: float, response: Response, weights: Float[Tensor, "*batch D N"]
 ) -> DMPState | None:
-    """`advance` of one motion that nothing couples to, in NumPy: a third of the time.
+    """`step` of one motion without coupling, in NumPy: a third of the time.
 
-    Of so few numbers PyTorch takes far longer to find out what to do than to do it.
+    For so few numbers, dispatch in PyTorch takes far longer than the arithmetic.
 
     Returns:
-        None where it does not apply: something derives, maps or traces the motion, or it is a
+        None where NumPy does not apply: the motion is differentiated, mapped or traced, is a
         batch, on another device or not in float64.
     """
     tensors = (
@@ -183,34 +211,26 @@ def advance_alone(
         return None
     ds = dt / state.duration.item()
     now = state.s.item() + ds
-    E = response.spring.propagator(ds).numpy()
-    rest, before = state.target.numpy(), state.forced.numpy()
-    w = weights.detach().numpy()
-    after = response.forced.at(now).dot(w.T)
+    after = response.forced.at(now).dot(weights.detach().numpy().T)
     if coast := response.coasting(now):
         after = response.spring.propagator(coast).numpy().dot(after)
+    before = state.forced.numpy()
     y = np.empty_like(before)
-    np.subtract(state.position.numpy(), rest, out=y[0])
-    y[1] = state.rate.numpy()
-    y = E.dot(y - before)
-    y += after
-    y[0] += rest
+    y[0], y[1] = state.position.numpy(), state.rate.numpy()
+    E = response.spring.propagator(ds).numpy()
+    y = numpy_step(E, y, before, after, state.target.numpy())
     return DMPState(
         position=torch.from_numpy(y[0]),
         rate=torch.from_numpy(y[1]),
         start=state.start,
         goal=state.target,
-        way=state.way,
+        displacement=state.displacement,
         target=state.target,
         duration=state.duration,
-        pace=_UNDISTURBED,
+        pace=_FULL_PACE,
         s=torch.from_numpy(np.array(now)),
         forced=torch.from_numpy(after),
     )
-
-
-_UNDISTURBED = torch.ones((), dtype=torch.float64)
-"""The pace of every motion that nothing slows: to make another one takes longer than to add."""
 
 
 def second_derivative(
@@ -219,33 +239,34 @@ def second_derivative(
     weights: Float[Tensor, "*#batch D N"],
     scale: Callable[[Tensor], Tensor],
 ) -> Float[Tensor, "*batch D"]:
-    """Y'' by s at a state, without coupling."""
+    """Second derivative y'' by s at a state, without coupling."""
     force = response.basis.forcing(state.s)[..., None, :].to(weights) @ weights.mT
     force = scale(force)[..., 0, :]
     if response.approach:
-        force = force + state.way * response.approach_force(state.s).to(force)[..., None]
+        curve = response.approach_force(state.s).to(force)[..., None]
+        force = force + state.displacement * curve
     return response.spring.acceleration(state.position - state.goal, state.rate) + force
 
 
-def _transitions(
+def _propagators(
     spring: SpringDamper, ds: Tensor | float, coast: Tensor | float
 ) -> tuple[Tensor, Tensor | None]:
-    """Over a step, and since the forcing has ended; None: it is known not to have."""
+    """Transition matrices of the step and since the end of the forcing; None: not ended yet."""
     if isinstance(ds, Tensor) and isinstance(coast, Tensor):
-        step, rest = spring.propagator(torch.stack([ds, coast]))  # both at once
-        return step, rest
+        over_step, since_end = spring.propagator(torch.stack([ds, coast]))  # both at once
+        return over_step, since_end
     return spring.propagator(ds), spring.propagator(coast) if coast else None
 
 
 def _product_plus(A: Tensor, x: Tensor, b: Tensor) -> Tensor:
-    """A x + b, in one call where there is one."""
+    """A x + b, fused where PyTorch can."""
     return torch.addmm(b, A, x) if A.ndim == x.ndim == b.ndim == 2 else A @ x + b
 
 
-def _lagging(
+def _filtered(
     goal: Tensor, target: Tensor, ds: Tensor | float, rate: float, spring: SpringDamper
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The goal after the step, and the (y - target, y') it leads to, before and after.
+    """Filtered goal after a step, and the motion (y - target, y') it causes before and after.
 
     y_p = target + k (g - target), k = alpha beta / (rate^2 - alpha rate + alpha beta), solves
     the equation for a goal that decays to its target.
@@ -256,7 +277,6 @@ def _lagging(
             f"a goal filter needs a positive rate off the modes of the spring, got {rate}"
         )
     gain = spring.stiffness / denominator
-    # A goal behind its target decays to it, and the motion it leads to with it.
     lag_before = goal - target
     if isinstance(ds, Tensor):
         lag_after = lag_before * torch.exp(-rate * ds).to(goal)[..., None]
@@ -269,16 +289,16 @@ def _lagging(
 
 
 def host_values(*times: Tensor) -> tuple[Tensor, ...] | tuple[float, ...]:
-    """The times as floats if each is a single one that nothing derives or traces."""
-    if not readable(*times) or not all(map(_plain, times)):
+    """The times as floats if each is a plain scalar that nothing differentiates or traces."""
+    if not readable(*times) or not all(map(_is_plain_scalar, times)):
         return times
     return tuple(time.item() for time in times)
 
 
-def _plain(time: Tensor) -> bool:
+def _is_plain_scalar(time: Tensor) -> bool:
     return (
         time.ndim == 0
-        and time.is_cpu  # of another device, reading would wait for all that was asked of it
+        and time.is_cpu  # reading from another device would wait for all work queued there
         and type(time) is Tensor
         and not time.requires_grad
     )
@@ -295,33 +315,35 @@ def continue_motion(
     elapsed: Float[Tensor, "*batch"],
     time: Float[Tensor, "*batch T"],
 ) -> tuple[Float[Tensor, "*batch T D"], Float[Tensor, "*batch T D"]]:
-    """Carry on from a position and a velocity, under whatever weights and goal hold from now.
+    """Continue from a position and a velocity with given weights and goal.
 
     x(s) = F(s) w + (g, 0) + E(s - s_0) [x(s_0) - F(s_0) w - (g, 0)],   x = (y, y')
 
     F is the response to the weights from rest at the goal and E the transition matrix of the
-    unforced spring, so that this is exact, one linear map of (w, g, x(s_0)), and starts with
-    the position and the velocity given. From s_0 = 0 it is `JointDMP.rollout`, from any later
-    state of a motion what follows of it; gradients flow to all arguments.
+    unforced spring, so the motion is exact, linear in (w, g, x(s_0)), and starts with the given
+    position and velocity. From s_0 = 0 it is `JointDMP.rollout`; from a later state of a
+    motion, the remainder of that motion. Gradients flow to all arguments.
 
     Args:
-        response: Of the primitive; its start and goal must act through the spring alone.
-        weights: Of the unscaled forcing term.
+        response: Response of the primitive, without approach.
+        weights: Weights of the unscaled forcing term.
         goal: g.
-        position: Where the motion is.
-        velocity: Per second.
-        duration: tau [s], of the whole motion.
-        elapsed: Since its start [s].
-        time: From now on [s], not negative.
+        position: Current position.
+        velocity: Current velocity [1/s].
+        duration: tau [s] of the whole motion.
+        elapsed: Time since the start of the motion [s].
+        time: Times from now on [s], not negative.
 
     Returns:
-        Position, and velocity per second, at those times.
+        Position, and velocity [1/s], at those times.
 
     Raises:
-        ValueError: A response with an approach of its own.
+        ValueError: The response has an approach.
     """
     if response.approach:
-        raise ValueError("a motion can be continued only with approach 0: start is forgotten")
+        raise ValueError(
+            "a motion can be continued only with approach=0: it needs no start then"
+        )
     tau = duration.double()[..., None]
     now, ahead = elapsed.double()[..., None] / tau, time.double() / tau
     count = response.basis.count
@@ -329,7 +351,7 @@ def continue_motion(
     free = response.spring.propagator(ahead)
     w, tau = weights.double().mT, tau[..., None]
     x = torch.stack([position.double(), velocity.double() * tau[..., 0]], dim=-2)
-    # (*batch, 1 + T, 2, D), seen from the goal, and for each row of the state.
+    # (*batch, 1 + T, 2, D), relative to the goal, for each row of the state.
     caused = (forced.flatten(-3, -2) @ w).unflatten(-2, (-1, 2))
     g = goal.double()[..., None, :]
     rest = torch.cat([g, torch.zeros_like(g)], dim=-2)

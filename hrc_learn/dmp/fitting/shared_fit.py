@@ -1,11 +1,11 @@
-"""One primitive from any number of demonstrations, one of them in memory at a time.
+"""One primitive fitted to any number of demonstrations, with one in memory at a time.
 
-Least squares over any number of rows: rows [A B] of min |A X - B|^2 enter as the triangular
-factor R of their QR decomposition, for R'R = [A B]'[A B] is all a solution depends on. Factors
-of different rows are stacked and factored anew, in any order and from any process (TSQR;
-Demmel et al. 2012, "Communication-optimal parallel and sequential QR and LU factorizations").
-The products A'A would be summed as easily, but square the condition number, and with it the
-rounding.
+Least squares over any number of rows: the rows [A B] of min |A X - B|^2 enter through the
+triangular factor R of their QR decomposition, because the solution depends on R'R = [A B]'[A B]
+alone. Factors of different rows are stacked and factored again, in any order and from any
+process (TSQR; Demmel et al. 2012, "Communication-optimal parallel and sequential QR and LU
+factorizations"). Summing the products A'A would be as easy, but would square the condition
+number and with it the rounding error.
 """
 
 from collections.abc import Sequence
@@ -16,44 +16,45 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn import distributed
-from hrc_learn.dmp._arguments import Points, Samples, Times, check_samples
-from hrc_learn.dmp._fitting import ridge_inverse
+from hrc_learn.dmp._arguments import Points, Times
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
-from hrc_learn.dmp._system.closed_forms import SpringDamper
 from hrc_learn.dmp._system.response import Response, response_of
+from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp.fitting.samples import Samples, check_samples
+from hrc_learn.dmp.fitting.solvers import REGULARIZATION, ridge_inverse
 from hrc_learn.dmp.joint_dmp import JointDMP
+
+TIMESTAMPS = 1000
+"""Samples of the default rollout, because the demonstrations have no common grid."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """What is known of min |A X - B|^2."""
+    """Accumulated rows of min |A X - B|^2."""
 
     factor: Float[Tensor, "n_and_k n_and_k"]
     """R, upper triangular up to the signs of its rows (float64)."""
     unknowns: int
-    """n: columns of A; the others are those of B."""
+    """n, the number of columns of A; the remaining columns are those of B."""
     rows: int
-    """Of A and B so far."""
+    """Number of rows so far."""
 
     @staticmethod
     def empty(unknowns: int, targets: int) -> "LeastSquares":
-        """No rows yet, of n unknowns and k columns of B."""
+        """Problem without rows, with n unknowns and k columns of B."""
         size = unknowns + targets
         return LeastSquares(torch.zeros(size, size, dtype=torch.float64), unknowns, 0)
 
     def with_rows(
         self, A: Float[Tensor, "rows n"], B: Float[Tensor, "rows k"]
     ) -> "LeastSquares":
-        """Some rows more."""
+        """Problem with additional rows."""
         new = torch.cat([A, B], dim=1).double()
-        return self._with_factor(new, len(new))
-
-    def __add__(self, other: "LeastSquares") -> "LeastSquares":
-        """The rows of both."""
-        return self._with_factor(other.factor, other.rows)
+        factor = _triangle(torch.cat([self.factor, new]))
+        return LeastSquares(factor, self.unknowns, self.rows + len(new))
 
     def over_processes(self) -> "LeastSquares":
-        """The rows of all processes, the same in each of them."""
+        """Problem with the rows of all processes, identical in each of them."""
         if distributed.count() == 1:
             return self
         rows = distributed.sum_over_processes(torch.tensor(self.rows))
@@ -62,52 +63,43 @@ class LeastSquares:
 
     @property
     def design(self) -> Float[Tensor, "n n"]:
-        """Square root of A'A: as far as singular values and norms go, it is A."""
+        """Square root of A'A, with the singular values and column norms of A."""
         return self.factor[: self.unknowns, : self.unknowns]
 
-    def solve(
-        self, regularization: float, unit: Float[Tensor, "n"] | None = None
-    ) -> Float[Tensor, "n k"]:
+    def solve(self, regularization: float, unit: Float[Tensor, "n"]) -> Float[Tensor, "n k"]:
         """Minimise |A X - B|^2 + (r sigma)^2 |X / unit|^2.
 
         Args:
             regularization: r, relative to sigma, the largest singular value of A times unit.
-            unit: Size in which each unknown is counted; 1 if None.
+            unit: Unit of each unknown.
         """
         n = self.unknowns
-        unit = torch.ones(n, dtype=torch.float64) if unit is None else unit
         inverse = ridge_inverse(self.design * unit, regularization)
         return unit[:, None] * (inverse @ self.factor[:n, n:])
 
     def residual(self, X: Float[Tensor, "n k"]) -> Float[Tensor, "k"]:
-        """Root mean square of A X - B over all rows, column by column."""
+        """Root mean square of A X - B over all rows, for each column."""
         n = self.unknowns
         error = self.factor[:, :n] @ X - self.factor[:, n:]
-        # R'R is that of all rows, so norms are too.
+        # R'R equals the product over all rows, so norms are equal too.
         return error.norm(dim=0) / max(self.rows, 1) ** 0.5
-
-    def _with_factor(self, more: Tensor, rows: int) -> "LeastSquares":
-        factor = _triangle(torch.cat([self.factor, more]))
-        return LeastSquares(factor, self.unknowns, self.rows + rows)
 
 
 def _triangle(rows: Float[Tensor, "rows n"]) -> Float[Tensor, "n n"]:
     return torch.linalg.qr(rows, mode="r").R
 
 
-TIMESTAMPS = 1000
-"""Samples of a rollout without arguments: demonstrations need not be sampled alike."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SharedFit:
-    """What a pass over the demonstrations gave."""
+    """Result of one pass over the demonstrations."""
 
     primitive: JointDMP
     demonstrations: int
+    """Number of demonstrations."""
     samples: int
+    """Number of samples in all demonstrations."""
     rmse: Float[Tensor, "D"]
-    """Of all samples against the primitive with start, goal and duration of their own."""
+    """RMSE over all samples, with the start, goal and duration of each demonstration."""
 
 
 def fit_shared(
@@ -117,39 +109,39 @@ def fit_shared(
     basis: Basis | None = None,
     spring: SpringDamper | None = None,
     approach: float = 0.0,
-    regularization: float = 1e-7,
+    regularization: float = REGULARIZATION,
     joint_names: Sequence[str] | None = None,
     units: str = "rad",
 ) -> SharedFit:
-    """Learn what all demonstrations have in common, in one pass and bounded memory.
+    """Fit one primitive to all demonstrations, in one pass and bounded memory.
 
-    Minimises the distance of all samples to one primitive that starts and ends where, and
-    takes as long as, each demonstration: weights and start velocity (per duration) are
-    shared. Demonstrations sampled alike give the same as the mean of a primitive each. Of
-    several processes, each reads its share, and all return the same.
+    Minimises the distance of all samples to one primitive that takes start, goal and duration
+    from each demonstration; all have the same weights and start velocity (per duration).
+    For demonstrations on one grid the result is the mean of a primitive each. With several
+    processes, each reads its part of the demonstrations, and all return the same result.
 
     Args:
-        demonstrations: Timestamps (T,) [s] and positions (T, D) of each; read one by one, so a
-            sequence that loads them when asked is enough.
+        demonstrations: Timestamps (T,) [s] and positions (T, D) of each. They are read one by
+            one, so a sequence that loads them on demand is enough.
         n_basis: N, unless `basis` is given.
-        basis: Shape of the forcing term.
+        basis: Basis of the forcing term.
         spring: Gains.
-        approach: Share of the motion along which a new goal is taken up.
+        approach: Fraction of the motion over which it moves to a new goal.
         regularization: Ridge, relative to the largest singular value.
-        joint_names: D names, kept with the primitive.
-        units: Of the coordinates.
+        joint_names: D names, stored with the primitive.
+        units: Units of the coordinates.
 
     Raises:
-        ValueError: No demonstrations, or one that cannot be fitted; says which.
+        ValueError: No demonstrations, or one that cannot be fitted; the message names it.
     """
     if not len(demonstrations):
         raise ValueError("there are no demonstrations to learn from")
     response = response_of(
         spring or SpringDamper(), basis or GaussianBasis(count=n_basis), approach
     )
-    totals = _gather(demonstrations, response)
-    problem, mean = totals.problem, totals.sums / len(demonstrations)
-    # One more unknown than weights: the start velocity.
+    problem, sums = _accumulate(demonstrations, response)
+    mean = sums / len(demonstrations)
+    # The start velocity is one more unknown after the weights.
     unit = balanced_units(response.basis, problem.design, others=1)
     X = problem.solve(regularization, unit)
     start, goal, amplitude, duration = mean[0], mean[1], mean[2], mean[3, 0]
@@ -175,15 +167,10 @@ def fit_shared(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Totals:
-    problem: LeastSquares
-    sums: Float[Tensor, "4 D"]
-    """Over demonstrations: start, goal, range, duration."""
-
-
-def _gather(demonstrations: Sequence[tuple[Times, Points]], response: Response) -> _Totals:
-    """Everything a fit needs, of the demonstrations of all processes."""
+def _accumulate(
+    demonstrations: Sequence[tuple[Times, Points]], response: Response
+) -> tuple[LeastSquares, Float[Tensor, "4 D"]]:
+    """Rows of all processes, and sums of start, goal, range and duration."""
     N, D = response.basis.count, None
     problem, sums = None, None
     for i, (time, position) in distributed.share(demonstrations):
@@ -194,11 +181,11 @@ def _gather(demonstrations: Sequence[tuple[Times, Points]], response: Response) 
         problem = problem.with_rows(*_equations(samples, response))
         ends = [samples.first[0], samples.last[0], samples.span[0]]
         sums = sums + torch.stack([*ends, samples.duration.expand(D)]).double()
-    # A process without a share takes part with nothing, once it knows how many coordinates.
+    # A process without demonstrations contributes zeros, for as many coordinates as the others.
     D = int(max(distributed.gather(torch.tensor(D or 0))))
     problem = problem or LeastSquares.empty(N + 1, D)
     sums = torch.zeros(4, D, dtype=torch.float64) if sums is None else sums
-    return _Totals(problem.over_processes(), distributed.sum_over_processes(sums))
+    return problem.over_processes(), distributed.sum_over_processes(sums)
 
 
 def _checked(index: int, time: Times, position: Points) -> Samples:
@@ -207,14 +194,14 @@ def _checked(index: int, time: Times, position: Points) -> Samples:
     except ValueError as error:
         raise ValueError(f"demonstration {index}: {error}") from None
     if samples.batch:
-        raise ValueError(f"demonstration {index}: position must be (T, D), one of many")
+        raise ValueError(f"demonstration {index}: position must be (T, D), without a batch")
     return samples
 
 
 def _equations(
     samples: Samples, response: Response
 ) -> tuple[Float[Tensor, "T n"], Float[Tensor, "T D"]]:
-    """Rows of A X = B for one demonstration: what weights and start velocity have to give."""
+    """Rows of A X = B for the weights and start velocity of one demonstration."""
     N = response.basis.count
     H = response.evaluate(samples.s[0])[:, 0]
     ends = torch.stack([samples.first[0], samples.last[0]]).double()

@@ -1,0 +1,1 @@
+"""From sampled demonstrations to the weights of a primitive."""

@@ -1,0 +1,332 @@
+"""Recorded samples of demonstrations, checked and batched, and residuals of a fit."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.dmp._arguments import Mask, Points, Times, to_tensor
+
+MINIMUM_SAMPLES = 3
+"""Start, goal and one sample between them; two leave nothing to fit."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitReport:
+    """Residuals of a reproduction, in the units of the demonstration.
+
+    A robust fit weights each residual by the trust in the sample.
+    """
+
+    rmse: Float[Tensor, "*batch D"]
+    """Root mean square error of each coordinate."""
+    peak: Float[Tensor, "*batch D"]
+    """Largest absolute error of each coordinate."""
+    span: Float[Tensor, "*batch D"]
+    """Range of each coordinate in the demonstration."""
+    trust: Float[Tensor, "*batch T D"] | None = None
+    """Weight of each sample in a robust fit, 0 to 1."""
+    noise: Float[Tensor, "*batch D"] | None = None
+    """Estimated standard deviation of the noise removed by smoothing."""
+    peak_acceleration: Float[Tensor, "*batch D"] | None = None
+    """Largest absolute acceleration of the reproduction [1/s^2]; NRMSE ignores roughness."""
+    peak_jerk: Float[Tensor, "*batch D"] | None = None
+    """Largest absolute jerk of the reproduction [1/s^3]."""
+
+    @property
+    def nrmse(self) -> Float[Tensor, "*batch"]:
+        """RMSE over all samples and coordinates, relative to the largest range."""
+        return self.rmse.square().mean(-1).sqrt() / self.span.amax(-1)
+
+    def select(self, columns: slice) -> "FitReport":
+        """Report for a subset of the coordinates."""
+        return FitReport(**{k: values[..., columns] for k, values in self.tensors().items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Fields that are present, by name."""
+        return {name: values for name, values in vars(self).items() if values is not None}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Samples:
+    """Sampled demonstrations on a flat batch, time last, padded where `mask` is false."""
+
+    batch: tuple[int, ...]
+    """Batch shape that was flattened to B."""
+    s: Float[Tensor, "B T"]
+    """Normalised time since the first sample, 0 to 1, non-decreasing (float64)."""
+    duration: Float[Tensor, "B"]
+    """Time from the first to the last sample [s] (float64)."""
+    position: Float[Tensor, "B D T"]
+    velocity: Float[Tensor, "B D T"] | None
+    mask: Bool[Tensor, "B T"]
+    complete: bool
+    """True if the mask is true everywhere."""
+
+    @property
+    def columns(self) -> Float[Tensor, "*batch T D"]:
+        """Position in the layout of the caller, time before coordinates."""
+        return self.position.mT.reshape(*self.batch, -1, self.position.shape[-2])
+
+    @cached_property
+    def shared_grid(self) -> bool:
+        """True if all demonstrations have the same normalised times: one solve serves all."""
+        if len(self.s) == 1 or not self.complete:
+            return self.complete
+        # Timestamps with different origins differ by rounding, below 1e-12 of the duration.
+        return bool(((self.s - self.s[:1]).abs() < 1e-12).all())
+
+    @cached_property
+    def first(self) -> Float[Tensor, "B D"]:
+        """Position at the first valid sample."""
+        if self.complete:
+            return self.position[..., 0]
+        return self._at(self.mask.long().argmax(-1))
+
+    @cached_property
+    def last(self) -> Float[Tensor, "B D"]:
+        """Position at the last valid sample."""
+        if self.complete:
+            return self.position[..., -1]
+        return self._at(self.mask.shape[-1] - 1 - self.mask.flip(-1).long().argmax(-1))
+
+    @cached_property
+    def span(self) -> Float[Tensor, "B D"]:
+        """Range of each coordinate."""
+        # Padding repeats the first sample, which leaves the range unchanged.
+        position = self._filled(self.position, self.first[..., None])
+        # Two reductions, because `aminmax` takes ten times as long.
+        return position.amax(-1) - position.amin(-1)
+
+    @cached_property
+    def amplitude(self) -> Float[Tensor, "B D"]:
+        """Range of each coordinate; one where a coordinate never moves, to divide by."""
+        return self.span.masked_fill(self.span == 0, 1.0)
+
+    def compare(
+        self,
+        reproduction: Float[Tensor, "*batch T D"],
+        trust: Float[Tensor, "*batch T D"] | None = None,
+    ) -> FitReport:
+        """Residuals of a reproduction at the valid samples; `trust` is stored with them."""
+        made = reproduction.mT.reshape(self.position.shape)
+        error = self._filled(made - self.position, 0.0)
+        valid = error.shape[-1] if self.complete else self.mask.sum(-1, keepdim=True)
+        residuals = {
+            "rmse": error.norm(dim=-1) / valid**0.5,
+            "peak": error.abs().amax(-1),
+            "span": self.span,
+        }
+        batch = self.batch
+        residuals = {k: v.reshape(*batch, -1) if batch else v[0] for k, v in residuals.items()}
+        return FitReport(**residuals, trust=trust)
+
+    def _at(self, index: Tensor) -> Tensor:
+        return torch.take_along_dim(self.position, index[:, None, None], dim=-1)[..., 0]
+
+    def _filled(self, values: Tensor, filling: Tensor | float) -> Tensor:
+        return values if self.complete else torch.where(self.mask[:, None], values, filling)
+
+
+def padded(time: Any, mask: Mask | None, *columns: Any) -> tuple[Any, Mask | None, list[Any]]:
+    """Pad lists of demonstrations to one batch; other arguments are returned unchanged.
+
+    Args:
+        time: List of timestamps (T_i,), or one grid for all demonstrations.
+        mask: List of masks (T_i,), true at valid samples, or None.
+        columns: Lists of values, (T_i,) or (T_i, D); a column may be None.
+
+    Raises:
+        ValueError: The lists disagree about the number of demonstrations or samples.
+    """
+    first = columns[0]
+    listed = isinstance(first, list | tuple) and all(hasattr(x, "shape") for x in first)
+    if not listed or not first or not first[0].ndim:
+        return time, mask, list(columns)
+    parts = [None if x is None else [to_tensor(row) for row in x] for x in columns]
+    lengths = [len(x) for x in first]
+    if not isinstance(time, list | tuple) or not hasattr(time[0], "shape"):
+        time = [time] * len(first)
+    parts.append([to_tensor(row) for row in time])
+    for part in parts:
+        if part is not None and [len(row) for row in part] != lengths:
+            raise ValueError(
+                f"demonstrations have {lengths} samples, but time or another column has "
+                f"{[len(row) for row in part]}"
+            )
+    valid = [torch.ones(n, dtype=torch.bool) for n in lengths]
+    if mask is not None:
+        valid = [to_tensor(row).bool() for row in mask]
+    joined = [
+        None if part is None else torch.nn.utils.rnn.pad_sequence(part, batch_first=True)
+        for part in (*parts, valid)
+    ]
+    complete = mask is None and len(set(lengths)) == 1
+    return joined[-2], None if complete else joined[-1], joined[:-2]
+
+
+def check_samples(
+    time: Times,
+    position: Points,
+    velocity: Points | None = None,
+    mask: Mask | None = None,
+    *,
+    name: str = "position",
+) -> Samples:
+    """Check recorded samples and flatten their batch.
+
+    Args:
+        time: Timestamps [s], (T,) or (*B, T), with any origin and spacing.
+        position: (T,), (T, D) or (*B, T, D); D = 1 if its shape is that of `time`.
+        velocity: Same shape as `position`, or None.
+        mask: Same shape as `time`, true at valid samples. Invalid ones may hold anything, NaN
+            included. None: all samples are valid.
+        name: Name of `position` in error messages.
+
+    Raises:
+        ValueError: Shapes that do not fit, values that are not finite, time that does not
+            increase, or fewer than 3 samples. The message names the place.
+    """
+    position = _floating(position)
+    time = to_tensor(time, torch.float64, position.device)
+    if position.ndim == 0 or time.ndim == 0:
+        raise ValueError("time and position need a sample axis, got a single number")
+    if position.shape == time.shape:
+        position = position[..., None]
+        velocity = None if velocity is None else to_tensor(velocity)[..., None]
+    if position.ndim < 2:
+        raise ValueError(
+            f"time has shape {tuple(time.shape)}, position {tuple(position.shape)}: expected "
+            "(T,) and (T, D)"
+        )
+    *batch, T, D = position.shape
+    time = _expand("time", time, (*batch, T), position)
+    complete = mask is None
+    if mask is None:
+        mask = torch.ones_like(time, dtype=torch.bool)
+    else:
+        mask = to_tensor(mask, device=time.device).bool()
+        mask = _expand("mask", mask, (*batch, T), position)
+        complete = bool(mask.all())
+    if position.numel() == 0:
+        raise ValueError(f"position has shape {(*batch, T, D)}: there is nothing to fit")
+    time, mask = time.reshape(-1, T), mask.reshape(-1, T)
+    _check_count(mask, complete, batch)
+    _check_finite("time", time[:, None], mask, batch)
+    # Time comes last from here on, because all computations run along it.
+    position = _check_finite(name, position.reshape(-1, T, D).mT.contiguous(), mask, batch)
+    if velocity is not None:
+        velocity = to_tensor(velocity, position.dtype, position.device)
+        velocity = _expand("velocity", velocity, (*batch, T, D), position)
+        velocity = velocity.reshape(-1, T, D).mT.contiguous()
+        velocity = _check_finite("velocity", velocity, mask, batch)
+    s, duration = _normalised(time, mask, complete, batch)
+    return Samples(
+        batch=tuple(batch),
+        s=s,
+        duration=duration,
+        position=position,
+        velocity=velocity,
+        mask=mask,
+        complete=complete,
+    )
+
+
+def check_precision(dtype: torch.dtype) -> None:
+    """Raise ValueError unless the dtype is float32 or float64.
+
+    Weights reach several thousand: rounded to half precision, the path is off by over a radian.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"a primitive needs float32 or float64, got {dtype}: cast its rollouts instead"
+        )
+
+
+def demo_label(index: int, batch: Sequence[int]) -> str:
+    """Prefix of an error message that names a demonstration by its index in the batch."""
+    if not batch:
+        return ""
+    place = tuple(int(k) for k in np.unravel_index(index, batch))
+    return f"demonstration {place[0] if len(place) == 1 else place}: "
+
+
+def _floating(values: Points) -> Tensor:
+    tensor = to_tensor(values)
+    if tensor.is_floating_point():
+        check_precision(tensor.dtype)
+    return tensor if tensor.is_floating_point() else tensor.to(torch.get_default_dtype())
+
+
+def _expand(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:
+    try:
+        return values.expand(shape)
+    except RuntimeError:
+        raise ValueError(
+            f"{name} has shape {tuple(values.shape)}, position {tuple(position.shape)}: "
+            f"{name} must be {shape}, where leading axes may be left out"
+        ) from None
+
+
+def _check_count(mask: Bool[Tensor, "B T"], complete: bool, batch: Sequence[int]) -> None:
+    if complete and mask.shape[-1] >= MINIMUM_SAMPLES:
+        return
+    few = mask.sum(-1) < MINIMUM_SAMPLES
+    if few.any():
+        i = int(few.nonzero()[0])
+        raise ValueError(
+            f"{demo_label(i, batch)}a motion needs at least {MINIMUM_SAMPLES} samples, "
+            f"got {int(mask[i].sum())}"
+        )
+
+
+def _check_finite(
+    name: str,
+    values: Float[Tensor, "B D T"],
+    mask: Bool[Tensor, "B T"],
+    batch: Sequence[int],
+) -> Tensor:
+    """Values with masked NaN and infinities zeroed; ValueError if a valid sample holds one."""
+    # A finite sum of finite values proves them all finite, short of overflow: look twice.
+    if math.isfinite(values.sum().item()):
+        return values
+    bad = ~values.isfinite() & mask[:, None]
+    if bad.any():
+        i, column, k = bad.nonzero()[0].tolist()
+        where = f"sample {k}" if name == "time" else f"sample {k}, column {column}"
+        value = values[i, column, k].item()
+        raise ValueError(f"{demo_label(i, batch)}{name} is {value} at {where}")
+    return values.masked_fill(~mask[:, None], 0)
+
+
+def _normalised(
+    time: Tensor, mask: Tensor, complete: bool, batch: Sequence[int]
+) -> tuple[Float[Tensor, "B T"], Float[Tensor, "B"]]:
+    """Normalised times and durations [s]; ValueError if time does not increase."""
+    if complete:
+        elapsed = time - time[:, :1]
+        if (elapsed[:, 1:] > elapsed[:, :-1]).all():
+            duration = elapsed[:, -1:]
+            return elapsed / duration, duration[..., 0]
+    first = time.masked_fill(~mask, torch.inf).amin(-1, keepdim=True)
+    last = time.masked_fill(~mask, -torch.inf).amax(-1, keepdim=True)
+    # Masked samples repeat the time before them, so that times never decrease.
+    elapsed = (time - first).masked_fill(~mask, 0)
+    latest = torch.cat([torch.full_like(first, -1.0), elapsed.cummax(-1).values], dim=-1)
+    stalled = mask & (elapsed <= latest[..., :-1])
+    # The first valid sample has elapsed time zero, like the masked ones before it.
+    stalled &= mask.long().cumsum(-1) > 1
+    if stalled.any():
+        i, k = stalled.nonzero()[0].tolist()
+        raise ValueError(
+            f"{demo_label(i, batch)}time must increase, but is {time[i, k].item():.6f} s "
+            f"at sample {k} after {(latest[i, k] + first[i, 0]).item():.6f} s"
+        )
+    duration = last - first
+    return elapsed.cummax(-1).values / duration, duration[..., 0]

@@ -1,0 +1,166 @@
+"""Least-squares solvers: from samples to weights and start velocity.
+
+Demonstrations with the same normalised times are fitted by one matrix product.
+"""
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp._system.bases import balanced_units
+from hrc_learn.dmp._system.response import Response
+from hrc_learn.dmp.fitting.ragged_gram import fit_ragged
+from hrc_learn.dmp.fitting.samples import Samples
+
+REGULARIZATION = 1e-7
+"""Default ridge of a fit: far above rounding, far below what a sensor resolves."""
+METHODS = ("trajectory", "ridge", "lwr")
+type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
+"""Weights and start velocity dy/ds."""
+
+
+def fit_samples(
+    method: str, response: Response, samples: Samples, regularization: float
+) -> tuple[Float[Tensor, "B D N"], Float[Tensor, "B D"]]:
+    """Fit weights of the unscaled forcing term and the start velocity dy/ds, in float64.
+
+    Args:
+        method: `"trajectory"`, least squares on the positions; `"ridge"`, ridge regression on
+            the force; `"lwr"`, locally weighted regression on the force as in the paper, which
+            fits each weight alone.
+        response: Response of the primitive to be fitted.
+        samples: One demonstration or many.
+        regularization: Ridge, relative to the largest singular value of the design matrix.
+    """
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
+    position = samples.position.double()
+    rate = None
+    if samples.velocity is not None:
+        rate = samples.velocity.double() * samples.duration[:, None, None]
+    if samples.shared_grid:
+        return _fit(method, response, samples.s[0], position, rate, regularization)
+    weights = position.new_empty(*position.shape[:2], response.basis.count)
+    start_rate = position.new_empty(position.shape[:2])
+    remaining = torch.ones(len(position), dtype=torch.bool)
+    if method == "trajectory" and not (response.approach or response.basis.periodic):
+        weights, start_rate, remaining = fit_ragged(
+            response, samples, position, rate, regularization
+        )
+    for i in remaining.nonzero()[:, 0].tolist():
+        valid = samples.mask[i]
+        one_rate = None if rate is None else rate[i, :, valid]
+        s = samples.s[i, valid]
+        weights[i], start_rate[i] = _fit(
+            method, response, s, position[i, :, valid], one_rate, regularization
+        )
+    return weights, start_rate
+
+
+def _fit(
+    method: str,
+    response: Response,
+    s: Float[Tensor, "T"],
+    position: Float[Tensor, "*batch D T"],
+    rate: Float[Tensor, "*batch D T"] | None,
+    regularization: float,
+) -> Fit:
+    """Fit demonstrations on one time grid."""
+    # The timestamps as bytes are the key of the cached operators.
+    grid = response, s.cpu().numpy().tobytes(), s.device
+    if method == "trajectory":
+        # The squared distance to the samples, without differentiation. Start and goal are the
+        # first and the last sample; the start velocity is the recorded or a fitted one.
+        K, to_weights = _trajectory_operator(*grid, rate is None, regularization)
+        unknown = _apply(position, K)
+        if rate is None:
+            return unknown[..., :-1], unknown[..., -1]
+        return unknown - rate[..., :1] * to_weights, rate[..., 0]
+    if rate is None:
+        rate = differentiate(s, position)
+    goal = position[..., -1:]
+    force = differentiate(s, rate) - response.spring.acceleration(position - goal, rate)
+    if response.approach:
+        force = force - (goal - position[..., :1]) * response.approach_force(s)
+    return _apply(force, _force_operator(*grid, method, regularization)), rate[..., 0]
+
+
+def _apply(
+    y: Float[Tensor, "*batch D T"], K: Float[Tensor, "n T"]
+) -> Float[Tensor, "*batch D n"]:
+    """One flat product K y for all coordinates of all demonstrations."""
+    return (y.reshape(-1, y.shape[-1]) @ K.T).view(*y.shape[:-1], -1)
+
+
+def differentiate(
+    s: Float[Tensor, "T"], y: Float[Tensor, "*batch T"]
+) -> Float[Tensor, "*batch T"]:
+    """Derivative dy/ds of second order on any spacing, ends included (exact for parabolas)."""
+    slope = y.diff() / s.diff()
+    h = s.diff()
+    # The parabola through three samples: each slope is weighted by the opposite step.
+    inner = (h[1:] * slope[..., :-1] + h[:-1] * slope[..., 1:]) / (h[1:] + h[:-1])
+    # Slopes of the outer parabolas at their ends: linear, with the mean slope in the middle.
+    first = 2 * slope[..., :1] - inner[..., :1]
+    last = 2 * slope[..., -1:] - inner[..., -1:]
+    return torch.cat([first, inner, last], dim=-1)
+
+
+# 16 grids are as many datasets: demonstrations of one grid share an operator.
+@lru_cache(maxsize=16)
+def _trajectory_operator(
+    response: Response,
+    timestamps: bytes,
+    device: torch.device,
+    fit_rate: bool,
+    regularization: float,
+) -> tuple[Float[Tensor, "unknown T"], Float[Tensor, "unknown"]]:
+    """Matrix from samples to unknowns, and the effect of a known start velocity on them.
+
+    With y_0 = y(0) and g = y(1) taken from the samples, the residual is linear in the samples,
+    so that one matrix does it all.
+    """
+    N = response.basis.count
+    s = _timestamps(timestamps, device)
+    H = response.evaluate(s)[:, 0]
+    velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
+    unit = balanced_units(response.basis, H, int(fit_rate))
+    K = unit[:, None] * ridge_inverse(H[:, : N + fit_rate] * unit, regularization)
+    # Subtract the motion that start and goal cause by themselves.
+    from_samples = K.clone()
+    from_samples[:, 0] -= K @ start
+    from_samples[:, -1] -= K @ goal
+    return from_samples, K @ velocity
+
+
+@lru_cache(maxsize=16)
+def _force_operator(
+    response: Response,
+    timestamps: bytes,
+    device: torch.device,
+    method: str,
+    regularization: float,
+) -> Float[Tensor, "N T"]:
+    """Matrix from a force to the weights closest to it."""
+    s, basis = _timestamps(timestamps, device), response.basis
+    if method == "ridge":
+        return ridge_inverse(basis.forcing(s), regularization)
+    # w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i). It needs no
+    # ridge: each weight is a mean over its own samples, so nothing is ill-posed.
+    z = basis.phase(s)
+    weighted = (basis.kernels(s) * z[:, None]).T
+    # A Gaussian narrower than the sampling may cover no sample: its weight is zero then.
+    return weighted / (weighted @ z).clamp_min(torch.finfo(s.dtype).tiny)[:, None]
+
+
+def _timestamps(key: bytes, device: torch.device) -> Float[Tensor, "T"]:
+    return torch.frombuffer(bytearray(key), dtype=torch.float64).to(device)
+
+
+def ridge_inverse(A: Float[Tensor, "T n"], regularization: float) -> Float[Tensor, "n T"]:
+    """(A'A + (r sigma_max)^2 I)^-1 A' by singular values; A'A is never formed."""
+    U, sigma, Vh = torch.linalg.svd(A, full_matrices=False)
+    damping = regularization * sigma[0]
+    return (Vh.T * (sigma / (sigma**2 + damping**2))) @ U.T

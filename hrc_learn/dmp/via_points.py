@@ -1,0 +1,238 @@
+"""Motions changed to pass exactly through via points.
+
+After Zhou, Gao and Asfour 2019, "Learning via-movement primitives": a motion is an elementary
+trajectory plus the shape that a demonstration adds, and via points change the elementary
+trajectory piecewise. Here the weights make that change, so that the result is an ordinary
+primitive: it follows the curve as closely as the basis allows, and passes the via points and
+the end exactly. `MotionPrimitive.condition` applies it to values of any kind.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hrc_learn.dmp._system.response import Response
+from hrc_learn.dmp._system.spring import minimum_jerk_curve
+from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+
+SAMPLES_PER_FUNCTION = 8
+"""Times per basis function at which curve and motion are compared: no basis function follows a
+change within an eighth of their distance."""
+OUTSIDE = 1e-9
+"""Height that a basis function may reach outside of a window, relative to its peak. Of the
+Gaussians, only the few nearest to the ends of the window exceed it."""
+RIDGE = 1e-7
+"""Ridge that keeps weights with equal effect small, relative to the largest."""
+DEPENDENT = 1e-12
+"""Relative singular value below which a constraint follows from the others."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViaPoints:
+    """Positions and rates that a linear primitive has to pass; NaN leaves a value free."""
+
+    s: Float[Tensor, "*batch n"]
+    """Normalised times (float64)."""
+    position: Float[Tensor, "*batch n D"]
+    rate: Float[Tensor, "*batch n D"]
+    """Derivative by s."""
+
+
+def through_via_points(
+    motion: LinearPrimitive,
+    via: ViaPoints,
+    within: tuple[float | int, float | int] | None = None,
+) -> LinearPrimitive:
+    """Linear primitive changed to pass exactly through via points.
+
+    Args:
+        motion: One primitive, or a batch with the same number of via points each.
+        via: Via points in its columns.
+        within: Times [s] between which the motion may change; None: from start to end.
+
+    Raises:
+        ValueError: Via points at one time or outside of the window, or too many for the basis.
+    """
+    x = motion.coordinates().detach()
+    weights = x[..., :-3] + _weight_change(motion, via, within)
+    return motion.with_coordinates(torch.cat([weights, x[..., -3:]], dim=-1))
+
+
+def _weight_change(
+    motion: LinearPrimitive, via: ViaPoints, within: tuple[float, float] | None
+) -> Float[Tensor, "*batch D N"]:
+    if motion.basis.periodic:
+        raise ValueError("a rhythm has no via points: every time occurs in each period")
+    window = _window(motion, within)
+    follower = _curve_follower(motion.response, window)
+    # One equation each for position and rate at every via point and at the end.
+    if 2 + 2 * via.s.shape[-1] > len(follower.chosen):
+        raise ValueError(
+            f"{via.s.shape[-1]} via points are too many for the {len(follower.chosen)} basis "
+            f"functions between {window[0]:.3f} and {window[1]:.3f} of the duration"
+        )
+    missing = _missing(motion, via)
+    z = follower.follow(_change_curve(follower.s, via.s, missing, window))
+    # What the basis cannot follow is corrected at the constraints, by the smallest change.
+    required = ~missing.flatten(-3, -2).mT.isnan()
+    H = motion.response.evaluate(via.s)[..., :2, follower.chosen]
+    rows = (H @ follower.to_weights).flatten(-3, -2)
+    rows = rows[..., None, :, :] * required[..., None]
+    end = follower.end.expand(*rows.shape[:-2], *follower.end.shape)
+    A = torch.cat([rows, end], dim=-2)
+    wanted = torch.where(required, missing.flatten(-3, -2).mT, 0.0)
+    wanted = torch.nn.functional.pad(wanted, (0, len(follower.end)))
+    size = A.norm(dim=-1)
+    # Rows without a requirement are zero and stay so.
+    size = torch.where(size > 0, size, 1.0)
+    residual = (wanted - (A @ z[..., None])[..., 0]) / size
+    inverse = torch.linalg.pinv(A / size[..., None], rtol=DEPENDENT)
+    z = z + (inverse @ residual[..., None])[..., 0]
+    change = z.new_zeros(*z.shape[:-1], motion.basis.count)
+    change = change.index_copy(-1, follower.chosen, z @ follower.to_weights.mT)
+    return motion.forcing_scale.unscale(change.mT, motion.demonstrated()).mT
+
+
+def _missing(motion: LinearPrimitive, via: ViaPoints) -> Float[Tensor, "*batch n 2 D"]:
+    """Differences in position and rate by s at the via points; NaN where they are free."""
+    fixed = motion.with_coordinates(motion.coordinates().detach()).requires_grad_(False)
+    time = via.s * motion.duration.double()[..., None]
+    now = fixed.rollout_columns(Boundary(), fixed.duration, time)
+    position = via.position - now.position
+    rate = via.rate - now.velocity * motion.duration[..., None, None]
+    # Where only a position is given, the rate of the motion stays.
+    rate = torch.where(rate.isnan() & ~position.isnan(), 0.0, rate)
+    return torch.stack(torch.broadcast_tensors(position, rate), dim=-2)
+
+
+def _change_curve(
+    s: Float[Tensor, "G"],
+    via: Float[Tensor, "*batch n"],
+    missing: Float[Tensor, "*batch n 2 D"],
+    window: tuple[float, float],
+) -> Float[Tensor, "*batch G 3 D"]:
+    """Piecewise quintic through the differences at via points, zero at the window's ends."""
+    knots, order = _knots(via, window)
+    values = torch.nn.functional.pad(missing, (0, 0, 0, 0, 1, 1))
+    values = torch.take_along_dim(values, order[..., None, None], dim=-3)
+    active = ~values[..., 0, :].isnan()
+    value, rate = torch.where(active[..., None, :], values, 0.0).unbind(-2)
+    return piecewise_quintic(s, knots, value, rate.nan_to_num(), active)
+
+
+def _window(
+    motion: LinearPrimitive, within: tuple[float | int, float | int] | None
+) -> tuple[float, float]:
+    """Window in normalised time."""
+    if within is None:
+        return 0.0, 1.0
+    duration = motion.duration.double().reshape(-1)
+    if not (duration == duration[0]).all():
+        raise ValueError("a window in seconds needs primitives of one duration")
+    return max(within[0] / duration[0].item(), 0.0), min(within[1] / duration[0].item(), 1.0)
+
+
+def _knots(
+    s: Float[Tensor, "*batch n"], window: tuple[float, float]
+) -> tuple[Float[Tensor, "*batch n_and_2"], Int[Tensor, "*batch n_and_2"]]:
+    """Ends of the window and via points in order, and the permutation that sorts them."""
+    first, last = (torch.full_like(s[..., :1], end) for end in window)
+    knots, order = torch.cat([first, s, last], dim=-1).sort(dim=-1, stable=True)
+    ends_first = (order[..., 0] == 0) & (order[..., -1] == s.shape[-1] + 1)
+    if not (knots.diff() > 0).all() or not ends_first.all():
+        raise ValueError(
+            f"via points must lie between {window[0]:.3f} and {window[1]:.3f} of the duration, "
+            f"at different times, got {s.tolist()}"
+        )
+    return knots, order
+
+
+@dataclass(frozen=True, eq=False)
+class _CurveFollower:
+    """Least-squares fit of curves that start at rest, with the weights inside a window.
+
+    In the coordinates z of the weights, the distance to a curve is |z - follow(curve)|.
+    """
+
+    chosen: Int[Tensor, "K"]
+    """Basis functions inside the window."""
+    s: Float[Tensor, "G"]
+    """Times at which a curve is compared."""
+    units: Float[Tensor, "3"]
+    """Units of the curve and its derivatives."""
+    Q: Float[Tensor, "G3 K"]
+    to_weights: Float[Tensor, "K K"]
+    end: Float[Tensor, "2 K"]
+    """Position and rate at the end of the window, per z."""
+
+    def follow(self, curve: Float[Tensor, "*batch G 3 D"]) -> Float[Tensor, "*batch D K"]:
+        """Coordinates z of the closest motion."""
+        return (curve * self.units[:, None]).flatten(-3, -2).mT @ self.Q
+
+
+# A decomposition of 8 N x 3 rows each; a task has few windows.
+@lru_cache(maxsize=16)
+def _curve_follower(response: Response, window: tuple[float, float]) -> _CurveFollower:
+    N, (first, last) = response.basis.count, window
+    grid = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)
+    forcing = response.basis.forcing(grid)
+    outside = ((grid < first) & (first > 0)) | ((grid > last) & (last < 1))
+    height = torch.where(outside[:, None], forcing, 0.0).amax(0)
+    chosen = (height <= OUTSIDE * forcing.amax(0)).nonzero()[:, 0]
+    s = torch.linspace(first, last, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)
+    H = response.evaluate(s)[..., chosen]
+    # Derivatives are weighted by their effect over the distance between basis functions, the
+    # finest detail that these can follow.
+    units = torch.tensor([1.0, 1 / N, 1 / N**2], dtype=torch.float64)
+    A = (H * units[:, None]).flatten(0, 1)
+    unit = 1 / A.norm(dim=0)
+    A = torch.cat([A * unit, RIDGE * torch.eye(len(chosen), dtype=torch.float64)])
+    Q, R = torch.linalg.qr(A)
+    to_weights = unit[:, None] * torch.linalg.inv(R)
+    return _CurveFollower(chosen, s, units, Q[: 3 * len(s)], to_weights, H[-1, :2] @ to_weights)
+
+
+def piecewise_quintic(
+    s: Float[Tensor, "G"],
+    knots: Float[Tensor, "*batch K"],
+    value: Float[Tensor, "*batch K D"],
+    rate: Float[Tensor, "*batch K D"],
+    active: Bool[Tensor, "*batch K D"],
+) -> Float[Tensor, "*batch G 3 D"]:
+    """Value and two derivatives of a curve through knots, without acceleration at them.
+
+    Args:
+        s: Times from the first to the last knot.
+        knots: Increasing times.
+        value: Values at the knots.
+        rate: Derivatives at the knots.
+        active: Knots that count for each coordinate; the first and the last always do.
+    """
+    K = knots.shape[-1]
+    index = torch.arange(K, device=s.device)[:, None]
+    passed = (knots[..., None, :] <= s[:, None])[..., None]
+    active = active[..., None, :, :]
+    before = torch.where(active & passed, index, 0).amax(-2).clamp(max=K - 2)
+    after = torch.where(active & ~passed, index, K - 1).amin(-2)
+    times = knots[..., None].expand_as(value)
+    (t0, y0, v0), (t1, y1, v1) = (
+        [torch.take_along_dim(x, at, dim=-2) for x in (times, value, rate)]
+        for at in (before, after)
+    )
+    L = t1 - t0
+    u = (s[:, None] - t0) / L
+    m, slope, curvature = minimum_jerk_curve(u)
+    change, w0, w1 = y1 - y0, v0 * L, v1 * L
+    # Hermite's quintic without second derivatives at its ends: m(u) for the change of the
+    # value, and one polynomial for each of the two rates.
+    position = y0 + change * m
+    position = position + w0 * (u - u**3 * (6 - 8 * u + 3 * u**2))
+    position = position - w1 * u**3 * (4 - 7 * u + 3 * u**2)
+    velocity = change * slope + w0 * (1 - u**2 * (18 - 32 * u + 15 * u**2))
+    velocity = velocity - w1 * u**2 * (12 - 28 * u + 15 * u**2)
+    acceleration = change * curvature - w0 * u * (36 - 96 * u + 60 * u**2)
+    acceleration = acceleration - w1 * u * (24 - 84 * u + 60 * u**2)
+    return torch.stack([position, velocity / L, acceleration / L**2], dim=-2)
