@@ -31,7 +31,7 @@ from threadpoolctl import threadpool_info
 from timing import Timing, time_calls
 
 from hrc_learn import cli
-from hrc_learn.dmp import JointDMP, PoseDMP, Stepper
+from hrc_learn.dmp import JointDMP, PoseDMP, Stepper, export_dmp
 from hrc_learn.dmp.exported_dmp import resting_inputs, state_tensors
 from hrc_learn.geometry import quaternion
 
@@ -182,7 +182,7 @@ def measure_steps(repeats: int) -> dict[str, float]:
     dmp = JointDMP.fit(time.double(), position.double(), BASIS)
     stepper = Stepper(dmp)
     state, plain = dmp.step(dmp.initial_state(), 0.5), stepper.initial_state()
-    program, tensors = dmp.export().program.module(), state_tensors(state)
+    program, tensors = export_dmp(dmp).program.module(), state_tensors(state)
     dt, resting = torch.tensor([1e-3], dtype=torch.float64), resting_inputs(dmp, tensors)
     calls: dict[str, Callable[[], object]] = {
         "step": lambda: dmp.step(state, 1e-3),

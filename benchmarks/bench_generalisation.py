@@ -26,7 +26,6 @@ from hrc_learn.dmp import (
     PoseTrajectory,
     ProbabilisticDMP,
     mean_primitive,
-    through,
 )
 from hrc_learn.geometry import Pose, quaternion
 
@@ -145,17 +144,17 @@ def another(task: Task) -> PoseDMP:
     away = start + goal
     nearest = torch.zeros(len(away), dtype=torch.bool)
     nearest[away.argmin()] = True
-    return mean_primitive(select(task.others, nearest)).with_ends(*task.ends)
+    return mean_primitive(select(task.others, nearest)).with_boundary(*task.ends)
 
 
 def mean(task: Task) -> PoseDMP:
     """The mean of all others, adapted."""
-    return mean_primitive(task.others).with_ends(*task.ends)
+    return mean_primitive(task.others).with_boundary(*task.ends)
 
 
 def gentle_mean(task: Task) -> PoseDMP:
     """The same along a minimum-jerk approach."""
-    return mean_primitive(task.gentle).with_ends(*task.ends)
+    return mean_primitive(task.gentle).with_boundary(*task.ends)
 
 
 def conditioned(task: Task, slack: float, times: list[float]) -> PoseDMP:
@@ -175,8 +174,8 @@ METHODS: dict[str, Callable[[Task], Any]] = {
     "mean": mean,
     "mean, approach": gentle_mean,
     "distribution 0.3": lambda task: conditioned(task, 0.3, [0.0, DURATION]),
-    "via: mean, through": lambda task: through(mean(task), [HALF], task.via),
-    "via: mean, approach, through": lambda task: through(gentle_mean(task), [HALF], task.via),
+    "via: mean, through": lambda task: mean(task).condition([HALF], task.via),
+    "via: mean, approach, through": lambda task: gentle_mean(task).condition([HALF], task.via),
     "via: mean, around": lambda task: (
         ProbabilisticDMP.around(mean(task)).condition([HALF], task.via).mean_primitive()
     ),

@@ -135,7 +135,7 @@ def predict(
     # Samples of all sets are evenly spaced.
     s = torch.linspace(0, 1, position.shape[1], dtype=torch.float64)
     for name, dmp in predictions.items():
-        path = dmp.with_ends(start, goal).rollout(s * dmp.duration).position
+        path = dmp.with_boundary(start, goal).rollout(s * dmp.duration).position
         off = (path - position[i]).square().mean().sqrt()
         errors[name].append(100 * (off / (high - low).max()).item())
     return len(mixture.modes)

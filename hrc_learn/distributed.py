@@ -1,7 +1,6 @@
-"""One answer from several processes, as `torchrun` starts them.
+"""Work divided over the processes that `torchrun` starts, with one common result.
 
-In a process that stands alone every function here does nothing, so that code written for
-many is the code for one.
+In a single process every function here does nothing, so that the same code serves both.
 """
 
 import os
@@ -15,10 +14,10 @@ from torch import Tensor, nn
 
 @contextmanager
 def processes() -> Iterator[int]:
-    """Joins the processes that `torchrun` started, and yields the rank of this one.
+    """Join the processes that `torchrun` started, and yield the rank of this one.
 
-    Alone, which is when the environment names no rank, the rank is 0. Over gloo, as the
-    statistics of a fit are small and live on the CPU.
+    A single process, without a rank in the environment, has rank 0. The backend is gloo,
+    because the statistics of a fit are small and on the CPU.
     """
     if "RANK" not in os.environ or dist.is_initialized():
         yield rank()
@@ -36,21 +35,21 @@ def rank() -> int:
 
 
 def count() -> int:
-    """How many processes there are."""
+    """Number of processes."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def share[T](items: Sequence[T]) -> Iterator[tuple[int, T]]:
-    """Every n-th of the items, which this process works on, with its index among all.
+def local_items[T](items: Sequence[T]) -> Iterator[tuple[int, T]]:
+    """Items of this process, every n-th one, with their indices among all.
 
-    A sequence that reads its items when asked is sliced, not read as a whole.
+    The sequence is sliced, so that one that loads items on demand loads only these.
     """
     mine = slice(rank(), None, count())
     return zip(range(len(items))[mine], items[mine], strict=True)
 
 
 def sum_over_processes(tensor: Tensor) -> Tensor:
-    """Sum of the tensors of all processes; the same in each of them."""
+    """Sum of the tensors of all processes, identical in each of them."""
     if count() == 1:
         return tensor
     total = tensor.detach().clone()
@@ -59,7 +58,7 @@ def sum_over_processes(tensor: Tensor) -> Tensor:
 
 
 def gather(tensor: Tensor) -> list[Tensor]:
-    """The tensors of all processes, of one shape, in the order of their ranks."""
+    """Tensors of all processes, of equal shape, in the order of their ranks."""
     if count() == 1:
         return [tensor]
     tensors = [torch.empty_like(tensor) for _ in range(count())]
@@ -68,10 +67,10 @@ def gather(tensor: Tensor) -> list[Tensor]:
 
 
 def differentiable_sum(tensor: Tensor) -> Tensor:
-    """As `sum_over_processes`, with gradients for modules inside `data_parallel`.
+    """Sum over processes, differentiable for modules inside `data_parallel`.
 
-    Its backward sums the gradients of all processes, the mean that `data_parallel` takes
-    afterwards divides by their number again: what is left is the gradient of the sum.
+    The backward pass sums the gradients of all processes, and the mean that `data_parallel`
+    takes afterwards divides by their number, which leaves the gradient of the sum.
     """
     if count() == 1:
         return tensor
@@ -81,5 +80,5 @@ def differentiable_sum(tensor: Tensor) -> Tensor:
 
 
 def data_parallel(module: nn.Module) -> nn.Module:
-    """The module with its gradients averaged over processes."""
+    """Module with its gradients averaged over processes."""
     return module if count() == 1 else nn.parallel.DistributedDataParallel(module)

@@ -1,7 +1,7 @@
-"""Learned models on disk: a folder with `config.json` and `model.safetensors`.
+"""Learned models on disk: folders with `config.json` and `model.safetensors`.
 
-They are written through `hrc_learn.store`, so an interrupted save leaves the old model or none,
-never half of one.
+Models are written through `hrc_learn.store`: an interrupted save leaves the old model, or none,
+but never an incomplete one.
 """
 
 import json
@@ -25,16 +25,16 @@ def write_model(
     """Write or replace a saved model.
 
     Args:
-        folder: Where.
-        kind: Class of the model, checked when it is read.
-        config: What the model needs besides its tensors, as JSON values.
-        tensors: By name.
+        folder: Folder of the model.
+        kind: Class of the model, checked when the folder is read.
+        config: Contents besides the tensors, as JSON values.
+        tensors: Tensors by name.
 
     Raises:
-        InTheWayError: A ValueError: `folder` exists and holds anything else; it is left alone.
+        InTheWayError: A ValueError: `folder` holds anything else; it is left unchanged.
         BusyError: Another process is writing there.
     """
-    # Clones, as buffers may share memory, which safetensors refuses to write.
+    # Clones, because safetensors refuses tensors that use the same memory.
     tensors = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     header = {"format": FORMAT, "version": VERSION, "kind": kind}
     with store.replacing(folder, store.MODEL, overwrite=True) as new:
@@ -46,7 +46,7 @@ def write_model(
 
 
 class SavedModel:
-    """A folder read back, whose complaints name the file and the field."""
+    """A saved model, whose error messages name the file and the field."""
 
     def __init__(self, folder: str | Path, kind: str):
         self.folder = Path(folder)
@@ -60,7 +60,7 @@ class SavedModel:
         self.tensors = self._read_tensors()
 
     def get(self, field: str, *types: type) -> Any:
-        """Value of a field of the config, which must be of one of `types`."""
+        """Value of a config field, which must have one of these types."""
         if field not in self.config:
             raise ValueError(f"{self.folder / CONFIG}: field {field!r} is missing")
         value = self.config[field]
@@ -72,7 +72,7 @@ class SavedModel:
         return value
 
     def flag(self, field: str) -> bool:
-        """Value of a field of the config, which must be true or false."""
+        """Value of a config field, which must be true or false."""
         value = self.config.get(field)
         if not isinstance(value, bool):
             raise ValueError(
@@ -81,7 +81,7 @@ class SavedModel:
         return value
 
     def tensor(self, name: str) -> Tensor:
-        """Tensor of that name, which must be finite."""
+        """Tensor with this name, which must be finite."""
         if name not in self.tensors:
             raise ValueError(f"{self.folder / MODEL}: tensor {name!r} is missing")
         if not self.tensors[name].isfinite().all():
@@ -89,11 +89,11 @@ class SavedModel:
         return self.tensors[name]
 
     def invalid_field(self, field: str, complaint: object) -> ValueError:
-        """A complaint about what a field of the config holds."""
+        """Error about the value of a config field."""
         return ValueError(f"{self.folder / CONFIG}: field {field!r}: {complaint}")
 
     def invalid(self, complaint: object) -> ValueError:
-        """The complaint of a constructor, with the folder that caused it."""
+        """Error of a constructor, with the folder that caused it."""
         return ValueError(f"{self.folder}: {complaint}")
 
     def _read_tensors(self) -> dict[str, Tensor]:
@@ -107,11 +107,11 @@ class SavedModel:
 
 
 def saved_kind(folder: str | Path) -> str:
-    """Class of the model in a folder, for who can read several.
+    """Class of the model in a folder.
 
     Raises:
-        FileNotFoundError: No saved model there.
-        ValueError: Its config is not one.
+        FileNotFoundError: The folder holds no saved model.
+        ValueError: The config is not valid.
     """
     return str(_read_config(Path(folder)).get("kind"))
 

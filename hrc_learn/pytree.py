@@ -9,20 +9,20 @@ from torch.utils import _pytree
 
 
 def static(default: Any) -> Any:
-    """Field of a pytree dataclass that is no tensor: structure, not a leaf.
+    """Field of a pytree dataclass that is structure instead of a leaf.
 
-    Gains and names belong here: `vmap` then maps the tensors alone, and `torch.compile` and
+    Use it for gains and names: `vmap` then maps the tensors only, and `torch.compile` and
     `torch.export` treat the value as a constant.
     """
     return dataclasses.field(default=default, metadata={"static": True})
 
 
 def pytree[T](cls: type[T]) -> type[T]:
-    """Register a dataclass: its fields are children, the `static` ones its structure.
+    """Register a dataclass as a pytree: fields are children, `static` ones structure.
 
     A field that is None has no child, so an optional tensor may be absent. Unlike
-    `torch.export.register_dataclass` this keeps floats out of the leaves, where `vmap` would
-    refuse them.
+    `torch.export.register_dataclass`, this keeps floats out of the leaves, which `vmap` would
+    refuse.
     """
     fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
     children = [f.name for f in fields if not f.metadata.get("static")]
@@ -39,7 +39,7 @@ def pytree[T](cls: type[T]) -> type[T]:
         return list(zip(keys, values, strict=True)), context
 
     def unflatten(values: Any, context: Any) -> T:
-        # Not through __init__: torch also unflattens things that are no tensors.
+        # Bypasses __init__, because torch also unflattens placeholders that are not tensors.
         present, structure = context
         instance = object.__new__(cls)
         for name in children:

@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.dmp._system.closed_forms import quintic
+from hrc_learn.geometry import minimum_jerk
 from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 from hrc_learn.lerobot.policy.closed_form import SampleWindows
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
@@ -34,7 +34,7 @@ def reaching(count: int, seed: int = 0) -> list[Episode]:
         goal = torch.tensor([1.0, -2.0]) + 0.5 * torch.randn(2, generator=rng)
         frames = int(torch.randint(36, 45, (), generator=rng))
         u = torch.linspace(0, 1, frames)[:, None]
-        path = start + (goal - start) * quintic(u)[0]
+        path = start + (goal - start) * minimum_jerk(u)[0]
         path = path + 0.3 * torch.sin(torch.pi * u) ** 2 * torch.tensor([-1.0, 1.0])
         episodes.append(
             {

@@ -14,7 +14,6 @@ from torch.utils import _pytree
 
 from hrc_learn.controller import constrained_velocity
 from hrc_learn.dmp import ContextualDMP, JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
-from hrc_learn.dmp.training import DescentConfig, Tracking, train
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, panda, separation, solve_inverse
 
@@ -130,13 +129,6 @@ def contexts(device: str):
     return dmp.at(context[:3] + 0.01).rollout().position
 
 
-def training(device: str):
-    time, position = demonstrations(device)
-    dmp = JointDMP.fit(time, position[0], 8)
-    trained = train(dmp, Tracking(position[1]), DescentConfig(steps=5))
-    return trained.dmp.rollout().position
-
-
 @pytest.mark.parametrize(
     "compute",
     [
@@ -152,7 +144,6 @@ def training(device: str):
         distribution,
         mixture,
         contexts,
-        training,
     ],
 )
 def test_a_gpu_does_what_the_cpu_does(compute: Callable[[str], object]):

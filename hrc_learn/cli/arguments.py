@@ -295,8 +295,8 @@ class FitPrimitives(Columns, Fit):
     """Channels to learn. Default: joint and pose, if the dataset has them."""
     several: Literal["best", "mean", "distribution", "contextual", "streamed"] = "best"
     """Common model of several demonstrations: the best of mean, contextual and nearest on
-    held-out ones; their mean; their mean and all of them (for a DMPDistribution); a function of
-    the context; or one primitive fitted in a single pass over the data."""
+    held-out ones; their mean; their mean and all of them (for a ProbabilisticDMP); a function
+    of the context; or one primitive fitted in a single pass over the data."""
     context: tuple[str, ...] = ()
     """Columns whose first row is the context. Default: start and goal."""
     n_basis: int | None = 60

@@ -139,7 +139,7 @@ def pose_inputs(pose: Pose, reference: Float[Tensor, "4"] | None) -> Float[Tenso
 def _mean_orientation(demonstrations: Sequence[ImageDemonstration]) -> Float[Tensor, "4"]:
     """Largest eigenvector of the summed outer products (Markley et al. 2007); either sign."""
     total = torch.zeros(4, 4, dtype=torch.float64)
-    for _, demonstration in distributed.share(demonstrations):
+    for _, demonstration in distributed.local_items(demonstrations):
         orientation = demonstration.pose.orientation.double()
         total += orientation.mT @ orientation
     return torch.linalg.eigh(distributed.sum_over_processes(total)).eigenvectors[:, -1]
@@ -151,7 +151,7 @@ def _range(
     """Smallest and largest value of every input."""
     low = torch.full((6,), torch.inf, dtype=torch.float64)
     high = -low
-    for _, demonstration in distributed.share(demonstrations):
+    for _, demonstration in distributed.local_items(demonstrations):
         pose = demonstration.pose
         pose = Pose(pose.position.double(), pose.orientation.double())
         inputs = pose_inputs(pose, reference)

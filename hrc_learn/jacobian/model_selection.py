@@ -237,7 +237,7 @@ def _motions(
             f"{len(demonstrations)}: record more, or fit without learning the neurons."
         )
     sets: tuple[list[MotionSamples], list[MotionSamples]] = ([], [])
-    for i, demonstration in distributed.share(demonstrations):
+    for i, demonstration in distributed.local_items(demonstrations):
         # Numbered over all demonstrations, so that the set does not depend on the processes.
         is_held_out = (i + 1) % learning.hold_out == 0
         sets[is_held_out].append(demonstration.motion(config))

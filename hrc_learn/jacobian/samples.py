@@ -262,7 +262,7 @@ def samples_by_fold(
     demonstrations: Sequence[ImageDemonstration], config: KeyFrameConfig
 ) -> Iterator[tuple[int, MotionSamples]]:
     """Motion between key frames in the demonstrations of this process, with its fold."""
-    for i, demonstration in distributed.share(demonstrations):
+    for i, demonstration in distributed.local_items(demonstrations):
         motion = demonstration.motion(config)
         if len(demonstrations) == 1:
             yield from enumerate(motion.split(FOLDS))

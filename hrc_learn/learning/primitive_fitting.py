@@ -14,9 +14,9 @@ from hrc_learn.demos import DemonstrationSet, PaddedDemonstrations
 from hrc_learn.dmp import (
     BasisSelection,
     ContextualDMP,
-    DMPDistribution,
     JointDMP,
     PoseDMP,
+    ProbabilisticDMP,
     mean_primitive,
     select_basis_count,
 )
@@ -74,20 +74,20 @@ class FittedPrimitives:
         Args:
             folder: Folder of the model.
             each: Also write the primitives of single demonstrations, from which
-                `DMPDistribution` is fitted, to `folder/each/CHANNEL`.
+                `ProbabilisticDMP` is fitted, to `folder/each/CHANNEL`.
         """
         for channel, primitive in self.common.items():
             primitive.save(folder / channel)
         for channel, primitives in {**self.each, **self.every}.items() if each else ():
             primitives.save(folder / EACH / channel)
 
-    def distribution(self, channel: str) -> DMPDistribution:
+    def distribution(self, channel: str) -> ProbabilisticDMP:
         """Gaussian distribution over the primitives of one channel.
 
         Raises:
             ValueError: There are fewer than two demonstrations, or the primitives are scaled.
         """
-        return DMPDistribution.fit({**self.each, **self.every}[channel])
+        return ProbabilisticDMP.fit({**self.each, **self.every}[channel])
 
     def metrics(self) -> dict[str, float]:
         """Errors of the primitives, by name.

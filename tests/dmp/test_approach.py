@@ -5,7 +5,7 @@ from dmp_oracle import solve
 from torch.autograd.functional import jvp
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, fit_rhythmic
-from hrc_learn.dmp._system.closed_forms import minimum_jerk as approach_curve
+from hrc_learn.dmp._system.spring import minimum_jerk_curve as approach_curve
 from hrc_learn.geometry import quaternion
 
 S = torch.linspace(0, 1, 1000, dtype=torch.float64)
@@ -64,7 +64,7 @@ def test_a_moved_goal_makes_no_haste():
 def test_impossible_approaches_are_refused():
     time, position = arm_motion()
     for approach in (-0.1, 1.1):
-        with pytest.raises(ValueError, match="approach must be a share"):
+        with pytest.raises(ValueError, match="approach must be a fraction"):
             JointDMP.fit(time, position, approach=approach)
     rhythm = fit_rhythmic(time, torch.sin(8 * time)[:, None])
     with pytest.raises(ValueError, match="0 for rhythms"):

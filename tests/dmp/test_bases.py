@@ -14,17 +14,12 @@ from hrc_learn.dmp import (
     ExponentialPhase,
     GaussianBasis,
     JointDMP,
-    LearnedGaussianBasis,
     PeriodicBasis,
     Response,
     SigmoidPhase,
     SplineBasis,
     SpringDamper,
     Stepper,
-)
-
-UNEVEN = LearnedGaussianBasis(
-    centres=(0.0, 0.1, 0.3, 0.33, 0.36, 0.6, 1.0), widths=(0.1, 0.1, 0.01, 0.02, 0.02, 0.2, 0.1)
 )
 
 
@@ -48,10 +43,6 @@ BASES = {
     "spline": SplineBasis(count=12),
     "spline, few": SplineBasis(count=3),
     "spline, sigmoid": SplineBasis(count=20, phase=SigmoidPhase(steepness=200.0)),
-    "placed": UNEVEN,
-    "placed, sigmoid": LearnedGaussianBasis(
-        centres=UNEVEN.centres, widths=UNEVEN.widths, phase=SigmoidPhase()
-    ),
 }
 
 
@@ -77,13 +68,8 @@ def shares(basis, s):
     N = basis.count
     if isinstance(basis, SplineBasis):
         return np.nan_to_num(splines(N)(s))
-    if isinstance(basis, LearnedGaussianBasis):
-        c, sigma = np.array(basis.centres), np.array(basis.widths)
-        c = np.append(c, c[-1] + max(c[-1] - c[-2], sigma.max()))
-        sigma = np.append(sigma, sigma.max())
-    else:
-        c = np.arange(N + 1) / (N - 1)
-        sigma = basis.width / (N - 1)
+    c = np.arange(N + 1) / (N - 1)
+    sigma = basis.width / (N - 1)
     exponent = -((s - c) ** 2) / (2 * sigma**2)
     psi = np.exp(exponent - exponent.max())
     return psi[:N] / psi.sum()
@@ -134,13 +120,6 @@ def test_splines_add_up_to_one_until_they_fade():
     torch.testing.assert_close(basis.kernels(s).sum(-1), torch.ones_like(s))
 
 
-def test_alike_and_equally_placed_gaussians_are_the_usual_ones():
-    usual = GaussianBasis(count=9)
-    placed = LearnedGaussianBasis(centres=tuple(k / 8 for k in range(9)), widths=(0.6 / 8,) * 9)
-    s = torch.linspace(0, 1.5, 100, dtype=torch.float64)
-    torch.testing.assert_close(placed.forcing(s), usual.forcing(s))
-
-
 def finer(basis):
     """The same basis, that asks for a table of a third of the interval."""
 
@@ -161,9 +140,6 @@ def finer(basis):
         PeriodicBasis(count=6, width=0.35),
         PeriodicBasis(count=6, width=0.9),
         SplineBasis(count=8),
-        LearnedGaussianBasis(
-            centres=(0.0, 0.1, 0.15, 0.5, 1.0), widths=(0.1, 0.03, 0.04, 0.2, 0.3)
-        ),
     ],
 )
 def test_a_table_of_the_response_is_exact_to_rounding(basis):
@@ -176,11 +152,11 @@ def test_a_table_of_the_response_is_exact_to_rounding(basis):
 
 
 @pytest.mark.parametrize("method", ["trajectory", "ridge", "lwr"])
-@pytest.mark.parametrize("basis", [SplineBasis(), UNEVEN, GaussianBasis(phase=SigmoidPhase())])
+@pytest.mark.parametrize("basis", [SplineBasis(), GaussianBasis(phase=SigmoidPhase())])
 def test_a_fit_steps_and_saves_on_it(basis, method, tmp_path):
     time, position = arm_motion(moving_start=True)
     dmp = JointDMP.fit(time, position, basis=basis, method=method)
-    assert dmp.fit_report.nrmse < (0.1 if basis is UNEVEN or method == "lwr" else 1e-4)
+    assert dmp.fit_report.nrmse < (0.1 if method == "lwr" else 1e-4)
     state, stepper = dmp.initial_state(), Stepper(dmp)
     numpy_state = stepper.initial_state()
     for dt in [0.05] * 20 + [0.4] * 8:
@@ -216,23 +192,6 @@ def test_files_without_a_type_of_phase_are_read(tmp_path):
     ("make", "complaint"),
     [
         (lambda: SplineBasis(count=1), "at least 2"),
-        (lambda: LearnedGaussianBasis(centres=(0.0,), widths=(0.1,)), "at least 2"),
-        (
-            lambda: LearnedGaussianBasis(centres=(0.0, 0.5), widths=(0.1,)),
-            "1 widths for 2 centres",
-        ),
-        (
-            lambda: LearnedGaussianBasis(centres=(0.5, 0.5), widths=(0.1, 0.1)),
-            "must increase.*place 1",
-        ),
-        (
-            lambda: LearnedGaussianBasis(centres=(0.0, 0.5), widths=(0.1, 0.0)),
-            "width must be positive",
-        ),
-        (
-            lambda: LearnedGaussianBasis(centres=(0.0, float("inf")), widths=(0.1, 0.1)),
-            "finite",
-        ),
         (lambda: SigmoidPhase(steepness=0.0), "steepness must be positive"),
         (lambda: SigmoidPhase(middle=-1.0), "middle must be positive"),
     ],

@@ -7,7 +7,7 @@ from dmp_contract import DMPContract
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, SplineBasis
-from hrc_learn.dmp import _ude_formulation as ude
+from hrc_learn.dmp import ude_formulation as ude
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -182,7 +182,7 @@ class TestOrientationOfUde(TestOrientation):
 
     @pytest.fixture(autouse=True)
     def coarse(self, monkeypatch):
-        monkeypatch.setattr(ude, "LONGEST", 1 / 80)
+        monkeypatch.setattr(ude, "MAXIMUM_STEP", 1 / 80)
         # Its many short steps take four times as long with their shapes checked, which the
         # tests of the formulation do.
         with shapes_unchecked():
@@ -193,7 +193,7 @@ class TestOrientationOfUde(TestOrientation):
 
     def test_gradients_are_exact(self, monkeypatch):
         # Coarse: the derivative of what is computed is exact at any step length.
-        monkeypatch.setattr(ude, "LONGEST", 0.1)
+        monkeypatch.setattr(ude, "MAXIMUM_STEP", 0.1)
         super().test_gradients_are_exact()
 
     @pytest.mark.parametrize("n_steps", [150])

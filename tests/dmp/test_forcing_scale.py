@@ -248,7 +248,7 @@ def test_curvature_is_the_derivative_of_the_rate():
     state = dmp.step(dmp.initial_state(goal=dmp.goal + 0.4), 0.7)
     ahead, behind = (dmp.step(state, dt) for dt in (1e-5, -1e-5))
     numeric = (ahead.rate - behind.rate) / (2e-5 / dmp.duration)
-    torch.testing.assert_close(numeric, dmp.curvature(state), rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(numeric, dmp.second_derivative(state), rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("columns", [None, 2])

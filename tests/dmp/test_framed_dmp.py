@@ -208,7 +208,7 @@ def test_what_cannot_be_is_refused(model):
         FramedDMP.fit(time, position, frames, basis=PeriodicBasis(count=9))
     with pytest.raises(ValueError, match="has 2 frames of 2 coordinates, got 1 of 2"):
         model.at(Frames(frames.A[:, :1], frames.b[:, :1]))
-    with pytest.raises(ValueError, match="of one place"):
+    with pytest.raises(ValueError, match="without a batch"):
         model.distribution(frames)
     with shapes_unchecked(), pytest.raises(ValueError, match="must have A"):
         replace(frames, A=frames.A[..., :1])

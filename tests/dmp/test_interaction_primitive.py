@@ -114,7 +114,7 @@ def test_refuses_with_a_sentence(model):
         InteractionPrimitive.fit(time, hand, robot)
     with pytest.raises(ValueError, match="must be \\(n,\\) and"):
         model.observe(time[:3], hand[:4], 0.1)
-    with pytest.raises(ValueError, match="nothing was seen"):
+    with pytest.raises(ValueError, match="no value of the person"):
         model.observe(time[:3], hand[:3] * math.nan, 0.1)
     with pytest.raises(ValueError, match="noise must be positive"):
         model.observe(time[:3], hand[:3], 0.0)

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch.autograd import forward_ad
 
 from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper
-from hrc_learn.dmp._system import products, response
+from hrc_learn.dmp._system import products, trajectory
 
 # Files
 
@@ -98,7 +98,7 @@ def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
         ("basis", {"count": 8}, r"config\.json: field 'basis': 'type' is missing"),
         ("basis", {"type": "Wavelets"}, "field 'basis': unknown type 'Wavelets'"),
         ("spring", {"gamma": 1.0}, "field 'spring': .*gamma"),
-        ("approach", 2.0, "approach must be a share"),
+        ("approach", 2.0, "approach must be a fraction"),
         ("joint_names", ["only"], "1 joint names for 2"),
     ],
 )
@@ -450,8 +450,8 @@ def test_every_way_to_multiply_gives_the_same_motions(monkeypatch, shape, most, 
     positions = position + torch.randn(*shape, 1, 7, dtype=torch.float64)
     dmp = JointDMP.fit(time, positions, 12)
     derived = dmp.rollout()
-    for module in (products, response):
-        monkeypatch.setattr(module, "most_in_numpy", lambda: most)
+    for module in (products, trajectory):
+        monkeypatch.setattr(module, "numpy_limit", lambda: most)
     before = torch.get_num_threads()
     torch.set_num_threads(n_threads)
     try:
@@ -478,7 +478,7 @@ def test_every_way_to_multiply_gives_the_same_motions(monkeypatch, shape, most, 
 def test_numpy_multiplies_what_its_library_has_kernels_for(monkeypatch, libraries, most):
     found = [{"internal_api": api, "architecture": name} for api, name in libraries]
     monkeypatch.setattr("threadpoolctl.threadpool_info", lambda: found)
-    assert products.most_in_numpy.__wrapped__() == most
+    assert products.numpy_limit.__wrapped__() == most
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (2, 3, 5), (2, 4, 5)])

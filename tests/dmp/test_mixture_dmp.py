@@ -168,7 +168,7 @@ def test_held_out_ways_are_predicted():
                 "mixture": told.mean_primitive(),
             }
             for name, dmp in predictions.items():
-                path = dmp.with_ends(start, goal).rollout(S * dmp.duration).position
+                path = dmp.with_boundary(start, goal).rollout(S * dmp.duration).position
                 errors[name].append((path - position[i]).square().mean().sqrt().item())
     worst = {name: torch.tensor(values).quantile(0.9) for name, values in errors.items()}
     usual = {name: torch.tensor(values).median() for name, values in errors.items()}

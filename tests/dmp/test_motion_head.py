@@ -284,7 +284,7 @@ def test_state_survives_a_file(head, tmp_path):
         ("parameters must have shape", lambda: head_of(3)(torch.zeros(5), [0.0], [0.0] * 3)),
         ("parameters must be finite", lambda: planned(z=torch.full((22,), torch.nan))),
         ("start must have", lambda: planned(start=[0.0])),
-        ("none negative", lambda: planned(time=[-1.0])),
+        ("non-negative", lambda: planned(time=[-1.0])),
         ("no time may be before", lambda: planned(time=[0.2], since=0.5)),
         ("since must be", lambda: planned(since=-1.0)),
         ("give since", lambda: planned(origin=[0.0, 0.0])),

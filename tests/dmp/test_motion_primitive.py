@@ -1,7 +1,6 @@
-"""What every kind of primitive promises as a `MotionPrimitive`, beside `dmp_contract.py`."""
+"""Behaviour of every kind of primitive, in addition to `dmp_contract.py`."""
 
-import json
-
+import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion, turning_motion
@@ -9,19 +8,15 @@ from safetensors.torch import load_file, save_file
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
-    DualArmDMP,
     JointDMP,
-    LearnedGaussianBasis,
-    LimitedDMP,
     MotionPrimitive,
     MovingGoalDMP,
     OrientationDMP,
     PoseDMP,
     fit_rhythmic,
     fit_rhythmic_pose,
-    through,
 )
-from hrc_learn.dmp.exported_dmp import resting_inputs, state_tensors
+from hrc_learn.dmp.exported_dmp import export_dmp, resting_inputs, state_tensors
 from hrc_learn.geometry import Pose, quaternion
 
 TIME, POSITION = arm_motion(n_samples=120, n_joints=5, moving_start=True)
@@ -30,18 +25,11 @@ ROUND = torch.linspace(0, 2, 120, dtype=torch.float64)
 SWING = 0.3 * torch.sin(2 * torch.pi * ROUND[:, None] * torch.ones(3))
 
 
-def two_hands():
-    position = torch.stack([POSITION[:, :3], POSITION[:, 2:]], dim=-2)
-    return DualArmDMP.fit(TIME, position, torch.stack([TURN, TURN.flip(0)], dim=-2), 12, gain=4)
-
-
 KINDS = {
     "joint": lambda: JointDMP.fit(TIME, POSITION, 12),
     "orientation": lambda: OrientationDMP.fit(TIME, TURN, 12),
     "pose": lambda: PoseDMP.fit(TIME, POSITION[:, :3], TURN, 12, POSITION[:, 3:]),
-    "limited": lambda: LimitedDMP.fit(TIME, POSITION, -2.0, 2.5, 12),
     "moving goal": lambda: MovingGoalDMP.fit(TIME, POSITION, 12),
-    "two arms": two_hands,
 }
 RHYTHMS = {
     "rhythm": lambda: fit_rhythmic(ROUND, SWING, 8, period=1.0),
@@ -99,35 +87,24 @@ def test_every_kind_is_conditioned_on_via_points(kind):
     assert off(value_at(dmp.rollout(), 60), value_at(before, 60)) < 1e-15
 
 
-def test_through_is_the_same_as_condition():
-    dmp = KINDS["joint"]()
-    via = POSITION[60:61] + 0.1
-    ours, same = through(dmp, [1.0], via), dmp.condition([1.0], via)
-    assert torch.equal(ours.rollout().position, same.rollout().position)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_ends_can_be_put_into_every_kind(kind):
     dmp = KINDS[kind]()
     given = {"duration": 1.5}
     if kind == "joint":
         given["goal"] = POSITION[-1] + 0.2
-    there, own = dmp.rollout(**given), dmp.with_ends(**given).rollout()
+    there, own = dmp.rollout(**given), dmp.with_boundary(**given).rollout()
     assert off(value_at(own, 60), value_at(there, 60)) < 1e-9
 
 
-@pytest.mark.parametrize(
-    "kind", ["limited", "moving goal", pytest.param("two arms", marks=pytest.mark.slow)]
-)
-def test_a_program_of_every_kind_does_what_the_primitive_does(kind):
-    """Those of joints, orientations and poses are in `test_exported_dmp.py`."""
-    dmp = KINDS[kind]()
+def test_a_program_without_a_stepper_does_what_the_primitive_does():
+    """Programs of joints, orientations and poses are in `test_exported_dmp.py`."""
+    dmp = KINDS["moving goal"]()
     with shapes_unchecked():
-        exported = dmp.export()
+        exported = export_dmp(dmp)
     assert exported.stepper is None
     program = exported.program.module()
-    start = {"end_velocity": torch.ones(5).double()} if kind == "moving goal" else {}
-    state = dmp.initial_state(**start)
+    state = dmp.initial_state(end_velocity=torch.ones(5).double())
     tensors = state_tensors(state)
     for dt, waiting in ((0.05, 0.0), (0.2, 1.0)):
         inputs = resting_inputs(dmp, tensors)
@@ -139,33 +116,36 @@ def test_a_program_of_every_kind_does_what_the_primitive_does(kind):
             torch.testing.assert_close(tensors[name], value, rtol=1e-9, atol=1e-9, msg=name)
 
 
-def test_exporters_register_for_a_type():
-    class Toaster:
-        duration = torch.tensor(1.0)
-
-    from hrc_learn.dmp.motion_primitive import export_primitive
-
-    with pytest.raises(TypeError, match="no exporter is registered for Toaster"):
-        export_primitive(Toaster())
-
-
-def test_a_kept_end_velocity_is_refused():
-    dmp = KINDS["moving goal"]()
-    with pytest.raises(ValueError, match="is given to rollout"):
-        dmp.with_ends(end_velocity=torch.ones(5).double())
-
-
-def test_files_with_older_names_are_read(tmp_path):
-    """Timestamps were once "stamps", learned bases placed ones."""
-    basis = LearnedGaussianBasis(centres=(0.0, 0.3, 1.0), widths=(0.2, 0.3, 0.3))
-    dmp = JointDMP.fit(TIME, POSITION, basis=basis)
+def test_files_with_the_older_name_of_timestamps_are_read(tmp_path):
+    dmp = JointDMP.fit(TIME, POSITION, 12)
     dmp.save(tmp_path)
-    model, config = tmp_path / "model.safetensors", tmp_path / "config.json"
-    tensors, fields = load_file(model), json.loads(config.read_text())
+    model = tmp_path / "model.safetensors"
+    tensors = load_file(model)
     tensors["stamps"] = tensors.pop("timestamps")
     save_file(tensors, model)
-    fields["basis"]["type"] = "PlacedBasis"
-    config.write_text(json.dumps(fields))
-    older = JointDMP.load(tmp_path)
-    assert older.basis == basis
-    assert torch.equal(older.rollout().position, dmp.rollout().position)
+    assert torch.equal(JointDMP.load(tmp_path).rollout().position, dmp.rollout().position)
+
+
+@pytest.mark.parametrize("kind", ["joint", "orientation", "moving goal"])
+def test_arguments_of_other_kinds_are_refused(kind):
+    dmp = KINDS[kind]()
+    with pytest.raises(ValueError, match="has no goal_body"):
+        dmp.rollout(goal_body=[0.1])
+    with pytest.raises(ValueError, match="has no goal_body"):
+        dmp.step(dmp.initial_state(), 0.1, goal_body=[0.1])
+    with pytest.raises(ValueError, match="has no end_velocity"):
+        KINDS["pose"]().initial_state(end_velocity=[0.1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_outputs_that_require_gradients_can_be_plotted(kind):
+    dmp = KINDS[kind]()
+    motion = dmp.rollout()
+    for name, expected in motion.numpy().items():
+        values = getattr(motion, name)
+        assert np.array_equal(np.asarray(values), expected), name
+        assert np.array_equal(np.asarray(values[3:, ...]), expected[3:]), name
+    first = motion.position if hasattr(motion, "position") else motion.orientation
+    assert first.requires_grad
+    first.square().sum().backward()
+    assert dmp.motion.weights.grad.abs().max() > 0

@@ -76,7 +76,7 @@ def test_switched_at_half_time_the_acceleration_goes_on_and_no_path_flips():
 def acceleration(dmp, state):
     """Angular [rad/s^2]."""
     motion = state.motion
-    curvature = dmp.motion.curvature(motion)
+    curvature = dmp.motion.second_derivative(motion)
     scaled = angular_acceleration(motion.position, motion.rate, curvature)
     return scaled / motion.duration[..., None] ** 2
 

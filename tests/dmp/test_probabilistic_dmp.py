@@ -143,7 +143,7 @@ def test_what_cannot_be_is_refused(distribution):
         ProbabilisticDMP.fit(JointDMP.fit(time, both, scaling="amplitude"))
     with pytest.raises(ValueError, match=r"value must have shape \(1, 2\)"):
         distribution.condition([0.5], [0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="none negative"):
+    with pytest.raises(ValueError, match="non-negative"):
         distribution.position([-1.0])
 
 

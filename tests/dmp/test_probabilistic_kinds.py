@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from torch.autograd import gradcheck
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import LimitedDMP, OrientationDMP, PoseDMP, ProbabilisticDMP
+from hrc_learn.dmp import OrientationDMP, PoseDMP, ProbabilisticDMP
 from hrc_learn.dmp.orientation_error import nearest_turn, to_error
 from hrc_learn.geometry import Pose, quaternion
 
@@ -126,18 +126,6 @@ def test_one_pose_bends_through_via_points_and_keeps_its_ends():
     assert quaternion.angle(there.orientation, via.orientation) < 1e-5
     torch.testing.assert_close(bent.goal.vector(), dmp.goal.vector())
     torch.testing.assert_close(bent.rollout().body, dmp.rollout().body)
-
-
-def test_limited_joints_stay_inside_whatever_is_sampled():
-    time, position = arm_motion(n_joints=2)
-    lower, upper = position.amin(0) - 0.05, position.amax(0) + 0.05
-    dmp = LimitedDMP.fit(time, position, lower, upper)
-    wild = ProbabilisticDMP.around(dmp, slack=3.0)
-    moved = wild.sample(50, torch.Generator().manual_seed(0)).rollout().position
-    assert ((moved > lower) & (moved < upper)).all()
-    via = ((lower + 3 * upper) / 4)[None]
-    there = wild.condition([1.0], via).mean_primitive().rollout(time=[1.0]).position
-    torch.testing.assert_close(there, via, rtol=0, atol=1e-5)
 
 
 def test_a_via_orientation_is_on_the_branch_of_the_motion():

@@ -32,7 +32,7 @@ class TestRhythmicOrientation(DMPContract):
     reproduction = 1e-4
 
     def test_reversed_goes_the_same_way_back(self, dmp):
-        with pytest.raises(ValueError, match="rhythm goes on"):
+        with pytest.raises(ValueError, match="a rhythm cannot be reversed"):
             dmp.reversed()
 
     def demonstrate(self, seed, n_samples=300):

@@ -5,8 +5,8 @@ import torch
 from demo_motions import arm_motion, turning_motion
 
 from hrc_learn.dmp import GaussianBasis, JointDMP, OrientationDMP, SpringDamper, response_of
-from hrc_learn.dmp._arguments import check_samples
-from hrc_learn.dmp._fitting import robust_weights
+from hrc_learn.dmp.fitting.noise import without_outliers
+from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.geometry import quaternion
 
 
@@ -64,7 +64,7 @@ def test_samples_are_taken_back_as_far_as_they_are_not_trusted():
     samples = check_samples(time, position)
     response = response_of(SpringDamper(), GaussianBasis(count=20))
     for loss in ("huber", "tukey"):
-        tamed, trust = robust_weights(loss, response, samples, 1e-7)
+        tamed, trust = without_outliers(loss, response, samples, 1e-7)
         whole = trust == 1
         assert whole.any() == (loss == "huber")
         torch.testing.assert_close(tamed.position[whole], samples.position[whole])
@@ -143,5 +143,5 @@ def test_trust_is_saved(tmp_path):
 
 
 def test_a_loss_that_there_is_not_is_refused():
-    with pytest.raises(ValueError, match="there are huber, tukey"):
+    with pytest.raises(ValueError, match="choose from huber, tukey"):
         JointDMP.fit(*arm_motion(n_samples=30), 5, robust="cauchy")

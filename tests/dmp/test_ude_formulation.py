@@ -161,5 +161,7 @@ def test_files_keep_the_formulation_and_older_ones_have_none(dmp, tmp_path):
 
 
 def test_unknown_formulations_are_refused():
-    with pytest.raises(ValueError, match="unknown formulation 'hamilton'; there are log, ude"):
+    with pytest.raises(
+        ValueError, match="unknown formulation 'hamilton'; choose from log, ude"
+    ):
         OrientationDMP.fit(*turning_motion(), formulation="hamilton")

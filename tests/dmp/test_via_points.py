@@ -7,13 +7,10 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
     JointDMP,
-    LimitedDMP,
     OrientationDMP,
     PoseDMP,
     ProbabilisticDMP,
     fit_rhythmic,
-    through,
-    with_ends,
 )
 from hrc_learn.geometry import Pose, quaternion
 
@@ -39,7 +36,7 @@ def test_via_points_are_passed_exactly_with_the_velocity_kept():
     dmp = JointDMP.fit(*arm_motion(n_joints=3))
     times = [0.4, 1.5, 2.2]
     via = torch.tensor([[0.4, NAN, 1.0], [NAN, NAN, -2.0], [5.0, NAN, NAN]]).double()
-    there, plain = (d.rollout(time=times) for d in (through(dmp, times, via), dmp))
+    there, plain = (d.rollout(time=times) for d in (dmp.condition(times, via), dmp))
     expected = torch.where(via.isnan(), there.position, via)
     torch.testing.assert_close(there.position, expected, rtol=0, atol=1e-10)
     kept = ~via.isnan()
@@ -49,7 +46,7 @@ def test_via_points_are_passed_exactly_with_the_velocity_kept():
 
 def test_ends_stay_with_their_velocity():
     dmp = JointDMP.fit(*arm_motion(n_joints=2, moving_start=True))
-    bent = through(dmp, [1.0], [[2.0, -1.0]])
+    bent = dmp.condition([1.0], [[2.0, -1.0]])
     for name in ("position", "velocity"):
         one, other = (getattr(d.rollout(time=[0.0, 3.0]), name) for d in (bent, dmp))
         torch.testing.assert_close(one, other, rtol=0, atol=1e-9, msg=name)
@@ -57,7 +54,7 @@ def test_ends_stay_with_their_velocity():
 
 def test_within_a_window_all_else_is_unchanged():
     dmp = JointDMP.fit(*arm_motion(n_joints=2))
-    bent = through(dmp, [1.5], [[0.9, NAN]], within=(0.9, 2.1))
+    bent = dmp.condition([1.5], [[0.9, NAN]], within=(0.9, 2.1))
     outside = (DENSE < 0.9) | (DENSE > 2.1)
     change = (bent.rollout(time=DENSE).position - dmp.rollout(time=DENSE).position).abs()
     assert change[outside].max() < 1e-9
@@ -71,7 +68,7 @@ def flat(n_basis):
 
 
 def test_between_via_points_the_change_is_a_minimum_jerk_curve():
-    bump = through(flat(100), [1.0, 2.4], [[1.0], [-2.0]]).rollout(time=DENSE).position[:, 0]
+    bump = flat(100).condition([1.0, 2.4], [[1.0], [-2.0]]).rollout(time=DENSE).position[:, 0]
     before = minimum_jerk((DENSE / 1.0).clamp(max=1))
     between = 3 * minimum_jerk(((DENSE - 1.0) / 1.4).clamp(0, 1))
     after = 2 * minimum_jerk(((DENSE - 2.4) / 0.6).clamp(min=0))
@@ -79,7 +76,7 @@ def test_between_via_points_the_change_is_a_minimum_jerk_curve():
 
 
 def test_a_given_velocity_bends_the_curve_to_the_quintic_with_it():
-    bent = through(flat(100), [1.2], [[0.5]], velocity=[[-1.5]]).rollout(time=DENSE)
+    bent = flat(100).condition([1.2], [[0.5]], velocity=[[-1.5]]).rollout(time=DENSE)
     for begin, end, ends in ((0.0, 1.2, (0, 0, 0.5, -1.5)), (1.2, 3.0, (0.5, -1.5, 0, 0))):
         # Six conditions, with no acceleration at either knot.
         T = end - begin
@@ -91,7 +88,7 @@ def test_a_given_velocity_bends_the_curve_to_the_quintic_with_it():
         expected = sum(c[k] * (t - begin) ** k for k in range(6))
         got = bent.position[(begin <= DENSE) & (end >= DENSE), 0]
         torch.testing.assert_close(got, expected, rtol=0, atol=1e-3)
-    there = through(flat(100), [1.2], [[0.5]], velocity=[[-1.5]]).rollout(time=[1.2])
+    there = flat(100).condition([1.2], [[0.5]], velocity=[[-1.5]]).rollout(time=[1.2])
     assert there.velocity.item() == pytest.approx(-1.5, abs=1e-9)
 
 
@@ -100,7 +97,7 @@ def test_via_points_far_outside_of_the_demonstration_cause_no_overshoot(far):
     time, position = arm_motion(n_joints=1)
     dmp = JointDMP.fit(time, position)
     for at in (0.3, 1.5, 2.6):
-        moved = through(dmp, [at], [[far]]).rollout(time=DENSE).position
+        moved = dmp.condition([at], [[far]]).rollout(time=DENSE).position
         change = (moved - dmp.rollout(time=DENSE).position)[:, 0] / (
             far - dmp.rollout(time=[at]).position[0, 0]
         )
@@ -112,7 +109,7 @@ def test_as_conditioning_without_noise_it_passes_but_keeps_the_end():
     """`around` makes the least change of the forcing, wherever that leads to at the end."""
     dmp = JointDMP.fit(*arm_motion(n_joints=1))
     soft = ProbabilisticDMP.around(dmp).condition([1.2], [[0.7]]).mean_primitive()
-    hard = through(dmp, [1.2], [[0.7]])
+    hard = dmp.condition([1.2], [[0.7]])
     for bent in (soft, hard):
         assert bent.rollout(time=[1.2]).position.item() == pytest.approx(0.7, abs=1e-5)
     end, softs, hards = (d.rollout(time=[3.0]).position.item() for d in (dmp, soft, hard))
@@ -124,7 +121,7 @@ def test_orientations_are_passed_by_either_sign_of_the_quaternion():
     times = torch.tensor([0.8, 1.9], dtype=torch.float64)
     via = torch.stack([orientation(0.5, -1.0, 0.3), orientation(2.0, 1.0, 0.0)])
     omega = torch.tensor([[0.1, -0.2, 0.3], [NAN, NAN, NAN]]).double()
-    bent, other = (through(dmp, times, q, omega) for q in (via, -via))
+    bent, other = (dmp.condition(times, q, omega) for q in (via, -via))
     there = bent.rollout(time=times)
     assert quaternion.angle(there.orientation, via).max() < 1e-7
     torch.testing.assert_close(there.angular_velocity[0], omega[0], rtol=0, atol=1e-8)
@@ -138,7 +135,7 @@ def test_a_via_orientation_past_a_turn_is_on_the_branch_of_the_motion():
     axis = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     dmp = OrientationDMP.fit(s, quaternion.exp(12 * minimum_jerk(s)[:, None] * axis))
     via = orientation(*(6.3 * axis))[None]
-    bent = through(dmp, [0.5], via)
+    bent = dmp.condition([0.5], via)
     assert quaternion.angle(bent.rollout(time=[0.5]).orientation, via).max() < 1e-7
     way = bent.rollout().angular_velocity.norm(dim=-1).mean()
     assert way.item() == pytest.approx(12, rel=0.02)
@@ -149,7 +146,7 @@ def test_any_part_of_a_pose_is_passed():
     position = torch.tensor([[0.2, NAN, 0.4], [NAN, NAN, NAN]], dtype=torch.float64)
     rotation = torch.stack([torch.full((4,), NAN).double(), orientation(0.3, 0.2, -0.5)])
     body = torch.tensor([[NAN, 0.1], [NAN, NAN]], dtype=torch.float64)
-    bent = through(dmp, [1.0, 2.0], Pose(position, rotation), body=body)
+    bent = dmp.condition([1.0, 2.0], Pose(position, rotation), body=body)
     there, plain = (d.rollout(time=[1.0, 2.0]) for d in (bent, dmp))
     torch.testing.assert_close(there.position[0, [0, 2]], position[0, [0, 2]])
     torch.testing.assert_close(there.position[:, 1], plain.position[:, 1])
@@ -158,52 +155,40 @@ def test_any_part_of_a_pose_is_passed():
     torch.testing.assert_close(there.body[:, 0], plain.body[:, 0])
 
 
-def test_limited_joints_pass_without_leaving_their_limits():
-    time, position = arm_motion(n_joints=2)
-    lower, upper = position.amin(0) - 0.1, position.amax(0) + 0.1
-    dmp = LimitedDMP.fit(time, position, lower, upper)
-    via = (upper - 1e-3)[None]
-    motion = through(dmp, [1.0], via).rollout(time=DENSE)
-    torch.testing.assert_close(motion.position[200:201], via, rtol=0, atol=1e-8)
-    assert ((motion.position > lower) & (motion.position < upper)).all()
-    with pytest.raises(ValueError, match="not between the limits"):
-        through(dmp, [1.0], via + 1)
-
-
 def test_a_batch_passes_points_of_its_own():
     demonstrations = [arm_motion(n_joints=2, seed=seed) for seed in range(3)]
     time, positions = demonstrations[0][0], torch.stack([y for _, y in demonstrations])
     dmp = JointDMP.fit(time, positions)
     times = torch.tensor([[0.5], [1.0], [1.5]], dtype=torch.float64)
     via = torch.tensor([[[1.0, NAN]], [[2.0, 0.0]], [[NAN, 3.0]]], dtype=torch.float64)
-    together = through(dmp, times, via).rollout().position
+    together = dmp.condition(times, via).rollout().position
     for i in range(3):
-        alone = through(JointDMP.fit(time, positions[i]), times[i], via[i])
+        alone = JointDMP.fit(time, positions[i]).condition(times[i], via[i])
         torch.testing.assert_close(together[i], alone.rollout().position, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("scaling", ["amplitude", "paper"])
 def test_scaled_forcing_passes_as_well(scaling):
     dmp = JointDMP.fit(*arm_motion(n_joints=2), scaling=scaling)
-    there = through(dmp, [1.1], [[1.0, -1.0]]).rollout(time=[1.1]).position
+    there = dmp.condition([1.1], [[1.0, -1.0]]).rollout(time=[1.1]).position
     torch.testing.assert_close(there, torch.tensor([[1.0, -1.0]]).double())
 
 
 def test_new_ends_become_a_primitives_own():
     dmp = fitted_pose(approach=1.0)
     goal = Pose(torch.tensor([0.4, 0.1, -0.2]).double(), orientation(1.0, 0.2, 0.6))
-    moved = with_ends(dmp, goal=goal, duration=2.0, goal_body=[0.3, 0.1])
+    moved = dmp.with_boundary(goal=goal, duration=2.0, goal_body=[0.3, 0.1])
     expected = dmp.rollout(goal=goal, duration=2.0, goal_body=[0.3, 0.1])
     own = moved.rollout()
     torch.testing.assert_close(own.position, expected.position)
     torch.testing.assert_close(own.body, expected.body)
     assert quaternion.angle(own.orientation, expected.orientation).max() < 1e-7
     via = Pose(torch.tensor([[0.9, 0.9, 0.9]]).double(), orientation(0.0, 0.5, 0.0)[None])
-    there = through(moved, [0.8], via).rollout(time=[0.8, 2.0])
+    there = moved.condition([0.8], via).rollout(time=[0.8, 2.0])
     torch.testing.assert_close(there.position[:1], via.position)
     torch.testing.assert_close(there.position[1], own.position[-1], rtol=0, atol=1e-9)
-    with pytest.raises(ValueError, match="changes with the ends"):
-        with_ends(JointDMP.fit(*arm_motion(), scaling="paper"), goal=torch.zeros(7))
+    with pytest.raises(ValueError, match="depends on start and goal"):
+        JointDMP.fit(*arm_motion(), scaling="paper").with_boundary(goal=torch.zeros(7))
 
 
 def test_gradients_are_exact():
@@ -212,7 +197,7 @@ def test_gradients_are_exact():
 
     def moved(time, position, vector, twist):
         via = Pose(position, quaternion.exp(vector))
-        motion = through(dmp, time, via, twist).rollout(time=at)
+        motion = dmp.condition(time, via, twist).rollout(time=at)
         return motion.position, motion.orientation
 
     rng = torch.Generator().manual_seed(0)
@@ -227,19 +212,19 @@ def test_what_cannot_be_is_refused():
     time, position = arm_motion(n_joints=1)
     dmp = JointDMP.fit(time, position, n_basis=10)
     with pytest.raises(ValueError, match="too many for the 10 basis functions"):
-        through(dmp, [0.3, 0.5, 1.0, 1.5, 2.0], torch.zeros(5, 1))
+        dmp.condition([0.3, 0.5, 1.0, 1.5, 2.0], torch.zeros(5, 1))
     for times in ([3.0], [1.0, 1.0]):
         with pytest.raises(ValueError, match=r"between 0\.000 and 1\.000 of the duration"):
-            through(dmp, times, torch.zeros(len(times), 1))
+            dmp.condition(times, torch.zeros(len(times), 1))
     with pytest.raises(ValueError, match=r"value must have shape \(1, 1\), got \(1, 2\)"):
-        through(dmp, [1.0], [[0.0, 0.0]])
-    with pytest.raises(ValueError, match="none negative"):
-        through(dmp, [-1.0], [[0.0]])
-    with pytest.raises(ValueError, match="only a pose has a body"):
-        through(dmp, [1.0], [[0.0]], body=[[0.0]])
+        dmp.condition([1.0], [[0.0, 0.0]])
+    with pytest.raises(ValueError, match="non-negative"):
+        dmp.condition([-1.0], [[0.0]])
+    with pytest.raises(ValueError, match="has no body"):
+        dmp.condition([1.0], [[0.0]], body=[[0.0]])
     swing = fit_rhythmic(time, torch.sin(8 * time), period=np.pi / 4)
     with pytest.raises(ValueError, match="a rhythm has no via points"):
-        through(swing, [1.0], [[0.0]])
+        swing.condition([1.0], [[0.0]])
     turning = OrientationDMP.fit(*turning_motion(), formulation="ude")
     with pytest.raises(ValueError, match="'ude' is not linear"):
-        through(turning, [1.0], orientation(0.0, 0.0, 0.0)[None])
+        turning.condition([1.0], orientation(0.0, 0.0, 0.0)[None])

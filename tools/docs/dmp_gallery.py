@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
-from dmp_pictures import joint_pictures, loop_pictures, space_pictures, training_pictures
+from dmp_pictures import joint_pictures, loop_pictures, space_pictures
 from dmp_pictures.drawing import Picture
 from matplotlib.figure import Figure
 
@@ -32,13 +32,9 @@ PICTURES: dict[str, tuple[Picture, float]] = {
     "force": (loop_pictures.force, 2.8),
     "orientation": (space_pictures.orientation, 3.1),
     "pose": (space_pictures.pose, 3.4),
-    "dual_arm": (space_pictures.dual_arm, 2.8),
-    "bases": (training_pictures.bases, 2.4),
-    "learned_basis": (training_pictures.learned_basis, 2.6),
-    "obstacle_training": (training_pictures.obstacle_training, 2.8),
-    "tool_training": (training_pictures.tool_training, 2.8),
+    "bases": (joint_pictures.bases, 2.4),
 }
-"""By name, with their heights [inch]."""
+"""Pictures by name, with their heights [inch]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,13 +42,13 @@ class Args:
     """Draw the pictures of docs/concepts/dmp_gallery.md."""
 
     out: Path
-    """Folder that receives dmp_NAME.png for each."""
+    """Folder for the pictures dmp_NAME.png."""
     only: tuple[str, ...] = ()
     """Names of the pictures to draw; all of them by default."""
 
 
 def draw(name: str) -> bytes:
-    """A picture as PNG."""
+    """Picture as PNG."""
     picture, height = PICTURES[name]
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height))

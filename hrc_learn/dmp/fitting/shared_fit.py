@@ -173,7 +173,7 @@ def _accumulate(
     """Rows of all processes, and sums of start, goal, range and duration."""
     N, D = response.basis.count, None
     problem, sums = None, None
-    for i, (time, position) in distributed.share(demonstrations):
+    for i, (time, position) in distributed.local_items(demonstrations):
         samples = _checked(i, time, position)
         D = samples.position.shape[1]
         problem = problem or LeastSquares.empty(N + 1, D)

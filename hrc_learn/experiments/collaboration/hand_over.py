@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.dmp import InteractionPrimitive
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import ObjectConfig, Worker, WorkerConfig, WorkerSensor, World
 from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over

@@ -42,19 +42,3 @@ def swing() -> tuple[Tensor, Tensor]:
     position = torch.stack([0.3 + 0.25 * m, -0.25 + 0.5 * m, 0.3 + 0.2 * bow + 0.05 * m], -1)
     vector = torch.stack([0.9 * bow, -0.4 * m, 1.4 * m], -1)
     return time, torch.cat([position, quaternion.exp(vector)], -1)
-
-
-def carried() -> tuple[Tensor, Tensor, Tensor]:
-    """Times, positions (T, 2, 3) and orientations (T, 2, 4) of two hands with one object."""
-    time, path = swing()
-    m = rise(time / time[-1])
-    turn = quaternion.exp(torch.stack([0 * m, 0 * m, 0.6 * m], -1))
-    hold = torch.tensor([[-0.15, 0.0, 0.0], [0.15, 0.0, 0.0]], dtype=torch.float64)
-    hands = path[:, None, :3] + quaternion.rotate(turn[:, None], hold)
-    return time, hands, turn[:, None].expand(-1, 2, -1)
-
-
-def knock() -> tuple[Tensor, Tensor]:
-    """A slow reach with a knock of some hundredths of its 2 s [rad]."""
-    time, s = stamps(2.0, 300)
-    return time, (0.8 * rise(s) + 0.12 * torch.exp(-(((s - 0.6) / 0.018) ** 2)))[:, None]

@@ -6,12 +6,13 @@ from matplotlib.figure import Figure
 
 from hrc_learn.dmp import (
     ContextualDMP,
+    GaussianBasis,
     JointDMP,
-    MovingGoal,
+    MovingGoalDMP,
     PolynomialFeatures,
     ProbabilisticDMP,
+    SplineBasis,
     fit_rhythmic,
-    through,
 )
 from hrc_learn.viz import palette
 
@@ -27,9 +28,7 @@ def joint(figure: Figure) -> None:
     left, right = panels(figure, 2)
     left.plot(time, position, **DEMO)
     for j, colour in enumerate((palette.BLUE, palette.VERMILION)):
-        left.plot(
-            motion.time, motion.position[:, j].detach(), color=colour, label=f"joint {j + 1}"
-        )
+        left.plot(motion.time, motion.position[:, j], color=colour, label=f"joint {j + 1}")
     left.plot([], [], label="demonstration", **DEMO)
     left.legend(loc="lower left")
     for offset in (-0.4, -0.2, 0.0, 0.2, 0.4):
@@ -75,8 +74,8 @@ def approach(figure: Figure) -> None:
     for share, colour in ((0.0, palette.VERMILION), (0.6, palette.ORANGE), (1.0, palette.BLUE)):
         motion = JointDMP.fit(time, position, approach=share).rollout(goal=goal)
         label = f"approach={share:g}"
-        where.plot(motion.time, motion.position[:, 0].detach(), color=colour, label=label)
-        how.plot(motion.time, motion.acceleration[:, 0].detach(), color=colour, label=label)
+        where.plot(motion.time, motion.position[:, 0], color=colour, label=label)
+        how.plot(motion.time, motion.acceleration[:, 0], color=colour, label=label)
     where.plot(2.0, goal[0], "s", color=palette.TARGET, ms=5)
     where.set(xlabel="time [s]", ylabel="joint 1 [rad]", title="Way to a goal 0.8 rad on")
     how.set(xlabel="time [s]", ylabel="acceleration [rad/s²]", title="What it takes")
@@ -150,10 +149,10 @@ def via_points(figure: Figure) -> None:
     one = torch.tensor([[0.2, 0.28]], dtype=torch.float64)
     left, right = panels(figure, 2, sharey=True)
     for axes, changed, marks, title in (
-        (left, through(dmp, at, points), points, "Through two points"),
+        (left, dmp.condition(at, points), points, "Through two points"),
         (
             right,
-            through(dmp, [1.0], one, within=(0.6, 1.5)),
+            dmp.condition([1.0], one, within=(0.6, 1.5)),
             one,
             "Changed from 0.6 to 1.5 s only",
         ),
@@ -198,18 +197,30 @@ def context(figure: Figure) -> None:
 def moving_goal(figure: Figure) -> None:
     """One motion that passes its goal at three velocities."""
     time, position = demonstrations.joints()
-    moving = MovingGoal(JointDMP.fit(time, position[:, :1]))
+    moving = MovingGoalDMP(JointDMP.fit(time, position[:, :1]))
     where, fast = panels(figure, 2)
     where.plot(time, position[:, 0], **DEMO)
     fast.plot(time, position[:, 0].diff(prepend=position[:1, 0]) / time[1], **DEMO)
     for v, colour in ((0.0, palette.BLUE), (0.5, palette.ORANGE), (1.0, palette.VERMILION)):
-        motion = moving.rollout([v], time=torch.linspace(0, 2.0, 200))
-        where.plot(motion.time, motion.position[:, 0].detach(), color=colour)
-        fast.plot(
-            motion.time, motion.velocity[:, 0].detach(), color=colour, label=f"{v:g} rad/s"
-        )
+        motion = moving.rollout(torch.linspace(0, 2.0, 200), end_velocity=[v])
+        where.plot(motion.time, motion.position[:, 0], color=colour)
+        fast.plot(motion.time, motion.velocity[:, 0], color=colour, label=f"{v:g} rad/s")
         fast.plot(2.0, v, "s", color=colour, ms=4.5)
     where.plot(2.0, position[-1, 0], "s", color=palette.TARGET, ms=5)
     where.set(xlabel="time [s]", ylabel="joint [rad]", title="The goal is met at the end ...")
     fast.set(xlabel="time [s]", ylabel="velocity [rad/s]", title="... at a given velocity")
     fast.legend(loc="lower right")
+
+
+def bases(figure: Figure) -> None:
+    """Ten basis functions each: Gaussians, which act everywhere, and splines."""
+    s = torch.linspace(0, 1.25, 700, dtype=torch.float64)
+    for axes, basis in zip(
+        panels(figure, 2, sharey=True),
+        (GaussianBasis(count=10), SplineBasis(count=10)),
+        strict=True,
+    ):
+        axes.plot(s, basis.forcing(s) / basis.phase(s)[:, None])
+        axes.axvline(1.0, color=palette.GREY, lw=0.8, ls=":")
+        axes.set(xlabel="s = t / duration", title=type(basis).__name__)
+    figure.axes[0].set_ylabel("forcing term per weight")

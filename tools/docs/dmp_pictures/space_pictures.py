@@ -5,15 +5,11 @@ import torch
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
-from hrc_learn.dmp import DualArmDMP, OrientationDMP, PoseDMP
+from hrc_learn.dmp import OrientationDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.viz import palette
 
 from . import demonstrations
-from .drawing import plane
-
-PUSHED = (0.7, 1.5)
-"""From when to when a hand is pushed [s]."""
 
 FRAME = (palette.VERMILION, palette.GREEN, palette.BLUE)
 """Colours of the axes x, y, z of a frame."""
@@ -87,47 +83,6 @@ def pose(figure: Figure) -> None:
     space.set_title("Path of the hand with its frames", loc="left")
     space.legend(loc="upper left")
     over_time.set(xlabel="time [s]", ylabel="arm angle [rad]", title="The body keeps its shape")
-
-
-def dual_arm(figure: Figure) -> None:
-    """Two hands with one object, the first one pushed on the way: apart and coupled."""
-    time, position, orientation = demonstrations.carried()
-    grid = figure.add_gridspec(1, 3, width_ratios=[1, 1, 1.1])
-    error = figure.add_subplot(grid[2])
-    for k, (gain, colour, label) in enumerate(
-        ((0.0, palette.VERMILION, "apart"), (25.0, palette.RUN, "coupled"))
-    ):
-        hands = figure.add_subplot(grid[k])
-        dmp = DualArmDMP.fit(time, position, orientation, gain=gain)
-        seconds, now, planned = _pushed(dmp)
-        hands.plot(*planned.position[..., :2].movedim(-1, 0), color=palette.DEMO, lw=3)
-        hands.plot(*now.position[..., :2].movedim(-1, 0), color=colour)
-        for i in range(0, len(seconds), 12):
-            hands.plot(*now.position[i, :, :2].T, "o-", color=palette.BLACK, lw=0.9, ms=2.5)
-        plane(hands, f"Seen from above, {label}")
-        apart, wanted = (p[..., 0].inverse() @ p[..., 1] for p in (now, planned))
-        off = (apart.position - wanted.position).norm(dim=-1)
-        error.plot(seconds, 100 * off, color=colour, label=label)
-    error.axvspan(*PUSHED, color=palette.DEMO, alpha=0.3, lw=0, label="pushed")
-    error.set(xlabel="time [s]", ylabel="distance [cm]", title="Relative position off plan")
-    error.legend()
-
-
-def _pushed(dmp: DualArmDMP) -> tuple[torch.Tensor, Pose, Pose]:
-    """Times, poses of both hands and the planned ones, one hand pushed for a while."""
-    dt, push = 0.02, torch.zeros(2, 6, dtype=torch.float64)
-    push[0, 0] = -5.0
-    seconds = dt * torch.arange(1, 176, dtype=torch.float64)
-    states = [dmp.initial_state()]
-    with torch.no_grad():
-        for t in seconds:
-            coupling = push if PUSHED[0] <= t < PUSHED[1] else None
-            states.append(dmp.step(states[-1], dt, coupling=coupling))
-    now, planned = (
-        torch.stack([pose.vector() for pose in poses])
-        for poses in ([s.pose for s in states[1:]], [s.planned.pose for s in states[1:]])
-    )
-    return seconds, Pose.from_vector(now), Pose.from_vector(planned)
 
 
 def _draw_frame(axes: Axes3D, position: torch.Tensor, rotation: torch.Tensor) -> None:

@@ -9,7 +9,12 @@ from torch.autograd.functional import jvp
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.coupling import distance_error, learn, offset_error, velocity_coupling
+from hrc_learn.dmp.coupling import (
+    distance_error,
+    learn_feed_forward,
+    offset_error,
+    velocity_coupling,
+)
 
 TAU = 2.0
 S = torch.linspace(0, 1, 400, dtype=torch.float64)
@@ -119,7 +124,7 @@ def test_the_wanted_force_on_a_wall_is_reached_by_learning():
     for _ in range(6):
         force = press_on_a_wall(dmp, wanted, learned, dt)
         last.append((force[-1] - wanted[-1]).item())
-        learned = learn(learned, wanted - force, gain=GAIN, retention=1.0)
+        learned = learn_feed_forward(learned, wanted - force, gain=GAIN, retention=1.0)
     # At rest the pull of the goal, 20 N - 8 N, is fed back over K = stiffness tau / beta.
     shrink = 1 / (1 + GAIN * STIFFNESS * TAU / dmp.spring.beta)
     for i, miss in enumerate(last):
@@ -133,7 +138,7 @@ def test_the_wanted_force_on_a_wall_is_reached_by_learning():
 
 def test_forgetting_leaves_the_share_it_should():
     error, learned = torch.tensor([[3.0]]), torch.tensor([[0.5]])
-    got = learn(learned, error, gain=0.2, rate=0.5, retention=0.9)
+    got = learn_feed_forward(learned, error, gain=0.2, rate=0.5, retention=0.9)
     assert got.item() == pytest.approx(0.9 * (0.5 + 0.5 * 0.2 * 3.0))
 
 

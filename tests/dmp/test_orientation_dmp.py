@@ -132,7 +132,9 @@ def turned_away(dmp, angle):
 def acceleration_of(dmp, state):
     """Angular acceleration at a state, times the duration squared."""
     motion = state.motion
-    return angular_acceleration(motion.position, motion.rate, dmp.motion.curvature(motion))
+    return angular_acceleration(
+        motion.position, motion.rate, dmp.motion.second_derivative(motion)
+    )
 
 
 @pytest.mark.parametrize("angle", [90, 150])

@@ -13,14 +13,15 @@ from hrc_learn.dmp import (
     ExponentialPhase,
     GaussianBasis,
     JointDMP,
-    LearnedGaussianBasis,
     PeriodicBasis,
     SplineBasis,
     SpringDamper,
     response_of,
 )
-from hrc_learn.dmp._system import own_times
-from hrc_learn.dmp._system.own_times import ColumnPieces, motion, power_by_power
+from hrc_learn.dmp._system import ragged_times
+from hrc_learn.dmp._system.ragged_times import motion, power_by_power
+from hrc_learn.dmp.fitting import ragged_gram
+from hrc_learn.dmp.fitting.ragged_gram import ColumnPieces
 
 BASES = {
     "gaussian": (GaussianBasis(count=12), 0.0),
@@ -29,7 +30,6 @@ BASES = {
     "approach": (GaussianBasis(count=12), 0.7),
     "spline": (SplineBasis(count=12), 0.0),
     "periodic": (PeriodicBasis(count=9), 0.0),
-    "learned": (LearnedGaussianBasis(centres=(0.1, 0.2, 0.9), widths=(0.1, 0.05, 0.3)), 0.3),
 }
 SPRINGS = (
     SpringDamper(),
@@ -98,9 +98,9 @@ def test_a_gradient_by_times_alone_makes_none_by_coordinates(monkeypatch):
     def unwanted(*arguments):
         raise AssertionError("nobody asked for it")
 
-    monkeypatch.setattr(own_times, "_Adjoint", SimpleNamespace(apply=unwanted))
+    monkeypatch.setattr(ragged_times, "_Adjoint", SimpleNamespace(apply=unwanted))
     torch.testing.assert_close(torch.autograd.grad(y.sum(), s, retain_graph=True)[0], by_s)
-    monkeypatch.setattr(own_times, "_along", unwanted)
+    monkeypatch.setattr(ragged_times, "_by_time", unwanted)
     with pytest.raises(AssertionError):
         torch.autograd.grad(y.sum(), leaf)
 
@@ -156,7 +156,7 @@ def test_maps_over_durations(batch, output):
 COMPILED = """
 import torch
 from hrc_learn.dmp import (
-    JointDMP, LimitedDMP, OrientationDMP, PoseDMP, SplineBasis, fit_rhythmic
+    JointDMP, OrientationDMP, PoseDMP, SplineBasis, fit_rhythmic
 )
 from hrc_learn.geometry import quaternion
 
@@ -165,7 +165,6 @@ y = torch.stack([torch.sin(t), t**2, torch.cos(t)], -1)
 kinds = (
     (JointDMP.fit(t, y, 12), "acceleration"),
     (OrientationDMP.fit(t, quaternion.exp(y), 12), "orientation"),
-    (LimitedDMP.fit(t, y, -20.0, 20.0, 12), "position"),
     (JointDMP.fit(t, y, basis=SplineBasis(count=12)), "velocity"),
     (JointDMP.fit(t, y, 12, approach=0.7, scaling="amplitude"), "position"),
     (fit_rhythmic(t, torch.sin(2 * torch.pi * t)[:, None].repeat(1, 3), 9, 1.0), "position"),
@@ -219,9 +218,7 @@ def recordings(n, lengths, velocity=False):
 # Of 14 samples 12 functions cannot be told apart: those are solved by themselves.
 @pytest.mark.parametrize("velocity", [False, True], ids=["positions", "velocities"])
 @pytest.mark.parametrize("lengths", [(200, 200, 200), (90, 200, 140), (200, 14, 90)], ids=str)
-@pytest.mark.parametrize(
-    "basis", [GaussianBasis(count=12), SplineBasis(count=12), BASES["learned"][0]], ids=repr
-)
+@pytest.mark.parametrize("basis", [GaussianBasis(count=12), SplineBasis(count=12)], ids=repr)
 def test_fits_of_own_timestamps_are_a_loop(basis, lengths, velocity):
     times, positions, rates = recordings(3, lengths, velocity)
     together = JointDMP.fit(times, positions, velocity=rates, basis=basis)
@@ -253,9 +250,9 @@ def test_samples_that_do_not_count_change_no_fit():
         torch.testing.assert_close(together[i].start_velocity, alone.start_velocity)
 
 
-@pytest.mark.parametrize("most", [own_times.MOST_IN_TABLE, 0])
+@pytest.mark.parametrize("most", [ragged_gram.MAXIMUM_TABLE, 0])
 def test_products_are_those_of_the_design(monkeypatch, most):
-    monkeypatch.setattr(own_times, "MOST_IN_TABLE", most)
+    monkeypatch.setattr(ragged_gram, "MAXIMUM_TABLE", most)
     rng = torch.Generator().manual_seed(0)
     s = torch.rand(3, 60, generator=rng, dtype=torch.float64).sort(-1).values
     s[:, 0], s[:, -1] = 0.0, 1.0

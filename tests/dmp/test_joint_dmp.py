@@ -327,7 +327,7 @@ def test_errors_say_which_demonstration():
         ({"start": 1.0}, "start must have shape"),
         ({"duration": 0.0}, "duration must be positive"),
         ({"duration": 1.0, "speed": 1.0}, "not both"),
-        ({"time": [-0.1, 0.0]}, "none negative"),
+        ({"time": [-0.1, 0.0]}, "non-negative"),
     ],
 )
 def test_bad_rollouts_are_refused(kwargs, complaint):
