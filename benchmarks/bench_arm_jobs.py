@@ -32,8 +32,12 @@ from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.experiments.arm_access import through_franka, through_franky
-from hrc_learn.experiments.collaboration.metrics import collaboration_metrics
-from hrc_learn.experiments.collaboration.trial import NULL_SPACE_FORCES, simulate_collaboration
+from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
+from hrc_learn.experiments.collaboration_trial import (
+    NULL_SPACE_FORCES,
+    CollaborationScenario,
+    simulate_collaboration,
+)
 from hrc_learn.hardware import DriverError
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, World
@@ -124,11 +128,13 @@ def job(
             aiming,
             placing,
             (SHELF,),
-            camera="synthetic",
-            forces=NULL_SPACE_FORCES if args.pulls == "scripted" else "random",
-            config=args.config,
-            imperfections=Imperfections.nominal(),
-            worker=args.worker,
+            CollaborationScenario(
+                camera="synthetic",
+                forces=NULL_SPACE_FORCES if args.pulls == "scripted" else "random",
+                config=args.config,
+                imperfections=Imperfections.nominal(),
+                worker=args.worker,
+            ),
             access=through(serve=serve),
             seed=seed,
         )

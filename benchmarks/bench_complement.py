@@ -27,8 +27,7 @@ from rich.progress import track
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.collaboration.pulls import elbow_room
-from hrc_learn.experiments.path_distance import path_distance
+from hrc_learn.experiments.elbow_pulls import elbow_margin, path_distance
 from hrc_learn.kinematics import panda
 
 # LeRobot takes ten seconds to import: only once there is something to do.
@@ -203,7 +202,7 @@ def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoArmRobot) -
             continue
         during = posture[torch.from_numpy(rows)]
         rooms = [
-            elbow_room(q, pull, panda, clearance=robot.clearance)
+            elbow_margin(q, pull, panda, clearance=robot.clearance)
             for q in during[:: len(during) // 3]
         ]
         effects.append(
@@ -234,7 +233,7 @@ def _figures(
         undisturbed.append(_off_path(alone))
         true.append(_from_line(run.hand[rows], alone.hand))
     moved = np.array([effect.elbow for effect in effects])
-    possible = np.array([effect.room >= _WANTED for effect in effects])
+    possible = np.array([effect.margin >= _WANTED for effect in effects])
     return {
         "rollouts": len(beside),
         "success_without": float(np.mean([run.success for run in free])),

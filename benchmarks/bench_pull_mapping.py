@@ -21,7 +21,7 @@ from rich.table import Table
 from torch import Tensor
 
 from hrc_learn import cli
-from hrc_learn.experiments.collaboration.trial import NULL_SPACE_FORCES
+from hrc_learn.experiments.collaboration_trial import NULL_SPACE_FORCES
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.workplace import Workplace

@@ -24,7 +24,7 @@ from rich.progress import track
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.collaboration.pulls import elbow_room
+from hrc_learn.experiments.elbow_pulls import elbow_margin
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import Imperfections, World
@@ -147,7 +147,7 @@ def push(where: Literal["elbow", "hand"], seed: int, args: Args) -> dict[str, An
     )
     return {
         "stopped": stopped,
-        "room": elbow_room(home, pull, panda, workplace.arm_clearance),
+        "room": elbow_margin(home, pull, panda, workplace.arm_clearance),
         "elbow": float(elbow.max()),
         "hand": float(np.percentile(hand, 95)),
         "hand_most": float(hand.max()),

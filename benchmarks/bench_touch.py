@@ -13,6 +13,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import gc
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,10 +22,15 @@ from rich.console import Console
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.collaboration.trial import NULL_SPACE_FORCES, simulate_collaboration
+from hrc_learn.experiments.collaboration_trial import (
+    NULL_SPACE_FORCES,
+    CollaborationScenario,
+    simulate_collaboration,
+)
+from hrc_learn.experiments.simulated_cell import Observer
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
-from hrc_learn.sim import Imperfections, World
+from hrc_learn.sim import Imperfections, MotionLog, World
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell
@@ -81,20 +88,23 @@ def main(args: Args) -> None:
         for seed in range(args.first_seed, args.first_seed + args.jobs):
             listeners: list[Listener] = []
 
-            def listen(world: World, cell: WorkCell, listeners: list = listeners) -> None:
-                listener = Listener(cell.human, Touch(panda, args.config))
-                cell.human = listener
+            @contextmanager
+            def listen(
+                cell: WorkCell, world: World, motion: MotionLog, listeners: list = listeners
+            ) -> Iterator[None]:
+                cell.human = listener = Listener(cell.human, Touch(panda, args.config))
                 listeners.append(listener)
+                yield
 
             run = simulate_collaboration(
                 aiming,
                 placing,
                 ("middle",),
-                camera="synthetic",
-                forces=forces,
-                imperfections=Imperfections.nominal(),
+                CollaborationScenario(
+                    camera="synthetic", forces=forces, imperfections=Imperfections.nominal()
+                ),
                 seed=seed,
-                on_start=listen,
+                observer=Observer(view=listen),
             )
             done += not run.failure
             hours += float(run.cell.log["time"][-1]) / 3600

@@ -229,7 +229,7 @@ def read_dataset(out: Path) -> int:
 
 
 def write_trials(out: Path) -> None:
-    from hrc_learn.experiments.monte_carlo import Trial, TrialFile
+    from hrc_learn.experiments.trials import Trial, TrialFile
 
     with TrialFile(out, {"tried": "nothing"}) as file:
         for number in itertools.count(len(file.trials) + 1):
@@ -238,7 +238,7 @@ def write_trials(out: Path) -> None:
 
 
 def read_trials(out: Path) -> int:
-    from hrc_learn.experiments.monte_carlo import TrialFile
+    from hrc_learn.experiments.trials import TrialFile
 
     with TrialFile(out, {"tried": "nothing"}) as file:
         return len(file.trials)

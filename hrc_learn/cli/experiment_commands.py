@@ -17,11 +17,12 @@ from hrc_learn.cli._run import command_line, refuse_existing
 from hrc_learn.cli._settings import with_settings
 from hrc_learn.cli.arguments import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.arm_arguments import Demo, Record, Run, WithImperfections, WithRobot
-from hrc_learn.experiments.collaboration.experiment import CollaborationExperiment
-from hrc_learn.experiments.collaboration.trial import Disturbances, Pulls, workplace_for
-from hrc_learn.experiments.frame import Experiment, RunOptions, conduct
-from hrc_learn.experiments.grasping.experiment import GraspingExperiment
-from hrc_learn.experiments.on_arm import (
+from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment, Pulls
+from hrc_learn.experiments.collaboration_trial import Disturbances
+from hrc_learn.experiments.experiment import Experiment, RunOptions, run_experiment
+from hrc_learn.experiments.grasping_experiment import GraspingExperiment
+from hrc_learn.experiments.placing_experiment import PlacingExperiment, dataset_of
+from hrc_learn.experiments.real_arm import (
     ArmSite,
     Task,
     collaboration_task,
@@ -29,8 +30,8 @@ from hrc_learn.experiments.on_arm import (
     placing_task,
     run_on_arm,
 )
-from hrc_learn.experiments.placing.experiment import PlacingExperiment, dataset_of
-from hrc_learn.experiments.run_recording import LiveViewConfig
+from hrc_learn.experiments.run_recorder import LiveViewConfig
+from hrc_learn.experiments.table_objects import workplace_for
 from hrc_learn.hardware import open_camera
 from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections
@@ -93,7 +94,7 @@ def run(args: Run) -> int:
         overwrite=args.overwrite,
         json=args.json,
     )
-    return conduct(settings.experiment, options, command=command_line())
+    return run_experiment(settings.experiment, options, command=command_line())
 
 
 def _folder(args: Run) -> Path:

@@ -1,10 +1,10 @@
-"""How a run leads the arm of its world: directly, or by the driver of the real one.
+"""Access of a run to the arm of its world: directly, or through the driver of the real arm.
 
     access = through_franky(FrankyConfig(dynamics=0.3, realtime="ignore"))
     simulate_collaboration(aiming, placing, shelves, access=access)
 
-By the driver the same task goes through all that stands before a real arm: its package, its
-sockets, and the 1 ms cycles of its protocol, which the world answers.
+A driver takes the same task through everything in front of a real arm: the driver package, its
+sockets, and the 1 ms cycles of the protocol, which the world answers.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,26 +20,26 @@ from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import ArmServer, ServedArm, serve_world
 
 type Serve = Callable[[World], AbstractContextManager[ArmServer]]
-"""Puts the arm of a world behind its protocol, as `serve_world` does."""
+"""Function that serves the arm of a world over its network protocol, such as `serve_world`."""
 
 FRANKY_DELAY = 0.003
-"""From a command to franky until the arm's servos have it [s]: two cycles of the protocol, and
-one that the state read before is old. Measured with commands every 10 ms."""
+"""Delay from a command to franky until the servos have it [s]: two cycles of the protocol, and
+one because the state read before it is one cycle old. Measured with commands every 10 ms."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArmAccess:
-    """How a run leads the arm of its world."""
+    """Connection to the arm of a world, with the delay and dynamics of its driver."""
 
     open: Callable[[World], AbstractContextManager[OpenedArm]]
-    """Connects to the arm of a world that is at rest, until the run ends."""
+    """Connects to the arm of a world at rest, until the run ends."""
     delay: float = 0.0
-    """From a command until the arm's servos have it [s]."""
+    """Delay from a command until the servos of the arm have it [s]."""
     dynamics: float = 1.0
-    """Fraction of the arm's acceleration that the driver uses."""
+    """Fraction of the acceleration of the arm that the driver uses."""
 
-    def told(self, sizes: Imperfections) -> Imperfections:
-        """What a controller has to be told of the arm: its imperfections and the driver's."""
+    def declared(self, sizes: Imperfections) -> Imperfections:
+        """Imperfections that a controller must allow for: those of arm and driver."""
         return replace(
             sizes,
             command_delay=sizes.command_delay + self.delay,
@@ -48,66 +48,61 @@ class ArmAccess:
 
 
 SIMULATED = ArmAccess(open=lambda world: nullcontext(world.opened_arm))
-"""The simulated arm itself."""
+"""Direct access to the simulated arm."""
 
 
 def through_franky(config: FrankyConfig | None = None, serve: Serve = serve_world) -> ArmAccess:
-    """Over the network protocol, by the driver package franky.
+    """Access over the network protocol through the driver package franky.
 
     Args:
-        config: How the driver leads the arm; None: as a real one, but for real time, which a
-            server that waits for each answer does not need, and the grip of the simulated hand.
-        serve: Puts the arm behind its protocol.
+        config: Configuration of the driver. By default that of a real arm without the real-time
+            check, which a server that waits for each answer does not need, and with the grip
+            force of the simulated gripper.
+        serve: Serves the arm over its protocol.
     """
     config = config or FrankyConfig(realtime="ignore", grip_force=40.0)
-    return through_protocol(
-        partial(FrankyArm, config=config),
-        delay=FRANKY_DELAY,
-        dynamics=config.dynamics,
-        serve=serve,
-    )
+    driver = partial(FrankyArm, config=config)
+    return through_protocol(driver, delay=FRANKY_DELAY, dynamics=config.dynamics, serve=serve)
 
 
 def through_franka(
     chain: SerialChain, config: FrankaConfig | None = None, serve: Serve = serve_world
 ) -> ArmAccess:
-    """Over the network protocol, by our loop at 1 kHz.
+    """Access over the network protocol through our own loop at 1 kHz.
 
     Args:
-        chain: The arm.
-        config: How the arm is driven; None: as for `through_franky`, and in lockstep with the
-            server.
-        serve: Puts the arm behind its protocol.
+        chain: Kinematics of the arm.
+        config: Configuration of the loop. By default as for `through_franky`, in lockstep with
+            the server.
+        serve: Serves the arm over its protocol.
     """
     config = config or FrankaConfig(realtime=False, lockstep=True)
+    driver = partial(FrankaArm, chain=chain, config=config)
     return through_protocol(
-        partial(FrankaArm, chain=chain, config=config),
-        delay=FRANKY_DELAY,
-        dynamics=config.acceleration,
-        serve=serve,
+        driver, delay=FRANKY_DELAY, dynamics=config.acceleration, serve=serve
     )
 
 
 ArmDriver = Literal["sim", "franky", "franka"]
-"""What leads an arm: the simulator itself, or a driver of the real one."""
+"""Driver of a simulated arm: the simulator itself, or a driver of the real arm."""
 
 
 def access_by(driver: ArmDriver, robot: Arm) -> ArmAccess:
-    """How a driver leads the arm of a world.
+    """Access to the arm of a world through a named driver.
 
     Args:
-        driver: Its name.
-        robot: The arm.
+        driver: Name of the driver.
+        robot: Arm of the world.
 
     Raises:
-        ValueError: The driver is of other arms.
+        ValueError: If the driver does not support the arm.
     """
     if driver == "sim":
         return SIMULATED
     if not robot.is_franka:
         raise ValueError(
-            f"--arm {driver} drives Franka's arms, not the {robot.name}: leave it out, and the "
-            "simulated arm is led without a driver."
+            f"--arm {driver} drives Franka arms only, not the {robot.name}: leave it out to "
+            "simulate without a driver."
         )
     return through_franky() if driver == "franky" else through_franka(robot)
 
@@ -119,13 +114,14 @@ def through_protocol(
     dynamics: float,
     serve: Serve = serve_world,
 ) -> ArmAccess:
-    """Over the network protocol, by any driver.
+    """Access over the network protocol through any driver.
 
     Args:
-        open_driver: Connects to the arm at an address: an `Arm` and a `Gripper` with `close`.
-        delay: From a command until the arm's servos have it [s].
-        dynamics: Fraction of the arm's acceleration that the driver uses.
-        serve: Puts the arm behind its protocol.
+        open_driver: Connects to the arm at an address; returns an `Arm` and `Gripper` with
+            a method `close`.
+        delay: Delay from a command until the servos of the arm have it [s].
+        dynamics: Fraction of the acceleration of the arm that the driver uses.
+        serve: Serves the arm over its protocol.
     """
 
     @contextmanager

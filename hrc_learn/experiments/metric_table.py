@@ -1,7 +1,7 @@
-"""What an experiment measures, as a table: of one run, and over many trials.
+"""Metrics of an experiment, for one run and over many trials.
 
-A `Metric` has a name, a unit, a bound and what the paper claims. A `Summary` is the success
-rate, quantiles and totals of trials, of which `median`, `p95` and others make metrics.
+A `Metric` has a name, a unit, a bound and the claim of the paper. A `Summary` holds the success
+rate, quantiles and totals of trials, from which `median`, `p95` and others make metrics.
 """
 
 import math
@@ -12,62 +12,61 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.experiments.monte_carlo import Trial
+from hrc_learn.experiments.trials import Trial
 from hrc_learn.viz.report import Measurement
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 RESOLUTIONS = {
-    # Encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm; MuJoCo's contacts give way by
-    # about as much.
+    # Encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm; contacts in MuJoCo are as soft.
     "mm": 0.1,
     # The same noise of seven joints: sqrt(7) * 1e-4 rad.
     "deg": 0.02,
-    # Noise of a detected marker's centre is 0.08 px a coordinate (docs/training.md).
+    # Noise of a detected marker centre: 0.08 px per coordinate (docs/concepts/training.md).
     "px": 0.1,
     # The control step.
     "s": 0.01,
 }
-"""Smallest values that measurements tell from zero, by unit; others are shown as they are."""
+"""Resolution of measurements by unit; values in other units are shown as they are."""
 
 
 @dataclass(frozen=True)
 class Metric[Run]:
-    """One row of the table. `Run` is whatever the experiment leaves to be measured.
+    """One row of the table. `Run` is the result of one run of the experiment.
 
     Raises:
         ValueError: If it has both an upper and a lower bound.
     """
 
     name: str
-    """In words; with the unit it makes the key of the measured value in JSON files."""
+    """Name in words; with the unit it makes the key of the value in JSON files."""
     of: Callable[[Run], float | int | None]
-    """Measures a run. An integer is a count, summed up over trials. None leaves the row out."""
+    """Measures a run. An integer is a count, summed over trials. None leaves the row out."""
     unit: str = ""
     _: KW_ONLY
     at_most: float | int | None = None
-    """Upper bound; without any bound the value is only reported."""
+    """Upper bound; without a bound the value is only reported."""
     at_least: float | int | None = None
     """Lower bound."""
     claim: str = ""
-    """What the paper says about it."""
+    """Claim of the paper."""
     essential: bool = False
-    """Whether a run that misses the bound does not count as a success."""
+    """True if a run that misses the bound is a failure."""
     listed: bool = True
-    """Whether the report's table has the row; the JSON file has it in any case."""
+    """True if the table of the report has the row; the JSON file always has it."""
     detail: Callable[[Run], str] = lambda run: ""
-    """What to add to the reason when an essential bound was missed."""
+    """Detail for the reason when an essential bound was missed."""
     resolution: float | None = None
-    """Below which the value is not shown, nor digits finer than it; None: that of its unit in
-    `RESOLUTIONS`. Files hold the value in full."""
+    """Resolution at which the value is shown; None: that of its unit in `RESOLUTIONS`. Files
+    hold the value in full."""
 
     def __post_init__(self) -> None:
         if self.at_most is not None and self.at_least is not None:
-            raise ValueError(f"metric {self.name!r} is bounded on both sides: make it two.")
+            raise ValueError(f"metric {self.name!r} has two bounds: split it into two metrics.")
 
     def measure(self, run: Run) -> Measurement | None:
-        """The measured value beside its bound; None where the run has none."""
+        """Measured value with its bound; None if the run has no such value."""
         value = self.of(run)
         if value is None:
             return None
@@ -86,12 +85,12 @@ class Metric[Run]:
     def of_part[Whole](
         self, part: Callable[[Whole], Run], prefix: str = "", *, bounded: bool = True
     ) -> "Metric[Whole]":
-        """The same metric of a part of a larger run.
+        """The same metric for a part of a larger run.
 
         Args:
-            part: Takes the part out of the whole.
-            prefix: Of the name.
-            bounded: Whether the bound goes along; else the value is reported for comparison.
+            part: Extracts the part from the whole.
+            prefix: Prefix of the name.
+            bounded: Keep the bound; else the value is only reported for comparison.
         """
         return Metric(
             f"{prefix}{self.name}",
@@ -109,7 +108,7 @@ class Metric[Run]:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What a table of metrics came to."""
+    """Values of a table of metrics."""
 
     table: tuple[Measurement, ...]
     """Listed rows, in order."""
@@ -119,7 +118,7 @@ class Evaluation:
     """Essential bounds that were missed, in words."""
 
     def __add__(self, other: "Evaluation") -> "Evaluation":
-        """Both tables, one after the other."""
+        """Concatenation of both tables."""
         return Evaluation(
             table=self.table + other.table,
             values=self.values | other.values,
@@ -137,9 +136,9 @@ def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run) -> Evaluation:
         values[measured.key] = measured.value
         if metric.listed:
             table.append(measured)
-        # NaN keeps no bound: what could not be measured is no success.
+        # NaN meets no bound: a value that could not be measured is no success.
         if metric.essential and measured.ok is False:
-            fault = f"{metric.name}: {measured.shown}, but {measured.bound} is wanted"
+            fault = f"{metric.name}: {measured.shown}, but the bound is {measured.bound}"
             detail = metric.detail(run)
             faults.append(f"{fault} ({detail})" if detail else fault)
     return Evaluation(table=tuple(table), values=values, faults=tuple(faults))
@@ -149,24 +148,24 @@ def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run) -> Evaluation:
 _Z = 1.959964
 
 _UNITS = {"s", "m", "mm", "rad", "deg", "px", "%"}
-"""Ends of keys: statistics are named before them, as in `place_error_p95_mm`."""
+"""Units at the ends of keys; statistics are named before them: `place_error_p95_mm`."""
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Interval of 95 % of a share (Wilson 1927); honest for few trials and shares near 0 or 1.
+    """Confidence interval (95 %) of a success rate (Wilson 1927), valid also near 0 and 1.
 
     Args:
-        successes: Of the trials.
-        trials: At least one.
+        successes: Number of successes.
+        trials: Number of trials, at least one.
 
     Raises:
         ValueError: If there are no trials, or more successes than trials.
     """
     if not 0 <= successes <= trials or trials == 0:
-        raise ValueError(f"{successes} successes of {trials} trials make no share.")
-    share, z2 = successes / trials, _Z**2 / trials
-    middle = share + z2 / 2
-    half = _Z * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials))
+        raise ValueError(f"{successes} successes of {trials} trials are no rate.")
+    rate, z2 = successes / trials, _Z**2 / trials
+    middle = rate + z2 / 2
+    half = _Z * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials))
     return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
 
 
@@ -181,8 +180,8 @@ class Spread:
 
     @classmethod
     def of(cls, values: Float[np.ndarray, " trials"]) -> "Spread":
-        """Of finite values, at least one."""
-        # "higher": a value that was measured, and at least the share asked for lies below it.
+        """Quantiles of finite values, at least one."""
+        # "higher": a measured value, with at least the requested fraction below it.
         median, p95 = (float(np.quantile(values, q, method="higher")) for q in (0.5, 0.95))
         return cls(median=median, p95=p95, min=float(values.min()), max=float(values.max()))
 
@@ -195,13 +194,13 @@ class Summary:
     failed: Mapping[int, str]
     """Reason by seed."""
     spread: Mapping[str, Spread]
-    """By key of the values that are no counts; failed trials as far as they measured them."""
+    """Quantiles of the values that are no counts, by key; failed trials are included."""
     totals: Mapping[str, int]
-    """Sums of the values that are counts, by key."""
+    """Sums of the counts, by key."""
 
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> "Summary":
-        """Count and sort.
+        """Statistics of the trials.
 
         Raises:
             ValueError: Without trials.
@@ -263,7 +262,7 @@ class Summary:
         return values
 
     def table(self, title: str) -> "Table":
-        """To be printed; the heading has the success rate, the foot why others failed."""
+        """Table to print, with the success rate above and the reasons of failures below."""
         from rich.table import Table
         from rich.text import Text
 
@@ -290,19 +289,19 @@ def column(trials: Sequence[Trial], key: str) -> Float[np.ndarray, " trials"]:
     return np.array([math.nan if isinstance(v, str) else v for v in values], dtype=float)
 
 
-# What a metric over trials is computed by: `Metric("place error, p95", p95("place_error_mm"))`.
+# Statistics make metrics over trials: `Metric("place error, p95", p95("place_error_mm"))`.
 
 type Statistic = Callable[[Sequence[Trial]], float | int | None]
-"""A number of many trials; None if no trial measured what it is made of."""
+"""Number computed from many trials; None if no trial measured its value."""
 
 
 def success_rate(trials: Sequence[Trial]) -> float:
-    """Share of the trials that did not fail."""
+    """Fraction of the trials that did not fail."""
     return sum(not trial.failure for trial in trials) / len(trials)
 
 
 def median(key: str) -> Statistic:
-    """Over the trials that measured the value."""
+    """Median over the trials that measured the value."""
     return _spread(key, "median")
 
 
@@ -320,7 +319,7 @@ def _spread(key: str, kind: str) -> Statistic:
 
 
 def largest(key: str) -> Statistic:
-    """NaN, which keeps no bound, if a trial was given up before it measured the value."""
+    """Largest value; NaN, which meets no bound, if a trial did not measure the value."""
     return lambda trials: float(column(trials, key).max())
 
 

@@ -5,6 +5,7 @@ take the recording that the dashboards take, and raise ValueError where it lacks
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from io import BytesIO
 
 import matplotlib
@@ -29,23 +30,84 @@ from hrc_learn.viz.figure_parts import (
 from hrc_learn.viz.recordings import FitRecording, Seen
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointCurves:
+    """Joint positions of one motion over time, with their look."""
+
+    label: str
+    time: Float[np.ndarray, " time"]
+    """Time [s]."""
+    position: Float[np.ndarray, "time joints"]
+    """Joint positions [rad, or m for sliding joints]."""
+    colour: str = palette.RUN
+    width: float = 1.4
+
+    @classmethod
+    def demonstrated(
+        cls, time: Float[np.ndarray, " time"], position: Float[np.ndarray, "time joints"]
+    ) -> "JointCurves":
+        """Thick grey curves of a demonstration."""
+        return cls(
+            label="demonstration", time=time, position=position, colour=palette.DEMO, width=3.5
+        )
+
+
+def joint_grid_figure(
+    names: Sequence[str],
+    motions: Sequence[JointCurves],
+    limits: JointRanges | None = None,
+    unit: str = "rad",
+) -> Figure:
+    """Joint positions of several motions over time, one panel for each joint.
+
+    Args:
+        names: Names of the joints.
+        motions: Motions, the last one on top.
+        limits: Joint limits; None: none are drawn.
+        unit: Unit of the positions.
+    """
+    rows = -(-len(names) // 2)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 1.45 * rows + 0.5))
+        grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
+        for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
+            for motion in motions:
+                axes.plot(
+                    motion.time,
+                    motion.position[:, i],
+                    color=motion.colour,
+                    lw=motion.width,
+                    label=motion.label,
+                )
+            axes.set(title=name, ylabel=unit)
+            axes.margins(x=0)
+            if limits is not None:
+                draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))
+        legend_in_free_cell(figure, grid, len(names))
+    return figure
+
+
 def joints_figure(run: RunRecording) -> Figure:
-    """Every joint over time, with its demonstration and its limits."""
-    return _joints(
-        run.joint_names,
-        [(run.time, run.joint_position)],
-        [] if run.demo_joint_position is None else [(run.time, run.demo_joint_position)],
-        run.joint_limits,
-        label="run",
-    )
+    """Joint positions over time, with the demonstration and the limits."""
+    motions = []
+    if run.demo_joint_position is not None:
+        motions.append(JointCurves.demonstrated(run.time, run.demo_joint_position))
+    motions.append(JointCurves(label="run", time=run.time, position=run.joint_position))
+    return joint_grid_figure(run.joint_names, motions, run.joint_limits)
 
 
 def fit_joints_figure(fit: FitRecording) -> Figure:
-    """Every joint of the first four demonstrations and of their reproductions."""
-    reproductions = list(zip(fit.time, fit.reproductions, strict=True))[:4]
-    demos = list(zip(fit.time, fit.demos, strict=True))[:4]
-    names, limits = fit.joint_names, fit.joint_limits
-    return _joints(names, reproductions, demos, limits, label="reproduction", unit=fit.unit)
+    """Joint positions of the first four demonstrations and of their reproductions."""
+    demos = [
+        JointCurves.demonstrated(time, position)
+        for time, position in zip(fit.time, fit.demos, strict=True)
+    ]
+    reproductions = [
+        JointCurves(label="reproduction", time=time, position=position)
+        for time, position in zip(fit.time, fit.reproductions, strict=True)
+    ]
+    motions = [*demos[:4], *reproductions[:4]]
+    return joint_grid_figure(fit.joint_names, motions, fit.joint_limits, fit.unit)
 
 
 def person_figure(run: RunRecording) -> Figure:
@@ -171,32 +233,6 @@ def _decoded(file: bytes) -> np.ndarray:
 
     with Image.open(BytesIO(file)) as image:
         return np.asarray(image)
-
-
-def _joints(
-    names: tuple[str, ...],
-    done: list[tuple[np.ndarray, np.ndarray]],
-    demos: list[tuple[np.ndarray, np.ndarray]],
-    limits: JointRanges | None,
-    *,
-    label: str,
-    unit: str = "rad",
-) -> Figure:
-    rows = -(-len(names) // 2)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.45 * rows + 0.5))
-        grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
-        for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
-            for time, values in demos:
-                axes.plot(time, values[:, i], color=palette.DEMO, lw=3.5, label="demonstration")
-            for time, values in done:
-                axes.plot(time, values[:, i], color=palette.RUN, label=label)
-            axes.set(title=name, ylabel=unit)
-            axes.margins(x=0)
-            if limits is not None:
-                draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))
-        legend_in_free_cell(figure, grid, len(names))
-    return figure
 
 
 def workspace_figure(

@@ -4,6 +4,7 @@ One run is shared by most tests; what may go wrong is provoked in MuJoCo.
 """
 
 import json
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -13,31 +14,26 @@ from commands import done, hrc
 from taught_models import teach
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments.collaboration import experiment
-from hrc_learn.experiments.collaboration.metrics import collaboration_metrics
-from hrc_learn.experiments.collaboration.report import collaboration_sections
-from hrc_learn.experiments.collaboration.snapshots import (
-    EYE,
-    TOWARDS,
-    moments,
-    take_snapshots,
-)
-from hrc_learn.experiments.collaboration.trial import (
+from hrc_learn.experiments import collaboration_experiment as experiment
+from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
+from hrc_learn.experiments.collaboration_report import collaboration_sections
+from hrc_learn.experiments.collaboration_trial import (
     NULL_SPACE_FORCES,
-    THREE_OBJECTS,
+    CollaborationScenario,
     Disturbances,
     simulate_collaboration,
-    with_objects,
 )
 from hrc_learn.experiments.metric_table import evaluate
-from hrc_learn.experiments.run_recording import (
+from hrc_learn.experiments.run_measures import (
     Deviation,
-    record,
     span,
     true_image_jacobian,
     worker_distance,
 )
-from hrc_learn.experiments.snapshots import viewpoint
+from hrc_learn.experiments.run_recorder import record
+from hrc_learn.experiments.simulated_cell import Observer
+from hrc_learn.experiments.snapshots import collaboration_snapshots, moments, viewpoint
+from hrc_learn.experiments.table_objects import THREE_OBJECTS, with_objects
 from hrc_learn.geometry import Box, quaternion
 from hrc_learn.sim import NOWHERE, CameraChange, Imperfections, OcclusionInterval
 from hrc_learn.sim.workplace import Workplace
@@ -63,6 +59,16 @@ SHELVES = ("lower", "middle", "upper")
 WORKPLACE = Workplace()
 
 
+RUN_OPTIONS = ("workplace", "access", "seed", "observer", "on_phase")
+
+
+def simulate(aiming, placing, shelves, **options):
+    """Run a scenario with the given settings."""
+    run = {name: options.pop(name) for name in RUN_OPTIONS if name in options}
+    scenario = CollaborationScenario(camera=options.pop("camera", "synthetic"), **options)
+    return simulate_collaboration(aiming, placing, shelves, scenario, **run)
+
+
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
     """Folder of the models `placing` and `aiming`."""
@@ -78,7 +84,7 @@ def skills(models):
 @pytest.fixture(scope="module")
 @shapes_unchecked()
 def job(skills):
-    return simulate_collaboration(
+    return simulate(
         *skills,
         ("upper",),
         camera="synthetic",
@@ -116,8 +122,8 @@ def test_the_object_ends_on_the_shelf_and_every_target_is_met(job, models):
 def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, tmp_path):
     asked, out, figures = [], tmp_path / "run", tmp_path / "measured.json"
 
-    def already_done(aiming, placing, shelves, **options):
-        asked.append((shelves, options))
+    def already_done(aiming, placing, shelves, scenario, **options):
+        asked.append((shelves, scenario, options))
         return job
 
     monkeypatch.setattr(experiment, "simulate_collaboration", already_done)
@@ -130,19 +136,19 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
         "experiment.cell.latency={delay=0.04, frame_loss=0.1}",
         *("--imperfections", 0.5, "--worker"),
     )
-    ((shelves, options),) = asked
-    assert (shelves, options["camera"], options["seed"]) == (("upper",), "synthetic", 3)
+    ((shelves, scenario, options),) = asked
+    assert (shelves, scenario.camera, options["seed"]) == (("upper",), "synthetic", 3)
     # Twice forward and back, with the time that takes: longer than asked for.
-    assert options["forces"][:2] == NULL_SPACE_FORCES
-    assert [force.towards for force in options["forces"]] == 2 * [
+    assert scenario.forces[:2] == NULL_SPACE_FORCES
+    assert [force.towards for force in scenario.forces] == 2 * [
         force.towards for force in NULL_SPACE_FORCES
     ]
-    assert options["config"].interaction > options["forces"][-1].end
-    assert options["worker"] is True
-    assert options["handover"] is False
-    assert options["disturbances"] == Disturbances(occlusions=OCCLUDED)
-    assert options["cell_config"].latency == LATE
-    assert options["imperfections"] == Imperfections.nominal().scaled(0.5)
+    assert scenario.config.interaction > scenario.forces[-1].end
+    assert scenario.worker
+    assert not scenario.handover
+    assert scenario.disturbances == Disturbances(occlusions=OCCLUDED)
+    assert scenario.cell.latency == LATE
+    assert scenario.imperfections == Imperfections.nominal().scaled(0.5)
     assert experiment.CollaborationExperiment(
         aiming=models, placing=models, config=PickAndPlaceConfig(interaction=2.5)
     )._job() == PickAndPlaceConfig(interaction=2.5)
@@ -261,9 +267,7 @@ def _axis_z(orientation):
 @pytest.mark.slow
 def test_a_person_who_keeps_away_changes_nothing(skills):
     config = PickAndPlaceConfig(interaction=0.5)
-    job = simulate_collaboration(
-        *skills, ("middle",), camera="synthetic", forces=(), config=config, seed=5
-    )
+    job = simulate(*skills, ("middle",), camera="synthetic", forces=(), config=config, seed=5)
     assert job.failure == ""
     assert np.isnan(Deviation.of(job.cell.log, job.motion, job.world).elbow).all()
     assert job.world.rests_on("box", "board_middle")
@@ -327,8 +331,8 @@ def test_a_worker_is_measured_logged_and_shown(skills, beside_worker):
     assert "worker" in figures
     # As many of the moments as there were, in their order.
     shown = moments(job)
-    assert shown[0] == ("before he comes", 0)
-    assert shown[-1] == ("all is done", steps - 1)
+    assert shown[0] == ("before the worker comes", 0)
+    assert shown[-1] == ("the end of the job", steps - 1)
     at = [step for _, step in shown]
     assert at == sorted(at)
     # Somebody else comes with another seed, nobody without the option.
@@ -343,12 +347,12 @@ def test_a_worker_is_measured_logged_and_shown(skills, beside_worker):
 @pytest.mark.egl
 def test_pictures_show_the_worker_where_he_was_and_what_is_nearest(beside_worker):
     job = beside_worker
-    pictures = take_snapshots(job)
+    pictures = collaboration_snapshots(job)
     assert [title[:3] for title, _ in pictures] == ["(a)", "(b)", "(c)"][: len(pictures)]
     for (title, picture), (what, step) in zip(pictures, moments(job), strict=True):
         assert title.endswith(f"t = {job.cell.log['time'][step]:.1f} s: {what}")
         # The line to the nearest point is drawn where both ends are seen.
-        camera = viewpoint(EYE, TOWARDS)
+        camera = viewpoint((1.55, 1.45, 1.25), (0.0, 0.25, 0.30))
         ends = camera.project(job.motion.nearest(step + 1)[step].points)
         x, y = np.round(ends.mean(axis=0)).astype(int)
         violet = np.abs(picture[y - 4 : y + 5, x - 4 : x + 5].astype(int) - [204, 121, 167])
@@ -377,7 +381,7 @@ def test_a_job_beside_a_worker_keeps_its_distance_and_is_done(skills):
 
 def test_an_unknown_shelf_is_refused_before_anything_moves(skills):
     with pytest.raises(ValueError, match="attic"):
-        simulate_collaboration(*skills, ("attic",), camera="synthetic")
+        simulate(*skills, ("attic",), camera="synthetic")
 
 
 def test_a_hidden_marker_is_waited_for_and_the_wait_noted(job):
@@ -392,14 +396,14 @@ def test_a_hidden_marker_is_waited_for_and_the_wait_noted(job):
 @shapes_unchecked()
 def provoked(skills, workplace=WORKPLACE, config=BRIEF, **options):
     """A job without a person, disturbed in its course."""
-    return simulate_collaboration(
+    return simulate(
         *skills,
         ("middle",),
         workplace=workplace,
         camera="synthetic",
         forces=(),
         config=config,
-        cell_config=WorkCellConfig(keep_image_every=0),
+        cell=WorkCellConfig(keep_image_every=0),
         **options,
     )
 
@@ -411,17 +415,22 @@ class Meddler:
         self._phase, self._deed, self._after = phase, deed, after
         self._begun, self._done = None, False
 
-    def start(self, world, cell):
-        self._world, send = world, cell._send
+    def hooks(self):
+        return {"observer": Observer(view=self.watch), "on_phase": self.phase}
 
-        def meddled(*command, **columns):
+    @contextmanager
+    def watch(self, cell, world, motion):
+        advance = motion.advance
+
+        def meddled(duration):
             due = self._begun is not None and world.time >= self._begun + self._after
             if due and not self._done:
                 self._done = True
                 self._deed(world)
-            send(*command, **columns)
+            advance(duration)
 
-        cell._send = meddled
+        motion.advance = meddled
+        yield
 
     def phase(self, name, time):
         if name == self._phase and self._begun is None:
@@ -442,7 +451,7 @@ def mishaps(job):
 @pytest.mark.slow
 def test_an_object_moved_away_under_the_gripper_is_grasped_at_the_second_attempt(skills):
     meddler = Meddler("grasp", shifted(0.0, 0.09))
-    job = provoked(skills, on_start=meddler.start, on_phase=meddler.phase, seed=5)
+    job = provoked(skills, **meddler.hooks(), seed=5)
     assert mishaps(job) == ["missed grasp"]
     assert job.picks[0].attempts == 2
     assert verdict(job) == ""
@@ -451,7 +460,7 @@ def test_an_object_moved_away_under_the_gripper_is_grasped_at_the_second_attempt
 @pytest.mark.slow
 def test_an_object_lost_on_the_way_up_is_looked_for_again(skills):
     meddler = Meddler("lift", shifted(0.0, 0.08, 0.0), after=0.4)
-    job = provoked(skills, on_start=meddler.start, on_phase=meddler.phase, seed=5)
+    job = provoked(skills, **meddler.hooks(), seed=5)
     assert mishaps(job)[0] == "dropped object"
     assert verdict(job) == ""
 
@@ -460,7 +469,7 @@ def test_an_object_lost_on_the_way_up_is_looked_for_again(skills):
 def test_an_object_lost_for_good_is_given_up_and_the_arm_goes_home(skills):
     """Half-way to the shelf it falls where the camera does not see it."""
     meddler = Meddler("transfer", shifted(0.0, 0.0, -0.3), after=3.0)
-    job = provoked(skills, on_start=meddler.start, on_phase=meddler.phase, seed=5)
+    job = provoked(skills, **meddler.hooks(), seed=5)
     assert mishaps(job) == ["dropped object"]
     assert "does not see marker 11" in job.failure
     home = torch.from_numpy(job.cell.state.joint_position)
@@ -487,7 +496,7 @@ def test_what_blocks_every_way_is_waited_for(skills):
     meddler = Meddler(
         "transfer", lambda world: world.move_obstacle("crate", NOWHERE), after=1.0
     )
-    job = provoked(skills, workplace, on_start=meddler.start, on_phase=meddler.phase, seed=5)
+    job = provoked(skills, workplace, **meddler.hooks(), seed=5)
     assert mishaps(job) == ["blocked path"]
     assert verdict(job) == ""
 
@@ -511,7 +520,7 @@ def test_where_no_way_gets_free_the_object_is_put_back(skills):
 def test_a_turn_near_the_edge_of_the_image_keeps_the_marker_in_view(skills):
     """80 degrees, for an object whose grasp has the marker 80 px above the lower edge."""
     servo = VisualServoConfig(timeout=5.0)
-    job = simulate_collaboration(
+    job = simulate(
         *skills,
         ("middle",),
         camera="synthetic",
@@ -549,7 +558,7 @@ def test_a_marker_that_stays_hidden_ends_the_attempts_cleanly(skills):
 )
 def test_three_objects_are_placed_though_the_camera_is_changed_between_them(skills, change):
     workplace = with_objects(WORKPLACE, THREE_OBJECTS)
-    job = simulate_collaboration(
+    job = simulate(
         *skills,
         SHELVES,
         workplace=workplace,
@@ -563,7 +572,7 @@ def test_three_objects_are_placed_though_the_camera_is_changed_between_them(skil
             camera_change=change,
         ),
         config=PickAndPlaceConfig(interaction=2.5),
-        cell_config=WorkCellConfig(keep_image_every=0),
+        cell=WorkCellConfig(keep_image_every=0),
         seed=1,
     )
     assert verdict(job) == ""
@@ -575,18 +584,18 @@ def test_every_object_needs_a_shelf_of_its_own(skills):
     workplace = with_objects(WORKPLACE, THREE_OBJECTS[:2])
     for shelves in (("lower",), ("lower", "lower")):
         with pytest.raises(ValueError, match="a shelf of its own"):
-            simulate_collaboration(*skills, shelves, workplace=workplace)
+            simulate(*skills, shelves, workplace=workplace)
 
 
 def test_one_person_comes_at_a_time(skills):
     with pytest.raises(ValueError, match="one person comes"):
-        simulate_collaboration(*skills, ("upper",), worker=True, handover=True)
+        simulate(*skills, ("upper",), worker=True, handover=True)
 
 
 @pytest.mark.slow
 @shapes_unchecked()
 def test_an_object_is_handed_over_and_placed(skills):
-    job = simulate_collaboration(
+    job = simulate(
         *skills,
         ("middle",),
         camera="synthetic",

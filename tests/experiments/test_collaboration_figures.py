@@ -7,8 +7,8 @@ import torch
 from PIL import Image
 from sample_runs import sample_run
 
-from hrc_learn.experiments.collaboration import report as collaboration_figures
-from hrc_learn.experiments.collaboration.report import (
+from hrc_learn.experiments import collaboration_report as collaboration_figures
+from hrc_learn.experiments.collaboration_report import (
     end_effector_figure,
     marker_figure,
     timeline_figure,

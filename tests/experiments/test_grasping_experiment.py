@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from hrc_learn.experiments.grasping import experiment
-from hrc_learn.experiments.grasping.experiment import GraspingExperiment
-from hrc_learn.experiments.grasping.trial import SimulatedGrasp
+from hrc_learn.experiments import grasping_experiment as experiment
+from hrc_learn.experiments.grasping_experiment import GraspingExperiment
+from hrc_learn.experiments.grasping_trial import SimulatedGrasp
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.sim import Imperfections
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -38,10 +38,10 @@ def test_variants_are_compared_by_servoing_alone(asked):
     assert list(runs.compared) == ["learned", "fixed"]
     whole, *compared = asked
     assert whole.config == grasping.config
-    assert not whole.told_target
+    assert not whole.known_target
     assert whole.imperfections == Imperfections.nominal()
     for settings in compared:
-        assert settings.told_target
+        assert settings.known_target
         assert settings.imperfections == whole.imperfections
         assert settings.config.attempts == 1
         assert settings.config.servo.probe == 0.0

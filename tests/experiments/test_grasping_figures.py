@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sample_runs import STEPS, camera_recording, sample_run
 
-from hrc_learn.experiments.grasping.report import reach_figure, regions_figure, variants_figure
+from hrc_learn.experiments.grasping_report import reach_figure, regions_figure, variants_figure
 
 TARGET = np.array([80.0, 80.0])
 
@@ -40,7 +40,7 @@ def test_errors_count_from_the_true_target_and_from_when_the_first_one_saw():
 def test_what_never_saw_the_feature_cannot_be_compared():
     run = sample_run()
     blind = replace(run.camera, feature=np.full((STEPS, 2), np.nan))
-    with pytest.raises(ValueError, match="ever saw"):
+    with pytest.raises(ValueError, match="no run saw"):
         variants_figure({"blind": replace(run, camera=blind)}, TARGET)
 
 

@@ -17,7 +17,7 @@ from hrc_learn.experiments.metric_table import (
     total,
     wilson_interval,
 )
-from hrc_learn.experiments.monte_carlo import Trial
+from hrc_learn.experiments.trials import Trial
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def test_the_interval_is_that_of_wilson(successes, trials):
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 0), (2, 1), (-1, 3)])
 def test_no_share_without_trials(successes, trials):
-    with pytest.raises(ValueError, match="no share"):
+    with pytest.raises(ValueError, match="no rate"):
         wilson_interval(successes, trials)
 
 

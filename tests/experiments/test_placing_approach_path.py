@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hrc_learn.experiments.placing.trial import ApproachPath
+from hrc_learn.experiments.placing_trial import ApproachPath
 
 GOAL = np.array([0.4, -0.6, 0.3])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hrc_learn.experiments.placing import figures as draw
+from hrc_learn.experiments import placing_figures as draw
 from hrc_learn.geometry import Box
 from hrc_learn.log import JointRanges
 
@@ -56,7 +56,7 @@ def test_each_joint_shows_the_demonstration_and_every_shelf():
         np.testing.assert_array_equal(
             lines["upper shelf"], by_shelf()["upper"].joint_position[:, i]
         )
-        assert "demo" in lines
+        assert "demonstration" in lines
         low, high = axes.get_ylim()
         assert low <= lines["lower shelf"].min()
         assert lines["upper shelf"].max() <= high

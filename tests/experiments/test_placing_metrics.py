@@ -1,27 +1,23 @@
 """What counts as a good placing, and how trials are summed up."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from hrc_learn.experiments.frame import TRIALS, Study
 from hrc_learn.experiments.metric_table import evaluate
-from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.placing import arm_angle_ablation
-from hrc_learn.experiments.placing.experiment import RandomStart, demonstrated_shelf
-from hrc_learn.experiments.placing.metrics import (
-    BLOCKED,
+from hrc_learn.experiments.placing_experiment import (
+    demonstrated_shelf,
     placing_metrics,
     random_start_metrics,
 )
-from hrc_learn.experiments.placing.trial import (
+from hrc_learn.experiments.placing_trial import (
     PlacingOutcome,
     random_start,
     taught_correction,
 )
+from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, Touch, World
@@ -48,7 +44,7 @@ def trial(seed, **changes):
     """A trial in which the upper shelf differs."""
     outcomes = dict.fromkeys(SHELVES, GOOD) | {"upper": replace(GOOD, **changes)}
     values = evaluate(placing_metrics(SHELVES), outcomes).values
-    return Trial(seed=seed, values={**values, BLOCKED: 1})
+    return Trial(seed=seed, values={**values, "joint_space_plans_blocked": 1})
 
 
 def random_starts(trials):
@@ -124,18 +120,6 @@ def test_one_place_in_fifty_may_be_missed_and_two_may_not():
         assert missed(random_starts([*good, *off])) == {WITHIN}
 
 
-def test_the_arm_may_hit_the_cabinet_without_the_posture_but_not_with_it():
-    def pair(seed, without, taught):
-        values = {"without_posture_hit": without, "with_posture_hit": taught}
-        return Trial(seed=seed, values=values)
-
-    def evaluated(*pairs):
-        return evaluate(arm_angle_ablation.TRIAL_METRICS, pairs).table
-
-    assert missed(evaluated(pair(0, 1, 0), pair(1, 1, 0))) == set()
-    assert len(missed(evaluated(pair(0, 1, 0), pair(1, 0, 1)))) == 1
-
-
 def test_the_demonstrated_shelf_is_where_the_end_effector_ended():
     for shelf in SHELVES:
         goal = WORKPLACE.shelf(shelf).position.numpy()
@@ -189,24 +173,6 @@ def test_a_correction_shifts_and_turns_in_the_frame_of_the_tool():
     torch.testing.assert_close(corrected.position - other.position, shift)
     back = quaternion.multiply(quaternion.conjugate(other.orientation), corrected.orientation)
     torch.testing.assert_close(back, turn)
-
-
-def test_random_starts_are_repeated_with_each_size_of_the_imperfections():
-    start = RandomStart(
-        placing=Path("skill"),
-        demonstrations=Path("demos"),
-        speed=1.5,
-        noise=0.1,
-        imperfections=Imperfections.nominal(),
-        taught=True,
-    )
-    studies = Study(title="", trial=start).at_sizes((0.0, 1.0, 2.0))
-    sizes = {name: study.trial.imperfections for name, study in studies.items()}
-    assert sizes == {
-        TRIALS: Imperfections.nominal(),
-        "imperfections_0": Imperfections.ideal(),
-        "imperfections_2": Imperfections.nominal().scaled(2.0),
-    }
 
 
 def test_starts_that_cannot_be_free_are_given_up():

@@ -9,13 +9,15 @@ from taught_models import teach
 from unchecked import shapes_unchecked
 
 from hrc_learn.experiments.arm_access import through_franka, through_franky
-from hrc_learn.experiments.collaboration.trial import simulate_collaboration
-from hrc_learn.experiments.grasping.trial import (
-    GraspingScene,
-    GraspingSceneConfig,
+from hrc_learn.experiments.collaboration_trial import (
+    CollaborationScenario,
+    simulate_collaboration,
+)
+from hrc_learn.experiments.grasping_scene import GraspingScene, GraspingSceneConfig
+from hrc_learn.experiments.grasping_trial import (
     simulate_grasp,
 )
-from hrc_learn.experiments.placing.trial import place
+from hrc_learn.experiments.placing_trial import place
 from hrc_learn.hardware import FrankyConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections
@@ -45,12 +47,15 @@ def untouched(world):
 
 @shapes_unchecked()
 def test_a_whole_job_is_done_with_imperfections(skills):
-    job = simulate_collaboration(
-        *skills,
-        ("middle",),
+    scenario = CollaborationScenario(
         camera="synthetic",
         config=PickAndPlaceConfig(interaction=2.5, speed=2.0),
         imperfections=Imperfections.nominal(),
+    )
+    job = simulate_collaboration(
+        *skills,
+        ("middle",),
+        scenario,
         access=through_franky(),
         seed=3,
     )

@@ -224,11 +224,11 @@ def test_servers_beside_each_other_take_addresses_of_their_own():
 def test_a_controller_is_told_of_the_drivers_delay_and_acceleration():
     access = through_franky(FrankyConfig(dynamics=0.4, realtime="ignore"))
     sizes = Imperfections(command_delay=0.02, slowness=0.3)
-    told = access.told(sizes)
+    told = access.declared(sizes)
     assert told.command_delay == pytest.approx(0.02 + FRANKY_DELAY)
     assert told.slowness == pytest.approx(0.6)
-    assert access.told(Imperfections(slowness=0.8)).slowness == 0.8
-    assert SIMULATED.told(sizes) == sizes
+    assert access.declared(Imperfections(slowness=0.8)).slowness == 0.8
+    assert SIMULATED.declared(sizes) == sizes
 
 
 def test_without_the_simulator_its_extra_is_named(monkeypatch):

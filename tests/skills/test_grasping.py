@@ -12,22 +12,21 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments.grasping.metrics import (
+from hrc_learn.experiments.grasping_experiment import (
     TRIAL_METRICS,
     Descent,
     grasp_metrics,
     jacobian_errors,
     lift,
 )
-from hrc_learn.experiments.grasping.report import RegionActivity, record_grasp
-from hrc_learn.experiments.grasping.trial import (
+from hrc_learn.experiments.grasping_report import RegionActivity, record_grasp
+from hrc_learn.experiments.grasping_scene import GraspingScene, GraspingSceneConfig
+from hrc_learn.experiments.grasping_trial import (
     VARIANTS,
-    GraspingScene,
-    GraspingSceneConfig,
     simulate_grasp,
 )
 from hrc_learn.experiments.metric_table import evaluate
-from hrc_learn.experiments.monte_carlo import Trial
+from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda

@@ -8,8 +8,12 @@ import pytest
 from page_in_browser import PATIENCE, Browser, chromium, wait_until
 from taught_models import teach
 
-from hrc_learn.experiments.collaboration.trial import simulate_collaboration
-from hrc_learn.experiments.run_recording import ELBOW, Deviation, link_poses, span
+from hrc_learn.experiments.collaboration_trial import (
+    CollaborationScenario,
+    simulate_collaboration,
+)
+from hrc_learn.experiments.run_measures import ELBOW, Deviation, link_poses, span
+from hrc_learn.experiments.simulated_cell import Observer
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.teleoperation import page_session as task_page
@@ -31,12 +35,14 @@ class Job:
             aiming,
             placing,
             ("middle",),
-            camera="synthetic",
-            forces=(),
-            config=PickAndPlaceConfig(interaction=15.0),
+            CollaborationScenario(
+                camera="synthetic",
+                forces=(),
+                config=PickAndPlaceConfig(interaction=15.0),
+                page=PageConfig(timeout=PATIENCE),
+            ),
             seed=3,
-            page=PageConfig(timeout=PATIENCE),
-            view=self._watch,
+            observer=Observer(view=self._watch),
         )
 
     def _watch(self, cell, world, motion):

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.experiments.collaboration.experiment import CollaborationExperiment
-from hrc_learn.experiments.collaboration.trial import simulate_collaboration
+from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.teleoperation import (
@@ -36,7 +35,6 @@ def field_default(cls, name):
 
 def test_every_part_has_the_same_default():
     assert default_of(force_to_nullspace_input, "mapping") == DEFAULT_MAPPING
-    assert default_of(simulate_collaboration, "mapping") == DEFAULT_MAPPING
     assert field_default(CollaborationExperiment, "mapping") == DEFAULT_MAPPING
     for forces in (InteractionForceConfig(), PageConfig().forces, GamepadConfig().forces):
         assert forces.mapping == DEFAULT_MAPPING

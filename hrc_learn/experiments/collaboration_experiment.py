@@ -1,0 +1,166 @@
+"""Experiment 3 of the paper: objects grasped near a person and placed on shelves."""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from hrc_learn.demos import Demonstration, load_demos
+from hrc_learn.experiments.arm_access import ArmDriver, access_by
+from hrc_learn.experiments.collaboration_metrics import TRIAL_METRICS, collaboration_metrics
+from hrc_learn.experiments.collaboration_report import SUMMARY, collaboration_sections
+from hrc_learn.experiments.collaboration_trial import (
+    DRAGS_NEAR_WORKER,
+    NULL_SPACE_FORCES,
+    CollaborationRun,
+    CollaborationScenario,
+    simulate_collaboration,
+)
+from hrc_learn.experiments.experiment import RepeatedRun, Study
+from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.experiments.run_measures import worker_distance
+from hrc_learn.experiments.run_recorder import record
+from hrc_learn.experiments.simulated_cell import UNOBSERVED, Observer
+from hrc_learn.experiments.snapshots import collaboration_snapshots
+from hrc_learn.experiments.table_objects import workplace_for
+from hrc_learn.geometry import Box
+from hrc_learn.kinematics import ArmChoice
+from hrc_learn.log import LoggedSteps, RunRecording
+from hrc_learn.sim import Imperfections, RenderingUnavailableError
+from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.store import read_made_by
+from hrc_learn.teleoperation import ScriptedForce
+from hrc_learn.viz.report import Section
+
+Pulls = Literal["scripted", "random", "none"]
+"""Times at which a scripted person pulls the elbow: while the robot waits above the first
+object, at random moments of the whole job, or never."""
+
+# Time for the elbow to come to rest after the last drag [s], as after the two without a worker.
+_AFTER_DRAGS = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollaborationExperiment(CollaborationScenario):
+    """Grasp each object near a person, carry it to the cabinet, place it on its shelf."""
+
+    title: ClassVar[str] = "Collaboration: grasping and placing near a person"
+    summary: ClassVar[str] = SUMMARY
+
+    aiming: Path
+    """Folder of the visual-servoing skill."""
+    placing: Path
+    """Folder of the placing skill."""
+    shelves: tuple[str, ...] = ("middle",)
+    """Shelf of each of up to three objects."""
+    shelf_x: float | None = None
+    """Position along the boards at which objects are placed [m]; None: the cell's layout."""
+    shelf_depth: float | None = None
+    """Distance behind the front edge of the boards [m]; None: the cell's layout."""
+    pulls: Pulls = "scripted"
+    """Times at which the scripted person pulls the elbow; overrides `forces`."""
+    imperfections: Imperfections = field(default_factory=Imperfections.nominal)
+    """Imperfections of arm, calibration, camera and objects."""
+    robot: ArmChoice = field(default_factory=ArmChoice)
+    """The arm."""
+    arm: ArmDriver = "sim"
+    """Driver of the simulated arm: the simulator itself, or a driver of the real arm over its
+    network protocol."""
+
+    def run(self, seed: int, observer: Observer = UNOBSERVED) -> CollaborationRun:
+        """Do the whole job once; the seed draws object poses, imperfections and image noise."""
+        # The same number of images for any number of objects: 200 of them take 1 GB of memory.
+        keep_every = self.cell.keep_image_every * len(self.shelves)
+        robot = self.robot.work_arm()
+        scenario = replace(
+            self,
+            forces=self._forces(),
+            config=self._job(),
+            cell=replace(self.cell, keep_image_every=keep_every),
+        )
+        return simulate_collaboration(
+            VisualServoSkill.load(self.aiming),
+            PlacingSkill.load(self.placing, robot),
+            self.shelves,
+            scenario,
+            workplace=workplace_for(self.shelves, robot, self.shelf_x, self.shelf_depth),
+            access=access_by(self.arm, robot),
+            seed=seed,
+            observer=observer,
+        )
+
+    def failure(self, run: CollaborationRun) -> str:
+        """Reasons of the robot for objects that it did not deliver."""
+        return run.failure
+
+    def metrics(self) -> Sequence[Metric[CollaborationRun]]:
+        """Metrics of contacts, errors and the influence of the person."""
+        fit = json.loads((self.placing / "metrics.json").read_text(encoding="utf-8"))
+        return collaboration_metrics(len(self.shelves), fit["joint_nrmse_median"])
+
+    def recordings(self, run: CollaborationRun) -> Mapping[str, RunRecording]:
+        """Recording of the whole job."""
+        # Box above the table in which the vision region takes over.
+        x, y, z = run.workplace.hover().position.tolist()
+        region = Box(centre=(x, y, z), half_size=self.config.grasping.servo.half_size)
+        recording = record(
+            f"Collaboration, placing on {', '.join(self.shelves)}",
+            run.cell,
+            run.world,
+            run.motion,
+            plans=[pick.plan for pick in run.picks if pick.plan is not None],
+            cameras=run.cameras,
+            region=region,
+            demonstration=self._demonstration(),
+        )
+        return {"run": recording}
+
+    def log(self, run: CollaborationRun) -> LoggedSteps:
+        """Log of the whole job; with a worker also the true distance to them [m]."""
+        log = run.cell.log
+        if run.visit is None:
+            return log
+        return log.with_columns(person_distance_true=worker_distance(run.motion, len(log)))
+
+    def sections(
+        self, run: CollaborationRun, recordings: Mapping[str, RunRecording]
+    ) -> Sequence[Section]:
+        """Report sections: timeline, grasping, person, worker, placing."""
+        snapshots = []
+        if run.visit is not None and len(run.visit.markers) and len(run.cell.log):
+            try:
+                snapshots = collaboration_snapshots(run)
+            except RenderingUnavailableError as error:
+                print(f"note: no pictures of the worker: {error}", file=sys.stderr)
+        return collaboration_sections(run, recordings["run"], snapshots)
+
+    def study(self) -> Study:
+        """Trials with other object poses, imperfections and noise."""
+        cell = replace(self.cell, keep_image_every=0)
+        return Study(
+            title="Collaborations with other seeds",
+            trial=RepeatedRun(replace(self, cell=cell, page=None)),
+            metrics=TRIAL_METRICS,
+            text="Each seed draws other imperfections, object poses and image noise.",
+        )
+
+    def _forces(self) -> Sequence[ScriptedForce] | Literal["random"]:
+        """Forces of the person on the elbow."""
+        drags = DRAGS_NEAR_WORKER if self.worker else NULL_SPACE_FORCES
+        return {"none": (), "random": "random", "scripted": drags}[self.pulls]
+
+    def _job(self) -> PickAndPlaceConfig:
+        """Job with the time that the drags take, also without drags: runs stay comparable."""
+        if not self.worker:
+            return self.config
+        end = DRAGS_NEAR_WORKER[-1].end + _AFTER_DRAGS
+        return replace(self.config, interaction=max(self.config.interaction, end))
+
+    def _demonstration(self) -> Demonstration | None:
+        """First demonstration of the placing motion, if its dataset still exists."""
+        dataset = Path(read_made_by(self.placing)["dataset"])
+        return load_demos(dataset, episodes=[0])[0] if dataset.is_dir() else None

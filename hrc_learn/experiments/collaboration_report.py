@@ -1,0 +1,347 @@
+"""Report of a collaboration: sections, and figures after those of the paper's Experiment 3.
+
+Each figure takes the recording of the run and the time interval of each object, by its name.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.figure import Figure
+
+from hrc_learn.experiments.collaboration_trial import CollaborationRun
+from hrc_learn.experiments.snapshots import Image, snapshots_figure
+from hrc_learn.log import Event, RunRecording
+from hrc_learn.viz import palette
+from hrc_learn.viz.figure_parts import (
+    STYLE,
+    WIDTH,
+    active_intervals,
+    draw_box,
+    finite_span,
+    frame_space,
+    near,
+    needed,
+    shade,
+    space,
+)
+from hrc_learn.viz.figures import image_jacobian_figure, joints_figure, person_figure
+from hrc_learn.viz.report import Picture, Section
+
+Spans = Mapping[str, tuple[float, float]]
+"""Start and end of the work on each object [s], by its name."""
+
+CARRYING = ("transfer", "release")
+"""Phases in which the end effector moves an object into the cabinet."""
+
+_HIDDEN = "#8D8F94"
+
+SUMMARY = (
+    "An arm grasps objects with an uncalibrated camera while a person pushes its elbow aside "
+    "to reach under it. It then carries each object to a cabinet along a motion learned from "
+    "demonstrations of the end effector and the null-space posture, and places it on a shelf. "
+    "Simulated in MuJoCo, which also decides on success by contacts."
+)
+
+
+def collaboration_sections(
+    run: CollaborationRun,
+    recording: RunRecording,
+    snapshots: Sequence[tuple[str, Image]] = (),
+) -> list[Section]:
+    """Report sections: timeline, grasping, person, worker if one came, placing.
+
+    Args:
+        run: The run.
+        recording: Recording of the run.
+        snapshots: Pictures of the job near the worker, with their titles; empty without a
+            worker, or if this machine cannot render.
+    """
+    objects: Spans = {pick.item.name: pick.span for pick in run.picks}
+    notes = [
+        f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
+        for pick in run.picks
+        for note in pick.recoveries
+    ]
+    return [
+        Section(
+            heading="The job",
+            text=(
+                "A state machine: detect, servo, wait for the person, grasp, carry home, "
+                f"transfer, release, retreat. {' '.join(notes) or 'No recovery was needed.'}"
+            ),
+            figures=(
+                Picture("timeline", timeline_figure(recording, objects), "Phases over time."),
+            ),
+        ),
+        Section(
+            heading="Grasping with an uncalibrated camera",
+            text=(
+                "Visual servoing moves the marker of the gripper to its demonstrated place "
+                "above the object. The image Jacobian was learned from the demonstrations and "
+                "adapts online, also to a moved camera."
+            ),
+            figures=(
+                Picture(
+                    "marker",
+                    marker_figure(recording, objects),
+                    "Paths of the marker over the camera's first image, and its distance from "
+                    "the target.",
+                ),
+                Picture(
+                    "image_jacobian",
+                    image_jacobian_figure(recording),
+                    "Image Jacobian: estimate of the controller, and truth in the simulator.",
+                ),
+            ),
+        ),
+        Section(
+            heading="The person",
+            text=(
+                "The force of the person acts in the null space of the task: the elbow yields, "
+                "the end effector stays."
+            ),
+            figures=(
+                Picture(
+                    "end_effector",
+                    end_effector_figure(recording),
+                    "Position and orientation of the end effector, and effort of the person.",
+                ),
+                Picture(
+                    "person",
+                    person_figure(recording),
+                    "Effort, elbow and end effector, enlarged.",
+                ),
+            ),
+        ),
+        *_worker_sections(recording, snapshots),
+        Section(
+            heading="Carrying and placing",
+            text="The demonstration, and the motion of the arm with every object.",
+            figures=(
+                Picture(
+                    "trajectories",
+                    trajectories_figure(recording, objects),
+                    "Paths of the end effector.",
+                ),
+                Picture("joints", joints_figure(recording), "Joint positions and limits."),
+            ),
+        ),
+    ]
+
+
+def _worker_sections(
+    recording: RunRecording, snapshots: Sequence[tuple[str, Image]]
+) -> list[Section]:
+    """Section about the worker; none without a worker."""
+    if not recording.worker_distance:
+        return []
+    text = (
+        "A worker comes to the table, puts something down, reaches for markers under the arm "
+        "and leaves, without regard to the robot. The robot sees the worker late and with "
+        "noise, keeps the protective distance of ISO/TS 15066 from every part of the body, and "
+        "waits if necessary. The expert drags joint 4 forward and back twice to make space."
+    )
+    figures = []
+    if snapshots:
+        caption = (
+            "The job, after the paper's snapshots of Experiment 3. Violet: smallest distance. "
+            "Orange: direction in which the expert drags the elbow."
+        )
+        figures.append(Picture("worker_snapshots", snapshots_figure(snapshots), caption))
+    caption = (
+        "Smallest distance from the robot and its load: true, seen by the robot, and the "
+        "protective distance of the part with the smallest margin."
+    )
+    figures.append(Picture("worker", worker_figure(recording), caption))
+    return [Section(heading="The worker", text=text, figures=tuple(figures))]
+
+
+def worker_figure(run: RunRecording) -> Figure:
+    """Distance of the worker from the robot over time, with the last 30 cm enlarged."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 3.8))
+        far, near = figure.subplots(2, 1, sharex=True)
+        for axes in (far, near):
+            for name, distance in run.worker_distance.items():
+                axes.plot(run.time, distance, label=name, lw=0.9)
+            axes.axhline(0.0, color=palette.LIMIT, lw=0.8)
+            axes.set_ylabel("distance [m]")
+            axes.margins(x=0)
+        far.legend(loc="center right")
+        far.set_title("Distance of the worker from the robot and its load", loc="left")
+        near.set(ylim=(-0.05, 0.30), xlabel="time [s] (red: contact)")
+    return figure
+
+
+def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
+    """Paths of the end effector with every object, and the demonstration."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 5.2))
+        axes = space(figure)
+        points = run.position
+        if run.demo_path is not None:
+            points = np.concatenate([points, run.demo_path])
+        for box in near(run.boxes, points):
+            draw_box(axes, box, "#8D8F94", alpha=0.10)
+        if run.demo_path is not None:
+            axes.plot(*run.demo_path.T, color=palette.DEMO, lw=5.0, label="demonstration")
+        carried = np.zeros(len(run.time), dtype=bool)
+        for event, end in _lasting(run):
+            if event.text in CARRYING:
+                carried |= _within(run.time, (event.time, end))
+        for (name, span), colour in zip(objects.items(), palette.SERIES, strict=False):
+            rows = _within(run.time, span)
+            axes.plot(*run.position[rows].T, color=colour, lw=0.8, alpha=0.5)
+            path = run.position[rows & carried]
+            axes.plot(*path.T, color=colour, lw=2.0, label=f"carried: {name}")
+            if len(path):
+                axes.plot(*path[-1], "s", color=colour, ms=5)
+        axes.legend(loc="upper right")
+        axes.set_title("Paths of the tool centre point (square: release)", loc="left")
+        frame_space(axes, points)
+    return figure
+
+
+def marker_figure(run: RunRecording, objects: Spans) -> Figure:
+    """Paths of the gripper's marker in the image, and its distance from the target."""
+    camera = needed(run.camera, "camera")
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 6.0))
+        grid = figure.add_gridspec(2, 1, height_ratios=[2.1, 1])
+        image, error = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+        if len(camera.images):
+            image.imshow(camera.images[0], alpha=0.45)
+        for (name, span), colour in zip(objects.items(), palette.SERIES, strict=False):
+            rows = _within(run.time, span)
+            seen = rows & np.isfinite(camera.feature).all(axis=1)
+            if not seen.any():
+                continue
+            feature, target = camera.feature[seen], camera.target[seen]
+            image.plot(*feature.T, color=colour, label=name)
+            image.plot(*feature[0], "o", color=colour, ms=5)
+            image.plot(*target[-1], "+", color=colour, ms=13, mew=2)
+            error.plot(run.time[rows], camera.error[rows], color=colour)
+        image.set(
+            xlim=(0, camera.model.width),
+            ylim=(camera.model.height, 0),
+            aspect="equal",
+            xlabel="u [px]",
+            ylabel="v [px]",
+            title="Path of the gripper's marker (dot: first seen, cross: target)",
+        )
+        if image.get_legend_handles_labels()[0]:  # none if the marker was never seen
+            image.legend(loc="upper right", frameon=True, framealpha=0.75, edgecolor="none")
+        hidden = _out_of_sight(run)
+        for first, last in active_intervals(hidden):
+            error.axvspan(run.time[first], run.time[last], color=_HIDDEN, alpha=0.25, lw=0)
+        error.set_yscale("log")
+        error.margins(x=0)
+        error.set(
+            xlabel="time [s] (shaded: marker occluded)",
+            ylabel="distance [px]",
+            title="Distance to the target",
+        )
+        finite_span(error, run.time, hidden | np.isfinite(camera.error))
+    return figure
+
+
+def end_effector_figure(run: RunRecording) -> Figure:
+    """Position and orientation of the end effector, and effort of the person, over time."""
+    effort = needed(run.nullspace_input, "nullspace_input")
+    hand = next((body for body in run.bodies if body.name == "hand"), None)
+    acting = np.linalg.norm(effort, axis=1) > 0
+    rows = [
+        ("position [m]", "Position of the end effector", run.position, "xyz"),
+        ("effort d [N m]", "Null-space effort of the person, by joint", effort, None),
+    ]
+    if hand is not None:
+        turn = _euler_angles(hand.orientation)
+        rows.insert(1, ("angle [deg]", "Orientation of the end effector", turn, _ANGLES))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 1.9 * len(rows)))
+        column = figure.subplots(len(rows), 1, sharex=True)
+        for axes, (label, title, values, names) in zip(column, rows, strict=True):
+            shade(axes, run.time, acting)
+            axes.plot(run.time, values)
+            axes.set(ylabel=label, title=title)
+            axes.margins(x=0)
+            axes.legend(
+                axes.get_lines(),
+                names or run.joint_names,
+                loc="center left",
+                bbox_to_anchor=(1.0, 0.5),
+            )
+        column[-1].set_xlabel("time [s] (shaded: a person pushes the elbow)")
+        figure.align_ylabels()
+    return figure
+
+
+def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
+    """Phases of the task by object, with pushes and occlusions below."""
+    events = [(event, end) for event, end in _lasting(run) if end > event.time]
+    names = list(dict.fromkeys(event.text for event, _ in events))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 0.9 + 0.26 * (len(names) + 2)))
+        axes = figure.subplots()
+        colours = dict(zip(objects, palette.SERIES, strict=False))
+        for event, end in events:
+            owner = next((n for n, (a, b) in objects.items() if a <= event.time < b), None)
+            colour = palette.GREY if owner is None else colours[owner]
+            bar = (event.time, max(end - event.time, 0.15))
+            axes.broken_barh([bar], (names.index(event.text) - 0.38, 0.76), color=colour)
+        effort = run.nullspace_input
+        pushed = np.zeros(len(run.time), bool)
+        if effort is not None:
+            pushed = np.linalg.norm(effort, axis=1) > 0
+        rows = {
+            "person pushes": (pushed, palette.PURPLE),
+            "marker occluded": (_out_of_sight(run), _HIDDEN),
+        }
+        for k, (active, colour) in enumerate(rows.values(), start=len(names)):
+            spells = active_intervals(active)
+            bars = [(run.time[a], run.time[b] - run.time[a]) for a, b in spells]
+            axes.broken_barh(bars, (k - 0.38, 0.76), color=colour)
+        axes.set_yticks(range(len(names) + len(rows)), [*names, *rows])
+        axes.invert_yaxis()
+        axes.set(xlim=(run.time[0], run.time[-1]), xlabel="time [s]")
+        axes.grid(axis="y", visible=False)
+        handles = [axes.plot([], [], lw=6, color=c)[0] for c in colours.values()]
+        figure.legend(handles, colours, loc="outside upper right", ncols=len(colours))
+    return figure
+
+
+_ANGLES = ("about x", "about y", "about z")
+
+
+def _euler_angles(q: Float[np.ndarray, "time 4"]) -> Float[np.ndarray, "time 3"]:
+    """Rotations about the base's x, then y, then z from gripper down, unwrapped [deg]."""
+    w, x, y, z = q.T
+    # q = turn * down, where down = (0, s, s, 0) with s^2 = 1/2: turn = q * conj(down).
+    s = np.sqrt(0.5)
+    w, x, y, z = s * (x + y), s * (z - w), -s * (w + z), s * (y - x)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=1), axis=0))
+
+
+def _lasting(run: RunRecording) -> list[tuple[Event, float]]:
+    """Each phase with the start of the next one [s]."""
+    ends = [*(event.time for event in run.phases[1:]), float(run.time[-1])]
+    return list(zip(run.phases, ends, strict=True))
+
+
+def _within(
+    time: Float[np.ndarray, " time"], span: tuple[float, float]
+) -> Bool[np.ndarray, " time"]:
+    return (time >= span[0]) & (time < span[1])
+
+
+def _out_of_sight(run: RunRecording) -> Bool[np.ndarray, " time"]:
+    """True at steps with a target for the marker in which the camera did not see it."""
+    if run.camera is None:
+        return np.zeros(len(run.time), dtype=bool)
+    targeted = np.isfinite(run.camera.target).all(axis=1)
+    return np.asarray(targeted & ~np.isfinite(run.camera.feature).all(axis=1))

@@ -1,0 +1,414 @@
+"""One collaboration in simulation: the scenario, the run, and its result."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
+from hrc_learn.experiments.collaboration.reach_space import (
+    ReachSpace,
+    reach_spaces,
+    space_over_bench,
+)
+from hrc_learn.experiments.collaboration.worker import (
+    draw_visit,
+    move_worker,
+    separation_margin,
+)
+from hrc_learn.experiments.elbow_pulls import PullEffect, pull_effects
+from hrc_learn.experiments.hand_over_person import (
+    GivingPerson,
+    giver,
+    shown_hand_overs,
+    waiting_pose,
+)
+from hrc_learn.experiments.simulated_cell import (
+    UNOBSERVED,
+    Observer,
+    grasping_allows_for,
+    plan_checker,
+    simulated_cell,
+)
+from hrc_learn.experiments.table_objects import (
+    check_shelves,
+    draw_object_poses,
+    points_to_see,
+)
+from hrc_learn.protocols import Human
+from hrc_learn.sim import (
+    CameraChange,
+    CameraKind,
+    ChangingCamera,
+    Imperfections,
+    MotionLog,
+    OcclusionInterval,
+    ScriptedOcclusion,
+    WorkerSensor,
+    WorkerVisit,
+    World,
+    open_camera,
+    whole_arm,
+)
+from hrc_learn.sim.hand_over import HandOver
+from hrc_learn.sim.worker import PARTS
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.grasping import as_load
+from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
+from hrc_learn.skills.pick_and_place import (
+    HOME,
+    INTERACT,
+    RECEIVE,
+    RELEASE,
+    PickAndPlace,
+    PickAndPlaceConfig,
+    PickPlaceJob,
+)
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.skills.receiving import Receiving
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
+from hrc_learn.teleoperation import (
+    CombinedInput,
+    DrawnInterval,
+    ForceMapping,
+    InteractionForceConfig,
+    ScriptedDrawing,
+    ScriptedForce,
+    ScriptedPerturbation,
+    random_pulls,
+)
+from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
+from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.vision import CameraModel
+
+NULL_SPACE_FORCES = (
+    ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
+    ScriptedForce(start=5.5, duration=4.5, towards=(-0.10, 0.25, 0.60), max_force=60.0),
+)
+"""A worker reaches under the arm: the elbow is pushed aside and back. A force of 60 N moves it
+by 0.2 to 0.4 m within the 4.5 s of an interval."""
+
+DRAGS_NEAR_WORKER = NULL_SPACE_FORCES + tuple(
+    replace(force, start=force.start + 10.0) for force in NULL_SPACE_FORCES
+)
+"""Forward and back twice: in the paper the expert drags joint 4 while a worker reaches."""
+
+# Acceleration that the watch expects of a person who brings an object [m/s^2]. It is lower than
+# for others: the person watches the arm, and must come near enough to hand the object over.
+_GIVER_ACCELERATION = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbances:
+    """Disturbances of camera and images during the job."""
+
+    occlusions: tuple[OcclusionInterval, ...] = ()
+    """Intervals in which the gripper's marker is hidden."""
+    camera_change: CameraChange | None = None
+    """Motion of the camera between two objects; None: it stays."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollaborationScenario:
+    """Conditions under which objects are grasped and placed near a person."""
+
+    camera: CameraKind = "auto"
+    """Kind of camera that watches the table."""
+    forces: Sequence[ScriptedForce] | Literal["random"] = NULL_SPACE_FORCES
+    """Forces of the person on the elbow, in time since the robot waits for them; or forces at
+    random moments of the whole job."""
+    mapping: ForceMapping = DEFAULT_MAPPING
+    """Mapping of these forces to the joints."""
+    disturbances: Disturbances = field(default_factory=Disturbances)
+    config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
+    """Configuration of the job."""
+    cell: WorkCellConfig = field(default_factory=WorkCellConfig)
+    """Configuration of the control loop."""
+    imperfections: Imperfections = field(default_factory=Imperfections.ideal)
+    """Imperfections of arm, calibration, camera and objects."""
+    worker: bool = False
+    """A worker comes to the table unannounced and reaches under the arm."""
+    handover: bool = False
+    """A person hands over the last object."""
+    drawings: tuple[DrawnInterval, ...] = ()
+    """Regions, targets and rotations that a scripted person draws, in the time of the run."""
+    page: PageConfig | None = None
+    """Serves a page on which people push and draw too, in real time; None: no page."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollaborationRun:
+    """One run of the whole job, successful or not."""
+
+    workplace: Workplace
+    world: World
+    """World in the state that the run left."""
+    cell: WorkCell
+    motion: MotionLog
+    """Poses of everything that moved."""
+    picks: tuple[PickPlaceJob, ...]
+    """Result for each object, in order."""
+    cameras: tuple[tuple[float, CameraModel], ...]
+    """True cameras, each with the time from which it watched [s]."""
+    pulls: tuple[ScriptedForce, ...] = ()
+    """Forces on the elbow at random moments, in the time of the run."""
+    visit: WorkerVisit | None = None
+    """True motion of the worker; None without a worker."""
+    hand_over: HandOver | None = None
+    """Actions of the person who handed an object over; None without a hand-over."""
+    held_flat: frozenset[str] = frozenset()
+    """Objects that both pads held on opposite faces, after lifting and still at the release."""
+
+    @cached_property
+    def pull_effects(self) -> list[PullEffect]:
+        """Effect of each pull at a random moment, for each phase that it reached into."""
+        if not self.pulls:
+            return []
+        return pull_effects(
+            self.cell.log,
+            self.pulls,
+            self.workplace.robot.chain,
+            encoder_offset=self.world.arm.encoder_offset,
+            clearance=self.workplace.arm_clearance,
+        )
+
+    @cached_property
+    def separation_margin(self) -> Float[np.ndarray, " steps"] | None:
+        """Separation margin from the worker at each step [m]; None without a worker."""
+        if self.visit is None:
+            return None
+        log = self.cell.log
+        return separation_margin(
+            log,
+            self.visit,
+            whole_arm(self.world.config.arm),
+            self.cell.config.safety.separation,
+            encoder_offset=self.world.arm.encoder_offset,
+            loads={
+                item.name: (as_load(item), self.motion.held(item.name)[: len(log)])
+                for item in self.workplace.scene.objects
+            },
+        )
+
+    @cached_property
+    def reach_spaces(self) -> list[ReachSpace]:
+        """Free space of the worker at each marker; empty without a worker."""
+        if self.visit is None or not len(self.visit.markers):
+            return []
+        x, y, _ = self.visit.markers.mean(axis=0).tolist()
+        return reach_spaces(
+            self.cell.log,
+            self.visit,
+            whole_arm(self.world.config.arm),
+            space_over_bench((x, y), self.world.table_top),
+            self.world.arm.encoder_offset,
+        )
+
+    @property
+    def failure(self) -> str:
+        """Reasons of the robot for objects that it did not deliver; empty if there are none."""
+        failures = [pick.failure for pick in self.picks if pick.failure]
+        if left := len(self.workplace.scene.objects) - len(self.picks):
+            failures.append(f"{left} objects were not started")
+        return "; ".join(failures)
+
+
+def simulate_collaboration(
+    aiming: VisualServoSkill,
+    placing: PlacingSkill,
+    shelves: Sequence[str],
+    scenario: CollaborationScenario | None = None,
+    *,
+    workplace: Workplace | None = None,
+    access: ArmAccess = SIMULATED,
+    seed: int = 0,
+    observer: Observer = UNOBSERVED,
+    on_phase: Callable[[str, float], None] | None = None,
+) -> CollaborationRun:
+    """Grasp objects at random poses and put them on shelves, in MuJoCo.
+
+    Args:
+        aiming: Learned image Jacobian and visual target.
+        placing: Learned placing motion.
+        shelves: Shelf of each object of the scene, in turn.
+        scenario: Person, camera, imperfections and configuration.
+        workplace: Workplace; by default that of a Panda.
+        access: Access to the arm.
+        seed: Seed of object poses, imperfections, people and image noise.
+        observer: Live dashboard and messages.
+        on_phase: Called with name and start time [s] of each phase; by default the observer
+            shows them.
+
+    Raises:
+        ValueError: If not every object has a shelf of its own, a shelf is unknown or out of
+            reach, or both a worker and a hand-over are asked for.
+    """
+    scenario = scenario or CollaborationScenario()
+    workplace = (workplace or Workplace()).approached(aiming.approach)
+    check_shelves(workplace, shelves)
+    if scenario.worker and scenario.handover:
+        raise ValueError("only one person comes: give --worker or --handover, not both.")
+    rng, sizes = np.random.default_rng(seed), scenario.imperfections
+    plant = access.declared(sizes)
+    config = scenario.config
+    config = replace(config, grasping=grasping_allows_for(config.grasping, plant))
+    # Scripted forces wait for the robot; random ones do not, and the robot does not wait.
+    pulls: tuple[ScriptedForce, ...] = ()
+    if scenario.forces == "random":
+        # A generator of its own keeps runs with and without pulls alike otherwise.
+        pulls = random_pulls(np.random.default_rng([seed, 1]))
+        config = replace(config, interactions=0)
+    person = _scripted_person(workplace, scenario, pulls)
+    stage = _Stage(workplace, scenario, plant, seed, rng)
+    world, items = stage.world, workplace.scene.objects
+    eyes = ChangingCamera(
+        workplace.scene.camera,
+        lambda model: open_camera(
+            world, scenario.camera, model, rng=rng, noise=sizes.camera_noise
+        ),
+    )
+    held_flat: dict[str, set[str]] = {HOME: set(), RELEASE: set()}
+
+    def begin_phase(phase: str, time: float) -> None:
+        (on_phase or observer.tell_phase)(phase, time)
+        if phase in held_flat:
+            held_flat[phase] |= {item.name for item in items if world.holds_flat(item.name)}
+        if phase == RECEIVE and stage.giving is not None:
+            stage.giving.begin(time)
+        if phase == INTERACT and not pulls:
+            person.begin(time)
+
+    def change_camera(number: int) -> None:
+        """Move the camera before every object but the first."""
+        change = scenario.disturbances.camera_change
+        if change is not None and number > 0:
+            model = change.applied(eyes.model, points_to_see(workplace, world), rng)
+            eyes.change(world.time, model)
+
+    human: Human = person
+    if scenario.drawings:
+        human = CombinedInput(person, ScriptedDrawing(scenario.drawings))
+    with simulated_cell(
+        world,
+        human=human,
+        sensor=MarkerSensor(eyes, workplace.scene.marker_ids),
+        config=scenario.cell,
+        access=access,
+        page=scenario.page,
+        observer=observer,
+        on_phase=begin_phase,
+        on_step=stage.update,
+        rng=rng,
+        clearance=workplace.arm_clearance,
+        watch=stage.watch,
+    ) as simulated:
+        cell = simulated.cell
+        task = PickAndPlace(
+            cell,
+            workplace,
+            aiming,
+            placing,
+            plan_checker(world),
+            config,
+            stage.receiving(cell),
+        )
+        picks = task.run(list(zip(items, shelves, strict=True)), change_camera)
+    giving = stage.giving
+    return CollaborationRun(
+        workplace=workplace,
+        world=world,
+        cell=cell,
+        motion=simulated.motion,
+        picks=tuple(picks),
+        cameras=tuple(eyes.history),
+        pulls=pulls,
+        visit=stage.visit if giving is None else giving.hand_over.visit,
+        hand_over=None if giving is None else giving.hand_over,
+        held_flat=frozenset(held_flat[HOME] & held_flat[RELEASE]),
+    )
+
+
+def _scripted_person(
+    workplace: Workplace, scenario: CollaborationScenario, pulls: Sequence[ScriptedForce]
+) -> ScriptedPerturbation:
+    chain, interaction = (
+        workplace.robot.chain,
+        InteractionForceConfig(mapping=scenario.mapping),
+    )
+    if scenario.forces == "random":
+        return ScriptedPerturbation(chain, pulls, 0.0, interaction)
+    return ScriptedPerturbation(chain, scenario.forces, None, interaction)
+
+
+class _Stage:
+    """World of a collaboration, with its objects and the person who comes.
+
+    Attributes:
+        world: World at rest, with all objects at their random poses.
+        visit: Visit of the worker; None without a worker.
+        giving: Person who hands over the last object; None without a hand-over.
+        watch: Watch for that person by the robot's tracker; None if nobody comes.
+    """
+
+    def __init__(
+        self,
+        workplace: Workplace,
+        scenario: CollaborationScenario,
+        plant: Imperfections,
+        seed: int,
+        rng: np.random.Generator,
+    ):
+        self._workplace, self._sizes = workplace, scenario.imperfections
+        # Generators of their own keep runs with and without a person alike otherwise.
+        person_rng = np.random.default_rng([seed, 2])
+        self.visit: WorkerVisit | None = None
+        scene = workplace.scene
+        if scenario.worker:
+            self.visit = draw_visit(workplace, person_rng, beside_elbow=True)
+            scene = replace(scene, worker=self.visit.worker.config)
+        if scenario.handover:
+            scene = replace(scene, worker=giver(seed).config)
+        self.world = World(scene, self._sizes.draw(rng, workplace.robot.joints))
+        poses = draw_object_poses(workplace, self.world, self._sizes.object_yaw, rng)
+        self.world.reset(workplace.home_joints().numpy(), poses)
+        self.giving: GivingPerson | None = None
+        if scenario.handover:
+            self.giving = GivingPerson(
+                self.world, scene.objects[-1], np.random.default_rng([seed, 3])
+            )
+        self._tracker: WorkerSensor | None = None
+        self.watch: PersonWatch | None = None
+        person = self.giving or self.visit
+        if person is not None:
+            world = self.world
+            self._tracker = WorkerSensor(person, lambda: world.time, self._sizes, person_rng)
+            expected = None
+            if scenario.handover:
+                expected = PersonWatchConfig(acceleration=_GIVER_ACCELERATION)
+            separation = plant.plant(scenario.cell.safety).separation
+            self.watch = PersonWatch(self._tracker, whole_arm(scene.arm), separation, expected)
+        self._occluder = ScriptedOcclusion(self.world, scenario.disturbances.occlusions)
+        if self.visit is not None:
+            move_worker(self.world, self.visit)
+
+    def update(self) -> None:
+        """Move occluder and person to where they are now."""
+        self._occluder.update()
+        if self.visit is not None:
+            move_worker(self.world, self.visit)
+        if self.giving is not None:
+            self.giving.update()
+
+    def receiving(self, cell: WorkCell) -> dict[str, Receiving]:
+        """Skill that receives the last object, by its name; empty without a hand-over."""
+        if self.giving is None or self._tracker is None:
+            return {}
+        item = self._workplace.scene.objects[-1]
+        model = shown_hand_overs(self._workplace, self._sizes, item)
+        place = waiting_pose(self._workplace)
+        return {item.name: Receiving(cell, self._tracker, model, PARTS, place)}

@@ -1,0 +1,328 @@
+"""Frame of every experiment: run once, repeat with other seeds, evaluate, report.
+
+An experiment is a frozen dataclass of its settings with the methods of `Experiment`;
+`run_experiment` runs it and writes its results.
+"""
+
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+
+from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
+from hrc_learn.experiments.run_film import film
+from hrc_learn.experiments.run_recorder import LiveViewConfig, live_view
+from hrc_learn.experiments.simulated_cell import UNOBSERVED, Observer, no_live_view
+from hrc_learn.experiments.trials import Trial, TrialRun, repeat
+from hrc_learn.log import LoggedSteps, RunRecording
+from hrc_learn.sim import PhysicsError
+from hrc_learn.skills.failures import TaskFailedError
+from hrc_learn.store import new_folder, write_json
+from hrc_learn.viz.report import (
+    FILM,
+    PAGE,
+    Film,
+    Measurement,
+    Picture,
+    Report,
+    Section,
+    show_command,
+    show_measurements,
+    software_versions,
+    write_report,
+)
+from hrc_learn.viz.run_dashboard import record_run
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+RUN = "run"
+"""Name of the recording of the run itself, among the recordings of an experiment."""
+TRIALS = "trials"
+"""Name of the file of the trials."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A Monte Carlo study that accompanies the run shown in detail."""
+
+    title: str
+    """Heading of its section in the report."""
+    trial: TrialRun
+    """Runs one trial with a seed. A frozen dataclass, so that it can be sent to other processes
+    and its settings can be saved with the trials."""
+    metrics: Sequence[Metric[Sequence[Trial]]] = ()
+    """Rows of the table that the trials add."""
+    text: str = ""
+    """Description of the differences between trials."""
+    pictures: Callable[[Sequence[Trial]], Sequence[Picture]] = lambda trials: ()
+    """Makes figures of the trials."""
+
+    def section(self, trials: Sequence[Trial]) -> Section:
+        """Section of the report: success rate, failures, figures."""
+        summary = Summary.of(trials)
+        lines = [
+            self.text,
+            f"{summary.rate}.",
+            *(f"Seed {seed}: {reason}." for seed, reason in summary.failed.items()),
+        ]
+        text = "\n\n".join(filter(None, lines))
+        return Section(heading=self.title, text=text, figures=self.pictures(trials))
+
+
+@runtime_checkable
+class Experiment[Run](Protocol):
+    """Methods that an experiment supplies; `Run` is the result of one run."""
+
+    title: ClassVar[str]
+    """Heading of the report."""
+    summary: ClassVar[str]
+    """Description of the experiment, in plain text; blank lines part paragraphs."""
+
+    def run(self, seed: int, observer: Observer = UNOBSERVED) -> Run:
+        """Draw a scenario from the seed and carry it out once."""
+        ...
+
+    def failure(self, run: Run) -> str:
+        """Reason of the task to give up; empty if it did not. Metrics are evaluated apart."""
+        ...
+
+    def metrics(self) -> Sequence[Metric[Run]]:
+        """Metrics of a run, in the order of the report's table."""
+        ...
+
+    def recordings(self, run: Run) -> Mapping[str, RunRecording]:
+        """Recordings to look at, by the name of the file."""
+        ...
+
+    def log(self, run: Run) -> LoggedSteps:
+        """All columns of the control loop."""
+        ...
+
+    def sections(self, run: Run, recordings: Mapping[str, RunRecording]) -> Sequence[Section]:
+        """Text and figures of the report, from the run and its recordings."""
+        ...
+
+    def study(self) -> Study:
+        """Monte Carlo study of the experiment."""
+        ...
+
+
+@dataclass(frozen=True)
+class RepeatedRun:
+    """A trial that runs an experiment once; its values are the metrics of the run."""
+
+    experiment: Experiment[Any]
+
+    def __call__(self, seed: int) -> Mapping[str, Any]:
+        """Run once and measure."""
+        run = self.experiment.run(seed)
+        evaluation = evaluate(self.experiment.metrics(), run)
+        failure = failure_of(self.experiment.failure(run), evaluation)
+        return {**evaluation.values, "failure": failure}
+
+
+def failure_of(given_up: str, evaluation: Evaluation) -> str:
+    """Reasons of a failed run: the task gave up, or an essential bound was missed."""
+    return "; ".join(filter(None, (given_up, *evaluation.faults)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """Evaluated results of a run and its trials."""
+
+    table: tuple[Measurement, ...]
+    values: dict[str, float | int]
+    """Values of run and trials, as written to JSON."""
+    failure: str
+    """Reason of a failed run; empty after a success."""
+
+    @classmethod
+    def of[Run](
+        cls, experiment: Experiment[Run], run: Run, seed: int, trials: Sequence[Trial]
+    ) -> "Results":
+        """Evaluate a run and its trials.
+
+        Without trials the run itself counts as the only one, so that the keys of the values do
+        not depend on the number of trials.
+        """
+        total = evaluate(experiment.metrics(), run)
+        failure = failure_of(experiment.failure(run), total)
+        single = Trial(seed=seed, values=total.values, failure=failure)
+        values = Summary.of(trials or [single]).figures()
+        if trials:
+            total += evaluate(experiment.study().metrics, trials)
+        # Totals over all trials replace the counts of the single run.
+        return cls(table=total.table, values=total.values | values, failure=failure)
+
+    @property
+    def ok(self) -> bool:
+        """True if the run succeeded and every bound of the table is met."""
+        return not self.failure and all(m.ok is not False for m in self.table)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Options common to all experiments: repetition, outputs and live dashboard."""
+
+    out: Path
+    """Folder for recordings, report and measured values."""
+    seed: int = 0
+    """Seed of the run; the first one of the trials."""
+    trials: int = 0
+    """Number of further runs, each with the next seed, for statistics. The same command resumes
+    interrupted trials."""
+    processes: int = 1
+    """Number of parallel trials."""
+    serve: bool = False
+    """Serve the dashboard of the run in the browser while it goes on."""
+    serving: LiveViewConfig = field(default_factory=LiveViewConfig)
+    """Ports of the dashboard, with --serve."""
+    film: bool = True
+    """Make a film of the run, in the folder and in the report."""
+    verbose: bool = False
+    """Print all measured values, not just the first."""
+    overwrite: bool = False
+    """Replace an earlier run in that folder."""
+    json: Path | None = None
+    """File for the measured values."""
+
+    @classmethod
+    def of(cls, args: object) -> "RunOptions":
+        """Options of a command line with fields of the same names."""
+        return cls(**{option.name: getattr(args, option.name) for option in fields(cls)})
+
+
+def run_experiment[Run](
+    experiment: Experiment[Run],
+    options: RunOptions,
+    *,
+    configuration: Mapping[str, object] | None = None,
+    command: str = "",
+) -> int:
+    """Run an experiment and its trials, write and print the results.
+
+    Args:
+        experiment: Experiment to run.
+        options: Repetition and outputs.
+        configuration: Configuration for the report; by default the options and the settings of
+            the experiment.
+        command: Command that repeats the experiment; by default the command line of this
+            process.
+
+    Returns:
+        Exit status: 0, or 1 if the run failed or a bound was missed. A run whose physics failed
+        leaves no folder, as its measurements would be invalid.
+
+    Raises:
+        ValueError: If the number of trials is negative.
+    """
+    from rich.console import Console
+
+    if options.trials < 0:
+        raise ValueError(f"--trials must not be negative, but is {options.trials}.")
+    if configuration is None:
+        configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
+    command = command or shlex.join(["python", *sys.argv])
+    console, study = Console(), experiment.study()
+    # Next to the folder, which exists only when all is done: interrupted trials resume.
+    trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
+    try:
+        with new_folder(options.out, configuration, options.overwrite) as folder:
+            with console.status(f"{experiment.title}: running"):
+                run = experiment.run(options.seed, _observer(experiment, options, console))
+            trials = _run_trials(study, trial_file, options) if options.trials else []
+            results = Results.of(experiment, run, options.seed, trials)
+            with console.status("Writing recordings and report"):
+                run_film = _write_report(
+                    folder, experiment, run, results, trials, options, configuration, command
+                )
+            if trials:
+                shutil.copy(trial_file, folder / f"{TRIALS}.jsonl")
+    except PhysicsError as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    if trials:
+        trial_file.unlink()
+    if options.json is not None:
+        write_json(options.json, results.values)
+    show_measurements(results.table, options.verbose)
+    if trials:
+        console.print(Summary.of(trials).table(study.title))
+    _print_outputs(options.out, results, run_film is not None)
+    return 0 if results.ok else 1
+
+
+def _write_report[Run](
+    folder: Path,
+    experiment: Experiment[Run],
+    run: Run,
+    results: Results,
+    trials: Sequence[Trial],
+    options: RunOptions,
+    configuration: Mapping[str, object],
+    command: str,
+) -> Film | None:
+    """Write log, recordings and report; returns the film of the run, if asked for."""
+    experiment.log(run).save(folder / "log.npz")
+    recordings = experiment.recordings(run)
+    run_film = _write_recordings(folder, recordings, options.film)
+    sections = [*experiment.sections(run, recordings)]
+    sections += [experiment.study().section(trials)] if trials else []
+    report = Report(
+        title=experiment.title,
+        summary=experiment.summary,
+        table=results.table,
+        film=run_film,
+        sections=sections,
+        configuration=configuration,
+        versions=software_versions(),
+        command=command,
+    )
+    write_report(folder, report)
+    write_json(folder / "measured.json", results.values)
+    return run_film
+
+
+def _observer(experiment: Experiment[Any], options: RunOptions, console: "Console") -> Observer:
+    view = no_live_view
+    if options.serve:
+        view = live_view(
+            experiment.title, options.serving, lambda at: console.print(f"Dashboard at {at}")
+        )
+    return Observer(view=view, tell=console.print)
+
+
+def _run_trials(study: Study, file: Path, options: RunOptions) -> list[Trial]:
+    return repeat(
+        study.trial,
+        range(options.seed, options.seed + options.trials),
+        file,
+        made_by=asdict(study.trial),  # pyright: ignore[reportArgumentType]
+        processes=options.processes,
+        failures=(TaskFailedError, PhysicsError),
+        title=study.title,
+    )
+
+
+def _write_recordings(
+    folder: Path, recordings: Mapping[str, RunRecording], make_film: bool
+) -> Film | None:
+    """Write all recordings; returns the film of the run, if asked for."""
+    for name, recording in recordings.items():
+        record_run(folder / f"{name}.rrd", recording)
+    recording = recordings.get(RUN)
+    return film(recording) if make_film and recording is not None else None
+
+
+def _print_outputs(out: Path, results: Results, has_film: bool) -> None:
+    if results.failure:
+        print(f"failed: {results.failure}", file=sys.stderr)
+    # On lines of their own and unbroken, to be copied at any width of the terminal.
+    print(f"Report: {shlex.quote(str(out / PAGE))}")
+    if has_film:
+        print(f"Film: {shlex.quote(str(out / FILM))}")
+    print(f"Dashboard: {show_command(out)}")

@@ -1,1 +1,0 @@
-"""Experiment 2 of the paper: a grasp with an uncalibrated camera."""

@@ -1,1 +1,0 @@
-"""Experiment 1 of the paper: a placing motion, repeated for other shelves."""

@@ -1,0 +1,333 @@
+"""Tasks of the experiments on a real arm with a real camera.
+
+The task code is that of the simulated work cell. The truth is unknown here: results are those
+that the robot itself measures. A simulated world of the assumed surroundings checks the plans,
+and follows the arm for the recording.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from hrc_learn.deploy import Rate
+from hrc_learn.experiments.run_recorder import record
+from hrc_learn.hardware import (
+    ArmProcess,
+    CameraError,
+    FrankaArm,
+    FrankaConfig,
+    FrankyArm,
+    FrankyConfig,
+)
+from hrc_learn.hardware.arm_process import StoppableArm
+from hrc_learn.kinematics import SerialChain, fr3, panda
+from hrc_learn.protocols import Camera, OpenedArm
+from hrc_learn.sim import MotionLog, World
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.failures import TaskFailedError
+from hrc_learn.skills.grasping import Grasping, GraspingConfig, as_load, joint_plan
+from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
+from hrc_learn.skills.path_following import follow_path
+from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, PickAndPlaceConfig, place_along
+from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
+from hrc_learn.store import new_folder, write_text
+from hrc_learn.teleoperation import ScriptedDrawing, Touch
+from hrc_learn.viz.run_dashboard import record_run
+
+Driver = Literal["franky", "franka"]
+"""Driver of a real arm: the package franky, or our loop at 1 kHz through pylibfranka."""
+
+_SILENCE = 0.15
+"""Silence of the loop after which the arm is stopped [s], as in `franka_panda`."""
+_DELAY = 0.03
+"""Delay from reading the joints to the motion of the arm [s]: that of
+`Imperfections.nominal`, not measured."""
+_REDUCED_SPEED = 0.25
+"""Speed of the tool near people [m/s] (ISO 10218-1, reduced speed)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmSite:
+    """Arm, camera and speed of a task on a real robot."""
+
+    driver: Driver = "franky"
+    """Driver of the arm."""
+    ip: str = ""
+    """Address of the control box."""
+    robot: Literal["panda", "fr3"] = "panda"
+    """Arm with its limits."""
+    camera_delay: float = 0.0
+    """Delay from exposure to arrival of an image [s]: `hrc_learn.hardware.measure_delay`."""
+    realtime: bool = True
+    """Refuse a kernel without real-time scheduling."""
+    dynamics: float = 0.3
+    """Fraction of the acceleration of the arm that is used."""
+    speed: float = 1.0
+    """Speed of all paths as a fraction of the planned speed: 0.1 for a first run."""
+    touch: bool = True
+    """React to touch: a push at the elbow moves the arm in its null space, a push at the end
+    effector pauses the task."""
+
+    def __post_init__(self) -> None:
+        for name in ("dynamics", "speed"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in (0, 1], but is {getattr(self, name)}.")
+
+    @property
+    def chain(self) -> SerialChain:
+        """Kinematics and limits of the arm."""
+        return {"panda": panda, "fr3": fr3}[self.robot]
+
+    def cell_config(self) -> WorkCellConfig:
+        """Configuration of the loop on this arm."""
+        config = WorkCellConfig()
+        safety = replace(
+            config.safety, braking=self.dynamics, delay=_DELAY, tcp_speed=_REDUCED_SPEED
+        )
+        return replace(
+            config,
+            safety=safety,
+            command_delay=_DELAY,
+            speed=self.speed,
+            latency=LatencyConfig(delay=self.camera_delay),
+        )
+
+
+@contextmanager
+def opened_arm(site: ArmSite) -> Iterator[StoppableArm]:
+    """Connect to the arm; it is at rest when the block ends, also after an error.
+
+    Raises:
+        ValueError: If the site has no address.
+        DriverError: If the arm cannot be reached; says why.
+    """
+    if not site.ip:
+        raise ValueError("ip is empty: give the address of the control box of the arm.")
+    # Never both: each driver registers the same types, and refuses to be loaded with the other.
+    if site.driver == "franky":
+        realtime = "enforce" if site.realtime else "ignore"
+        config = FrankyConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=realtime)
+        with ArmProcess(partial(FrankyArm, site.ip, config), timeout=_SILENCE) as arm:
+            yield arm
+        return
+    config = FrankaConfig(
+        hold=_SILENCE, acceleration=site.dynamics, jerk=site.dynamics, realtime=site.realtime
+    )
+    with FrankaArm(site.ip, site.chain, config) as arm:
+        yield arm
+
+
+@contextmanager
+def opened_site(site: ArmSite, workplace: Workplace) -> Iterator[tuple[World, OpenedArm]]:
+    """Connected arm, and a simulated world of its assumed surroundings, which follows the arm.
+
+    The caller keeps the time: `advance` takes none.
+
+    Args:
+        site: Arm and driver.
+        workplace: Assumed surroundings.
+    """
+    believed = World(workplace.scene)
+    with opened_arm(site) as arm:
+        believed.follow(arm.read())
+        yield (
+            believed,
+            OpenedArm(arm=arm, gripper=arm, advance=lambda _time: believed.follow(arm.read())),
+        )
+
+
+type Task = Callable[[WorkCell, Callable[[Plan], None]], str]
+"""Function that carries out a task, given the cell and a check of plans; returns the reason of
+a failure, or an empty string."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmRun:
+    """Result of a task on a real arm."""
+
+    cell: WorkCell
+    believed: World
+    """World of the assumed surroundings, with the arm in its last posture."""
+    motion: MotionLog
+    failure: str
+    """Reason of a failure, as the robot sees it; empty after a success."""
+
+    def save(self, folder: Path, title: str, configuration: dict[str, Any]) -> None:
+        """Write `run.rrd`, `log.npz`, `result.json` and `configuration.json`.
+
+        Args:
+            folder: Folder of the run; an existing one is replaced.
+            title: Title of the recording.
+            configuration: Configuration to save with the run.
+        """
+        log = self.cell.log
+        phases = [{"phase": event.text, "start": event.time} for event in log.events]
+        with new_folder(folder, configuration, overwrite=True) as part:
+            log.save(part / "log.npz")
+            record_run(part / "run.rrd", record(title, self.cell, self.believed, self.motion))
+            result = {
+                "failure": self.failure,
+                "duration": float(np.ptp(log["time"])) if len(log) else 0.0,
+                "phases": phases,
+                "remarks": [
+                    {"text": said.text, "time": said.time} for said in self.cell.remarks
+                ],
+            }
+            write_text(part / "result.json", json.dumps(result, indent=2))
+
+
+def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: float) -> Task:
+    """Task: carry the object in the hand home and to a shelf, and release it there.
+
+    Args:
+        skill: Learned placing motion.
+        workplace: Workplace with the shelf.
+        shelf: Name of the shelf.
+        speed: Speed relative to the demonstration.
+    """
+    goal, item = workplace.shelf(shelf), workplace.scene.objects[0]
+
+    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+        cell.load = as_load(item)
+        home = joint_plan(cell, cell.joints, workplace.home_joints())
+        cell.begin_phase(HOME)
+        check(home)
+        follow_path(cell, home.path)
+        plan = skill.plan(cell.joints, goal, space="pose", dt=cell.config.dt, speed=speed)
+        check(plan)
+        place_along(cell, plan, goal, workplace.lowering(item.half_size))
+        return ""
+
+    return task
+
+
+def grasping_task(
+    servoing: VisualServoSkill, workplace: Workplace, config: GraspingConfig
+) -> Task:
+    """Task: grasp the first object with the camera, and carry it home.
+
+    Args:
+        servoing: Learned image Jacobian and visual target.
+        workplace: Workplace with the object.
+        config: Configuration of the grasp.
+    """
+
+    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+        law = replace(config.controller, safety=cell.config.safety)
+        grasping = Grasping(
+            cell, workplace, servoing, replace(config, controller=law), check=check
+        )
+        grasping.grasp(workplace.scene.objects[0])
+        grasping.go_home()
+        return ""
+
+    return task
+
+
+def collaboration_task(
+    servoing: VisualServoSkill,
+    placing: PlacingSkill,
+    workplace: Workplace,
+    shelves: Sequence[str],
+    config: PickAndPlaceConfig,
+) -> Task:
+    """Task: grasp objects near a person, and put each on its shelf.
+
+    Args:
+        servoing: Learned image Jacobian and visual target.
+        placing: Learned placing motion.
+        workplace: Workplace with the objects.
+        shelves: Shelf of each object.
+        config: Configuration of the job.
+    """
+
+    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+        law = replace(config.grasping.controller, safety=cell.config.safety)
+        settings = replace(config, grasping=replace(config.grasping, controller=law))
+        job = PickAndPlace(cell, workplace, servoing, placing, check, settings)
+        jobs = job.run(list(zip(workplace.scene.objects, shelves, strict=True)))
+        return "; ".join(done.failure for done in jobs if done.failure)
+
+    return task
+
+
+def run_on_arm(
+    site: ArmSite,
+    workplace: Workplace,
+    task: Task,
+    *,
+    camera: Camera | None = None,
+    on_phase: Callable[[str, float], None] = lambda phase, time: None,
+) -> ArmRun:
+    """Connect to the arm and carry out a task.
+
+    The arm is at rest afterwards, also after an error.
+
+    Args:
+        site: Arm and driver.
+        workplace: Assumed surroundings.
+        task: Task to carry out.
+        camera: Camera; None for tasks without one.
+        on_phase: Called with name and start time [s] of each phase.
+
+    Raises:
+        DriverError: If the arm cannot be reached, or was stopped.
+    """
+    believed, failure = World(workplace.scene), ""
+    with torch.inference_mode(), opened_arm(site) as arm:
+        believed.follow(arm.read())
+        config = site.cell_config()
+        # The clock of the arm counts: that of a simulator may be slower than ours.
+        rate = Rate(config.dt, clock=lambda: arm.read().time)
+        held: str | None = None
+
+        def take_up() -> None:
+            """Put the object that the cell holds into the hand of the simulated arm."""
+            nonlocal held
+            before, held = held, _held(cell, workplace)
+            if held is not None and before is None:
+                believed.put_in_hand(held)
+
+        def advance(duration: float) -> None:
+            rate.wait()
+            take_up()
+            believed.follow(arm.read(), held)
+
+        def check(plan: Plan) -> None:
+            take_up()
+            check_plan(plan, believed, held)
+
+        motion = MotionLog(believed, advance)
+        cell = WorkCell(
+            chain=site.chain,
+            arm=arm,
+            gripper=arm,
+            sensor=None if camera is None else MarkerSensor(camera, workplace.scene.marker_ids),
+            human=Touch(site.chain) if site.touch else ScriptedDrawing(()),
+            advance=motion.advance,
+            config=config,
+            on_phase=on_phase,
+            clearance=workplace.arm_clearance,
+        )
+        try:
+            failure = task(cell, check)
+        except (TaskFailedError, CameraError) as error:
+            failure = str(error)
+    return ArmRun(cell=cell, believed=believed, motion=motion, failure=failure)
+
+
+def _held(cell: WorkCell, workplace: Workplace) -> str | None:
+    """Name of the held object, identified by its size; None without one."""
+    if cell.load is None:
+        return None
+    items = workplace.scene.objects
+    return next((item.name for item in items if as_load(item) == cell.load), items[0].name)

@@ -1,0 +1,273 @@
+"""Quantities measured from the log of a run and from the simulator.
+
+The simulator provides true poses and contacts, which the robot does not know.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.experiments.elbow_pulls import path_distance
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.log import LoggedSteps
+from hrc_learn.sim import MotionLog, Touch, World
+from hrc_learn.skills.pick_and_place import INTERACT
+from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.vision import CameraModel
+
+ELBOW, TOOL = 3, -1
+"""Indices of the elbow and the tool among the frames of the links."""
+
+# Orientation of a held object in the hand: its x axis along the closing direction of the
+# fingers, which is the y axis of the hand, its top towards the palm.
+_IN_HAND = quaternion.from_matrix(
+    torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=torch.float64)
+)
+
+
+def spans(log: LoggedSteps, phase: str) -> list[tuple[float, float]]:
+    """Start and end of each time a phase was entered [s]; the last end may be infinite."""
+    events = log.events
+    return [
+        (event.time, math.inf if following is None else following.time)
+        for event, following in zip(events, [*events[1:], None], strict=True)
+        if event.text == phase
+    ]
+
+
+def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
+    """Start and end of the first time a phase was entered [s]; (0, 0) if it never was."""
+    return (spans(log, phase) or [(0.0, 0.0)])[0]
+
+
+def true_image_jacobian(
+    log: LoggedSteps, world: World, cameras: Sequence[tuple[float, CameraModel]]
+) -> Float[np.ndarray, "time 2 6"]:
+    """True image Jacobian of the gripper's marker wherever the controller used its estimate.
+
+    Args:
+        log: Log of the run.
+        world: World with the true place of the marker on the gripper.
+        cameras: True cameras, each with the time from which it watched [s].
+    """
+    used = np.isfinite(log["image_jacobian"]).all(axis=(1, 2))
+    jacobian = np.full_like(log["image_jacobian"], np.nan)
+    poses = link_poses(log, world.arm.robot.chain)
+    offset = torch.from_numpy(world.hand_marker_offset())
+    ends = [*(start for start, _ in cameras[1:]), math.inf]
+    for (start, camera), end in zip(cameras, ends, strict=True):
+        rows = used & (log["time"] >= start) & (log["time"] < end)
+        tool = poses[torch.from_numpy(rows), TOOL]
+        marker = tool.apply(offset).numpy()
+        jacobian[rows] = camera.image_jacobian(marker, tool.position.numpy())
+    return jacobian
+
+
+def true_tool(motion: MotionLog, world: World, steps: int) -> Pose:
+    """True poses of the tool centre point, (time,), independent of the encoders."""
+    hand = body_poses(motion, "hand", steps)
+    # The hand itself may be mounted askew; the tool centre point lies on its axis.
+    return Pose(hand.apply(torch.from_numpy(world.arm.tool_offset)), hand.orientation)
+
+
+def body_poses(motion: MotionLog, name: str, steps: int) -> Pose:
+    """True poses of a link or an object in the first steps of a run, (time,)."""
+    (body,) = (body for body in motion.bodies(steps) if body.name == name)
+    return Pose(torch.from_numpy(body.position), torch.from_numpy(body.orientation))
+
+
+def link_poses(log: LoggedSteps, chain: SerialChain) -> Pose:
+    """Measured poses of the joint frames, the flange and the tool, (time, links)."""
+    return chain.link_poses(torch.from_numpy(log["joint_position"]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Deviation:
+    """Displacement of end effector and elbow while a person pushed; NaN otherwise."""
+
+    position: Float[np.ndarray, " time"]
+    """Displacement of the end effector [m]."""
+    rotation: Float[np.ndarray, " time"]
+    """Rotation of the end effector [rad]."""
+    elbow: Float[np.ndarray, " time"]
+    """Displacement of the elbow [m]."""
+
+    @classmethod
+    def of(cls, log: LoggedSteps, motion: MotionLog, world: World) -> "Deviation":
+        """Deviation from the first push until the end of the interaction phase.
+
+        Args:
+            log: Log of the run.
+            motion: True poses of everything that moved.
+            world: World of the run.
+        """
+        time = log["time"]
+        start, end = span(log, INTERACT)
+        within = (time >= start) & (time < end)
+        pushed = within & (np.abs(log["nullspace_input"]).max(axis=1) > 0)
+        first = int(pushed.argmax()) if pushed.any() else 0
+        rows = within & (np.arange(len(time)) >= first) & bool(pushed.any())
+        tool = true_tool(motion, world, len(time))
+        # The frame of joint 4 is at the elbow.
+        elbow = body_poses(motion, f"link{ELBOW + 1}", len(time))
+
+        def distance(pose: Pose) -> Float[np.ndarray, " time"]:
+            moved = (pose.position - pose.position[first]).norm(dim=-1).numpy()
+            return np.where(rows, moved, np.nan)
+
+        angle = quaternion.angle(tool.orientation, tool.orientation[first]).numpy()
+        return cls(
+            position=distance(tool),
+            rotation=np.where(rows, angle, np.nan),
+            elbow=distance(elbow),
+        )
+
+    @classmethod
+    def from_path(cls, log: LoggedSteps, chain: SerialChain) -> "Deviation":
+        """Deviation from the path, by the encoders, while the arm follows one and is pushed.
+
+        Args:
+            log: Log of the run.
+            chain: Kinematics of the arm.
+        """
+        joints, path = (
+            torch.from_numpy(log[name]) for name in ("joint_position", "path_joints")
+        )
+        pushed = (log["nullspace_input"] != 0).any(axis=1)
+        tool = chain.forward(joints).position.numpy()
+        off = path_distance(tool, log["goal_position"], log["time"])
+        elbow, planned = (chain.joint_origins(q)[:, ELBOW] for q in (joints, path))
+        moved = (elbow - planned).norm(dim=-1).numpy()
+        return cls(
+            position=np.where(pushed, off, np.nan),
+            rotation=np.full_like(off, np.nan),
+            elbow=np.where(pushed, moved, np.nan),
+        )
+
+
+def limit_violations(cell: WorkCell) -> int:
+    """Number of steps in which a joint was measured outside its position or velocity range."""
+    if not len(cell.log):
+        return 0
+    q = torch.from_numpy(cell.log["joint_position"])
+    v = torch.from_numpy(cell.log["joint_velocity"])
+    limits = cell.chain.limits
+    outside = (q < limits.lower) | (q > limits.upper) | (v.abs() > limits.velocity)
+    return int(outside.any(dim=-1).sum())
+
+
+def unwanted_contacts(
+    world: World, log: LoggedSteps, released: Mapping[str, float] | None = None
+) -> dict[str, tuple[Touch, ...]]:
+    """Contacts of the arm and of the objects it carried, by the object that was hit.
+
+    The fingertips may touch the table while the arm feels for its height.
+
+    Args:
+        world: World in the state that the run left.
+        log: Log of the run.
+        released: Time at which each object was released on its shelf [s]; its later contacts
+            are wanted.
+    """
+    released = released or {}
+    carried = [
+        touch
+        for touch in world.object_contacts.touches
+        if touch.start < released.get(touch.first, math.inf)
+    ]
+    grasps = spans(log, "grasp")
+    hit = (
+        touch
+        for touch in world.table_contacts.touches
+        if not (
+            touch.first.startswith("finger")
+            and any(start <= touch.start < end for start, end in grasps)
+        )
+    )
+    return {
+        "cabinet": (*world.cabinet_contacts.touches, *carried),
+        "table": tuple(hit),
+        "arm itself": tuple(world.self_contacts.touches),
+    }
+
+
+def worker_distance(motion: MotionLog, steps: int) -> Float[np.ndarray, " time"]:
+    """True smallest distance between worker and robot [m]; empty without a worker."""
+    return np.array([pair.distance for pair in motion.nearest(steps)])
+
+
+class Hold(NamedTuple):
+    """Stability of an object in the hand while it was carried."""
+
+    tilt: float
+    """Largest angle from the intended orientation in the hand [rad]."""
+    slip: float
+    """Displacement between the fingers [m]."""
+
+
+def hold(
+    log: LoggedSteps, motion: MotionLog, world: World, name: str, start: float, end: float
+) -> Hold:
+    """Compare the pose of an object in the hand at two times.
+
+    Args:
+        log: Log of the run.
+        motion: True poses of everything that moved.
+        world: World of the run.
+        name: Name of the object.
+        start: Time after lifting [s].
+        end: Time before the release [s]; at most the end of the run.
+    """
+    steps = np.searchsorted(log["time"], [start, end]).clip(max=len(log) - 1)
+    tool, item = true_tool(motion, world, len(log)), body_poses(motion, name, len(log))
+    hand, held = tool[torch.from_numpy(steps)], item[torch.from_numpy(steps)]
+    back = quaternion.conjugate(hand.orientation)
+    offset = quaternion.rotate(back, held.position - hand.position)
+    return Hold(
+        tilt=float(box_angle(quaternion.multiply(back, held.orientation), _IN_HAND).max()),
+        slip=float((offset[1] - offset[0]).norm()),
+    )
+
+
+def grasp_offset(
+    log: LoggedSteps, motion: MotionLog, world: World, name: str, descent: float
+) -> float:
+    """Horizontal distance between end effector and object at the start of a descent [m].
+
+    Args:
+        log: Log of the run.
+        motion: True poses of everything that moved.
+        world: World of the run.
+        name: Name of the object.
+        descent: Start of the descent [s].
+    """
+    step = int(np.searchsorted(log["time"], descent))
+    tool, item = true_tool(motion, world, len(log)), body_poses(motion, name, len(log))
+    return float((tool.position - item.position)[step, :2].norm())
+
+
+def place_angle(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> float:
+    """Angle of a placed box from its intended orientation [rad].
+
+    Args:
+        pose: Pose of the box.
+        goal: Orientation of the hand at the goal.
+    """
+    q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
+    return float(box_angle(q, quaternion.multiply(goal, _IN_HAND)))
+
+
+def box_angle(
+    q: Float[Tensor, "*batch 4"], goal: Float[Tensor, "4"]
+) -> Float[Tensor, "*batch"]:
+    """Angle between orientations of a box, equal under half a turn about its z axis [rad]."""
+    half_turn = q.new_tensor([0.0, 0.0, 0.0, 1.0])
+    other = quaternion.multiply(q, half_turn)
+    return torch.minimum(quaternion.angle(q, goal), quaternion.angle(other, goal))

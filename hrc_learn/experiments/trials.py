@@ -1,0 +1,275 @@
+"""Monte Carlo trials: one run repeated with other seeds, saved on disk and resumable."""
+
+import gc
+import json
+import math
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hrc_learn.store import Claim, new_file, sync_file
+
+# Keys of a line of the file: one JSON object per trial. The first line of the file holds the
+# settings under the last key, so that results of different settings never mix.
+_SEED, _FAILURE, _MADE_BY = "seed", "failure", "made_by"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """Result of one seed."""
+
+    seed: int
+    values: Mapping[str, float | int | str]
+    """Measured values by name; of a failed trial those that were measured nevertheless."""
+    failure: str = ""
+    """Reason of a failure; empty after a success."""
+
+    @classmethod
+    def of(cls, seed: int, measured: Mapping[str, Any]) -> "Trial":
+        """Trial from the mapping that a run returned: values, and "failure" with a reason.
+
+        Raises:
+            ValueError: If a value is neither a number nor text, or one is named "seed".
+        """
+        if _SEED in measured:
+            raise ValueError("a trial cannot measure 'seed': that key names the trial itself.")
+        values = {name: _plain(name, value) for name, value in measured.items()}
+        return cls(seed=seed, failure=str(values.pop(_FAILURE, "")), values=values)
+
+    def line(self) -> str:
+        """Trial as one line of JSON; NaN and infinity become null."""
+        row = {_SEED: self.seed, _FAILURE: self.failure, **self.values}
+        finite = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in row.items()
+        }
+        return json.dumps(finite) + "\n"
+
+    @classmethod
+    def from_line(cls, line: str) -> "Trial":
+        """Trial from a line; null becomes NaN."""
+        row = json.loads(line)
+        seed, failure = row.pop(_SEED), row.pop(_FAILURE)
+        values = {name: math.nan if value is None else value for name, value in row.items()}
+        return cls(seed=seed, failure=failure, values=values)
+
+
+class TrialFile:
+    """File of trials with the same settings, to which each trial is added as soon as it ends.
+
+    One process at a time may hold it.
+
+    Attributes:
+        trials: Trials in the file, by seed.
+    """
+
+    def __init__(self, path: Path, made_by: Mapping[str, Any]):
+        """Open a file to resume, or create one.
+
+        Args:
+            path: JSON-lines file.
+            made_by: Settings; values that JSON cannot hold are saved as text.
+
+        Raises:
+            BusyError: Another process is adding trials to it.
+            ValueError: If the file holds trials with other settings, or no trials.
+        """
+        self._path = path
+        self.trials: dict[int, Trial] = {}
+        made_by = json.loads(json.dumps(made_by, default=str))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._claim = Claim(path)
+        try:
+            if path.exists():
+                self._resume(made_by)
+            else:
+                self._write(json.dumps({_MADE_BY: made_by}) + "\n")
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "TrialFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the file for other processes."""
+        self._claim.release()
+
+    def append(self, trial: Trial) -> None:
+        """Add a trial; it is on disk when this method returns."""
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(trial.line())
+        sync_file(self._path)
+        self.trials[trial.seed] = trial
+
+    def _resume(self, made_by: Mapping[str, Any]) -> None:
+        text = self._path.read_text(encoding="utf-8")
+        whole = text[: text.rfind("\n") + 1]
+        lines = whole.splitlines()
+        try:
+            before = json.loads(lines[0])[_MADE_BY]
+            found = [Trial.from_line(line) for line in lines[1:]]
+        except (IndexError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{self._path} holds no trials: choose another file, or remove it."
+            ) from error
+        if before != made_by:
+            raise ValueError(
+                f"{self._path} holds trials with other settings "
+                f"({_difference(before, made_by)}): remove it, or choose another file."
+            )
+        if whole != text:  # interrupted in the middle of a line
+            self._write(whole)
+        self.trials = {trial.seed: trial for trial in found}
+
+    def _write(self, text: str) -> None:
+        with new_file(self._claim) as part:
+            part.write_text(text, encoding="utf-8")
+
+
+def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    for name in [*before, *now]:
+        if before.get(name) != now.get(name):
+            return f"{name} is {before.get(name)!r} in the file, but {now.get(name)!r} now"
+    raise AssertionError("nothing differs")
+
+
+def _plain(name: str, value: Any) -> float | int | str:
+    # Scalars of NumPy and PyTorch become their plain counterparts.
+    plain = value.item() if hasattr(value, "item") else value
+    if not isinstance(plain, (bool, int, float, str)):
+        raise ValueError(f"{name} must be a number or text, but is a {type(value).__name__}.")
+    return plain
+
+
+TrialRun = Callable[[int], Mapping[str, Any]]
+"""Runs one trial with a seed; returns the measured values, and "failure", empty or a reason."""
+
+
+def repeat(
+    run: TrialRun,
+    seeds: Iterable[int],
+    file: Path,
+    *,
+    made_by: Mapping[str, Any],
+    processes: int = 1,
+    failures: tuple[type[Exception], ...] = (),
+    title: str = "Trials",
+) -> list[Trial]:
+    """Run once for each seed that is not in the file yet.
+
+    Every result is saved at once: the same call resumes interrupted trials.
+
+    Args:
+        run: Called with each seed. A trial fails by returning a reason as `failure` with its
+            values, or by raising one of `failures`; any other exception stops all trials.
+            For several processes it must be picklable, such as a frozen dataclass of paths
+            and settings with `__call__` that loads its models itself.
+        seeds: Seeds in order; repeated seeds are run once.
+        file: JSON-lines file of the results; trials already in it are not repeated.
+        made_by: Settings. A file of trials with other settings is refused.
+        processes: Number of parallel processes, each with one thread.
+        failures: Exceptions that mark a failed trial.
+        title: Title of the progress bar.
+
+    Returns:
+        One trial for each seed, in the order of the seeds.
+
+    Raises:
+        ValueError: Without seeds or processes, or if the file has other settings.
+        BusyError: Another process is adding trials to the file.
+    """
+    seeds = list(dict.fromkeys(seeds))
+    if not seeds or processes < 1:
+        raise ValueError(
+            f"at least one seed and one process are needed, but there are {len(seeds)} and "
+            f"{processes}."
+        )
+    with TrialFile(file, made_by) as done:
+        waiting = [seed for seed in seeds if seed not in done.trials]
+        known = [done.trials[seed] for seed in seeds if seed in done.trials]
+        with _progress(title, len(seeds), known) as tell:
+            for trial in _trials(run, waiting, min(processes, len(waiting)), failures):
+                done.append(trial)
+                tell(trial)
+    return [done.trials[seed] for seed in seeds]
+
+
+def _trials(
+    run: TrialRun, seeds: list[int], processes: int, failures: tuple[type[Exception], ...]
+) -> Iterator[Trial]:
+    """Results in the order in which trials end."""
+    if processes <= 1:
+        yield from (_trial(run, seed, failures) for seed in seeds)
+        return
+    # A forked process would inherit locks of threads that do not exist in it.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(
+        processes, context, initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
+        waiting = {pool.submit(_trial, run, seed, failures) for seed in seeds}
+        try:
+            while waiting:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                # Keep the successful trials before an error stops everything.
+                for future in sorted(done, key=lambda f: f.exception() is not None):
+                    yield future.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _trial(run: TrialRun, seed: int, failures: tuple[type[Exception], ...]) -> Trial:
+    try:
+        return Trial.of(seed, run(seed))
+    except failures as error:
+        return Trial(seed=seed, values={}, failure=str(error))
+    except Exception as error:
+        error.add_note(f"in the trial with seed {seed}")
+        raise
+    finally:
+        # World, cell and log of a trial refer to each other, and the garbage collector does
+        # not count the memory of the simulator: fifty trials would occupy two gigabytes.
+        gc.collect()
+
+
+@contextmanager
+def _progress(
+    title: str, total: int, done: Iterable[Trial]
+) -> Iterator[Callable[[Trial], None]]:
+    """Progress bar with the number of failures; yields a function to call after each trial."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[failed]} failed"),
+        TimeRemainingColumn(),
+    )
+    failed = 0
+    with Progress(*columns) as bar:
+        task = bar.add_task(title, total=total, failed=0)
+
+        def tell(trial: Trial) -> None:
+            nonlocal failed
+            failed += bool(trial.failure)
+            bar.update(task, advance=1, failed=failed)
+
+        for trial in done:
+            tell(trial)
+        yield tell
