@@ -8,7 +8,7 @@ last, so that a reader never sees a partial upload.
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,8 +38,6 @@ class Push:
     """An upload, planned or done."""
 
     repo: str
-    revision: str
-    """Branch."""
     tag: str
     """Version of the format, which LeRobot looks for."""
     files: dict[str, int]
@@ -62,9 +60,6 @@ def push_dataset(
     private: bool = True,
     license: str | None = None,
     tags: Sequence[str] = (),
-    description: str = "",
-    revision: str = "main",
-    videos: bool = True,
     unsound: bool = False,
     dry_run: bool = False,
     api: "HfApi | None" = None,
@@ -79,9 +74,6 @@ def push_dataset(
         private: Make a new repository private; an existing one stays as it is.
         license: Identifier of the licence, such as "cc-by-4.0".
         tags: Tags besides "LeRobot" and the robot's name.
-        description: Description for the card, in Markdown.
-        revision: Branch, created if it does not exist. Only on "main" the version's tag moves.
-        videos: Send videos too.
         unsound: Send a dataset that has errors.
         dry_run: Send nothing.
         api: Client of the Hub; None takes endpoint and token from the environment.
@@ -105,91 +97,73 @@ def push_dataset(
             f"send it as it is (--unsound)",
             file=folder.root,
         )
-    text = CardText(license=license, tags=tuple(tags), description=description, videos=videos)
     push = Push(
         repo=repo,
-        revision=revision,
         tag=folder.version,
-        files=dict(_files(folder.root, videos)),
-        card=str(dataset_card(folder, report, repo, text)),
+        files=dict(_files(folder.root)),
+        card=str(dataset_card(folder, report, repo, license, tags)),
         report=report,
     )
     if dry_run:
         return push
     api = api or HfApi()
     url = api.create_repo(repo, repo_type="dataset", private=private, exist_ok=True)
-    if revision != "main":
-        api.create_branch(repo, repo_type="dataset", branch=revision, exist_ok=True)
-    _upload(api, folder.root, push, videos)
-    if revision == "main":
-        _move_tag(api, push)
+    _upload(api, folder.root, push)
+    _move_tag(api, push)
     return replace(push, url=str(url))
 
 
-def _upload(api: "HfApi", root: Path, push: Push, videos: bool) -> None:
+def _upload(api: "HfApi", root: Path, push: Push) -> None:
     from huggingface_hub import CommitOperationAdd
 
     head = [CommitOperationAdd(_CARD, push.card.encode())]
-    if attributes := _missing_attributes(api, push.repo, push.revision):
+    if attributes := _missing_attributes(api, push.repo):
         head.append(CommitOperationAdd(".gitattributes", attributes.encode()))
-    where: Any = {"repo_id": push.repo, "repo_type": "dataset", "revision": push.revision}
+    where: Any = {"repo_id": push.repo, "repo_type": "dataset"}
     # The attributes must exist before the files that they declare large.
     api.create_commit(operations=head, commit_message="Describe the dataset", **where)
     api.upload_folder(
         folder_path=root,
         allow_patterns=[*UPLOADED],
-        ignore_patterns=[_CARD, *([] if videos else ["videos/**"])],
-        # Files that are not sent are not known to be gone.
-        delete_patterns=[name for name in _OWNED if videos or name != "videos/*"],
+        ignore_patterns=[_CARD],
+        delete_patterns=[*_OWNED],
         commit_message="Upload the dataset",
         **where,
     )
 
 
 def _move_tag(api: "HfApi", push: Push) -> None:
-    """Set the tag of the format's version to the head of the branch."""
+    """Set the tag of the format's version to the uploaded commit."""
     known = api.list_repo_refs(push.repo, repo_type="dataset").tags
     if any(tag.name == push.tag for tag in known):
         api.delete_tag(push.repo, tag=push.tag, repo_type="dataset")
-    api.create_tag(push.repo, tag=push.tag, revision=push.revision, repo_type="dataset")
+    api.create_tag(push.repo, tag=push.tag, repo_type="dataset")
 
 
-def _files(root: Path, videos: bool) -> Iterator[tuple[str, int]]:
+def _files(root: Path) -> Iterator[tuple[str, int]]:
     for pattern in UPLOADED:
-        if pattern.startswith("videos") and not videos:
-            continue
         for path in sorted(root.glob(pattern.replace("/**", "/**/*"))):
             if path.is_file():
                 yield str(path.relative_to(root)), path.stat().st_size
 
 
-def _missing_attributes(api: "HfApi", repo: str, revision: str) -> str:
+def _missing_attributes(api: "HfApi", repo: str) -> str:
     """Completed `.gitattributes` of the repository; "" if it lacks nothing."""
     name, there = ".gitattributes", ""
-    if api.file_exists(repo, name, repo_type="dataset", revision=revision):
-        file = api.hf_hub_download(repo, name, repo_type="dataset", revision=revision)
+    if api.file_exists(repo, name, repo_type="dataset"):
+        file = api.hf_hub_download(repo, name, repo_type="dataset")
         there = Path(file).read_text(encoding="utf-8")
     known = {line.split()[0] for line in there.splitlines() if "filter=lfs" in line}
     lacking = [line for line in ATTRIBUTES.splitlines() if line.split()[0] not in known]
     return "\n".join([*there.splitlines(), *lacking]) + "\n" if lacking else ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CardText:
-    """Content of a card that the dataset itself does not tell."""
-
-    license: str | None = None
-    """Identifier of the licence."""
-    tags: tuple[str, ...] = field(default=())
-    """Further tags."""
-    description: str = ""
-    """Description in Markdown."""
-    videos: bool = True
-    """True if the videos are uploaded."""
-
-
 def dataset_card(
-    folder: DatasetFolder, report: ValidationReport, repo: str, text: CardText
+    folder: DatasetFolder,
+    report: ValidationReport,
+    repo: str,
+    license: str | None = None,
+    tags: Sequence[str] = (),
 ) -> "DatasetCard":
     """Card of the dataset: its own with a completed header, or a new one.
 
@@ -197,7 +171,8 @@ def dataset_card(
         folder: The dataset.
         report: Its check, with the contract of its columns.
         repo: "OWNER/NAME" on the Hub.
-        text: Licence, tags and description.
+        license: Identifier of the licence.
+        tags: Tags besides "LeRobot" and the robot's name.
     """
     from huggingface_hub import DatasetCard
 
@@ -205,14 +180,14 @@ def dataset_card(
     if own.is_file():
         card = DatasetCard(own.read_text(encoding="utf-8"), ignore_metadata_errors=True)
     else:
-        body = "\n".join(_body(folder, report, repo, text))
+        body = "\n".join(_body(folder, report, repo))
         card = DatasetCard(f"---\n{{}}\n---\n\n{body}\n")
     head: Any = card.data
-    if text.license is not None:
-        head.license = text.license
+    if license is not None:
+        head.license = license
     robot = [folder.robot_type] if folder.robot_type not in (None, "", "unknown") else []
     earlier = getattr(head, "tags", None) or []
-    head.tags = [*dict.fromkeys([*earlier, "LeRobot", *robot, *text.tags])]
+    head.tags = [*dict.fromkeys([*earlier, "LeRobot", *robot, *tags])]
     head.task_categories = head.task_categories or ["robotics"]
     head.size_categories = [_size_category(sum(entry.length for entry in folder.episodes))]
     if not getattr(head, "configs", None):
@@ -231,13 +206,9 @@ def _size_category(frames: int) -> str:
     return f"{_SIZES[place - 1]}<n<{_SIZES[place]}"
 
 
-def _body(
-    folder: DatasetFolder, report: ValidationReport, repo: str, text: CardText
-) -> Iterator[str]:
+def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterator[str]:
     frames = sum(entry.length for entry in folder.episodes)
     yield f"# {repo.split('/')[1]}\n"
-    if text.description:
-        yield f"{text.description}\n"
     robot = plain_text(folder.robot_type or "unknown robot")
     yield (
         f"{len(folder.episodes)} demonstrations by {robot}, {frames} frames at "
@@ -251,7 +222,7 @@ def _body(
     if len(shown) > _MOST_TASKS:
         yield f"| and {len(shown) - _MOST_TASKS} more | |"
     cameras = [feature for feature in folder.features.values() if feature.is_picture]
-    if cameras and text.videos:
+    if cameras:
         yield "\n| camera | shape | stored as |\n| --- | --- | --- |"
         for feature in cameras:
             shape = " x ".join(map(str, feature.shape))

@@ -32,6 +32,8 @@ _SKIP_SECONDS = 2.0
 apart."""
 _THUMBNAIL_RATE = 5.0
 """Thumbnails per second: a hand-guided arm moves by a few centimetres between two."""
+_JPEG_QUANTISER = 4
+"""Quality of JPEG files, 2 (best) to 31."""
 _THUMBNAIL_HEIGHT = 240
 """Largest height of a thumbnail [px]."""
 
@@ -326,13 +328,8 @@ def thumbnail_size(height: int, width: int) -> tuple[int, int]:
     return 2 * max(1, round(scale * height)), 2 * max(1, round(scale * width))
 
 
-def jpeg(image: Image, quality: int = 4) -> bytes:
-    """The image as a JPEG file.
-
-    Args:
-        image: RGB image.
-        quality: Quantiser of FFmpeg's encoder, 2 (best) to 31.
-    """
+def jpeg(image: Image) -> bytes:
+    """The RGB image as a JPEG file."""
     import av
 
     height, width = image.shape[:2]
@@ -343,7 +340,7 @@ def jpeg(image: Image, quality: int = 4) -> bytes:
     with av.open(stream, "w", format="mjpeg") as container:
         encoder = container.add_stream("mjpeg", rate=Fraction(1))
         encoder.width, encoder.height, encoder.pix_fmt = width, height, "yuvj420p"  # type: ignore[attr-defined]
-        encoder.codec_context.qmin = encoder.codec_context.qmax = quality  # type: ignore[attr-defined]
+        encoder.codec_context.qmin = encoder.codec_context.qmax = _JPEG_QUANTISER  # type: ignore[attr-defined]
         container.mux(encoder.encode(frame))  # type: ignore[attr-defined]
         container.mux(encoder.encode(None))  # type: ignore[attr-defined]
     return stream.getvalue()

@@ -72,7 +72,6 @@ def test_the_card_says_what_is_in_it(hub, dataset):
         "alice/reach",
         license="mit",
         tags=["reach"],
-        description="*Why*.",
         api=client(hub),
     )
     card = hub.repositories["alice/reach"].files()["README.md"].decode()
@@ -87,7 +86,6 @@ def test_the_card_says_what_is_in_it(hub, dataset):
     }
     frames = info["total_frames"]
     for told in (
-        "*Why*.",
         f"5 demonstrations by {info['robot_type']}, {frames} frames",
         "0 errors",
     ):
@@ -125,26 +123,6 @@ def test_the_tag_moves_when_all_is_there(hub, dataset, monkeypatch):
         push_dataset(dataset, "alice/reach", api=api)
     assert repo.tags == first
     assert repo.branches["main"] != first["v3.0"]
-
-
-def test_another_branch_leaves_main_and_its_tag_alone(hub, dataset):
-    push_dataset(dataset, "alice/reach", api=client(hub))
-    repo = hub.repositories["alice/reach"]
-    main, tags = repo.branches["main"], dict(repo.tags)
-    push_dataset(dataset, "alice/reach", revision="try", videos=False, api=client(hub))
-    assert (repo.branches["main"], repo.tags) == (main, tags)
-    assert any(path.startswith("videos/") for path in repo.files("main"))
-
-
-def test_videos_that_are_not_sent_stay_where_an_earlier_push_put_them(hub, dataset):
-    push_dataset(dataset, "alice/reach", videos=False, api=client(hub))
-    repo = hub.repositories["alice/reach"]
-    assert not any(path.startswith("videos/") for path in repo.files())
-    push_dataset(dataset, "alice/reach", api=client(hub))
-    videos = {path for path in repo.files() if path.startswith("videos/")}
-    assert videos
-    push_dataset(dataset, "alice/reach", videos=False, api=client(hub))
-    assert videos <= set(repo.files())
 
 
 def test_a_card_of_its_own_is_kept(hub, dataset):

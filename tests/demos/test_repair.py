@@ -333,10 +333,8 @@ def test_what_switches_between_levels_is_no_encoder_that_wrapped(tmp_path):
     episodes = [commanded(q, 0.01, levels), commanded(q + 0.1, 0.01, noisy)]
     names = {STATE: HAND, "action": HAND}
     root = write_folder(tmp_path / "old", episodes, names, dtype="float64")
-    for commands in (False, True):
-        options = RepairOptions(trim=False, unwrap_commands=commands)
-        report = repair_dataset(root, tmp_path / f"new{commands}", options)
-        assert report.changed == 0
+    report = repair_dataset(root, tmp_path / "new", RepairOptions(trim=False))
+    assert report.changed == 0
     report = repair_dataset(root, tmp_path / "named", RepairOptions(trim=False, fps=30))
     for row in load_demos(tmp_path / "named", episodes=[0])[0].joint_position[:, 3]:
         assert abs(row) == 3.0  # resampled, with nothing in between
@@ -349,12 +347,6 @@ def test_joints_are_not_torn_from_their_commands(tmp_path):
     names = {STATE: NAMES, "action": NAMES}
     root = write_folder(tmp_path / "old", [episode], names, dtype="float64")
     assert repair_dataset(root, tmp_path / "new", RepairOptions(trim=False)).changed == 0
-    both = RepairOptions(trim=False, unwrap_commands=True)
-    report = repair_dataset(root, tmp_path / "both", both)
-    assert len(report.changes[0]) == 2
-    (demo,) = load_demos(tmp_path / "both")
-    np.testing.assert_allclose(demo.joint_position, q, atol=1e-9)
-    np.testing.assert_allclose(demo.command_position, q + 0.05, atol=1e-9)
 
 
 @pytest.mark.parametrize("low", [-np.pi, 0.0])

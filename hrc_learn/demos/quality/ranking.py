@@ -17,7 +17,6 @@ from hrc_learn.demos.issues import DatasetError, Issue, plain_text
 from hrc_learn.demos.preprocessing import resting
 from hrc_learn.demos.quality.check import check_dataset
 from hrc_learn.demos.quality.episode_checks import motion_sketch
-from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.frames import each_or_fault
 from hrc_learn.demos.read.source import open_demos
 
@@ -137,8 +136,6 @@ class Ranking:
 
 def rank_episodes(
     path: str | Path,
-    mapping: MappingSpec | None = None,
-    units: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> Ranking:
     """Rank the episodes of a dataset by how doubtful they are.
@@ -149,15 +146,13 @@ def rank_episodes(
 
     Args:
         path: Folder of the dataset.
-        mapping: Columns by role, as in `load_demos`.
-        units: Units on disk by role, as in `load_demos`.
         progress: Wraps the episodes, such as with a progress bar.
 
     Raises:
         DatasetError: The dataset cannot be read as a whole.
     """
     root = Path(path)
-    report = check_dataset(root, mapping, units)
+    report = check_dataset(root)
     qualities = {
         e.index: EpisodeQuality(
             episode=e.index, length=e.length, task=" / ".join(e.tasks), stop=e.length
@@ -171,7 +166,7 @@ def rank_episodes(
     for quality, issue in _one_of_each_kind(qualities, report.warnings, len(qualities) // 2):
         quality.doubt(_WARNING, _reason(issue))
     shapes: dict[int, Float64[np.ndarray, " numbers"]] = {}
-    for quality, demo in _demonstrations(root, mapping, units, qualities, progress):
+    for quality, demo in _demonstrations(root, qualities, progress):
         _measure(quality, demo)
         if (motion := _motion(demo)) is not None:
             shapes[quality.episode] = motion_sketch(motion, _PHASES)
@@ -210,22 +205,20 @@ def _reason(issue: Issue) -> str:
 
 def _demonstrations(
     root: Path,
-    mapping: MappingSpec | None,
-    units: Mapping[str, str] | None,
     qualities: Mapping[int, EpisodeQuality],
     progress: Progress | None,
 ) -> Iterator[tuple[EpisodeQuality, Demonstration]]:
     """Readable episodes, one at a time; the error of each other one becomes its doubt."""
     entries = open_folder(root).episodes
     try:
-        source = open_demos(root, mapping=mapping, units=units)
+        source = open_demos(root)
     except DatasetError as error:
         if error.episode is None:
             raise
         sound = [e.index for e in entries if not qualities[e.index].broken]
         if not sound:
             return
-        source = open_demos(root, sound, mapping=mapping, units=units)
+        source = open_demos(root, sound)
         entries = tuple(e for e in entries if e.index in set(sound))
     shown = progress(entries) if progress else entries
     demos = each_or_fault(len(source), lambda first: source[first:], source.__getitem__)

@@ -52,8 +52,6 @@ class RepairOptions:
     """Drop frames that repeat the one before, commands included, for up to 0.1 s."""
     unwrap: bool = True
     """Remove jumps by whole turns from measured joints and angles of the arm."""
-    unwrap_commands: bool = False
-    """Unwrap commands too, and joints whose command jumps with them."""
     fix_signs: bool = True
     """Choose the signs of quaternions such that they do not jump."""
     drop_bad_frames: bool = False
@@ -263,7 +261,7 @@ class _Repair:
         if options.drop_repeats:
             edit = drop_repeats(edit)
         if options.unwrap:
-            edit = unwrap(edit, semantics, options.unwrap_commands)
+            edit = unwrap(edit, semantics)
         if options.fix_signs:
             edit = fix_signs(edit, semantics)
         if options.fps is not None:

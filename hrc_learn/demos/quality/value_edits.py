@@ -25,16 +25,14 @@ _NEIGHBOURS = 4
 _SMOOTH = ("joint_position", "joint_velocity", "position")
 
 
-def unwrap(edit: EpisodeEdit, semantics: ColumnSemantics, commands: bool) -> EpisodeEdit:
+def unwrap(edit: EpisodeEdit, semantics: ColumnSemantics) -> EpisodeEdit:
     """Remove jumps by whole turns from joints, Euler angles and rotation vectors.
 
-    Only measurements of the arm change: hands, grippers and switches stay as they are, and
-    so do commands unless `commands` is True. A joint whose command jumps with it stays, so
-    that the two agree.
+    Only measurements of the arm change: commands, hands, grippers and switches stay as they
+    are. A joint whose command jumps with it stays too, so that the two agree.
     """
     quantities = edit.quantities(semantics)
     roles = [role for role in (*_MEASURED_ANGLES, "rotation_vector") if role in quantities]
-    roles += ["command_position"] * (commands and "command_position" in quantities)
     for role in roles:
         values, turn = quantities[role], semantics.turn(role)
         if role == "rotation_vector":
@@ -44,7 +42,7 @@ def unwrap(edit: EpisodeEdit, semantics: ColumnSemantics, commands: bool) -> Epi
             smooth = values - turn * _turns(values / turn)
             fixed = ~_may_turn(edit, semantics, role)
             smooth[:, fixed] = values[:, fixed]
-        if role == "joint_position" and not commands and "command_position" in quantities:
+        if role == "joint_position" and "command_position" in quantities:
             other = quantities["command_position"] / semantics.turn("command_position")
             together = _turns(other).any(0)
             smooth[:, together] = values[:, together]
@@ -69,7 +67,7 @@ def _may_turn(edit: EpisodeEdit, semantics: ColumnSemantics, role: str) -> np.nd
     """Mask of components that are angles of the arm: no fingers, no switches."""
     values = edit.quantities(semantics)[role]
     discrete = is_discrete(profile_columns({role: values})[role], len(edit))
-    if role not in ("joint_position", "command_position"):
+    if role != "joint_position":
         return ~discrete
     hands = [
         label in semantics.joint_names and is_hand(label)

@@ -28,60 +28,28 @@ _FOLLOWED = 0.2
 _RESTING = 1e-10
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class ColumnProfile:
-    """Statistics of one feature during one episode, one number per component.
+    """Statistics of one feature during one episode, one number per component."""
 
-    A single array holds them all: for 10,000 episodes, small arrays cost more memory than
-    their numbers.
-    """
-
-    figures: Float64[np.ndarray, "13 components"]
-
-    @property
-    def levels(self) -> Float64[np.ndarray, "5 components"]:
-        """Quantiles 0.5, 5, 50, 95 and 99.5 %."""
-        return self.figures[:5]
-
-    @property
-    def start(self) -> Float64[np.ndarray, " components"]:
-        """Median of the first frames."""
-        return self.figures[5]
-
-    @property
-    def goal(self) -> Float64[np.ndarray, " components"]:
-        """Median of the last frames."""
-        return self.figures[6]
-
-    @property
-    def step(self) -> Float64[np.ndarray, " components"]:
-        """99 % quantile of the change from frame to frame."""
-        return self.figures[7]
-
-    @property
-    def noise(self) -> Float64[np.ndarray, " components"]:
-        """Median size of the second difference."""
-        return self.figures[8]
-
-    @property
-    def held(self) -> Float64[np.ndarray, " components"]:
-        """Largest number of consecutive frames without any change."""
-        return self.figures[9]
-
-    @property
-    def distinct(self) -> Float64[np.ndarray, " components"]:
-        """Number of distinct values."""
-        return self.figures[10]
-
-    @property
-    def largest(self) -> Float64[np.ndarray, " components"]:
-        """Largest absolute value."""
-        return self.figures[11]
-
-    @property
-    def flat(self) -> Float64[np.ndarray, " components"]:
-        """Fraction of steps without any change."""
-        return self.figures[12]
+    levels: Float64[np.ndarray, "5 _components"]
+    """Quantiles 0.5, 5, 50, 95 and 99.5 %."""
+    start: Float64[np.ndarray, " _components"]
+    """Median of the first frames."""
+    goal: Float64[np.ndarray, " _components"]
+    """Median of the last frames."""
+    step: Float64[np.ndarray, " _components"]
+    """99 % quantile of the change from frame to frame."""
+    noise: Float64[np.ndarray, " _components"]
+    """Median size of the second difference."""
+    held: Int64[np.ndarray, " _components"]
+    """Largest number of consecutive frames without any change."""
+    distinct: Int64[np.ndarray, " _components"]
+    """Number of distinct values."""
+    largest: Float64[np.ndarray, " _components"]
+    """Largest absolute value."""
+    flat: Float64[np.ndarray, " _components"]
+    """Fraction of steps without any change."""
 
     @property
     def peak(self) -> Float64[np.ndarray, " components"]:
@@ -161,18 +129,17 @@ def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
     steps = np.abs(np.diff(values, axis=0)) if len(values) > 1 else np.zeros_like(values)
     bends = np.abs(np.diff(values, 2, axis=0)) if len(values) > 2 else np.zeros_like(values)
     at = min(len(steps) - 1, int(0.99 * len(steps)))
-    figures = (
-        *ordered[places],
-        np.median(values[:few], axis=0),
-        np.median(values[-few:], axis=0),
-        np.partition(steps, at, axis=0)[at],
-        np.median(bends, axis=0),
-        _longest_hold(values),
-        1 + (np.diff(ordered, axis=0) > 0).sum(0),
-        np.maximum(np.abs(ordered[0]), np.abs(ordered[-1])),
-        (steps == 0).mean(0),
+    return ColumnProfile(
+        levels=ordered[places],
+        start=np.median(values[:few], axis=0),
+        goal=np.median(values[-few:], axis=0),
+        step=np.partition(steps, at, axis=0)[at].copy(),  # a view would keep all frames
+        noise=np.median(bends, axis=0),
+        held=_longest_hold(values),
+        distinct=1 + (np.diff(ordered, axis=0) > 0).sum(0),
+        largest=np.maximum(np.abs(ordered[0]), np.abs(ordered[-1])),
+        flat=(steps == 0).mean(0),
     )
-    return ColumnProfile(np.stack(figures).astype(float))
 
 
 def _longest_hold(
