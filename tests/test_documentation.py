@@ -30,10 +30,14 @@ CHECKOUT = {
     "docs/concepts/index.md": "# Concepts\n",
     "docs/benchmarks/index.md": "# Benchmarks\n",
     "hrc_learn/__init__.py": '"""Robots."""\n\nfrom .arm import move as move\n',
-    "hrc_learn/arm/__init__.py": '"""Arms."""\n\nfrom ._moving import move as move\n',
+    "hrc_learn/arm/__init__.py": (
+        '"""Arms."""\n\n'
+        "from ._moving import Limits as Limits\nfrom ._moving import move as move\n"
+    ),
     "hrc_learn/arm/_moving.py": (
         "def move(speed: float) -> None:\n"
-        '    """Move the arm.\n\n    Args:\n        speed: Of the hand [m/s].\n    """\n'
+        '    """Move the arm.\n\n    Args:\n        speed: Tool speed [m/s].\n    """\n\n\n'
+        'class Limits:\n    """Speed limits."""\n'
     ),
     "hrc_learn/_private/__init__.py": '"""Ours."""\n\nfrom .gear import gear as gear\n',
 }
@@ -47,8 +51,12 @@ def checkout(folder: Path, **changed: str) -> Path:
     return folder
 
 
-def test_a_page_for_each_public_face_and_no_other(tmp_path):
-    assert set(build_docs.reference(checkout(tmp_path))) == {"hrc_learn", "hrc_learn.arm"}
+def test_a_page_for_each_public_package_and_class(tmp_path):
+    pages = build_docs.reference(checkout(tmp_path))
+    assert set(pages) == {"hrc_learn", "hrc_learn.arm", "hrc_learn.arm.Limits"}
+    # A class has a page of its own, which its package lists.
+    assert "::: hrc_learn.arm.Limits" in pages["hrc_learn.arm.Limits"]
+    assert "[`Limits`](hrc_learn.arm.Limits.md) | Speed limits. |" in pages["hrc_learn.arm"]
 
 
 def test_an_object_is_described_once_and_linked_elsewhere(tmp_path):
@@ -81,7 +89,7 @@ def test_the_site_opens_without_a_network(tmp_path):
     out = tmp_path / "site"
     assert build_docs.build(checkout(tmp_path / "checkout"), out) == []
     page = (out / "api" / "hrc_learn.arm.html").read_text()
-    assert "Of the hand [m/s]." in page
+    assert "Tool speed [m/s]." in page
     assert 'id="hrc_learn.arm.move"' in page
     guide = (out / "howto" / "guide.html").read_text()
     assert 'href="../api/hrc_learn.arm.html#hrc_learn.arm.move"' in guide
@@ -97,7 +105,7 @@ def test_the_site_opens_without_a_network(tmp_path):
         ("docs/index.md", "howto/guide.md)", "howto/gide.md)", "gide.md"),
         ("docs/index.md", "#end", "#ends", "ends"),
         ("docs/howto/guide.md", "arm.move", "arm.moved", "hrc_learn.arm.moved"),
-        ("hrc_learn/arm/_moving.py", "speed: Of", "sped: Of", "'sped'"),
+        ("hrc_learn/arm/_moving.py", "speed: Tool", "sped: Tool", "'sped'"),
     ],
     ids=["page", "anchor", "reference", "argument"],
 )

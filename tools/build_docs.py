@@ -103,46 +103,87 @@ def absolute(package: str, node: ast.ImportFrom) -> str:
     return ".".join([*above, *([node.module] if node.module else [])])
 
 
-def exists(root: Path, module: str) -> bool:
+def module_file(root: Path, module: str) -> Path | None:
+    """Source file of a module or package, if it is part of the checkout."""
     path = root / module.replace(".", "/")
-    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+    files = (path.with_suffix(".py"), path / "__init__.py")
+    return next((file for file in files if file.exists()), None)
+
+
+def definition(root: Path, export: Export) -> ast.ClassDef | ast.FunctionDef | None:
+    """Class or function behind an export, followed through imports; None for other values."""
+    module, name, seen = export.origin, export.name, set()
+    while module not in seen and (file := module_file(root, module)) is not None:
+        seen.add(module)
+        package = module if file.name == "__init__.py" else module.rpartition(".")[0]
+        for node in ast.parse(file.read_text("utf-8")).body:
+            if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
+                return node
+            if isinstance(node, ast.ImportFrom) and name in imported(node):
+                module = absolute(package, node)
+    return None
+
+
+def imported(node: ast.ImportFrom) -> set[str]:
+    """Names that a statement binds."""
+    return {alias.asname or alias.name for alias in node.names}
 
 
 def reference(root: Path) -> dict[str, str]:
-    """The reference's pages as Markdown, by the dotted name of what they describe.
+    """Pages of the reference as Markdown, by the dotted name of what they describe.
 
-    An object has its description on one page only. A face that takes it over from another
-    public package links there.
+    The page of a package lists its classes, each described on a page of its own, and describes
+    functions and constants. An object is described once: a face that takes it over from
+    another public package links there.
     """
     listed = faces(root)
-    home = {export.path: face.name for face in listed for export in face.exports}
     packages = {face.name for face in listed}
+    home = {
+        export.path: face.name
+        for face in listed
+        for export in face.exports
+        if export.path not in packages
+    }
     pages = {}
     for face in listed:
         inner = [name for name in sorted(packages) if name.rpartition(".")[0] == face.name]
-        own, taken_over = [], []
+        classes, other, taken_over = [], [], []
         for export in face.exports:
             if export.path in packages:
                 continue
             if export.source != export.path and export.source in home:
                 link = f"[`{export.name}`][{export.source}] of `{home[export.source]}`"
                 taken_over.append(f"- {link}")
-            elif export.origin == export.path:
-                # A function in a module of its name: the path of both means the module.
-                own += ["", f"::: {export.source}"]
+                continue
+            # A function in a module of its name: the path of both means the module.
+            described = export.source if export.origin == export.path else export.path
+            node = definition(root, export)
+            if isinstance(node, ast.ClassDef):
+                classes.append(f"| [`{export.name}`]({export.path}.md) | {summary(node)} |")
+                pages[export.path] = f"::: {described}\n    options:\n      heading_level: 1\n"
             else:
-                own += ["", f"::: {export.path}"]
+                other += ["", f"::: {described}"]
         lines = [f"# {face.name}", "", face.docstring, ""]
         if inner:
             lines += ["## Packages", "", *(f"- [`{name}`]({name}.md)" for name in inner), ""]
+        if classes:
+            lines += ["## Classes", "", "| class | |", "|---|---|", *classes, ""]
         if taken_over:
             lines += ["## Names", "", *taken_over, ""]
-        pages[face.name] = "\n".join([*lines, *own]) + "\n"
+        if other:
+            lines += ["## Functions and constants", ""]
+        pages[face.name] = "\n".join([*lines, *other]) + "\n"
     for module in PUBLIC_MODULES:
-        if exists(root, f"{PACKAGE}.{module}"):
-            name = f"{PACKAGE}.{module}"
+        name = f"{PACKAGE}.{module}"
+        if module_file(root, name) is not None:
             pages[name] = f"::: {name}\n    options:\n      heading_level: 1\n"
     return pages
+
+
+def summary(node: ast.ClassDef) -> str:
+    """First line of a class's docstring, for a cell of a table."""
+    lines = (ast.get_docstring(node) or "").splitlines()
+    return (lines[0] if lines else "").replace("|", "\\|")
 
 
 def pages_of(root: Path) -> dict[Path, str]:
