@@ -81,11 +81,12 @@ class Watchdog:
             arm.command(runner.step())
             watchdog.feed()
 
-    The watchdog runs in its own thread. It notices a loop that hangs, but neither one that holds
-    the interpreter lock nor a stopped or killed process: for a real arm use `ArmProcess`. A stop
-    that fails is retried, with growing pauses, until it succeeds or the loop reports again. After
-    a trip the arm is at rest and the controller's state is stale: start from `initial_state`
-    again. If the context ends with an exception, or with a stop still pending, it stops the arm.
+    The watchdog runs in its own thread. It notices a loop that hangs, but neither one that
+    holds the interpreter lock nor a stopped or killed process: for a real arm use `ArmProcess`.
+    A stop that fails is retried, with growing pauses, until it succeeds or the loop reports
+    again. After a trip the arm is at rest and the controller's state is stale: start from
+    `initial_state` again. If the context ends with an exception, or with a stop still pending,
+    it stops the arm.
 
     Attributes:
         trips: Number of times the loop was silent for too long.

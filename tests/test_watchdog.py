@@ -132,7 +132,7 @@ def test_failures_are_reported_and_a_report_that_fails_changes_nothing(capsys):
         dog.check()
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # the first and the second; then the fourth, the eighth, ...
-    assert "stop failed 1 times, trying on: OSError('the control box is offline')" in lines[0]
+    assert "stop failed 1 times, retrying: OSError('the control box is offline')" in lines[0]
 
     def broken(error: BaseException, attempts: int) -> None:
         raise BrokenPipeError
