@@ -47,8 +47,8 @@ from hrc_learn.sim.workplace import Workplace
 _BEGIN, _END = "<!-- arms:begin -->", "<!-- arms:end -->"
 _HEADER = (
     "| arm | maker | joints | reach [m] | largest difference from MuJoCo, Pinocchio "
-    "| poses found | ms a pose | touches itself: capsules, MuJoCo, missed "
-    "| servoing: done; beyond limits, self-contacts "
+    "| poses found | ms a pose | self-collision: capsules, MuJoCo, missed "
+    "| servoing: done; steps beyond limits, self-contacts "
     "| `hrc demo` |\n|---|---|---|---|---|---|---|---|---|---|"
 )
 _COLUMNS = _HEADER.splitlines()[0].count("|") - 1

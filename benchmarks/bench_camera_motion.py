@@ -42,7 +42,7 @@ _HOME = torch.tensor([0.0, 0.2, 0.0, -2.1, 0.0, 2.3, 0.8], dtype=torch.float64)
 _SWING = 0.12  # standard deviation of each of three sines of a joint [rad]
 _PERIOD = 12.0  # of the slowest of them [s]
 _PIXEL_NOISE = 0.15
-"""Of a marker's centre [px]: docs/vision.md measures 0.05 to 0.22."""
+"""Of a marker's centre [px]: docs/benchmarks/kinematics.md gives 0.05 to 0.22."""
 _MARKER = (0.0, 0.06, 0.03)
 
 
