@@ -159,7 +159,7 @@ def test_nobody_hands_anything_over(model):
 def test_waits_no_longer_than_it_is_told_for_the_hand(model):
     met = np.array([0.2, 0.5, 0.25])
     cell = Cell([(1.0, 1.0, met + BESIDE), (2.5, 1.0, REST)], brings=False)
-    with pytest.raises(MissedGraspError, match="did not come"):
+    with pytest.raises(MissedGraspError, match="did not reach"):
         receiving(cell, model, timeout=8.0).receive(ITEM)
     assert np.linalg.norm(cell.pose.position.numpy() - met) < 0.05
 
