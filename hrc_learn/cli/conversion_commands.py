@@ -11,7 +11,7 @@ from rich.progress import track
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments import Extract, Import
 from hrc_learn.demos import DatasetWriter, Demonstration, Detector, extract_features
-from hrc_learn.demos.arrays import (
+from hrc_learn.demos.array_import import (
     ArrayOptions,
     ArraySources,
     demonstrations_from_arrays,

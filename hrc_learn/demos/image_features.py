@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, UInt8
 
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
+from hrc_learn.demos.format.dataset_files import open_parquet, read_table
 from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
-from hrc_learn.demos.format.files import open_parquet, read_table
 from hrc_learn.demos.format.videos import (
     VideoSegment,
     decode,

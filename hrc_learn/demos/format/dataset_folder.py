@@ -8,7 +8,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from hrc_learn.demos.format.files import (
+from hrc_learn.demos.format.dataset_files import (
     INFO_PATH,
     integer,
     path_in,

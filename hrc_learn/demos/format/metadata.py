@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Shaped, UInt8
 
-from hrc_learn.demos.format.files import INFO_PATH
+from hrc_learn.demos.format.dataset_files import INFO_PATH
 from hrc_learn.demos.issues import DatasetError
 
 NUMERIC = ("float", "int", "uint", "bool")

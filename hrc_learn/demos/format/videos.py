@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
+from hrc_learn.demos.format.dataset_files import path_in, read_rows
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, episode_lists
-from hrc_learn.demos.format.files import path_in, read_rows
 from hrc_learn.demos.format.metadata import Statistics, image_statistics
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.store import sync_file

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from hrc_learn.demos.format.dataset_files import open_parquet, read_table
 from hrc_learn.demos.format.dataset_folder import recorded_statistics
-from hrc_learn.demos.format.files import open_parquet, read_table
 from hrc_learn.demos.format.metadata import (
     INDEX_FEATURES,
     NUMERIC,

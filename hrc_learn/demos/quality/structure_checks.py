@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from hrc_learn.demos.format.dataset_files import INFO_PATH, open_parquet, read_json
 from hrc_learn.demos.format.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
@@ -19,7 +20,6 @@ from hrc_learn.demos.format.dataset_folder import (
     read_info,
     read_tasks,
 )
-from hrc_learn.demos.format.files import INFO_PATH, open_parquet, read_json
 from hrc_learn.demos.format.metadata import Feature, read_features
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, plain_text, warning
 from hrc_learn.demos.quality.episode_checks import ColumnSummary

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from hrc_learn.demos.format.dataset_files import is_inside, require_file
 from hrc_learn.demos.format.dataset_folder import DatasetFolder
-from hrc_learn.demos.format.files import is_inside, require_file
 from hrc_learn.demos.format.videos import (
     Segments,
     VideoSegment,

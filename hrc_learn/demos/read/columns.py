@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.format.files import INFO_PATH
+from hrc_learn.demos.format.dataset_files import INFO_PATH
 from hrc_learn.demos.format.metadata import SIDECAR_PATH, Feature, Sidecar
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.quantities import (

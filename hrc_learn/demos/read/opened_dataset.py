@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hrc_learn.demos.format.dataset_files import INFO_PATH
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
-from hrc_learn.demos.format.files import INFO_PATH
 from hrc_learn.demos.format.metadata import SIDECAR_PATH, Sidecar, read_sidecar
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
 from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns

@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from hrc_learn.demos.format.dataset_files import open_parquet, read_table
 from hrc_learn.demos.format.dataset_folder import episode_lists, open_folder
-from hrc_learn.demos.format.files import open_parquet, read_table
 from hrc_learn.demos.format.metadata import (
     CHUNK_SIZE,
     DATA_PATH,

@@ -8,7 +8,7 @@ from lerobot_folders import joint_path
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError
-from hrc_learn.demos.arrays import (
+from hrc_learn.demos.array_import import (
     ArrayOptions,
     ArraySources,
     demonstrations_from_arrays,
