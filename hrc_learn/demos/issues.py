@@ -184,4 +184,4 @@ def _summary(alike: list[Issue]) -> str:
     shown = ", ".join(map(str, [*places][:_PLACES_SHOWN]))
     more = ", ..." if len(places) > _PLACES_SHOWN else ""
     where = f"; episodes {shown}{more}" if places else ""
-    return f"{worst} (and {len(others)} times more{where})"
+    return f"{worst} (and {len(others)} more{where})"

@@ -545,7 +545,7 @@ def test_findings_that_differ_in_joints_and_figures_alone_share_a_line():
     # "spam" is not declared to be a component.
     report.add(warning(message="is noisier by 3 than usual: spam", episode=3))
     first, second, _ = report.lines()
-    assert first.endswith("usual: base (and 2 times more; episodes 0, 1)")
+    assert first.endswith("usual: base (and 2 more; episodes 0, 1)")
     assert second.endswith("usual: spam")
 
 
@@ -585,7 +585,7 @@ def test_a_damaged_sidecar(root):
 
 def test_the_report_reads_as_text(root):
     change_info(root, fps=40)
-    assert "(and 2 times more; episodes 1, 2)" in str(check_dataset(root))
+    assert "(and 2 more; episodes 1, 2)" in str(check_dataset(root))
     (root / DATA).unlink()
     text = str(check_dataset(root))
     assert text.startswith(f"error: {DATA}, episode 0: not found")

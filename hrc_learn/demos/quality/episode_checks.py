@@ -73,9 +73,9 @@ def repetitions(_: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> Ite
         )
     elif same.mean() > _REPEATED:
         yield entry.warning(
-            f"{100 * same.mean():.0f} % of the frames repeat the one before; the "
-            f"recording is faster than the robot reports, or the robot stood still; hrc repair "
-            f"drops them",
+            f"{100 * same.mean():.0f} % of the frames repeat the one before: the robot reports "
+            f"more slowly than it is recorded, or stood still; hrc repair --drop repeats removes "
+            f"them",
             frame=int(same.argmax()) + 1,
         )
 
