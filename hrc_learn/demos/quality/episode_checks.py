@@ -74,8 +74,8 @@ def repetitions(_: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> Ite
     elif same.mean() > _REPEATED:
         yield entry.warning(
             f"{100 * same.mean():.0f} % of the frames repeat the one before: the robot reports "
-            f"more slowly than it is recorded, or stood still; hrc repair --drop repeats removes "
-            f"them",
+            f"more slowly than it is recorded, or stood still; hrc repair --drop repeats "
+            f"removes them",
             frame=int(same.argmax()) + 1,
         )
 
