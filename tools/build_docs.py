@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -110,13 +111,18 @@ def module_file(root: Path, module: str) -> Path | None:
     return next((file for file in files if file.exists()), None)
 
 
+@cache  # a module is read once, not once for each of its names
+def parsed(file: Path) -> ast.Module:
+    return ast.parse(file.read_text("utf-8"))
+
+
 def definition(root: Path, export: Export) -> ast.ClassDef | ast.FunctionDef | None:
     """Class or function behind an export, followed through imports; None for other values."""
     module, name, seen = export.origin, export.name, set()
     while module not in seen and (file := module_file(root, module)) is not None:
         seen.add(module)
         package = module if file.name == "__init__.py" else module.rpartition(".")[0]
-        for node in ast.parse(file.read_text("utf-8")).body:
+        for node in parsed(file).body:
             if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
                 return node
             if isinstance(node, ast.ImportFrom) and name in imported(node):
@@ -254,7 +260,12 @@ def stage(root: Path, folder: Path) -> list:
         (folder / name).write_text(text, "utf-8")
     if (root / "docs" / "images").exists():
         shutil.copytree(root / "docs" / "images", folder / "images")
-    packages = [{name.removeprefix(f"{PACKAGE}."): f"api/{name}.md"} for name in sorted(api)]
+    # Pages of classes are reached from their package, by links and by search.
+    packages = [
+        {name.removeprefix(f"{PACKAGE}."): f"api/{name}.md"}
+        for name in sorted(api)
+        if not name.rpartition(".")[2][:1].isupper()
+    ]
     return [
         {"Home": "index.md"},
         {"Tutorial": "tutorial.md"},

@@ -71,11 +71,8 @@ def record(args: Record) -> int:
 def _record_placing(args: Record, episodes: int, seed: int) -> None:
     """Placing on a shelf: end effector and null-space posture at once."""
     config = with_settings(args.config, _PlacingSettings()).demonstration
-    robot = ArmChoice(args.robot, *args.links()).work_arm()
-    workplace = Workplace.of(robot)
+    workplace, world, rng = _work_cell(args, seed)
     goal = workplace.shelf(args.shelf).position.numpy()
-    world = World(workplace.scene)
-    rng = np.random.default_rng(seed)
     discarded, errors = [], []
 
     def demonstrations() -> Iterator[list[Frame]]:
@@ -92,13 +89,9 @@ def _record_placing(args: Record, episodes: int, seed: int) -> None:
         demonstrations(),
         f"place the box on the {args.shelf} shelf",
         config.fps,
-        details={
-            "shelf": args.shelf,
-            "scene": "hrc_learn workplace",
-            "recorded with": configuration(args),
-        },
+        robot=workplace.robot,
+        details={"shelf": args.shelf, **_details(args)},
         overwrite=args.overwrite,
-        robot=robot,
     )
     print(f"{episodes} demonstrations in {args.out} ({sum(discarded)} discarded)")
     values = {
@@ -112,10 +105,7 @@ def _record_placing(args: Record, episodes: int, seed: int) -> None:
 def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     """Visual servoing to an object with an uncalibrated camera."""
     config = with_settings(args.config, _ServoingSettings()).demonstration
-    robot = ArmChoice(args.robot, *args.links()).work_arm()
-    workplace = Workplace.of(robot)
-    world = World(workplace.scene)
-    rng = np.random.default_rng(seed)
+    workplace, world, rng = _work_cell(args, seed)
     sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
     visible = []
 
@@ -125,19 +115,29 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
             visible.append(float(np.mean([bool(f["feature_visible"]) for f in frames])))
             yield frames
 
+    features = {OBJECT_FEATURE: OBJECT_FEATURE_NAMES, ANGLE_FEATURE: ANGLE_FEATURE_NAMES}
     write_demonstrations(
         args.out,
         demonstrations(),
         "servo to the box",
         config.fps,
-        features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES, ANGLE_FEATURE: ANGLE_FEATURE_NAMES},
-        details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
+        robot=workplace.robot,
+        features=features,
+        details=_details(args),
         overwrite=args.overwrite,
-        robot=robot,
     )
     seen = 100 * min(visible)
     print(f"{episodes} demonstrations in {args.out}, marker visible in {seen:.0f} %")
     write_values(args.json, {"episodes": episodes, "marker_seen_min": min(visible)})
+
+
+def _work_cell(args: Record, seed: int) -> tuple[Workplace, World, np.random.Generator]:
+    workplace = Workplace.of(ArmChoice(args.robot, *args.links()).work_arm())
+    return workplace, World(workplace.scene), np.random.default_rng(seed)
+
+
+def _details(args: Record) -> dict[str, object]:
+    return {"scene": "hrc_learn workplace", "recorded with": configuration(args)}
 
 
 def _record_expert(args: Record, episodes: int, seed: int) -> None:
