@@ -15,7 +15,7 @@ from torch import Tensor
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit
 from hrc_learn.sim.worker import PARTS
-from hrc_learn.sim.worker_sensor import IMAGE_RATE
+from hrc_learn.sim.worker_tracking import IMAGE_RATE
 
 # Worker that left stands still: of then the tables hold so much, and repeat the last part of
 # it, a whole number of images and of control steps [s].

@@ -13,7 +13,7 @@ from hrc_learn.sim import ObjectConfig, Worker, WorkerConfig, WorkerSensor, Worl
 from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over
 from hrc_learn.sim.imperfections import Imperfections
 from hrc_learn.sim.worker import PARTS
-from hrc_learn.sim.worker_sensor import IMAGE_RATE
+from hrc_learn.sim.worker_tracking import IMAGE_RATE
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig
 

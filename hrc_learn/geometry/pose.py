@@ -11,14 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.arrays import as_tensor
+from hrc_learn.geometry.arrays import ArrayLike, as_tensor
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose of a frame; composes, inverts, and moves points from that frame to its parent.
+    """Pose of a frame in its parent frame.
 
-    A pytree: goes through `torch.func`, `torch.compile` and `torch.export` as it is.
+    Poses compose with `@`, have an inverse, and transform points to the parent frame. Fields
+    may be given as NumPy arrays or lists. A pose is a pytree, so `torch.func`, `torch.compile`
+    and `torch.export` accept it.
     """
 
     position: Float[Tensor, "*batch 3"]
@@ -34,8 +36,9 @@ class Pose:
                 object.__setattr__(self, name, as_tensor(value))
 
     @staticmethod
-    def from_matrix(T: Float[Tensor, "*batch rows 4"]) -> Pose:
-        """Pose of a homogeneous transform, or of its upper three rows (R | p)."""
+    def from_matrix(T: ArrayLike) -> Pose:
+        """Pose of a homogeneous transform (*batch, 4, 4), or of its upper rows (R | p)."""
+        T = as_tensor(T)
         return Pose(T[..., :3, 3], quaternion.from_matrix(T[..., :3, :3]))
 
     def matrix(self) -> Float[Tensor, "*batch 4 4"]:
@@ -46,8 +49,9 @@ class Pose:
         return torch.cat([upper, corner.expand(*upper.shape[:-2], 1, 4)], dim=-2)
 
     @staticmethod
-    def from_vector(r: Float[Tensor, "*batch 6"]) -> Pose:
-        """Pose of (position [m], rotation vector [rad])."""
+    def from_vector(r: ArrayLike) -> Pose:
+        """Pose of (position [m], rotation vector [rad]), shape (*batch, 6)."""
+        r = as_tensor(r)
         return Pose(r[..., :3], quaternion.exp(r[..., 3:]))
 
     def vector(self) -> Float[Tensor, "*batch 6"]:
@@ -65,13 +69,13 @@ class Pose:
         inverse = quaternion.conjugate(self.orientation)
         return Pose(-quaternion.rotate(inverse, self.position), inverse)
 
-    def apply(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*both 3"]:
-        """Move points [m] from this frame to its parent.
+    def apply(self, points: ArrayLike) -> Float[Tensor, "*both 3"]:
+        """Coordinates in the parent frame of points given in this frame [m].
 
         Args:
-            points: Their leading dimensions broadcast against the pose's.
+            points: Points (*points, 3) [m]; leading dimensions broadcast against the pose's.
         """
-        return quaternion.rotate(self.orientation, points) + self.position
+        return quaternion.rotate(self.orientation, as_tensor(points)) + self.position
 
     def twist_to(self, other: Pose) -> Float[Tensor, "*both 6"]:
         """Motion to `other` as (linear [m], angular [rad]) in the parent frame.

@@ -1,9 +1,8 @@
-"""Arms read from descriptions: URDF and MJCF files, and packages of models."""
+"""Arms read from URDF and MJCF files."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 
 import torch
@@ -65,43 +64,6 @@ def arm_from_file(
         raise ValueError(f"{path}: a description ends in .urdf, .xml or .mjcf")
     return arm_from_description(
         description, base=base, tip=tip, name=name, tool=tool, limits=limits, ready=ready
-    )
-
-
-def arm_from_package(
-    package: str,
-    model: str,
-    *,
-    base: str | None = None,
-    tip: str | None = None,
-    tool: Float[Tensor, "4 4"] | None = None,
-    limits: LimitsGiven = None,
-    ready: Sequence[float] | None = None,
-) -> Arm:
-    """An arm from a package that downloads its models on first use.
-
-    Args:
-        package: `robot_descriptions` or `mujoco_menagerie`.
-        model: Module of the former, such as `ur10e_description`, or folder of the latter, such
-            as `universal_robots_ur10e`.
-        base: See `arm_from_file`, as the arguments below.
-        tip: Flange.
-        tool: Tool centre point.
-        limits: Replaced limits.
-        ready: Comfortable posture [rad, m].
-
-    Raises:
-        ModuleNotFoundError: The package is not installed.
-        ValueError: It has no such model.
-    """
-    return arm_from_file(
-        _path_from_package(package, model),
-        name=model,
-        base=base,
-        tip=tip,
-        tool=tool,
-        limits=limits,
-        ready=ready,
     )
 
 
@@ -196,27 +158,3 @@ def _comfortable(chain: SerialChain) -> Float[Tensor, " joints"]:
     margin = (torch.minimum(q - lower, upper - q) / half).amin(-1)
     score = smallest / smallest.amax() + margin.clamp(max=1) - T[:, 2, 2] - away
     return q[score.argmax()]
-
-
-def _path_from_package(package: str, model: str) -> Path:
-    """File of a model, downloaded by its package if it is missing."""
-    try:
-        if package == "robot_descriptions":
-            found = import_module(f"robot_descriptions.{model}")
-            path = getattr(found, "URDF_PATH", None) or getattr(found, "MJCF_PATH", None)
-        elif package == "mujoco_menagerie":
-            path = import_module("mujoco_menagerie").get_model_path(model)
-        else:
-            raise ValueError(
-                f"models come from robot_descriptions or mujoco_menagerie, not {package!r}"
-            )
-    except ModuleNotFoundError as error:
-        if error.name == package:
-            raise ModuleNotFoundError(
-                f"{model} comes with the package {package.replace('_', '-')}: pip install it",
-                name=package,
-            ) from None
-        raise ValueError(f"{package} has no model {model!r}") from None
-    if path is None:
-        raise ValueError(f"{package} has neither URDF nor MJCF of {model!r}")
-    return Path(path)

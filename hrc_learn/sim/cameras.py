@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import Camera
-from hrc_learn.sim.drawn_world import DrawnWorld, RecordedWorld
+from hrc_learn.sim.recorded_world import DrawnWorld, RecordedWorld
 from hrc_learn.sim.scene import (
     HAND_MARKER,
     NOWHERE,

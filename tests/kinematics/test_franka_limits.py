@@ -12,7 +12,7 @@ from sampling import generator, within
 from torch.testing import assert_close
 
 from hrc_learn.kinematics import FR3_VINTAGES, JointLimits, fr3, panda
-from hrc_learn.kinematics.franka_limits import strictest
+from hrc_learn.kinematics.franka import strictest
 
 
 def everywhere(*batch: int) -> torch.Tensor:

@@ -1,8 +1,7 @@
-"""URDF text, and chains of pytorch-kinematics in both directions."""
+"""URDF text, and chains of pytorch-kinematics."""
 
 from xml.etree import ElementTree
 
-import pytest
 import pytorch_kinematics
 import torch
 from arm_samples import joint_positions
@@ -13,7 +12,6 @@ from hrc_learn.kinematics import (
     JointLimits,
     SerialChain,
     arm_from_file,
-    from_pytorch_kinematics,
     panda,
     to_pytorch_kinematics,
 )
@@ -76,36 +74,21 @@ def test_to_pytorch_kinematics_keeps_double_precision_and_names():
     )
 
 
-def test_there_and_back_again():
-    back = from_pytorch_kinematics(to_pytorch_kinematics(panda), acceleration=10.0, jerk=5000.0)
-    assert back.joint_names == panda.joint_names
-    q = joint_positions(50, rng=generator(3))
-    assert_close(back.forward(q).matrix(), panda.forward(q).matrix(), rtol=0, atol=1e-14)
-    assert_close(back.limits.upper, panda.limits.upper)
-    assert_close(back.limits.torque, panda.limits.torque)
-
-
-def test_from_pytorch_kinematics_takes_any_axis():
+def test_axes_of_any_direction_move_as_in_pytorch_kinematics(tmp_path):
+    (tmp_path / "odd.urdf").write_text(ODD_ARM, encoding="utf-8")
+    robot = arm_from_file(tmp_path / "odd.urdf", tip="tip")
     peer = pytorch_kinematics.build_serial_chain_from_urdf(ODD_ARM.encode(), "tip")
     peer = peer.to(dtype=torch.float64)
-    arm = from_pytorch_kinematics(peer, acceleration=10.0, jerk=100.0)
-    assert arm.joint_names == ("one", "two", "three")
-    assert arm.limits.velocity.tolist() == [3, 5, 7]
+    assert robot.joint_names == ("one", "two", "three")
+    assert robot.limits.velocity.tolist() == [3, 5, 7]
     q = torch.randn(20, 3, generator=generator(4), dtype=torch.float64)
-    pose, J = arm.forward_and_jacobian(q)
-    # 0.6, 0.8 and the origins went through float32.
+    pose, J = robot.forward_and_jacobian(q)
+    # 0.6, 0.8 and the peer's origins went through float32.
     assert_close(pose.matrix(), peer.forward_kinematics(q).get_matrix(), rtol=0, atol=1e-6)
     assert_close(J, peer.jacobian(q), rtol=0, atol=1e-6)
 
 
-def test_sliding_joint_is_refused_by_name():
-    text = ODD_ARM.replace('name="two" type="revolute"', 'name="two" type="prismatic"')
-    peer = pytorch_kinematics.build_serial_chain_from_urdf(text.encode(), "tip")
-    with pytest.raises(ValueError, match="joint two is prismatic"):
-        from_pytorch_kinematics(peer, acceleration=10.0, jerk=100.0)
-
-
-def test_urdf_keeps_how_each_joint_moves(tmp_path):
+def test_urdf_keeps_the_kind_of_each_joint(tmp_path):
     turn, slide = torch.eye(4).double(), torch.eye(4).double()
     turn[:3, 3] = torch.tensor([0.1, 0.0, 0.3])
     slide[:3, :3] = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]]).double()

@@ -12,7 +12,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm, ArmChoice, LinkCapsule, panda
 from hrc_learn.sim import ArmModelConfig, World
 from hrc_learn.sim.arm_model import add_arm, whole_arm
-from hrc_learn.sim.drawn_world import DrawnWorld
+from hrc_learn.sim.recorded_world import DrawnWorld
 from hrc_learn.sim.workplace import Workplace
 
 ARMS = {
