@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.demos import Demonstration
 from hrc_learn.experiments.metric_table import column
 from hrc_learn.experiments.placing_figures import (
@@ -32,7 +33,6 @@ from hrc_learn.experiments.snapshots import Snapshots, snapshots_figure
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Box
 from hrc_learn.log import RunRecording
-from hrc_learn.skills.work_cell import SAFETY_COLUMNS
 from hrc_learn.viz.report import Picture, Section
 
 SUMMARY = (
@@ -74,7 +74,7 @@ def record_placing(
         plan_path=run.plan.tool_pose.position.numpy(),
         bodies=run.motion.bodies(),
         boxes=boxes,
-        safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
+        safety={name: safety[:, i] for i, name in enumerate(INTERVENTIONS)},
         phases=tuple(log.events),
     )
 

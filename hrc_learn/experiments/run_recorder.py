@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.demos import Demonstration
 from hrc_learn.experiments.run_measures import (
     Deviation,
@@ -23,10 +24,11 @@ from hrc_learn.geometry import Box
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import CameraRecording, JointRanges, LoggedSteps, RunRecording
+from hrc_learn.protocols import HINDRANCES
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.work_cell import HINDRANCE_COLUMNS, SAFETY_COLUMNS, WorkCell
+from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.vision import CameraModel
 
 # Joint, counted from 1, whose frame is at the elbow of an arm with seven joints: the person
@@ -103,12 +105,12 @@ def record(
         nullspace_input=log["nullspace_input"],
         push=push_arrows(cell.chain, log["joint_position"], log["nullspace_input"]),
         followed=log["followed"],
-        hindered={name: log["hindered"][:, i] for i, name in enumerate(HINDRANCE_COLUMNS)},
+        hindered={name: log["hindered"][:, i] for i, name in enumerate(HINDRANCES)},
         elbow_motion=deviation.elbow,
         position_deviation=deviation.position,
         rotation_deviation=deviation.rotation,
         **_worker_fields(motion, log),
-        safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
+        safety={name: safety[:, i] for i, name in enumerate(INTERVENTIONS)},
         phases=tuple(log.events),
         remarks=tuple(cell.remarks),
     )

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from hrc_learn.controller import INTERVENTIONS, Command, Distances, SafetyConfig
+from hrc_learn.controller import Command, Distances, SafetyConfig
 from hrc_learn.controller.arm_loop import ArmLoop
 from hrc_learn.controller.arm_loop_state import (
     ArmLoopConfig,
@@ -29,9 +29,16 @@ from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.log import Event, StepLog
-from hrc_learn.protocols import HINDRANCES, Arm, ArmState, Feedback, Gripper, Human, HumanInput
+from hrc_learn.protocols import Arm, ArmState, Feedback, Gripper, Human, HumanInput
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import StraightLine
+from hrc_learn.skills.cell_log import (
+    NO_VISION,
+    motion_columns,
+    report_columns,
+    separation_columns,
+    servo_columns,
+)
 from hrc_learn.skills.failures import BlockedPathError, StoppedByPersonError, TaskFailedError
 from hrc_learn.skills.marker_sensor import (
     DelayedDetection,
@@ -41,12 +48,6 @@ from hrc_learn.skills.marker_sensor import (
 )
 from hrc_learn.skills.person_feedback import PersonFeedback, contact_force
 from hrc_learn.skills.person_watch import NEAR_PEOPLE, PersonWatch, WatchedPeople
-
-HINDRANCE_COLUMNS = HINDRANCES
-"""Names of the components of the log's column "hindered"."""
-
-SAFETY_COLUMNS = INTERVENTIONS
-"""Names of the components of the log's column "safety"."""
 
 # Time for joints to return at the end of a path [s].
 _LONGEST_RETURN = 5.0
@@ -60,24 +61,7 @@ _AVERAGED, _GETTING_UNDER_WAY = 5, 25
 # Time after feeling for a contact in which one is still expected: the fingers open and the
 # gripper leaves. Time in which an arm that is stopped comes to rest [s].
 _LEAVING, _COMING_TO_REST = 1.0, 1.0
-_NAN = float("nan")
-_NO_POSITION = np.full(3, _NAN)
-_UNHINDERED = np.zeros(len(HINDRANCE_COLUMNS), dtype=bool)
 _STILL = torch.zeros(6, dtype=torch.float64)
-# Columns of steps without a camera in the loop.
-_NO_VISION = {
-    "feature": np.full(2, _NAN),
-    "target": np.full(2, _NAN),
-    "image_jacobian": np.full((2, 6), _NAN),
-    "weight_norm": _NAN,
-    "potential": _NAN,
-    "potential_rate": _NAN,
-    "vision_activation": _NAN,
-    "approach": _NAN,
-    "region": np.full(6, _NAN),
-    "drawn": False,
-    "turn": np.full(3, _NAN),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,7 +176,6 @@ class WorkCell:
         self._contact_expected = -math.inf
         state = arm.read()
         asked = human.read(state)
-        self._no_joints = np.full(len(chain.joint_names), _NAN)
         self.human_input = replace(asked, nullspace_input=np.zeros(len(chain.joint_names)))
         self._sensed = self._sense(state, self.human_input)
         self._state = self._loop.initial_state(self.joints, state.time)
@@ -310,19 +293,9 @@ class WorkCell:
             SendCommand(command),
             explained=approach == 0,
             region=region,
-            columns={
-                "feature": feature,
-                "target": target,
-                "image_jacobian": command.image_jacobian.numpy(),
-                "weight_norm": float(command.weight_norm),
-                "potential": float(command.potential),
-                "potential_rate": float(command.potential_rate),
-                "vision_activation": float(command.vision_level),
-                "approach": approach,
-                "region": torch.cat([region.centre, region.half_size]).numpy(),
-                "drawn": drawn,
-                "turn": np.zeros(3) if turn is None else turn,
-            },
+            columns=servo_columns(
+                command, target, feature, approach, region=region, drawn=drawn, turn=turn
+            ),
         )
 
     def track_pose(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
@@ -459,7 +432,7 @@ class WorkCell:
         *,
         explained: bool = True,
         region: PositionRegion | None = None,
-        columns: dict[str, Any] = _NO_VISION,
+        columns: dict[str, Any] = NO_VISION,
     ) -> None:
         """Send what the loop makes of a request, let one step pass, and read again.
 
@@ -588,45 +561,12 @@ class WorkCell:
         columns: dict[str, Any],
     ) -> None:
         """Append a row to the log."""
-        goal, joints = report.goal, report.path_joints
+        watched, n = self._sensed.watched, len(self.joints)
+        if watched is not None:
+            separation, scale = self.config.safety.separation, float(self.pace.people_scale)
+            columns = columns | separation_columns(watched, separation, velocity, scale)
         self.log.append(
-            time=self.time,
-            joint_position=self.state.joint_position,
-            joint_velocity=self.state.joint_velocity,
-            command_velocity=velocity.numpy(),
-            nullspace_input=self.human_input.effort(len(self._no_joints)),
-            gripper=self.state.gripper_width,
-            followed=told.followed if told.pushed else _NAN,
-            hindered=_hindered(told),
-            safety=report.safety.flags.numpy(),
-            goal_position=_NO_POSITION if goal is None else goal.position.numpy(),
-            path_joints=self._no_joints if joints is None else joints.numpy(),
-            **self._separation_columns(velocity),
+            **motion_columns(self.state, velocity, self.human_input.effort(n)),
+            **report_columns(report, told, n),
             **columns,
         )
-
-    def _separation_columns(self, velocity: Float[Tensor, " joints"]) -> dict[str, float]:
-        """Columns of the distance from people, and of the protective one at this speed."""
-        watched = self._sensed.watched
-        if watched is None:
-            return {}
-        near, separation = watched.distances, self.config.safety.separation
-        needed = separation.protective_distance(
-            -(near.gradient @ velocity), near.approach_speed
-        )
-        tightest = (near.distance - needed).argmin()
-        return {
-            "person_distance": watched.nearest,
-            "person_age": watched.age,
-            "protective_distance": float(needed[tightest]),
-            "separation_margin": float((near.distance - needed)[tightest]),
-            "pace": float(self.pace.people_scale),
-        }
-
-
-def _hindered(told: Feedback) -> Bool[np.ndarray, " hindrances"]:
-    """Hindrances of the person, in the order of `HINDRANCE_COLUMNS`."""
-    if not told.reasons:
-        return _UNHINDERED
-    reasons = {reason.hindrance for reason in told.reasons}
-    return np.array([hindrance in reasons for hindrance in HINDRANCE_COLUMNS])

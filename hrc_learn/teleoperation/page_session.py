@@ -18,7 +18,7 @@ from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.pick_and_place import INTERACT
-from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
+from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import CombinedInput, InputFilter, InputFilterConfig
 from hrc_learn.teleoperation.gate.messages import TrackedHand
@@ -357,7 +357,7 @@ class TaskPage:
         note = _INVITATION if phase == INTERACT else ""
         if cell.remarks and cell.time - cell.remarks[-1].time < _REMARK_STAYS:
             note = cell.remarks[-1].text
-        acted = log["safety"].sum(axis=0) if len(log) else [0] * len(SAFETY_COLUMNS)
+        acted = log["safety"].sum(axis=0) if len(log) else [0] * len(INTERVENTIONS)
         return PageStatus(
             title=self._title,
             doing=phase,
@@ -365,7 +365,7 @@ class TaskPage:
             note=note,
             region=_followed(cell),
             plan=_way(cell),
-            interventions=dict(zip(SAFETY_COLUMNS, map(int, acted), strict=True)),
+            interventions=dict(zip(INTERVENTIONS, map(int, acted), strict=True)),
             contacts=len(world.cabinet_contacts.touches) + len(world.table_contacts.touches),
         )
 

@@ -1,5 +1,7 @@
 """Planned paths of the joints, off which a person pushes an arm that does as it is told."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -64,9 +66,16 @@ def pushed_along(path, push, seconds, **options):
     return cell
 
 
+@cache
 def transfer():
     far = torch.tensor([-0.9, 0.3, 0.1, 0.3, -0.1, 0.3, -0.3], dtype=torch.float64)
     return joint_line(panda.ready, panda.ready + far, speed=0.4, dt=0.01).numpy()
+
+
+@cache
+def along_transfer(strength, begin):
+    """A transfer with a push until 2.5 s, shared by tests that only read it."""
+    return pushed_along(transfer(), strength * PUSH, (begin, 2.5))
 
 
 def hand_off(cell):
@@ -81,7 +90,7 @@ def hand_off(cell):
 
 def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_goes_on():
     path = transfer()
-    free, pushed = (pushed_along(path, push, (0.5, 2.5)) for push in (0 * PUSH, PUSH))
+    free, pushed = along_transfer(0.0, 0.5), along_transfer(1.0, 0.5)
     elbows = [
         panda.link_poses(torch.from_numpy(cell.log["joint_position"][: len(path)])).position
         for cell in (free, pushed)
@@ -202,7 +211,7 @@ def test_joints_stay_beside_the_path_if_wanted():
 def test_nobody_pushes_the_arm_into_what_is_around_it():
     """A wall where the elbow would be pushed to; the hand goes on all the same."""
     path = transfer()
-    free = pushed_along(path, PUSH, (0.5, 2.5))
+    free = along_transfer(1.0, 0.5)
     reached = panda.link_poses(torch.from_numpy(free.log["joint_position"])).position[:, 3]
     middle, start = reached[reached[:, 1].argmax()], reached[0]
 
@@ -270,7 +279,7 @@ def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():
 def test_the_path_waits_where_the_arm_aside_would_meet_something():
     """A wall across the way of the elbow that is pushed aside, but not of the planned one."""
     path = transfer()
-    free, pushed = (pushed_along(path, push, (0.2, 2.5)) for push in (0 * PUSH, PUSH))
+    free, pushed = along_transfer(0.0, 0.5), along_transfer(1.0, 0.2)
 
     def elbow(cell):
         return panda.link_poses(torch.from_numpy(cell.log["joint_position"])).position[:, 3]

@@ -291,3 +291,29 @@ def test_however_hard_and_long_a_person_pushes_the_task_keeps_its_place_and_room
 def self_motion(q):
     q = torch.as_tensor(q, dtype=torch.float64)
     return np.linalg.svd(panda.jacobian(q).numpy())[2][6]
+
+
+class SlowArm(ObedientArm):
+    """Follows a third of a command for a while, as at a limit."""
+
+    def advance(self, duration):
+        now = self.velocity
+        if 0.4 < self.time < 1.4:
+            self.velocity = now / 3
+        super().advance(duration)
+        self.velocity = now
+
+
+def test_a_straight_line_slows_down_for_an_arm_that_falls_behind():
+    cell = cell_with(SlowArm(HOVER.numpy()))
+    start = cell.pose.position
+    with shapes_unchecked():
+        cell.move_straight(lowered(0.15), speed=0.15)
+    hand = panda.forward(torch.from_numpy(cell.log["joint_position"])).position
+    goal = torch.from_numpy(cell.log["goal_position"])
+    planned = -(goal - start)[:, 2] / 0.15
+    # Without the rule the pose would be 46 mm ahead of the arm.
+    assert (hand - goal).norm(dim=-1).max() < 0.035
+    assert cell.time > 1.4 + 0.5
+    assert planned.diff().min() > -1e-9
+    torch.testing.assert_close(hand[-1], lowered(0.15).position, rtol=0, atol=2e-3)
