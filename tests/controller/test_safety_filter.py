@@ -8,7 +8,7 @@ from torch import Tensor
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import INTERVENTIONS, SafetyConfig, SafetyFilter, SafetyState
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import arm, panda
 
 LIMITS = panda.limits
 READY = panda.ready
@@ -360,3 +360,23 @@ def test_follows_its_dtype():
     q = READY.float()
     v, state, _ = safety.step(safety.initial_state(q), q, torch.ones(7), 0.01)
     assert v.dtype == state.position.dtype == torch.float32
+
+
+def test_an_arm_gives_its_limits_and_arrays_and_lists_are_accepted():
+    ur5e = arm("ur5e")
+    by_arm, by_limits = SafetyFilter(ur5e), SafetyFilter(ur5e.limits)
+    q, u = ur5e.ready, torch.full((6,), 0.3, dtype=torch.float64)
+    expected, _, _ = by_limits.step(by_limits.initial_state(q), q, u, 0.01)
+    for convert in (lambda x: x, lambda x: x.numpy(), lambda x: x.tolist()):
+        state = by_arm.initial_state(convert(q))
+        velocity, _, _ = by_arm.step(state, convert(q), convert(u), 0.01)
+        torch.testing.assert_close(velocity, expected)
+
+
+def test_a_wrong_number_of_joints_is_named():
+    safety = SafetyFilter(arm("ur5e"))
+    state = safety.initial_state(torch.zeros(6, dtype=torch.float64))
+    with pytest.raises(ValueError, match=r"joint_position needs 6 values.*\(7,\)"):
+        safety.initial_state(torch.zeros(7, dtype=torch.float64))
+    with pytest.raises(ValueError, match="joint_velocity_command needs 6 values"):
+        safety.step(state, torch.zeros(6, dtype=torch.float64), [0.0] * 7, 0.01)

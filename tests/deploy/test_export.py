@@ -23,7 +23,7 @@ from hrc_learn.deploy import EagerRunner, NoCompilerError, PackageRunner, export
 from hrc_learn.deploy import export as export_module
 from hrc_learn.deploy import package as package_module
 from hrc_learn.deploy.export import trace
-from hrc_learn.deploy.package import PackedStep, Vectors, load, tensors_of
+from hrc_learn.deploy.package import PackedStep, Vectors, load
 from hrc_learn.kinematics import panda
 
 ROOT = Path(__file__).parents[2]
@@ -125,11 +125,12 @@ class TestArrays:
             torch.testing.assert_close(before, after, equal_nan=True)
 
     def _state_after_writing(self, value: float) -> list[Tensor]:
+        fields = ("safety.position", "blending.feature", "pose_drift.joint_position")
         runner = EagerRunner(self.controller, self.observation)
         runner.step()
         for array in runner.observation.values():
             array[...] = value
-        return tensors_of(runner._state)
+        return [torch.from_numpy(runner.state(field).copy()) for field in fields]
 
     def test_start_forgets_and_takes_another_place(self):
         q = panda.ready + 0.1

@@ -123,15 +123,15 @@ def inside(position, region, tolerance=1e-3):
 
 def test_a_drawing_leads_the_end_effector_and_what_was_planned_does_so_again_afterwards():
     loop = Loop()
-    at_plan = loop.run(3.0)
+    at_plan = loop.run(2.0)
     assert np.abs(at_plan - CENTRE.numpy())[2] < 5e-3
     assert not inside(at_plan, ELSEWHERE)
-    led = loop.run(5.0, region=ELSEWHERE, target=TARGET)
+    led = loop.run(4.0, region=ELSEWHERE, target=TARGET)
     assert inside(led, ELSEWHERE)
     # The box of a target is approached from outside: within its walls, and a little beyond.
     np.testing.assert_allclose(led, TARGET, atol=CONFIG.target_half_size + 5e-4)
     assert loop.drawn.away
-    back = loop.run(6.0)
+    back = loop.run(4.0)
     assert np.abs(back - CENTRE.numpy())[2] < 5e-3
     # Without the camera the last centimetres to the wide planned box take long.
     assert (np.abs(back - CENTRE.numpy())[:2] < 0.16).all()
