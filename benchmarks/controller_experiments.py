@@ -20,7 +20,7 @@ from hostile_trials import (
     run_plant_trials,
     run_poison_trials,
 )
-from printed_estimator import PrintedEstimator
+from paper_law import PrintedEstimator
 from torch import Tensor
 
 from hrc_learn.experiments.metric_table import Metric

@@ -13,10 +13,11 @@ from typing import Any, Literal
 import torch
 from grasp_trials import MARKER
 from jaxtyping import Bool, Float, Int
+from limit_monitor import LimitMonitor
 from torch import Tensor
 from torch.utils import _pytree
 
-from hrc_learn.controller import AdaptiveController, Goals, LimitMonitor, Observation
+from hrc_learn.controller import AdaptiveController, Goals, Observation
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,

@@ -11,6 +11,8 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
+from limit_monitor import LimitMonitor
+from paper_law import paper_goals, paper_joint_region
 from torch import Tensor
 
 from hrc_learn.controller import (
@@ -21,10 +23,7 @@ from hrc_learn.controller import (
     ControllerConfig,
     ControllerState,
     Goals,
-    LimitMonitor,
     Observation,
-    paper_goals,
-    paper_joint_region,
 )
 from hrc_learn.controller.interface import HALF_SIZE
 from hrc_learn.geometry import Pose, quaternion

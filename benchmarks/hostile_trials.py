@@ -20,12 +20,12 @@ from disturbance_trials import (
     uniform,
 )
 from jaxtyping import Bool, Float, Int
+from limit_monitor import LimitMonitor
 from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import (
     Goals,
-    LimitMonitor,
     Observation,
     SafetyConfig,
     SafetyFilter,

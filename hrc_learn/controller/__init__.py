@@ -31,9 +31,6 @@ from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMA
 from hrc_learn.controller.interface import Command as Command
 from hrc_learn.controller.interface import Goals as Goals
 from hrc_learn.controller.interface import Observation as Observation
-from hrc_learn.controller.interface import paper_goals as paper_goals
-from hrc_learn.controller.interface import paper_joint_region as paper_joint_region
-from hrc_learn.controller.limit_barrier import LimitMonitor as LimitMonitor
 from hrc_learn.controller.safety_filter import INTERVENTIONS as INTERVENTIONS
 from hrc_learn.controller.safety_filter import ConstraintReport as ConstraintReport
 from hrc_learn.controller.safety_filter import SafetyConfig as SafetyConfig

@@ -14,12 +14,10 @@ from torch import Tensor
 
 from hrc_learn.controller.constraint_layer import Distances
 from hrc_learn.controller.safety_filter import SafetyReport
-from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import JointLimits, TaskSpace
+from hrc_learn.kinematics import TaskSpace
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import (
     AxisRegion,
-    JointRegion,
     OrientationRegion,
     PositionRegion,
     PostureRegion,
@@ -256,35 +254,3 @@ INITIAL_IMAGE_JACOBIAN = (
     (0.0, 2400.0, 170.0, -200.0, 0.0, 180.0),
 )
 """J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above the table, image right along -x."""
-
-
-def paper_joint_region(limits: JointLimits) -> JointRegion:
-    """The paper's joint-space region in its printed, symmetric form, with default gains."""
-    return JointRegion.from_limits(limits.lower, limits.upper, formulation="paper")
-
-
-def paper_goals(
-    centre: Float[Tensor, "*#batch 3"],
-    half_size: Float[Tensor, "*#batch 3"],
-    target: Float[Tensor, "*#batch 2"],
-    stiffness: tuple[float, float, float] = (4e-4, 4e-4, 4e-5),
-) -> Goals:
-    """The paper's regions with their printed gains and gradients.
-
-    Args:
-        centre: Centre of the box, chosen by the expert in the paper [m].
-        half_size: Half edges of the box, chosen by the expert in the paper [m].
-        target: Target in the image [px].
-        stiffness: k_c of the box; default: as printed.
-    """
-    goal = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
-    return Goals(
-        position=PositionRegion(centre=centre, half_size=half_size, stiffness=stiffness),
-        orientation=OrientationRegion(goal=goal, stiffness=1.0, formulation="paper"),
-        vision=VisionRegion(
-            target=target,
-            half_size=target.new_tensor(_PAPER_IMAGE),
-            formulation="paper",
-        ),
-        vision_enabled=torch.tensor(True, device=centre.device),
-    )

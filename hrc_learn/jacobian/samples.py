@@ -11,7 +11,7 @@ from operator import add
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
@@ -103,8 +103,6 @@ class MotionSamples:
     """Motion of the tool, rotation scaled to metres [m]."""
     dx: Float[Tensor, "pairs 2"]
     """Motion of the image feature [px]."""
-    frames: Int[Tensor, "pairs 2"]
-    """Indices of both frames."""
 
     @staticmethod
     def of(
@@ -130,7 +128,6 @@ class MotionSamples:
             after=after[near],
             dr=dr[near],
             dx=feature[keys].diff(dim=0)[near],
-            frames=torch.stack([keys[:-1], keys[1:]], dim=-1)[near],
         )
 
     @staticmethod
@@ -138,7 +135,7 @@ class MotionSamples:
         """No pairs."""
         none = torch.zeros(0, 6, dtype=torch.float64)
         pose = Pose(none[:, :3], none[:, :4])
-        return MotionSamples(pose, pose, none, none[:, :2], none[:, :2].long())
+        return MotionSamples(pose, pose, none, none[:, :2])
 
     @staticmethod
     def joined(motions: Sequence[MotionSamples]) -> MotionSamples:

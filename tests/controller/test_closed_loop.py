@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 import sampling
 import torch
+from paper_law import paper_goals, paper_joint_region
 from servoing import (
     CENTRE,
     DOUBLE,
@@ -29,8 +30,6 @@ from hrc_learn.controller import (
     ControllerConfig,
     ControllerState,
     Goals,
-    paper_goals,
-    paper_joint_region,
 )
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (

@@ -1,4 +1,5 @@
-"""V falls at the rate |s|^2 under the assumptions of docs/concepts/controller.md, and only then."""
+"""V falls at the rate |s|^2 under the assumptions of docs/concepts/controller.md, and only
+then."""
 
 import sampling
 import torch

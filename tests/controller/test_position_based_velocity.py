@@ -10,6 +10,7 @@ from hostile_streams import (
     StreamConfig,
     hostile_streams,
 )
+from limit_monitor import LimitMonitor
 from sampling import generator
 from step_equality import controller_and_observation
 from unchecked import shapes_unchecked
@@ -17,7 +18,6 @@ from unchecked import shapes_unchecked
 from hrc_learn.controller import (
     AdaptiveController,
     ConstraintConfig,
-    LimitMonitor,
     Observation,
     SafetyConfig,
     SafetyFilter,

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from paper_law import PrintedEstimator
 from pinhole import Pinhole, wander
-from printed_estimator import PrintedEstimator
 from sampling import generator
 from torch.testing import assert_close
 from unchecked import shapes_unchecked

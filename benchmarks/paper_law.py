@@ -1,10 +1,49 @@
-"""The paper's adaptation law with its initial weights exactly as printed."""
+"""The paper's law as printed: regions of Table I, and the adaptation with its initial
+weights.
+"""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.controller import GRIPPER_DOWN, Goals
+from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import Measurement, PaperEstimator, RBFImageJacobian
 from hrc_learn.jacobian.estimator import WeightState
+from hrc_learn.kinematics import JointLimits
+from hrc_learn.regions import JointRegion, OrientationRegion, PositionRegion, VisionRegion
+
+
+def paper_joint_region(limits: JointLimits) -> JointRegion:
+    """The paper's joint-space region in its printed, symmetric form, with default gains."""
+    return JointRegion.from_limits(limits.lower, limits.upper, formulation="paper")
+
+
+def paper_goals(
+    centre: Float[Tensor, "*#batch 3"],
+    half_size: Float[Tensor, "*#batch 3"],
+    target: Float[Tensor, "*#batch 2"],
+    stiffness: tuple[float, float, float] = (4e-4, 4e-4, 4e-5),
+) -> Goals:
+    """The paper's regions with their printed gains and gradients.
+
+    Args:
+        centre: Centre of the box, chosen by the expert in the paper [m].
+        half_size: Half edges of the box, chosen by the expert in the paper [m].
+        target: Target in the image [px].
+        stiffness: k_c of the box; default: as printed.
+    """
+    goal = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
+    return Goals(
+        position=PositionRegion(centre=centre, half_size=half_size, stiffness=stiffness),
+        orientation=OrientationRegion(goal=goal, stiffness=1.0, formulation="paper"),
+        vision=VisionRegion(
+            target=target,
+            half_size=target.new_tensor((1440.0, 1080.0)),
+            formulation="paper",
+        ),
+        vision_enabled=torch.tensor(True, device=centre.device),
+    )
 
 
 class PrintedEstimator(PaperEstimator):

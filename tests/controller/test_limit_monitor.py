@@ -1,6 +1,6 @@
 import torch
+from limit_monitor import LimitMonitor
 
-from hrc_learn.controller import LimitMonitor
 from hrc_learn.kinematics import panda
 
 LIMITS, DT = panda.limits, 0.001
