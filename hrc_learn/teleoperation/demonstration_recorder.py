@@ -19,8 +19,10 @@ RecorderState = Literal["ready", "recording", "stopped"]
 """Stopped: a demonstration waits to be saved or discarded."""
 
 _LATE, _MOST_LATE = 2.0, 0.2
-"""Periods after which a frame is late, and share of such frames from which a demonstration is
-doubted: one in five, so that a machine that is busy for a moment asks for nothing."""
+"""Delay in control periods after which a frame counts as late, and the fraction of late frames
+from which a demonstration is doubted. One in five, so that a briefly busy machine raises no
+warning.
+"""
 _SLOWEST = 0.8
 """Pace of a simulated arm from which a demonstration is doubted: it is a quarter faster in the
 dataset than it was shown, and reproductions that are faster still meet limits."""
@@ -33,7 +35,7 @@ UNNAMED = "not named"
 
 @dataclass(frozen=True, kw_only=True)
 class RecorderStatus:
-    """What a person wants to know of a recording."""
+    """Recording status shown to the person."""
 
     state: RecorderState = "ready"
     seconds: float = 0.0
@@ -41,7 +43,7 @@ class RecorderStatus:
     saved: int = 0
     """Demonstrations saved so far."""
     note: str = ""
-    """What became of the last request."""
+    """Outcome of the last request."""
 
 
 class DemonstrationRecorder:
@@ -63,13 +65,13 @@ class DemonstrationRecorder:
         clock: Callable[[], float] = time.monotonic,
         chain: SerialChain | None = None,
     ):
-        """Prepare.
+        """Prepare the recorder.
 
         Args:
-            writer: Of the dataset, used by nobody else.
-            task: What is demonstrated, in words; asked for when a demonstration is saved.
-            clock: Tells the time that passes for the person [s].
-            chain: Of the arm, whose limits are watched; None: they are not known.
+            writer: Dataset writer, not used elsewhere.
+            task: Description of the task, read when a demonstration is saved.
+            clock: Wall clock of the person [s].
+            chain: Kinematics of the arm, for checking joint limits; None skips this check.
         """
         self._writer, self._task, self._clock = writer, task, clock
         self._frames: list[Frame] = []
@@ -104,7 +106,7 @@ class DemonstrationRecorder:
 
     @property
     def status(self) -> RecorderStatus:
-        """As it is now."""
+        """Current recording status."""
         saved = sum(w.done() and w.exception() is None for w in self._writing)
         failed = next((w.exception() for w in self._writing[::-1] if w.done()), None)
         note = self._note if failed is None else f"not saved: {failed}"
@@ -113,7 +115,7 @@ class DemonstrationRecorder:
 
     @property
     def recording(self) -> bool:
-        """Whether frames are kept."""
+        """True while frames are recorded."""
         return self._state == "recording"
 
     def handle(self, request: Request) -> None:

@@ -47,7 +47,7 @@ class CombinedInput(Human):
         self._sources = sources
 
     def read(self, state: ArmState) -> HumanInput:
-        """What all sources ask for together."""
+        """Combined input of all sources."""
         inputs = [source.read(state) for source in self._sources]
         joints = len(state.joint_position)
         return HumanInput(
@@ -169,13 +169,14 @@ _FULL = 32767.0  # an axis at its end
 BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
     {_A: "start", _B: "stop", _X: "save", _Y: "discard", _BACK: "home", _START: "finish"}
 )
-"""What the buttons ask for: A starts, B stops, X saves, Y discards, "back" goes back to the
-start, "start" finishes."""
+"""Request sent by each button: A starts, B stops, X saves, Y discards, "back" returns home,
+"start" finishes.
+"""
 
 
 @runtime_checkable
 class Controller(Protocol):
-    """What we use of SDL's game controllers, as pygame has them."""
+    """Part of pygame's SDL game controller that is used here."""
 
     def get_axis(self, axis: int) -> int: ...
     def get_button(self, button: int) -> bool: ...
@@ -185,9 +186,9 @@ class Controller(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RumbleConfig:
-    """How a gamepad tells what the arm feels: slow shaking for what is met or near, a quick
-    one for a push that is not followed. Both in pulses, which a hand tells from motors that
-    run on.
+    """Rumble of a gamepad. The slow motor reports contact and nearby people, the quick one an
+    input that the arm does not follow. Both pulse, because pulses are easier to notice than
+    motors that run continuously.
     """
 
     every: float = 0.25
@@ -226,7 +227,7 @@ def rumble_strength(feedback: Feedback, config: RumbleConfig) -> tuple[float, fl
 
 @dataclass(frozen=True, kw_only=True)
 class GamepadConfig:
-    """How sticks act."""
+    """Response of the sticks."""
 
     dead_zone: float = 0.12
     """Fraction of its range in which a stick has no effect: worn sticks do not return to 0."""
@@ -237,7 +238,7 @@ class GamepadConfig:
     opening: float = 0.08
     """Width of the open gripper [m]."""
     rumble: RumbleConfig = field(default_factory=RumbleConfig)
-    """How it shakes."""
+    """Rumble settings."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.dead_zone < 1 and self.curve > 0):
@@ -387,11 +388,11 @@ DIRECTIONS = MappingProxyType(
 
 
 class KeyboardState:
-    """Which keys are held, and the direction they ask for.
+    """Keys held down, and the direction that they request.
 
-    Terminals and browsers tell presses and repeats, no releases: a press counts for a moment,
-    and a key that is held is pressed again before that is over (after a quarter to half a
-    second at first, then every 30 ms). So a keyboard that falls silent asks for no motion.
+    Terminals report presses and repeats but no releases. A press therefore counts for a short
+    time, and a held key repeats before that time is over (after a quarter to half a second at
+    first, then every 30 ms). A keyboard that falls silent requests no motion.
     """
 
     def __init__(self, holds_for: float = 0.3, clock: Callable[[], float] = time.monotonic):
@@ -428,7 +429,7 @@ class KeyboardState:
 KEYS: MappingProxyType[str, Request] = MappingProxyType(
     {"1": "start", "2": "stop", "3": "save", "4": "discard", "0": "home", "q": "finish"}
 )
-"""What keys ask for, beside those that lead (see `DIRECTIONS`)."""
+"""Request sent by each key; `DIRECTIONS` has the keys that move the end effector."""
 
 _GRIPPER = {"[": 0.08, "]": 0.0}
 

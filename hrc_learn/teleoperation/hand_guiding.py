@@ -1,10 +1,10 @@
-"""How a person acts on the arm: pulls at its body become null-space input d, a held end
-effector is led, and a hand-guided arm does what is asked.
+"""Hand guiding: pulls at the arm's body become null-space input d, a held end effector is
+guided, and a hand-guided arm follows the combined input.
 
-The paper's mixed interface: the displacement of a joint's gizmo is a velocity in proportion,
-mapped to the joints by the pseudo-inverse of that joint's Jacobian (section VII), which is
-"pinv" here; by default it is a force, mapped by the transpose. That of the end effector's gizmo
-guides the end effector.
+This is the mixed interface of the paper. There, the displacement of a joint's gizmo commands a
+proportional velocity, mapped to the joints by the pseudo-inverse of that joint's Jacobian
+(section VII), named "pinv" here. By default it is a force instead, mapped by the transpose. The
+gizmo of the end effector guides the end effector.
 """
 
 from dataclasses import dataclass, field
@@ -26,9 +26,10 @@ from hrc_learn.skills.person_feedback import PersonFeedback, filter_hindrance
 
 ForceMapping = Literal["transpose", "pinv"]
 DEFAULT_MAPPING: ForceMapping = "transpose"
-"""How a pull acts wherever nothing else is asked for: as a force. After the projection into the
-null space the paper's pseudo-inverse moves the elbow a quarter to a third as fast, and in 6 to
-23 % of all directions against the pull (benchmarks/bench_pull_mapping.py)."""
+"""Default mapping of a pull: a force. After projection into the null space, the paper's
+pseudo-inverse moves the elbow a quarter to a third as fast, and in 6 to 23 % of all directions
+against the pull (benchmarks/bench_pull_mapping.py).
+"""
 
 
 def force_to_nullspace_input(
@@ -71,11 +72,12 @@ def force_to_nullspace_input(
 
 @dataclass(frozen=True, kw_only=True)
 class InteractionForceConfig:
-    """How strongly the displacement of a gizmo acts, and what bounds it."""
+    """Gains of gizmo displacements, and bounds of their effect."""
 
     mapping: ForceMapping = DEFAULT_MAPPING
-    """How a joint's gizmo acts: "transpose" is a spring between joint and gizmo, and never
-    moves the joint against the pull; "pinv", the paper's, asks for a velocity."""
+    """Effect of a joint's gizmo: "transpose" is a spring between joint and gizmo, and never
+    moves the joint against the pull; "pinv", the paper's mapping, commands a velocity.
+    """
     rate: float = 2.0
     """Speed per displacement [1/s]."""
     speed: float = 0.25
@@ -231,7 +233,7 @@ def leading_twist(
 
 @dataclass(frozen=True, kw_only=True)
 class HandGuidingConfig:
-    """How the arm follows."""
+    """Gains and limits of a hand-guided arm."""
 
     dt: float = 0.01
     """Control step [s]."""
@@ -244,7 +246,7 @@ class HandGuidingConfig:
     return_speed: float = 0.3
     """Largest speed of a joint on its way to a posture [rad/s]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
-    """Of the safety filter, which is told what the arm's driver can do."""
+    """Settings of the safety filter, which knows the limits of the arm's driver."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -253,7 +255,7 @@ class HandGuidingConfig:
 
 
 _ARRIVED = 1e-3
-"""From a posture at which a joint is there [rad]: ten times the noise of an encoder."""
+"""Distance at which a joint has reached its target [rad]: ten times the noise of an encoder."""
 
 Frame = dict[str, np.ndarray | float | bool]
 """Columns of one recorded step, as `DatasetWriter.add_frame` takes them."""
@@ -266,12 +268,12 @@ class GuidedStep:
     state: ArmState
     human_input: HumanInput
     pose: Pose
-    """Of the end effector."""
+    """Pose of the end effector."""
     command: Float[np.ndarray, " joints"]
     """Joint velocity sent [rad/s]."""
 
     def frame(self) -> Frame:
-        """What is recorded of it."""
+        """Recorded quantities of the step."""
         return {
             "time": self.state.time,
             "joint_position": self.state.joint_position,
@@ -304,10 +306,10 @@ class HandGuidedArm:
         """Connect to the arm at rest.
 
         Args:
-            chain: Its kinematics.
-            arm: Its driver.
-            human: Who guides it.
-            config: How it follows.
+            chain: Kinematics of the arm.
+            arm: Driver of the arm.
+            human: Person that guides the arm.
+            config: Gains and limits.
         """
         self.config = config or HandGuidingConfig()
         self._chain, self._arm, self._human = chain, arm, human

@@ -28,7 +28,9 @@ from hrc_learn.teleoperation.hand_guiding import (
 
 @runtime_checkable
 class ForceDevice(Protocol):
-    """What we use of `forcedimension_core.dhd`, by its names; -1 says that something failed."""
+    """Part of `forcedimension_core.dhd` that is used here, under its names; -1 reports a
+    failure.
+    """
 
     def getPosition(self, out: Any, ID: int = -1) -> int: ...
     def getLinearVelocity(self, out: Any, ID: int = -1) -> int: ...
@@ -40,16 +42,16 @@ class ForceDevice(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class HapticDeviceConfig:
-    """How the device leads, and how it pushes back."""
+    """Scaling of motions and forces of the device."""
 
     scale: float = 2.5
     """Motion of the end effector for that of the hand: an Omega's workspace is 0.16 m wide."""
     stiffness: float = 120.0
-    """Of the spring that pulls the hand back to where the arm has followed it [N/m]."""
+    """Stiffness of the spring that pulls the device to where the arm has followed it [N/m]."""
     damping: float = 4.0
     """Against motion of the hand while the clutch is closed [N s/m]."""
     contact: float = 0.1
-    """Share of the contact force at the end effector that the hand feels."""
+    """Fraction of the contact force at the end effector that the device renders."""
     max_force: float = 6.0
     """Largest force on the hand [N]; an Omega can hold 12."""
     rate: float = 1000.0
@@ -71,31 +73,34 @@ class HapticDeviceConfig:
 
 
 class _Pull(NamedTuple):
-    """What the thread of forces is told, as one reference."""
+    """Input of the force thread, exchanged as one reference."""
 
     rest: Float[np.ndarray, "3"]
-    """Where the hand would be had it gone as far as the arm [m]."""
+    """Position of the device that corresponds to the present end-effector position [m]."""
     push: Float[np.ndarray, "3"]
     """Force of what the arm meets, as the hand feels it [N]."""
     until: float
-    """When it is stale [s]."""
+    """Time from which on this reference is stale [s]."""
 
 
 class HapticDevice(Human):
-    """Leads the end effector while its clutch is held, and is pulled to where the arm is.
+    """Guides the end effector while the clutch is held, and renders the tracking error as a
+    force.
 
-    The pointer is the end effector where the clutch closed, moved as the hand has moved since,
-    by `scale`; the end effector follows it as a gizmo. What the arm does not follow is felt:
+    When the clutch closes, the pointer is at the end effector. It then moves with the device,
+    scaled by `scale`, and the end effector follows it like a gizmo. The person feels what the
+    arm does not follow:
 
         f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force
 
-    with x_arm the place of the hand at which the pointer would be at the end effector. Axes of
-    the device are those of the base for a person who faces the arm: x to the person, z up.
+    with x_arm the device position at which the pointer would be at the end effector. The axes
+    of the device are those of the base for a person that faces the arm: x towards the person, z
+    up.
 
         with HapticDevice.open(panda) as device:
             HandGuidedArm(panda, arm, device)
 
-    A device that is unplugged asks for nothing.
+    An unplugged device requests nothing.
     """
 
     def __init__(

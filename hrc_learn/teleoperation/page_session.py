@@ -1,5 +1,5 @@
-"""A page beside the simulated arm: a person records demonstrations from it, or watches a
-job and pulls the arm's body.
+"""Sessions at the page with a simulated arm: recording demonstrations, or watching a job and
+pulling the arm's body.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -54,9 +54,10 @@ FEATURES = {
     "observation.left_hand": _HAND,
     "observation.right_hand": _HAND,
 }
-"""Recorded beside the usual columns: end-effector motion that the person asked for, the active
-region (zeros where there is none), and the pose of each hand in the base frame (zeros while no
-headset sees it)."""
+"""Additional recorded columns: end-effector motion requested by the person, the active region
+(zeros if there is none), and the pose of each hand in the base frame (zeros while no headset
+sees it).
+"""
 
 
 def place_targets(workplace: Workplace) -> list[Box]:
@@ -80,11 +81,11 @@ def place_targets(workplace: Workplace) -> list[Box]:
 
 
 def place_target_hint(workplace: Workplace, position: Float[np.ndarray, "3"]) -> str:
-    """How far the end effector is from the place target of the nearest shelf, in words.
+    """Distance from the end effector to the place target of the nearest shelf, as text.
 
     Args:
-        workplace: With the shelves.
-        position: Of the tool centre point [m].
+        workplace: Workplace with the shelves.
+        position: Position of the tool centre point [m].
     """
     names = workplace.shelf_names()
     offsets = {name: workplace.shelf(name).position.numpy() - position for name in names}
@@ -101,16 +102,16 @@ def place_target_hint(workplace: Workplace, position: Float[np.ndarray, "3"]) ->
 
 
 def counted(demonstrations: int) -> str:
-    """How many there are, in words."""
+    """Number and noun, in singular or plural."""
     return f"{demonstrations} demonstration{'s' * (demonstrations != 1)}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PageSessionConfig:
-    """How a session runs."""
+    """Settings of a recording session."""
 
     guiding: HandGuidingConfig = field(default_factory=HandGuidingConfig)
-    """How the arm follows."""
+    """Gains and limits of the guided arm."""
     input_filter: InputFilterConfig = field(default_factory=InputFilterConfig)
     """Bounds on the acceleration of the end effector."""
     record_every: int = 2
@@ -148,17 +149,17 @@ class PageSession:
         beside: tuple[Human, ...] = (),
         config: PageSessionConfig | None = None,
     ):
-        """Start where the arm is.
+        """Start at the present posture of the arm.
 
         Args:
-            workplace: Where.
-            page: Shows what happens, and hands on what the person asks for.
-            recorder: Of demonstrations.
-            world: Of the workplace, that the arm moves in.
-            opened: The arm; None: the simulated one without a driver, with an object in its
-                gripper at home.
-            beside: Other sources of the person's input, such as a gamepad.
-            config: How the session runs.
+            workplace: Workplace of the session.
+            page: Page that shows the session and reads the person's input.
+            recorder: Recorder of demonstrations.
+            world: World of the workplace, in which the arm moves.
+            opened: Driver of the arm; None: the simulated arm, with an object in its gripper,
+                at home.
+            inputs: Further sources of the person's input, such as a gamepad.
+            config: Settings of the session.
         """
         self.world, self.finished = world, False
         self._workplace, self._page, self._recorder = workplace, page, recorder
@@ -218,7 +219,7 @@ class PageSession:
             self._recorder.handle(request)
 
     def _met(self, step: GuidedStep) -> tuple[str, ...]:
-        """What the arm has met since the last frame that it should not, in words."""
+        """Unwanted contacts of the arm since the last frame, as text."""
         last, self._looked = self._looked, self.world.time
         if not self._recorder.recording:
             return ()
@@ -299,10 +300,10 @@ def hand_columns(hands: Mapping[str, TrackedHand]) -> Frame:
 
 
 class TaskPage:
-    """A page beside a task that runs by itself: people watch it, and pull the arm.
+    """Page next to a task that runs autonomously: people watch it and pull the arm.
 
     Attributes:
-        human: The person at the page.
+        human: Combined input of the people at the page.
     """
 
     human: PageHuman
@@ -329,11 +330,11 @@ class TaskPage:
     def joined(
         self, person: Human, advance: Callable[[float], None]
     ) -> tuple[Human, Callable[[float], None]]:
-        """A person with those at the page, and time that passes for both.
+        """Combine a person with those at the page, and let time pass for both.
 
         Args:
-            person: Beside the arm.
-            advance: Lets a given time pass in the world [s].
+            person: Person near the arm.
+            advance: Advances the world by a time [s].
         """
 
         def advance_and_show(duration: float) -> None:
@@ -351,7 +352,7 @@ class TaskPage:
         self._rate.wait()
 
     def status(self, cell: WorkCell) -> PageStatus:
-        """What the page says of a task that runs on a work cell."""
+        """Page status of a task that runs on a work cell."""
         world, log = self._world, cell.log
         phase = log.events[-1].text if log.events else "getting ready"
         note = _INVITATION if phase == INTERACT else ""
@@ -397,11 +398,11 @@ def task_page(
     """Serve a page on a world that a task moves.
 
     Args:
-        world: That is shown.
-        dt: Control step of the task [s].
-        config: Of the page.
-        on_open: Told the address of the page.
-        title: What is done, in words.
+        world: World to show.
+        dt: Control period of the task [s].
+        config: Settings of the page.
+        on_open: Callback that receives the address of the page.
+        title: Title of the task.
     """
     bodies = MovingBodies(world)
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))

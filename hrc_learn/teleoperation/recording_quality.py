@@ -1,7 +1,7 @@
-"""Whether a demonstration is worth keeping, judged while it is recorded.
+"""Quality checks of a demonstration while it is recorded.
 
-The page asks the person before it saves what is doubtful. lerobot-record asks its robots
-nothing, so they can only warn, at the end of an episode.
+The page asks the person to confirm before it saves a doubtful demonstration. lerobot-record
+cannot ask, so its robots only warn at the end of an episode.
 """
 
 from collections import Counter
@@ -23,8 +23,9 @@ _REST = (0.3, 0.7)
 _SHORTEST = 0.5
 """Shortest demonstration [s]: a mouse click on a link moves the arm for less."""
 _MOST_LOST, _LONGEST_GAP = 0.05, 0.2
-"""Share of lost frames, and time without one [s], from which a demonstration is doubted: at
-0.5 m/s the hand goes on for 10 cm meanwhile."""
+"""Fraction of lost frames, and longest gap [s], from which a demonstration is doubted. At 0.5
+m/s the end effector moves 10 cm during such a gap.
+"""
 _AT_LIMIT = 0.03
 """Distance from a joint's limit that counts as being there [rad]: the safety filter stops the
 joint 0.02 before it."""
@@ -49,11 +50,11 @@ class LateTicks:
     lost: int = 0
     """Frames that there should have been meanwhile."""
     latest: float = 0.0
-    """By how much at most [s]."""
+    """Largest delay [s]."""
     first: float | None = None
-    """When the first frame came [s]."""
+    """Time of the first frame [s]."""
     last: float | None = None
-    """When the last frame came [s]."""
+    """Time of the last frame [s]."""
 
     def gap(self, now: float) -> float:
         """Time since the last frame [s]; 0 before the first."""
@@ -71,11 +72,11 @@ class LateTicks:
 
 
 class RecordingQuality:
-    """What is to be said of the frames since the beginning.
+    """Statistics of the frames since the start of the demonstration.
 
     Attributes:
-        ticks: When they came.
-        states: Joints [rad] and gripper [m] of each.
+        ticks: Time of each frame.
+        states: Joint positions [rad] and gripper width [m] of each frame.
     """
 
     def __init__(self, fps: float, chain: SerialChain | None = None, late: float = 2.0):
@@ -152,7 +153,7 @@ class RecordingQuality:
         return ""
 
     def lost(self) -> str:
-        """Whether the stamps show that frames are missing, in words; empty if not."""
+        """Description of missing frames found from the stamps; empty if there are none."""
         gaps = np.diff(self._stamps)
         if not len(gaps):
             return ""
@@ -183,7 +184,7 @@ _NAMED = 3
 
 
 def pressed(chain: SerialChain, state: ArmState) -> tuple[str, ...]:
-    """What an arm feels that it should not, by its own estimate of external torques."""
+    """Unexpected contact, detected from external torques."""
     if state.external_torque is None:
         return ()
     jacobian = chain.jacobian(torch.from_numpy(state.joint_position))

@@ -34,32 +34,32 @@ from hrc_learn.vision import CameraModel, ImageNoise, SyntheticCamera
 
 
 class Scenario(ABC):
-    """A job, the same for the person who shows it and the policy that has learned it."""
+    """Task shared by the demonstrator and the learned policy."""
 
     workplace: Workplace
 
     @property
     @abstractmethod
     def task(self) -> str:
-        """What is to be done, in words."""
+        """Description of the task."""
 
     @property
     @abstractmethod
     def duration(self) -> float:
-        """Of a demonstration [s]."""
+        """Duration of a demonstration [s]."""
 
     @abstractmethod
     def begin(self, world: World, rng: np.random.Generator) -> Human:
-        """Put everything in place, and return who can show the job from there.
+        """Set up the scene, and return a demonstrator for it.
 
         Args:
-            world: Of the workplace; its clock begins at zero.
-            rng: Source of where objects are, and of the person's unsteadiness.
+            world: World of the workplace; its clock starts at zero.
+            rng: Random source of the objects' poses and of the person's tremor.
         """
 
     @abstractmethod
     def succeeded(self, world: World) -> bool:
-        """Whether the job is done."""
+        """True if the task is done."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,15 +103,15 @@ class Grasping(Scenario):
 
     workplace: Workplace = field(default_factory=Workplace)
     reach: tuple[float, float, float] = (0.10, 0.08, 0.0)
-    """How far from the middle of the table it lies [m]."""
+    """Largest distance of the object from the middle of the table [m]."""
     approach: float = 4.0
-    """From above the middle of the table down to the object [s]."""
+    """Duration of the approach, from above the middle of the table down to the object [s]."""
     grip: float = 0.7
     """Time for the fingers to close [s]."""
     lift: float = 2.0
     """Time to lift it [s]."""
     height: float = 0.15
-    """How far it is lifted [m]."""
+    """Height to which the object is lifted [m]."""
     settle: float = 0.5
     """Rest at the end [s]."""
     tremor: float = 2e-4
@@ -159,18 +159,18 @@ class Grasping(Scenario):
 
 
 class SequencedInput(Human):
-    """People who lead the arm one after the other, each with the gripper's opening."""
+    """Demonstrators that guide the arm in turn, each with a gripper width."""
 
     def __init__(self, turns: list[tuple[float, Human, float]]):
-        """Fix the turns.
+        """Store the turns.
 
         Args:
-            turns: When each begins [s], who leads, and how far the gripper opens [m].
+            turns: Start time [s], demonstrator and gripper width [m] of each turn.
         """
         self._turns, self._leads = turns, turns[0][1]
 
     def read(self, state: ArmState) -> HumanInput:
-        """What the one asks for whose turn it is."""
+        """Input of the demonstrator whose turn it is."""
         begun = [turn for turn in self._turns if turn[0] <= state.time]
         _, self._leads, width = begun[-1] if begun else self._turns[0]
         return replace(self._leads.read(state), gripper=width)
@@ -181,19 +181,19 @@ class SequencedInput(Human):
 
 
 class ScenarioRun:
-    """A world in which a scenario is done over and over, each time from a seed.
+    """Simulated world that repeats a scenario, each time from a seed.
 
-    Time passes by commands only, so that the same seed and commands lead to the same end.
+    Time advances with commands only, so the same seed and commands give the same result.
 
     Attributes:
-        scenario: What is to be done.
-        world: Where.
-        dt: Time that passes with each command [s].
-        expert: Who can show it from where it began.
-        servo: Leads the arm by positions.
-        camera: The fixed camera where it is now.
-        seed: Of the present initial configuration.
-        commands: Given since then.
+        scenario: Task to perform.
+        world: Simulated world.
+        dt: Control period [s].
+        expert: Demonstrator for the present initial configuration.
+        servo: Position servo of the arm.
+        camera: Fixed camera at its present pose.
+        seed: Seed of the present initial configuration.
+        commands: Number of commands since then.
     """
 
     expert: Human
@@ -233,7 +233,7 @@ class ScenarioRun:
         _reseed(self._tool_noise, [seed, 3])
 
     def _build(self, rng: np.random.Generator) -> None:
-        """The world with imperfections as they are drawn, and who leads the arm in it."""
+        """World with drawn imperfections, and the servo of its arm."""
         self.world = World(
             self.scenario.workplace.scene,
             self._sizes.draw(rng, self.scenario.workplace.robot.joints),
@@ -262,12 +262,12 @@ class ScenarioRun:
         return sent
 
     def object_pixel(self) -> Float[np.ndarray, "2"]:
-        """Where the fixed camera saw the object's marker (u, v) [px].
+        """Pixel (u, v) of the object's marker in the fixed camera.
 
-        It looked before the arm came between both, as a person would let it.
+        It is detected before the arm can hide the marker.
 
         Raises:
-            ValueError: The object was not in its view.
+            ValueError: The object was not in view.
         """
         marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
@@ -283,7 +283,7 @@ class ScenarioRun:
 
     @cached_property
     def _sensor(self) -> MarkerSensor:
-        """Of the fixed camera, before which nothing but the object is ever seen."""
+        """Marker detector of the fixed camera, which sees the object only."""
         scene = self.scenario.workplace.scene
         marker = scene.objects[0].marker
 
@@ -294,7 +294,7 @@ class ScenarioRun:
         return MarkerSensor(camera, scene.marker_ids)
 
     def tool_pixel(self) -> Float[np.ndarray, "2"] | None:
-        """Where the fixed camera sees the marker on the tool now (u, v) [px]; None: nowhere."""
+        """Pixel (u, v) of the tool's marker in the fixed camera; None: not in view."""
         return self._tool_sensor.detect().get(self.scenario.workplace.tool_marker)
 
     @cached_property
@@ -328,7 +328,7 @@ class ScenarioRun:
         self._pixel = None
 
     def _watched(self) -> Float[np.ndarray, "points 3"]:
-        """Where objects lie on the table, and the tool's marker at and above them [m]."""
+        """Positions of objects on the table, and of the tool's marker at and above them [m]."""
         place = self.scenario.workplace
         middle, half = (x.numpy() for x in place.object_region())
         corners = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]) * half
@@ -338,7 +338,7 @@ class ScenarioRun:
         return np.concatenate([centre + corners for centre in (middle, *above)])
 
     def succeeded(self) -> bool:
-        """Whether the job is done, by MuJoCo's contacts."""
+        """True if the task is done according to MuJoCo's contacts."""
         return self.scenario.succeeded(self.world)
 
 

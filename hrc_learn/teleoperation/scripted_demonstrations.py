@@ -34,7 +34,7 @@ from hrc_learn.vision import angle, centre
 
 @dataclass(frozen=True, kw_only=True)
 class DemonstrationConfig:
-    """How an arm is guided and recorded."""
+    """Settings of hand guiding and recording."""
 
     tremor: float = 4e-4
     """Amplitude of the tremor of the person's hand [m]."""
@@ -145,10 +145,10 @@ def write_demonstrations(
 
 @dataclass(frozen=True, kw_only=True)
 class ServoDemonstrationConfig(DemonstrationConfig):
-    """How the expert demonstrates visual servoing."""
+    """Scripted demonstration of visual servoing."""
 
     duration: float = 9.0
-    """From the first point to above the object [s]."""
+    """Duration from the first point to above the object [s]."""
     points: int = 4
     """Random points passed before the object."""
     descent: float = 0.06
@@ -170,10 +170,10 @@ def servo_expert(
     rng: np.random.Generator,
     turned: float = 0.0,
 ) -> ScriptedExpert:
-    """The expert who moves about over the table and ends at a given point, gripper down.
+    """Expert that moves over the table and ends at a given point, gripper down.
 
-    From the motion the image Jacobian is learned; from the ends, where in the image the marker
-    has to be, and in which orientation the object is approached.
+    The motions train the image Jacobian. The end points define the goal pixel of the marker and
+    the orientation of the approach.
     """
     middle = workplace.hover().position.numpy()
     spread = rng.uniform(-1, 1, (config.points, 3)) * config.reach
@@ -287,16 +287,17 @@ ELBOW_FORCES = (
 
 @dataclass(frozen=True, kw_only=True)
 class PlacingDemonstrationConfig(DemonstrationConfig):
-    """How the expert demonstrates placing."""
+    """Scripted demonstration of placing."""
 
     duration: float = 14.0
-    """From home to the shelf [s]."""
+    """Duration from home to the shelf [s]."""
     spread: float = 0.015
     """Standard deviation of the initial positions around home [m]."""
     pull_elbow: bool = True
-    """Whether the expert pulls the elbow past the cabinet's open door."""
+    """True if the expert pulls the elbow past the cabinet's open door."""
     lift: float = 0.03
-    """How far above its last height the end effector crosses the board's front edge [m]."""
+    """Height above the final one at which the end effector crosses the board's front edge [m].
+    """
 
 
 def placing_expert(
@@ -305,13 +306,13 @@ def placing_expert(
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
 ) -> ScriptedExpert:
-    """The expert who puts an object on a shelf.
+    """Expert that puts an object on a shelf.
 
     Args:
-        workplace: Where.
-        shelf: Which.
-        config: How.
-        rng: Source of the tremor and of the initial position.
+        workplace: Workplace with the shelves.
+        shelf: Index of the shelf.
+        config: Timing and heights.
+        rng: Random source of the tremor and of the initial position.
     """
     goal, front = workplace.shelf(shelf).position, workplace.shelf_front(shelf).position
     # The gripper is not quite level yet at the edge: what it carries hangs a little lower.

@@ -1,5 +1,5 @@
-"""Scripted people: one who pulls at the arm at given times, one who draws, and the expert, who
-also guides the end effector along way points.
+"""Scripted people: one pulls the arm at given times, one draws regions, and the expert also
+guides the end effector along way points.
 """
 
 import math
@@ -30,13 +30,13 @@ class ScriptedForce:
     duration: float
     """[s]"""
     towards: tuple[float, float, float]
-    """Where the person's hand is, in the base frame [m]."""
+    """Position of the person's hand, in the base frame [m]."""
     stiffness: float = 100.0
     """Force per distance between the joint and the person's hand [N/m]."""
     max_force: float = 25.0
     """Largest force [N]."""
     joint: int = 4
-    """Which joint is pulled, counted from 1."""
+    """Index of the pulled joint, counted from 1."""
     ramp: float = 0.4
     """Time to full strength, and back to none [s]."""
 
@@ -65,7 +65,7 @@ half that."""
 _FAR_AWAY = 10.0
 """Distance of the point towards which a pull goes [m]: its direction stays."""
 _SLOPE = math.radians(30.0)
-"""Of a pull against the horizontal, at most [rad]: who makes room draws an elbow aside."""
+"""Largest angle of a pull against the horizontal [rad]: people pull an elbow aside."""
 _FORCE = 60.0
 """Largest force [N], as where the person is waited for."""
 
@@ -97,7 +97,7 @@ def random_pulls(
 
 
 class ScriptedPerturbation(Human):
-    """A person who pulls at the arm at given times, and does nothing else."""
+    """Person that only pulls the arm, at given times."""
 
     def __init__(
         self,
@@ -267,10 +267,10 @@ class ScriptedExpert(Human):
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnInterval:
-    """What is drawn during an interval.
+    """Region drawn during an interval.
 
     Raises:
-        ValueError: If it has no duration.
+        ValueError: The interval has no duration.
     """
 
     start: float
@@ -291,7 +291,7 @@ class DrawnInterval:
 
 
 class ScriptedDrawing(Human):
-    """Draws by a script, and does nothing else; also beside others."""
+    """Person that only draws, by a script; can be combined with others."""
 
     def __init__(self, script: Sequence[DrawnInterval], joints: int = 7):
         """Prepare.
@@ -304,7 +304,7 @@ class ScriptedDrawing(Human):
         self._script, self._still = tuple(script), np.zeros(joints)
 
     def read(self, state: ArmState) -> HumanInput:
-        """What is drawn at the state's time."""
+        """Region drawn at the state's time."""
         now = [i for i in self._script if i.start <= state.time < i.start + i.duration]
         return HumanInput(
             nullspace_input=self._still,

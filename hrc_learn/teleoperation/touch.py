@@ -1,11 +1,11 @@
-"""Touch: the person's hand on the arm itself, felt in the external torques of its joints.
+"""Touch of the arm itself, estimated from the external torques of its joints.
 
-Who pushes the elbow moves the body in the null space, who pushes the hand pauses the task, and
-what meets the arm suddenly stops it. It takes no device but an arm that tells its torques.
+A push at the elbow moves the body in the null space, a push at the end effector pauses the
+task, and a sudden contact stops it. The arm needs no device other than torque estimates.
 
-A wrench W at the end effector puts the torques J^T W on the joints, and these have no part in
-the null space: what the torques have there comes from further up. So the null-space part of
-what a person does is theirs alone, whatever the gripper holds, lifts or puts down.
+A wrench W at the end effector causes joint torques J^T W without a null-space component.
+Torques in the null space therefore come from further up the arm: from the person, regardless of
+what the gripper holds, lifts or puts down.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 
 Place = Literal["nothing", "elbow", "hand"]
-"""Where an arm is touched; the elbow stands for all links above the wrist."""
+"""Place of a touch; the elbow stands for all links above the wrist."""
 
 # Joint whose origin is the elbow, counted from 1: joints after it feel nothing of it.
 _ELBOW = 4
@@ -34,10 +34,10 @@ _SLIDES = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class TouchConfig:
-    """What counts as a touch, and what is done about it.
+    """Thresholds of a touch, and its effects.
 
-    Sizes are for the nominal imperfections of the simulated arm (docs/experiments.md), with
-    which `tests/teleoperation/test_touch.py` tries them.
+    Values are for the nominal imperfections of the simulated arm
+    (docs/concepts/experiments.md); `tests/teleoperation/test_touch.py` checks them.
     """
 
     elbow_force: float = 7.0
@@ -47,14 +47,15 @@ class TouchConfig:
     """Null-space input per torque that is felt there. With a damping of 3 N m s/rad, 20 N at an
     elbow that moves by 0.1 m a radian make 0.13 m/s."""
     evidence: float = 16.0
-    """By how much the logarithm of the evidence for a touch exceeds that for none. In jobs that
-    nobody disturbed it came to 15, by friction; of 20 N it is 25 to 600."""
+    """Log evidence for a touch over that for none, as a threshold. Friction reached 15 in
+    undisturbed jobs; 20 N give 25 to 600.
+    """
     hand_force: float = 10.0
     """Force at the hand from which on the task pauses [N]; half of it lets it go on."""
     released: float = 0.4
-    """For which the hand must be let go until the task goes on [s]."""
+    """Time without a push at the end effector until the task resumes [s]."""
     resumes: Literal["release", "push"] = "release"
-    """Whether the task goes on when the hand is let go, or when it is pushed again."""
+    """Event that resumes the task: release of the end effector, or a second push."""
     collision_rise: float = 30.0
     """Change of the force within `collision_time` that no hand makes [N]."""
     collision_time: float = 0.04
@@ -67,9 +68,9 @@ class TouchConfig:
     smoothing: float = 0.03
     """Time constant of the torques in which a touch is looked for [s]."""
     longest_touch: float = 20.0
-    """For which somebody may touch the arm until they are taken for a load [s]."""
+    """Duration after which a touch is taken for a load [s]."""
     gripper_settles: float = 0.5
-    """For which the hand may meet its object after the fingers have moved [s]."""
+    """Duration after a finger motion in which contact with the object is expected [s]."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -78,11 +79,11 @@ class TouchConfig:
 
 
 class TorqueBias:
-    """What an arm that nobody touches tells as external torques, learned while it works.
+    """Bias of the external torques of an untouched arm, estimated online.
 
-    tau = -J_z^T w + o - F tanh(dq / v): a load's weight w at the hand, an offset o of each
-    joint (its model of gravity) and dry friction F that turns with the direction of motion. A
-    Kalman filter follows them; each is a random walk.
+    tau = -J_z^T w + o - F tanh(dq / v), with the weight w of a load at the end effector, an
+    offset o of each joint (errors of its gravity model) and dry friction F, which changes sign
+    with the direction of motion. A Kalman filter estimates them; each is a random walk.
     """
 
     # Standard deviations at first, of w [N], o and F [N m]: of a load of 0.5 kg, and of
@@ -114,11 +115,11 @@ class TorqueBias:
     def expected(
         self, jacobian: Float[np.ndarray, "6 joints"], velocity: Float[np.ndarray, " joints"]
     ) -> tuple[Float[np.ndarray, " joints"], Float[np.ndarray, "joints joints"]]:
-        """Torques of an arm that nobody touches [N m], and their covariance [N^2 m^2].
+        """Expected torques of an untouched arm [N m], and their covariance [N^2 m^2].
 
         Args:
-            jacobian: Of the end effector.
-            velocity: Of the joints [rad/s].
+            jacobian: Jacobian of the end effector.
+            velocity: Joint velocities [rad/s].
         """
         H = self._rows(jacobian, velocity)
         return H @ self.state, H @ self._covariance @ H.T + np.diag(self._unknown(velocity))
@@ -135,13 +136,13 @@ class TorqueBias:
         torque: Float[np.ndarray, " joints"],
         dt: float,
     ) -> None:
-        """Take in a reading.
+        """Update the bias with a reading.
 
         Args:
-            jacobian: Of the end effector.
-            velocity: Of the joints [rad/s].
-            torque: External torques of an arm that nobody touches [N m].
-            dt: Since the last reading [s].
+            jacobian: Jacobian of the end effector.
+            velocity: Joint velocities [rad/s].
+            torque: External torques of the untouched arm [N m].
+            dt: Time since the last reading [s].
         """
         H = self._rows(jacobian, velocity)
         self._covariance += np.diag(self._drift**2 * dt)
@@ -163,7 +164,7 @@ class TorqueBias:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Explanation:
-    """How well a force at one place explains torques."""
+    """Force at one place that best explains the torques, and its evidence."""
 
     force: Float[np.ndarray, "3"]
     """Most likely one, in the base frame [N]."""
@@ -172,7 +173,7 @@ class Explanation:
 
     @property
     def size(self) -> float:
-        """Of the force [N]."""
+        """Magnitude of the force [N]."""
         return float(np.linalg.norm(self.force))
 
     def __lt__(self, other: Explanation) -> bool:
@@ -185,13 +186,13 @@ def explain(
     spread: Float[np.ndarray, " loads"],
     unknown: Float[np.ndarray, "joints joints"],
 ) -> Explanation:
-    """Explain torques by loads at a place, which are as likely as their size says.
+    """Explain torques by loads at a place, with a Gaussian prior on the loads.
 
     Args:
         torque: External torques without their bias [N m].
         rows: Transposed Jacobian of the place: its first three loads are a force.
-        spread: Standard deviation of each load before anything is felt [N, N m].
-        unknown: Covariance of the torques of an arm that nobody touches [N^2 m^2].
+        spread: Prior standard deviation of each load [N, N m].
+        unknown: Covariance of the torques of an untouched arm [N^2 m^2].
     """
     loaded = rows * spread
     covariance = loaded @ loaded.T + unknown
@@ -204,7 +205,7 @@ def explain(
 def evidence_of_none(
     torque: Float[np.ndarray, " joints"], unknown: Float[np.ndarray, "joints joints"]
 ) -> float:
-    """Logarithm of the probability density of torques [N m] of an arm that nobody touches."""
+    """Log probability density of the torques [N m] of an untouched arm."""
     _, size = np.linalg.slogdet(unknown)
     return -0.5 * float(torque @ np.linalg.solve(unknown, torque) + size)
 
@@ -230,12 +231,12 @@ _FINGERS_MOVE = 1e-4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Posture:
-    """What the torques of a posture say."""
+    """Jacobians and null space at a posture, for explaining torques."""
 
     jacobian: Float[np.ndarray, "6 joints"]
-    """Of the end effector."""
+    """Jacobian of the end effector."""
     elbow: Float[np.ndarray, "3 joints"]
-    """Of the elbow's position: later joints do not move it."""
+    """Jacobian of the elbow's position; its columns of later joints are zero."""
     null: Float[np.ndarray, "joints redundant"]
     """Orthonormal basis of the null space."""
 
@@ -243,7 +244,7 @@ class _Posture:
     def of(
         cls, origins: Float[np.ndarray, "joints 3"], jacobian: Float[np.ndarray, "6 joints"]
     ) -> _Posture:
-        """From the joints' origins [m] and the Jacobian of the end effector."""
+        """Build from the joints' origins [m] and the Jacobian of the end effector."""
         elbow, axes = np.zeros_like(jacobian[:3]), jacobian[3:, :_ELBOW].T
         elbow[:, :_ELBOW] = np.cross(axes, origins[_ELBOW - 1] - origins[:_ELBOW]).T
         _, _, basis = np.linalg.svd(jacobian)
@@ -263,19 +264,19 @@ class _Posture:
 
 
 class Touch(Human):
-    """A person who pushes the arm itself.
+    """Person that pushes the arm itself.
 
     Attributes:
-        place: Where the arm is touched now.
-        force: With which, as far as is known, in the base frame [N].
+        place: Place that is touched now.
+        force: Estimated force, in the base frame [N].
     """
 
     def __init__(self, chain: SerialChain, config: TouchConfig | None = None):
-        """Begin with an arm that nobody touches.
+        """Start with an untouched arm.
 
         Args:
-            chain: The arm.
-            config: What counts as a touch.
+            chain: Kinematics of the arm.
+            config: Thresholds of a touch.
         """
         self._chain, self._config = chain, config or TouchConfig()
         self._restart()
@@ -298,7 +299,7 @@ class Touch(Human):
         self._expected = feedback.contact_expected
 
     def read(self, state: ArmState) -> HumanInput:
-        """What the touch asks for; nothing of an arm that tells no torques."""
+        """Input derived from touch; no input for an arm without torque estimates."""
         still = np.zeros(len(state.joint_position))
         if state.external_torque is None:
             return HumanInput(nullspace_input=still)
@@ -329,7 +330,7 @@ class Touch(Human):
         )
 
     def _nobody_touches(self) -> bool:
-        """Whether the torques are those of an arm alone, for the bias to follow them."""
+        """True if the arm has been untouched long enough to update the bias."""
         if self.place != "nothing":
             self._let_go = self._time
         # When it stops, friction turns, and may hide the hand for a while that stopped it.
@@ -339,7 +340,7 @@ class Touch(Human):
         return since == 0 or since > self._config.longest_touch
 
     def _meets_objects(self, state: ArmState) -> bool:
-        """Whether the hand may meet what the task is about."""
+        """True if the gripper may be in contact with its object."""
         if abs(state.gripper_width - self._width) > _FINGERS_MOVE:
             self._fingers_moved = state.time
         self._width = state.gripper_width
@@ -379,13 +380,13 @@ class Touch(Human):
         self.force = forces[self.place]
 
     def _nullspace_input(self, arm: _Posture) -> Float[np.ndarray, " joints"]:
-        """What is felt in the null space, less near the dead band [N m]."""
+        """Null-space torques [N m], faded in above the dead band."""
         beyond = float(np.linalg.norm(self.force)) / self._config.elbow_force - 1.0
         share = self._config.gain * min(max(beyond, 0.0), 1.0)
         return share * (arm.null @ (arm.null.T @ self._felt))
 
     def _pauses(self, meets: bool) -> bool:
-        """Whether the task is to wait."""
+        """True while the task is paused."""
         config, pushed = self._config, self.place == "hand" and not meets
         again = pushed and self._time - self._pushed > config.released
         if pushed:

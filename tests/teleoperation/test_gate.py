@@ -44,7 +44,7 @@ def clock():
 
 @pytest.fixture
 def control(clock):
-    return Control(silence=0.15, timeout=0.6, patience=10.0, clock=clock)
+    return Control(silence=0.15, timeout=0.6, max_idle=10.0, clock=clock)
 
 
 def test_the_first_to_come_leads_and_the_others_watch(control):

@@ -1,4 +1,4 @@
-"""Serves the page on which episodes are accepted, cut and rejected, to who has its secret."""
+"""HTTP server of the curation page, on which episodes are accepted, trimmed and rejected."""
 
 from __future__ import annotations
 
@@ -57,15 +57,16 @@ class RefusedError(Exception):
 
 
 class CurationPage:
-    """A ranking to look through in a browser; decisions are kept at once, beside the dataset.
+    """Browser page for reviewing ranked episodes. Decisions are saved at once, next to the
+    dataset.
 
         with CurationPage(rank_episodes(path), out) as page:
             print(page.url)
             page.wait()
 
     Attributes:
-        decisions: By episode, as they are now.
-        url: With the secret that lets in.
+        decisions: Current decisions by episode.
+        url: Address of the page, including its secret.
     """
 
     def __init__(
@@ -77,17 +78,18 @@ class CurationPage:
         mapping: MappingSpec | None = None,
         units: Mapping[str, str] | None = None,
     ):
-        """
+        """Read the decisions made so far and bind the server to its port.
+
         Args:
-            ranking: Of the dataset.
-            out: Where the cleaned dataset goes.
-            address: Where the page is served.
-            mapping: Where quantities are that are not found by name, as in `load_demos`.
+            ranking: Ranking of the dataset's episodes.
+            out: Folder that receives the cleaned dataset.
+            address: Host, port and certificate of the page.
+            mapping: Columns of quantities that are not found by name, as in `load_demos`.
             units: Units on disk by role, as in `load_demos`.
 
         Raises:
-            DatasetError: Decisions are kept beside the dataset that are not about it.
-            ValueError: It cannot be served there, or not safely.
+            DatasetError: The saved decisions belong to another dataset.
+            ValueError: The page cannot be served at this address, or not securely.
         """
         config = address or AddressConfig()
         self.ranking, self.out = ranking, out
@@ -141,10 +143,10 @@ class CurationPage:
     # What is asked for.
 
     def answer(self, path: str) -> Content:
-        """What is at a path.
+        """Content at a path.
 
         Raises:
-            RefusedError: Nothing, or it cannot be read.
+            RefusedError: There is nothing at the path, or it cannot be read.
         """
         if path in self.contents:
             return self.contents[path]
@@ -186,7 +188,7 @@ class CurationPage:
         }
 
     def state(self) -> dict[str, Any]:
-        """What was decided, and whether it is written."""
+        """Decisions made so far, and the progress of writing the cleaned dataset."""
         with self._lock:
             written = {"out": str(self.out), "writing": False, "said": "", "failed": False}
             if self._written is not None:
@@ -232,7 +234,7 @@ class CurationPage:
         return Content(body=head + b"".join(found), kind="application/octet-stream")
 
     def _size(self, key: str) -> tuple[int, int]:
-        """Of the images sent: even, as their format wants it."""
+        """Height and width of the images sent [px]; even, as JPEG subsampling requires."""
         height, width = self._images.size(key)
         scale = min(1.0, _TALLEST / height)
         return 2 * max(1, round(scale * height / 2)), 2 * max(1, round(scale * width / 2))
@@ -335,7 +337,7 @@ def _charts(
 
 
 def _stretches(demo: Demonstration) -> np.ndarray | None:
-    """Where long curves are parted; None: every frame is shown."""
+    """Frame numbers that part a long curve into stretches; None if every frame is shown."""
     if len(demo) <= _MOST_POINTS:
         return None
     return np.linspace(0, len(demo), _MOST_POINTS // 2 + 1).astype(int)
@@ -357,7 +359,7 @@ class _Server(ThreadingHTTPServer):
     request_queue_size = 32
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Whoever went away, or spoke no HTTP, need not be told of."""
+        """Ignore clients that disconnect or do not speak HTTP."""
         _logger.debug("a request failed", exc_info=True)
 
 

@@ -1,4 +1,4 @@
-"""The way in for browsers: address with a secret, TLS, who leads, and what may be said."""
+"""Authenticated entrance for browsers: address and secret, TLS, control and message schemas."""
 
 from hrc_learn.teleoperation.gate.address import Address as Address
 from hrc_learn.teleoperation.gate.address import AddressConfig as AddressConfig

@@ -1,4 +1,4 @@
-"""How a person gets to the page: its address with a secret, TLS, and a code for their phone."""
+"""Address of the page: host and port, secret, TLS certificate, and a QR code for phones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LEAST_DAYS = 7  # that one of our own lasts still when it is used again
 
 @dataclass(frozen=True, kw_only=True)
 class AddressConfig:
-    """Where a page is served, and to whom."""
+    """Host, port, certificate and client limit of a page."""
 
     host: str = "127.0.0.1"
     """Address to serve at: this machine only, unless it is one of the network. There the page
@@ -47,7 +47,7 @@ class AddressConfig:
 
     @property
     def local(self) -> bool:
-        """Whether this machine alone can reach the page."""
+        """True if only this machine can reach the page."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -56,7 +56,7 @@ class AddressConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Address:
-    """Of a page that is served."""
+    """Address of a page that is being served."""
 
     scheme: str
     host: str
@@ -71,7 +71,7 @@ class Address:
         return f"{self.scheme}://{host}:{self.port}"
 
     def link(self, path: str = "/") -> str:
-        """With the secret: who has it can move the arm."""
+        """Address with the secret. Anyone with this link can move the arm."""
         return f"{self.origin}{path}?token={self.token}"
 
 
@@ -172,7 +172,7 @@ def _own_certificate(name: str) -> tuple[Path, Path]:
 
 
 def _lasts(certificate: Path) -> bool:
-    """Whether browsers will take it for some days still."""
+    """True if the certificate stays valid for a few more days."""
     seconds = str(_LEAST_DAYS * 24 * 3600)
     command = ["openssl", "x509", "-noout", "-checkend", seconds, "-in", str(certificate)]
     return subprocess.run(command, capture_output=True, check=False).returncode == 0

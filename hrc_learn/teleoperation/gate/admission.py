@@ -1,4 +1,6 @@
-"""Who is let in: those who opened the address with its secret, under our own name."""
+"""Admission of clients: the secret of the address, a session cookie, and checks of host and
+origin.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-"""Of every answer."""
+"""Security headers sent with every response."""
 
 
 @dataclass(kw_only=True)
@@ -43,7 +45,7 @@ class Bucket:
         self.left, self.last = self.burst, self.clock()
 
     def take(self) -> bool:
-        """Whether one more may pass."""
+        """Take one token; False if none is left."""
         now = self.clock()
         self.left = min(self.burst, self.left + self.rate * (now - self.last))
         self.last = now
@@ -55,21 +57,21 @@ class Bucket:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What a request is answered with before anything else is looked at."""
+    """Early response to a request that is refused or redirected."""
 
     code: int
-    """Of HTTP."""
+    """HTTP status code."""
     words: str = ""
     headers: dict[str, str] = field(default_factory=dict)
 
 
 class Admission:
-    """Tells whether a request comes from somebody who may be here.
+    """Checks if a request comes from an authorised client.
 
     The secret of the address is exchanged for a cookie, which no other site can send.
 
     Attributes:
-        address: Of what is served, with the secret.
+        address: Address of the page, with its secret.
     """
 
     def __init__(self, config: AddressConfig, port: int, *, tls: bool):
@@ -89,13 +91,16 @@ class Admission:
     def refuse(
         self, target: str, host: str, cookies: Iterable[str], known: Callable[[str], bool]
     ) -> Verdict | None:
-        """What a request is refused or led on with; None where it may pass.
+        """Check a request.
 
         Args:
-            target: Path and query that were asked for.
-            host: The header.
-            cookies: The headers.
-            known: Whether there is something at a path.
+            target: Requested path and query.
+            host: Host header.
+            cookies: Cookie headers.
+            known: True for paths that exist.
+
+        Returns:
+            The response that refuses or redirects the request; None if it may pass.
         """
         if not self.is_ours(host):
             return Verdict(code=403, words="This page is not served under that name.")
@@ -113,14 +118,16 @@ class Admission:
         return None
 
     def is_ours(self, host: str) -> bool:
-        """Whether a Host header names us: another name may have been bound to our address."""
+        """True if a Host header names this server. Another name may have been bound to our
+        address (DNS rebinding).
+        """
         with suppress(ValueError):
             parts = urlsplit(f"//{host}")
             return parts.hostname in self._hosts and parts.port in (self.address.port, None)
         return False
 
     def from_ours(self, origin: str) -> bool:
-        """Whether an Origin header is that of our own page."""
+        """True if an Origin header is that of our own page."""
         with suppress(ValueError):
             parts = urlsplit(origin)
             return parts.scheme == self.address.scheme and self.is_ours(parts.netloc)
@@ -144,10 +151,10 @@ class Admission:
 
 
 def same_secret(given: str, secret: str) -> bool:
-    """Whether they are alike, told in a time that says nothing of where they differ.
+    """Compare two strings in constant time.
 
     Args:
-        given: By a client; may hold bytes that are no text, as headers may.
-        secret: Of ASCII characters but `?`.
+        given: Text sent by a client; may hold bytes that are not valid text, as headers may.
+        secret: ASCII characters other than `?`.
     """
     return hmac.compare_digest(given.encode(errors="replace"), secret.encode())

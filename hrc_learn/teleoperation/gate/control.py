@@ -1,4 +1,4 @@
-"""Who leads the arm: one client at a time, as long as it gives signs of life."""
+"""Control of the arm by one client at a time, as long as that client is alive."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ Role = Literal["leads", "watches"]
 
 @dataclass(frozen=True, kw_only=True)
 class ControlView:
-    """What one client is told about who leads."""
+    """Control state as shown to one client."""
 
     role: Role
     taken: bool
-    """Whether anybody leads."""
+    """True if any client has control."""
     asked: bool
-    """Whether somebody else asks to lead; of a client that watches, whether it asks itself."""
+    """For the controlling client: true if another client requests control. For a watching
+    client: true if it has requested control itself.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Link:
-    """How the leader's browser was heard of in the last seconds."""
+    """Connection quality of the controlling client over the last seconds."""
 
     silence: float = 0.0
     """Longest time without a sign of life [s]."""
@@ -36,15 +38,15 @@ class Link:
 
 
 _REMEMBERED = 3.0
-"""How long what slowed a browser down is told [s]: a sentence is read in that."""
+"""Duration for which the cause of a slow browser is shown [s], enough to read a sentence."""
 
 
 class Control:
-    """One of several clients leads; the others watch, and may ask to lead.
+    """Gives control to one of several clients; the others watch and may request control.
 
-    The first to join leads. Who leads keeps that until they hand it over or leave; somebody who
-    asks also gets it when the leader has done nothing for `patience`. Nobody can take it in the
-    middle of a drag. Safe to use from several threads.
+    The first client to join has control and keeps it until it hands over or leaves. A client
+    that requests control also gets it when the controlling client has been idle for `max_idle`.
+    Control is never taken away during a drag. Safe to use from several threads.
     """
 
     def __init__(
@@ -52,17 +54,18 @@ class Control:
         silence: float,
         timeout: float,
         *,
-        patience: float = 10.0,
+        max_idle: float = 10.0,
         clock: Callable[[], float] = time.monotonic,
     ):
-        """Start with nobody there.
+        """Start without clients.
 
         Args:
-            silence: Time without a sign of life after which the leader asks for no motion [s].
-            timeout: Likewise until they lose what they hold, and a page that does not react is
-                taken for gone [s].
-            patience: How long a leader who does nothing keeps others waiting [s].
-            clock: Tells the time [s].
+            silence: Time without a sign of life after which the controlling client requests no
+                motion [s].
+            timeout: Time without a sign of life after which the client releases what it holds,
+                and an unresponsive page counts as gone [s].
+            max_idle: Idle time after which a waiting client gets control [s].
+            clock: Monotonic clock [s].
 
         Raises:
             ValueError: Times are not positive, or silence is longer than timeout.
@@ -72,7 +75,7 @@ class Control:
                 "silence must be positive and no longer than timeout, but they are "
                 f"{silence} and {timeout} s."
             )
-        self._silence, self._timeout, self._patience = silence, timeout, patience
+        self._silence, self._timeout, self._max_idle = silence, timeout, max_idle
         self._clock = clock
         self._heard: dict[str, float] = {}
         self._lag: dict[str, float] = {}
@@ -84,14 +87,14 @@ class Control:
         self._lock = RLock()
 
     def join(self, client: str) -> None:
-        """Somebody has come; where nobody leads, they do."""
+        """Add a client. It gets control if no other client has it."""
         with self._lock:
             self._heard[client], self._links[client] = self._clock(), deque()
             if self._leader is None:
                 self._give(client)
 
     def leave(self, client: str) -> None:
-        """Somebody has left."""
+        """Remove a client."""
         with self._lock:
             for table in (self._heard, self._lag, self._links, self._asking):
                 table.pop(client, None)
@@ -120,12 +123,12 @@ class Control:
                 links.popleft()
 
     def act(self, client: str, *, idle: bool = False) -> bool:
-        """Whether a client may act now.
+        """True if a client may act now.
 
         Args:
-            client: Who wants to.
-            idle: Whether it does nothing, as hands do that hold nothing: only who does
-                something keeps others waiting for longer.
+            client: Client that wants to act.
+            idle: True if its message changes nothing, such as a hand that holds nothing. Only
+                other messages reset the idle time.
         """
         with self._lock:
             self._pass_on()
@@ -141,7 +144,9 @@ class Control:
             self._acted = self._clock()
 
     def ask(self, client: str) -> None:
-        """A client wants to lead: at once where nobody does, else when the leader lets them."""
+        """Request control. A client gets it at once if it is free, else when the holder hands
+        over.
+        """
         with self._lock:
             if client not in self._heard or client == self._leader:
                 return
@@ -151,7 +156,7 @@ class Control:
                 self._asking.setdefault(client, self._clock())
 
     def hand_over(self, client: str) -> None:
-        """The leader hands over to who has asked first, or lets go of control."""
+        """Hand control over to the first client that requested it, or release control."""
         with self._lock:
             if client == self._leader:
                 self._give(min(self._asking, key=self._asking.__getitem__, default=None))
@@ -165,17 +170,17 @@ class Control:
 
     @property
     def present(self) -> bool:
-        """Whether the leader has been heard of lately enough to move the arm."""
+        """True if the controlling client has been heard from recently enough to move the arm."""
         return self._within(self._silence)
 
     @property
     def gone(self) -> bool:
-        """Whether the leader, if any, has been silent for so long that they hold nothing."""
+        """True if the controlling client has been silent for longer than `timeout`."""
         return not self._within(self._timeout)
 
     @property
     def lag(self) -> float:
-        """How long ago the leader's page last reacted [s]."""
+        """Time since the page of the controlling client last responded [s]."""
         with self._lock:
             return 0.0 if self._leader is None else self._lag.get(self._leader, 0.0)
 
@@ -195,12 +200,12 @@ class Control:
 
     @property
     def people(self) -> int:
-        """How many are there."""
+        """Number of connected clients."""
         with self._lock:
             return len(self._heard)
 
     def view(self, client: str) -> ControlView:
-        """What to tell a client."""
+        """Control state for a client."""
         with self._lock:
             self._pass_on()
             leads = client == self._leader
@@ -223,9 +228,11 @@ class Control:
         self._turn += 1
 
     def _pass_on(self) -> None:
-        """Give control to who asks where the leader does not answer."""
+        """Pass control on to a waiting client if the controlling client is idle or
+        unresponsive.
+        """
         if self._leader is None or not self._asking:
             return
         first = min(self._asking, key=self._asking.__getitem__)
-        if self._clock() - max(self._acted, self._asking[first]) >= self._patience:
+        if self._clock() - max(self._acted, self._asking[first]) >= self._max_idle:
             self._give(first)

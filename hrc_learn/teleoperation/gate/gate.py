@@ -1,6 +1,7 @@
-"""The one way in for browsers: all that they send is checked before it reaches anything else.
+"""Entrance for all browser traffic, which is validated before it reaches anything else.
 
-In front of viser, which lets anybody in who reaches its port, and of the XR client's socket.
+The gate stands in front of viser, which accepts any client that reaches its port, and of the XR
+client's socket.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _GONE, _TOO_MUCH, _FULL = 1001, 1008, 1013  # codes of the WebSocket protocol (R
 
 @dataclass(frozen=True, kw_only=True)
 class Content:
-    """What is served at a path."""
+    """Content served at a path."""
 
     body: bytes
     kind: str
@@ -64,7 +65,7 @@ class Content:
 
     @classmethod
     def of(cls, name: str, body: bytes) -> Content:
-        """By the ending of its name."""
+        """Content with the MIME type that belongs to a file name."""
         kinds = {".js": "text/javascript", ".glb": "model/gltf-binary"}
         suffix = name[name.rfind(".") :]
         guess = kinds.get(suffix) or mimetypes.guess_type(name)[0]
@@ -101,24 +102,24 @@ def static_contents(folder: Path) -> dict[str, Content]:
 
 @dataclass(frozen=True, kw_only=True)
 class GateCallbacks:
-    """What the page does with what the gate lets through; called by the gate's thread."""
+    """Callbacks of the page for validated messages; the gate's thread calls them."""
 
     heard: Callable[[Message], None]
     """A message of the client that leads."""
     fits: Callable[[GuiUpdate], bool]
-    """Whether a control of viser's panel takes a value."""
+    """True if a control of viser's panel accepts a value."""
     status: Callable[[], Mapping[str, Any]]
-    """What all clients are told ten times a second."""
+    """Status sent to all clients ten times a second."""
     scene: Callable[[], Mapping[str, Any]]
-    """What clients are told that draw the scene themselves, as often as it changes."""
+    """Scene sent on each change to clients that render it themselves."""
 
 
 class Gate:
-    """Serves pages and sockets to those who have the token, in a thread of its own.
+    """Serves pages and sockets to clients with the token, in a thread of its own.
 
     Attributes:
-        address: Where, with the secret.
-        control: Who leads.
+        address: Address, with the secret.
+        control: Control of the arm.
     """
 
     def __init__(
@@ -130,18 +131,18 @@ class Gate:
         viewer: str,
         secret: str,
     ):
-        """Listen; nobody is let in before `start`.
+        """Bind the port; no client is accepted before `start`.
 
         Args:
-            config: Where.
-            control: Who leads.
-            contents: By path.
-            callbacks: Of the page.
+            config: Host, port and certificate.
+            control: Control of the arm.
+            contents: Content by path.
+            callbacks: Callbacks of the page.
             viewer: Address of viser's socket.
-            secret: That it wants to see.
+            secret: Secret that viser's socket requires.
 
         Raises:
-            ValueError: It cannot be served there, or not safely.
+            ValueError: The page cannot be served at this address, or not securely.
         """
         self._context = tls_context(config)
         self._socket = listening_socket(config)
@@ -364,7 +365,7 @@ async def _first(*work: Awaitable[None]) -> None:
 
 
 def _quiet_logger() -> logging.Logger:
-    """Says nothing of those who are not let in: anybody could fill the terminal with that."""
+    """Drop log lines about refused clients, which could otherwise flood the terminal."""
     logger = logging.getLogger("hrc_learn.gate")
     if not logger.filters:
         logger.addFilter(lambda record: not record.getMessage().startswith("opening handshake"))
@@ -400,13 +401,13 @@ SECRET_HEADER = "X-Page-Secret"
 
 @contextmanager
 def guarded_servers(secret: str):
-    """Within the block, servers of `websockets` are made such that they want to see a secret.
+    """Make servers of `websockets` created within this block require a secret.
 
-    viser takes no hook by which to check who connects, and serves whoever reaches its port: any
-    site open in a browser of this machine does.
+    viser has no hook to check its clients, and serves any that reach its port, including any
+    site open in a browser of this machine.
 
     Args:
-        secret: That `SECRET_HEADER` has to hold.
+        secret: Required value of the header `SECRET_HEADER`.
     """
     import websockets.asyncio.server as server
 

@@ -1,6 +1,7 @@
-"""What browsers may say, as schemas: messages of our own clients, and those of viser's page.
+"""Schemas of the messages that browsers may send: those of our own clients, and of viser's
+page.
 
-A message that fits none of them raises `MessageError`, and reaches nothing.
+A message that fits no schema raises `MessageError` and is dropped.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, Literal
 from hrc_learn.protocols import Request
 
 REACH = 10.0
-"""Largest coordinate of a point that makes sense beside an arm [m]: the longest reach 3 m."""
+"""Largest accepted coordinate of a point near an arm [m]; the longest arm reaches 3 m."""
 _LONGEST_TEXT = 200
 _MOST_GRIPS = 4
 
@@ -41,10 +42,9 @@ class Beat:
     """A sign of life, several times a second."""
 
     lag: float
-    """How long ago the page has last reacted [s]."""
+    """Time since the page last responded [s]."""
     echo: float | None = None
-    """Clock of the server that it was told last, returned at once: how long the way there and
-    back takes."""
+    """Last server time that the client received, returned at once to measure the round trip."""
 
     def __post_init__(self) -> None:
         if self.lag < 0:
@@ -53,7 +53,7 @@ class Beat:
 
 @dataclass(frozen=True, kw_only=True)
 class Hello:
-    """What a client wants to be told: status alone, or the scene as it moves."""
+    """Subscription of a client: status only, or also the moving scene."""
 
     wants: Literal["status", "scene"]
 
@@ -74,7 +74,7 @@ class Ask:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is demonstrated, in words."""
+    """Description of the task."""
 
     task: str
 
@@ -121,17 +121,19 @@ class Target:
 
 @dataclass(frozen=True, kw_only=True)
 class Grip:
-    """What one hand holds: a link, or the end effector."""
+    """Link or end effector held by one hand."""
 
     hand: Literal["left", "right", "touch"]
     joint: int | None
     """That moves the link held, counted from 1; None: the end effector."""
     start: Point
-    """Where the hand took hold, in the base frame [m]."""
+    """Point at which the hand took hold, in the base frame [m]."""
     pointer: Point
-    """Where the hand is, in the base frame [m]."""
+    """Position of the hand, in the base frame [m]."""
     orientation: Quaternion | None = None
-    """By how much the hand has turned since (wxyz, base frame); None: it does not turn."""
+    """Rotation of the hand since it took hold (wxyz, base frame); None: no rotation is
+    commanded.
+    """
 
     def __post_init__(self) -> None:
         _near(self.start, self.pointer)
@@ -143,13 +145,13 @@ class Grip:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackedHand:
-    """Where a hand is, whether it holds something or not."""
+    """Tracked pose of a hand, holding an object or not."""
 
     hand: Literal["left", "right"]
     position: Point
     """Between thumb and index finger, or of the controller, in the base frame [m]."""
     orientation: Quaternion
-    """Of the hand's grip (wxyz, base frame)."""
+    """Orientation of the hand's grip (wxyz, base frame)."""
 
     def __post_init__(self) -> None:
         _near(self.position)
@@ -317,7 +319,7 @@ class ViewMessage:
 
     content: Any
     acts: bool
-    """Whether it does something, rather than watch."""
+    """True if the message acts on the arm or the session."""
 
 
 def view_message(raw: str | bytes) -> ViewMessage:

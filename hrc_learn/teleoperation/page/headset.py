@@ -1,4 +1,4 @@
-"""What a client is told that draws the scene itself, and what the hands that it tracks hold."""
+"""Scene state for clients that render the scene themselves, and their tracked hands."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class HeadsetHands:
 
     @property
     def tracked(self) -> Mapping[str, TrackedHand]:
-        """Where the hands are that are seen now, by name."""
+        """Tracked hands that are visible now, by name."""
         return self._tracked
 
     def hear(self, hands: Hands) -> None:
@@ -79,7 +79,9 @@ class HeadsetHands:
         self._grips = now
 
     def forget(self) -> None:
-        """Somebody else leads: what their hands hold already moves nothing until taken anew."""
+        """Forget the hands when control changes; held gizmos move nothing until they are taken
+        again.
+        """
         self._noted, self._tracked = False, {}
 
     def _take(self, grip: Grip, links: Pose) -> None:
@@ -109,18 +111,18 @@ def scene_state(
     active: bool,
     plan: Float[np.ndarray, "points 3"] | None = None,
 ) -> dict[str, Any]:
-    """Where everything is, for a client that draws the scene itself.
+    """Poses and regions of the scene, for a client that renders it itself.
 
     Args:
-        positions: Of the bodies [m].
-        orientations: Of the bodies (wxyz).
+        positions: Positions of the bodies [m].
+        orientations: Orientations of the bodies (wxyz).
         links: Frames of the arm; the last is the tool's.
-        arrows: From the points held to the pointers [m].
-        colour: Of the arrows: how far the arm follows.
+        arrows: Arrows from the points held to the pointers [m].
+        colour: Colour of the arrows, which shows how far the arm follows.
         followed: Region to which a controller takes the end effector.
         drawn: Region that the person draws.
-        active: Whether that attracts the end effector.
-        plan: Way that the end effector is about to take [m]; None: it has none.
+        active: True if the drawn region attracts the end effector.
+        plan: Planned path of the end effector [m]; None: there is none.
     """
     return {
         "bodies": np.concatenate([positions, orientations], axis=1).round(6).tolist(),

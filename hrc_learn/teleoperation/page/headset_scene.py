@@ -24,12 +24,12 @@ BUILD = "make xr"
 def headset_contents(
     bodies: Sequence[Body], boxes: Sequence[Box], **more: Any
 ) -> dict[str, Content]:
-    """What the client is made of, by path; empty where it has not been built.
+    """Files of the headset client by path; empty if it has not been built.
 
     Args:
-        bodies: What moves.
-        boxes: What stands.
-        more: Of the description: what the page offers.
+        bodies: Moving bodies.
+        boxes: Fixed boxes.
+        more: Further entries of the description, such as the page's features.
     """
     built = CLIENT / "built"
     if not (built / "client.js").is_file():
@@ -53,11 +53,11 @@ def headset_contents(
 def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
     """All shapes as one binary glTF file, each in the frame of its body.
 
-    Nodes are named `body<place among all>_<number of the colour>`, or `stands_<number>`.
+    Nodes are named `body<index>_<colour number>`, or `stands_<number>` for fixed ones.
 
     Args:
-        bodies: What moves; their poses are told as they change.
-        boxes: What stands, in the base frame.
+        bodies: Moving bodies; their poses are sent as they change.
+        boxes: Fixed boxes, in the base frame.
     """
     import trimesh
     import trimesh.exchange.gltf
@@ -87,7 +87,7 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
 
 
 def _held(body: Body) -> dict[str, Any]:
-    """What of a body can be held, by which joint and where."""
+    """Name, joint and capsules of a body, for picking it."""
     capsules = [[*c.start, *c.end, c.radius] for c in body.capsules]
     # A box is held as the ball around it.
     capsules += [

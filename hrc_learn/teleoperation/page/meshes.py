@@ -10,11 +10,13 @@ from hrc_learn.geometry import Body, Box, Capsule, read_mesh
 from hrc_learn.geometry.shapes import Colour
 
 _TRIANGLES = 1500
-"""Of one colour of a body: the Panda then has 29,000 rather than 135,000, which a browser
-without a graphics processor draws in half the time."""
+"""Most triangles for each colour of a body. The Panda then has 29,000 rather than 135,000, and
+a browser without a graphics processor draws it in half the time.
+"""
 _AGGRESSION = 5
-"""From 0 to 10, of fast-simplification: at the triangles above, 99 % of the Panda's surfaces
-stay within 1 mm, sockets of cables within 8 mm; at 7, its default, within 3 mm."""
+"""Aggression of fast-simplification, 0 to 10. At the triangles above, 99 % of the Panda's
+surfaces stay within 1 mm, sockets of cables within 8 mm; at 7, its default, within 3 mm.
+"""
 
 _OFF = 0.002
 """Farthest that simplifying may move a side of the box around a mesh [m]. Of the UR5e and the
@@ -94,7 +96,7 @@ def body_meshes(body: Body) -> dict[Colour, Mesh]:
 
 
 def body_shape(body: Body) -> Mesh:
-    """All that a body looks like as one mesh, for who draws it in one colour."""
+    """Shape of a body as one mesh, for drawing it in one colour."""
     return simplified(joined([*body_meshes(body).values()]))
 
 

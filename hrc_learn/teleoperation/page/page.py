@@ -61,20 +61,23 @@ class PageConfig(AddressConfig):
     """The page's own settings."""
 
     forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
-    """How strongly gizmos act."""
+    """Gains and bounds of gizmos."""
     silence: float = 0.12
-    """Time without a sign of life from who leads after which the arm is asked for no motion,
-    until the next one [s]."""
+    """Time without a sign of life from the controlling client after which the arm holds still
+    until the next one [s].
+    """
     timeout: float = 0.6
-    """Likewise until everything they hold is let go, and longest that their page may be busy
-    while they hold something [s]."""
+    """Time without a sign of life after which everything held is released, and longest time
+    that the page may be busy during a drag [s].
+    """
     refresh: float = 25.0
     """Times a second that the page follows the arm, and efforts are computed anew [1/s]."""
     meshes: bool = True
-    """Whether the arm is drawn as it is; otherwise as capsules, of which a browser without a
-    graphics processor draws twice as many frames in AR."""
+    """Draw the arm with its meshes; otherwise as capsules, with which a browser without a
+    graphics processor draws twice as many frames in AR.
+    """
     twin: tuple[float, float, float] = (-0.1, 1.3, 0.0)
-    """Where the virtual twin stands, from the arm [m]."""
+    """Position of the virtual twin relative to the arm [m]."""
     touch_points: tuple[Point, ...] = ((0.4, 0.0, 0.0), (0.7, 0.0, 0.0), (0.4, 0.3, 0.0))
     """Points of the real workplace, in the base frame, that a person in a headset touches to
     lay the virtual arm over the real one [m]; three at least, well apart."""
@@ -109,15 +112,15 @@ class Page:
                 page.place(positions, orientations)
                 page.show(status)
 
-    The control loop pays for `human.read`, `place` and `show`, which exchange references.
+    The control loop pays for `human.read`, `place` and `show` only, which exchange references.
 
     Attributes:
-        human: The person at the page.
-        address: Where the page is served.
-        url: Of the page, with the secret that opens it: who has it can move the arm.
-        headset_url: Likewise for headsets and phones; empty where that client is not built.
-        control: Who leads.
-        farewell: What browsers show when the page is closed.
+        human: Combined input of the people at the page.
+        address: Address of the page.
+        url: Link with the secret. Anyone with this link can move the arm.
+        headset_url: Link for headsets and phones; empty if that client is not built.
+        control: Control of the arm by one client at a time.
+        farewell: Text shown in browsers when the page is closed.
     """
 
     def __init__(
@@ -134,16 +137,16 @@ class Page:
         """Serve the page; it follows the arm within the `with` block.
 
         Args:
-            chain: The arm.
-            bodies: What moves, with its shapes and first poses. "link1", "link2", ... can be
-                held, and "hand", "finger_left", "finger_right", which move the end effector.
-            boxes: What stands.
-            config: Of the page.
-            task: What is to be demonstrated, in words.
-            guides: Whether the person guides the end effector and records. Beside an arm that
-                works by itself they do not.
-            draws: Whether they draw regions, mark targets and turn the end effector; None: as
-                they guide. People pull in the null space in any case.
+            chain: Kinematics of the arm.
+            bodies: Moving bodies with shapes and initial poses. "link1", "link2", ... can be
+                held; "hand", "finger_left" and "finger_right" move the end effector.
+            boxes: Fixed boxes.
+            config: Settings of the page.
+            task: Description of the task to demonstrate.
+            guides: True if the person guides the end effector and records; False next to an arm
+                that works autonomously.
+            draws: True if people draw regions, mark targets and turn the end effector; None:
+                same as `guides`. People can always pull in the null space.
         """
         import viser
 
@@ -246,17 +249,21 @@ class Page:
 
     @property
     def task(self) -> str:
-        """What is demonstrated, in words, as the person has put it."""
+        """Description of the task, as entered by the person."""
         return self._panel.task
 
     @property
     def hands(self) -> Mapping[str, TrackedHand]:
-        """Where the leader's hands are, by "left" and "right", if a headset sees them."""
+        """Tracked hands of the controlling client, by "left" and "right", if a headset sees
+        them.
+        """
         return self._hands.tracked if self.control.present else {}
 
     @property
     def alive(self) -> bool:
-        """Whether the page still follows the arm; leaving the block raises why it does not."""
+        """True while the page follows the arm. Leaving the block raises the error that stopped
+        it.
+        """
         return self._error is None
 
     def place(
@@ -352,10 +359,10 @@ class Page:
         return command
 
     def _held(self) -> dict[tuple[Hashable, str], HeldGizmo]:
-        """What the person who leads holds, as long as there are signs of life from them.
+        """Gizmos held by the controlling client, as long as it is alive.
 
-        A browser that is told nothing for a while may be gone, its network cable pulled: a
-        server learns of that much later. A pointer at rest sends nothing either.
+        The server notices a dropped connection, such as an unplugged cable, much later, and a
+        pointer at rest sends nothing. Signs of life are therefore checked separately.
         """
         control = self.control
         self._new_leader()
@@ -368,7 +375,7 @@ class Page:
         return held
 
     def _new_leader(self) -> None:
-        """Drop what was held where somebody else leads since this was last called."""
+        """Release what was held before control last changed."""
         with self._led_lock:
             if (led := self.control.turn) != self._led:
                 self._led = led
@@ -377,7 +384,7 @@ class Page:
                 self._hands.forget()
 
     def _heard(self, message: Message) -> None:
-        """What a client of our own asks for, that leads."""
+        """Handle a message from the controlling client."""
         match message:
             case Hands():
                 self._new_leader()
@@ -393,7 +400,7 @@ class Page:
         return self._panel.fits(update.uuid, update.updates)
 
     def _told(self) -> dict[str, Any]:
-        """What the bar at the top of the page says."""
+        """Status for the bar at the top of the page."""
         words = ""
         if self._error is not None:
             words = "The page does not follow the arm any more: see the terminal."

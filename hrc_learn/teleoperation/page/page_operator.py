@@ -1,4 +1,4 @@
-"""The people at the page as one `Human`: who holds which gizmo, and what all ask for."""
+"""People at the page as one `Human`: the gizmos that they hold, and their combined input."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NO_TURN = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldGizmo:
-    """A gizmo that somebody holds in their browser."""
+    """Gizmo held in a browser."""
 
     joint: int | None
     """Joint that moves the link held, counted from 1; None: the end effector is held."""
@@ -35,7 +35,7 @@ class HeldGizmo:
     """Point of the link that is held, in the frame of the link; of the end effector: that point
     less the tool centre point, in the base frame [m]."""
     pointer: Float[np.ndarray, "3"]
-    """Where the gizmo has been dragged to, in the base frame [m]."""
+    """Position to which the gizmo has been dragged, in the base frame [m]."""
     orientation: Float[np.ndarray, "4"] | None = None
     """Orientation the end effector's gizmo has been turned to (wxyz)."""
 
@@ -47,10 +47,10 @@ class HeldGizmos:
     """
 
     def __init__(self, changed: Callable[[], object] = lambda: None) -> None:
-        """Start with nobody holding anything.
+        """Start without held gizmos.
 
         Args:
-            changed: Called when a gizmo has been taken, dragged or released.
+            changed: Callback for gizmos taken, dragged or released.
         """
         self._changed = changed
         self._held: dict[tuple[Hashable, str], HeldGizmo] = {}
@@ -85,7 +85,7 @@ class HeldGizmos:
         self._changed()
 
     def release_all(self, holder: Hashable) -> None:
-        """Forget somebody who has left."""
+        """Forget a client that has left."""
         with self._lock:
             for key in [key for key in self._held if key[0] == holder]:
                 del self._held[key]
@@ -102,12 +102,12 @@ class HeldGizmos:
 
 
 class AddedTurn:
-    """Rotation that people add to the end effector's orientation by the rings of its gizmo.
+    """Rotation that people add to the end effector's orientation with the rings of its gizmo.
 
-    It stays when they let go, and the next one adds to it. Safe to use from several threads.
+    It stays after release, and the next drag adds to it. Safe to use from several threads.
 
     Attributes:
-        holder: Whose browser holds the rings; None: nobody's.
+        holder: Client that holds the rings; None: they are free.
     """
 
     def __init__(self) -> None:
@@ -133,7 +133,7 @@ class AddedTurn:
             self.holder = None
 
     def move(self, holder: Hashable, orientation: Float[np.ndarray, "4"]) -> None:
-        """Turn it on, for who holds it."""
+        """Rotate further, if this client holds the rings."""
         with self._lock:
             if self.holder != holder:
                 return
@@ -149,13 +149,13 @@ class AddedTurn:
 
     @property
     def rotation(self) -> Float[torch.Tensor, "4"]:
-        """As a unit quaternion (wxyz)."""
+        """Unit quaternion of the rotation (wxyz)."""
         with self._lock:
             return self._turn
 
     @property
     def vector(self) -> tuple[float, float, float] | None:
-        """As a rotation vector in the base frame [rad]; None: nothing was added."""
+        """Rotation vector in the base frame [rad]; None: nothing was added."""
         turn = self.rotation
         if float(quaternion.angle(turn, _NO_TURN)) == 0.0:
             return None
@@ -179,13 +179,13 @@ class PageHuman(Human):
         clock: Callable[[], float] = time.monotonic,
         present: Callable[[], bool] = lambda: True,
     ):
-        """Start with a person who asks for nothing.
+        """Start without input.
 
         Args:
             joints: Number of joints.
-            holds_for: Time that a posted wish holds [s].
-            clock: Tells the time [s].
-            present: Whether there are signs of life from the person; asked at each reading.
+            holds_for: Time for which a posted input stays valid [s].
+            clock: Monotonic clock [s].
+            present: True while the person gives signs of life; called at each reading.
 
         Raises:
             ValueError: `holds_for` is not positive.
@@ -202,7 +202,7 @@ class PageHuman(Human):
 
     @property
     def feedback(self) -> Feedback:
-        """The newest that the arm has told."""
+        """Latest feedback of the arm."""
         return self._feedback
 
     @property
@@ -221,7 +221,7 @@ class PageHuman(Human):
         self._requests.append(request)
 
     def read(self, state: ArmState) -> HumanInput:
-        """What the person asks for now. Its arrays are shared: they may not be written to."""
+        """Current input of the person. Its arrays must not be written to."""
         self._state = state
         asked, still, deadline = self._posted
         if self._clock() > deadline or not self._present():
@@ -250,9 +250,9 @@ class GizmoCommand:
     nullspace_input: Float[np.ndarray, " joints"]
     """d [N m]."""
     twist: Float[np.ndarray, "6"]
-    """Of the end effector, linear [m/s] and angular [rad/s]."""
+    """Twist of the end effector: linear [m/s] and angular [rad/s]."""
     arrows: Float[np.ndarray, "gizmos 2 3"]
-    """From the point held to the pointer, in the base frame [m]."""
+    """Arrows from the points held to the pointers, in the base frame [m]."""
     held: tuple[int | None, ...] = ()
     """Joints that are held, counted from 1; None: the end effector."""
 
@@ -266,15 +266,15 @@ def gizmo_command(
     coarse: bool = True,
     turn: Float[torch.Tensor, "4"] | None = None,
 ) -> GizmoCommand:
-    """The command of several held gizmos: their inputs add up, and are bounded as one is.
+    """Command of several held gizmos. Their inputs add up, with the bounds of a single one.
 
     Args:
-        chain: The arm.
-        joint_position: Where it is [rad].
-        gizmos: Who holds it where.
-        config: How strongly gizmos act.
-        coarse: Whether a hand-guided end effector turns by the coarse orientation rule;
-            otherwise it turns as its gizmo is turned, if it is.
+        chain: Kinematics of the arm.
+        joint_position: Joint positions [rad].
+        gizmos: Held gizmos.
+        config: Gains and bounds of gizmos.
+        coarse: Turn a hand-guided end effector by the coarse orientation rule; otherwise it
+            turns with its gizmo.
         turn: Rotation added to that rule (wxyz); None: none.
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
@@ -308,7 +308,7 @@ def gizmo_command(
 
 
 def _point_held(links: Pose, gizmo: HeldGizmo) -> Float[np.ndarray, "3"]:
-    """Where the point held is now, in the base frame [m]."""
+    """Present position of the point held, in the base frame [m]."""
     if gizmo.joint is None:
         return links[-1].position.numpy() + gizmo.held_at
     return links[gizmo.joint - 1].apply(torch.as_tensor(gizmo.held_at)).numpy()

@@ -49,7 +49,7 @@ def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 
 _KNOBS = (2, 4, 6)
 """Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
 _END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
-"""What moves with the end effector, the last link too: a drag there guides it."""
+"""Bodies that move with the end effector, including the last link: dragging them guides it."""
 _PERSON = rgba(PERSON)[:3]
 
 
@@ -59,9 +59,9 @@ PEDESTAL = Box(
     half_size=(0.12, 0.12, 0.36),
     colour=(0.30, 0.30, 0.32, 1.0),
 )
-"""What the arm stands on."""
+"""Pedestal of the arm."""
 _TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
-"""Of the virtual twin, which is seen through."""
+"""Opacity of the virtual twin."""
 
 
 class _DrawnBody(NamedTuple):
@@ -72,10 +72,10 @@ class _DrawnBody(NamedTuple):
 
 
 def held_joint(body: Body) -> int | Literal["nothing"] | None:
-    """What is held by a body: the joint that moves a link, from 1; None: the end effector.
+    """Joint that moves a link, from 1; None for bodies of the end effector.
 
     Args:
-        body: By its name.
+        body: Body, identified by its name.
     """
     if body.name in _END_EFFECTOR_PARTS:
         return None
@@ -312,17 +312,17 @@ class Gizmos:
         guides: bool = True,
         turns: bool = False,
     ):
-        """Connect.
+        """Connect the gizmos to the scene.
 
         Args:
-            server: Of the page.
-            scene: What can be held.
-            held_gizmos: Who holds what.
-            links: Frames of the arm as they are now (see `SerialChain.link_poses`); None
-                before the arm is known.
-            turn: What the rings of the end effector's gizmo add to its orientation.
-            guides: Whether the end effector can be held, too, and has a gizmo.
-            turns: Whether its gizmo has rings where it cannot be held.
+            server: Server of the page.
+            scene: Scene with the bodies that can be held.
+            held_gizmos: Record of held gizmos.
+            links: Present frames of the arm (see `SerialChain.link_poses`); None before the arm
+                is known.
+            turn: Rotation added by the rings of the end effector's gizmo.
+            guides: True if the end effector can be held and has a gizmo.
+            turns: True if its gizmo has rings even where it cannot be held.
         """
         self._held_gizmos, self._links, self._turns = held_gizmos, links, False
         self._turn = turn
@@ -343,7 +343,7 @@ class Gizmos:
         server.on_client_disconnect(lambda client: self._release(client.client_id))
 
     def follow(self, pose: Pose) -> None:
-        """Keep the end effector's gizmo at the end effector while nobody holds it."""
+        """Keep the end effector's gizmo at the end effector while it is not held."""
         gizmo = self._gizmo
         if gizmo is None or self._turn.holder is not None:
             return
@@ -366,7 +366,7 @@ class Gizmos:
             self._gizmo.disable_rotations = not rings
 
     def _release(self, holder: int) -> None:
-        """Forget somebody who has left."""
+        """Forget a client that has left."""
         self._held_gizmos.release_all(holder)
         self._turn.release(holder)
 

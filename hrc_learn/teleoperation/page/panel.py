@@ -1,4 +1,4 @@
-"""The panel beside the scene: status, buttons, folders of controls and settings."""
+"""Panel next to the scene: status, buttons, folders of controls and settings."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed
 
 @dataclass(frozen=True, kw_only=True)
 class PageStatus:
-    """What the session lets the page show."""
+    """Session status shown on the page."""
 
     title: str = ""
-    """What is guided here."""
+    """Name of the guided arm."""
     doing: str = ""
-    """What an arm that works by itself is doing; empty where a person leads and records."""
+    """Present activity of an autonomous arm; empty if a person guides and records."""
     recording: Literal["ready", "recording", "stopped"] = "ready"
     """Stopped: a demonstration waits to be saved or discarded."""
     seconds: float = 0.0
@@ -37,23 +37,23 @@ class PageStatus:
     saved: int = 0
     """Demonstrations saved."""
     note: str = ""
-    """What became of the last request."""
+    """Outcome of the last request."""
     interventions: Mapping[str, int] = field(default_factory=dict)
     """Steps in which each kind of intervention of the safety filter was needed."""
     contacts: int = 0
     """Touches of the surroundings."""
     region: DrawnRegion | None = None
-    """To which a controller takes the end effector; None: it follows no region."""
+    """Region to which a controller takes the end effector; None: there is none."""
     plan: Float[np.ndarray, "points 3"] | None = None
     """Way that the end effector is about to take [m]; None: it has none."""
 
 
 def can_do(status: PageStatus, task: str) -> str:
-    """What the person can do now, in words; empty beside an arm that works by itself.
+    """Instruction for the person; empty next to an autonomous arm.
 
     Args:
-        status: Of the session.
-        task: What is demonstrated, in words.
+        status: Status of the session.
+        task: Description of the task.
     """
     if status.doing:
         return ""
@@ -67,13 +67,13 @@ def can_do(status: PageStatus, task: str) -> str:
 
 
 def state_html(status: PageStatus, rate: float, people: int, task: str = "") -> str:
-    """What is guided here, what it is doing, and who watches.
+    """Name of the arm, its activity, and the number of viewers, as HTML.
 
     Args:
-        status: Of the session.
-        rate: Steps that the loop takes [1/s].
-        people: Browsers that show the page.
-        task: What is demonstrated, in words.
+        status: Status of the session.
+        rate: Control rate [Hz].
+        people: Number of browsers that show the page.
+        task: Description of the task.
     """
     if status.doing:
         doing = f"{_badge(BLUE, status.doing)}&ensp;{status.seconds:.1f} s"
@@ -131,12 +131,13 @@ _LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
 
 
 def feedback_html(feedback: Feedback) -> str:
-    """How far the arm follows, why not further, and what it feels; empty if there is nothing.
+    """Fraction of the input that the arm follows, the reason, and contact, as HTML; may be
+    empty.
 
-    Numbers are rounded as far as they are steady: what is shown changes when something does.
+    Numbers are rounded to steady digits, so that the text changes only when something does.
 
     Args:
-        feedback: That the arm has told.
+        feedback: Feedback of the arm.
     """
     rows = []
     if feedback.pushed:
@@ -151,10 +152,10 @@ def feedback_html(feedback: Feedback) -> str:
 
 
 def felt_words(feedback: Feedback) -> list[str]:
-    """What the arm feels, in words.
+    """Contact felt by the arm, as text.
 
     Args:
-        feedback: That the arm has told.
+        feedback: Feedback of the arm.
     """
     force, felt = feedback.contact_force, []
     if force is not None and (size := float(np.linalg.norm(force))) >= _LEAST_CONTACT:
@@ -172,12 +173,12 @@ def felt_words(feedback: Feedback) -> list[str]:
 
 
 def interventions_html(status: PageStatus, more: Sequence[str], latest: str) -> str:
-    """What the safety filter had to do.
+    """Interventions of the safety filter, as HTML.
 
     Args:
-        status: Of the session.
-        more: Kinds of interventions that have just been needed.
-        latest: Kind that was needed last; empty if none was.
+        status: Status of the session.
+        more: Kinds of interventions since the last refresh.
+        latest: Kind of the latest intervention; empty if there was none.
     """
     rows = [
         f'<tr style="{f"color:{VERMILION};font-weight:600" if name in more else ""}">'
@@ -207,7 +208,7 @@ def _block(title: str, content: str) -> str:
 
 
 def _turn_words(turn: tuple[float, float, float] | None) -> str:
-    """What is added to the orientation of the end effector."""
+    """Rotation added to the orientation of the end effector, as text."""
     if turn is None:
         return "Turned by its rings: not at all."
     x, y, z = np.rad2deg(turn)
@@ -355,12 +356,12 @@ class Panel:
 
     @property
     def task(self) -> str:
-        """What is demonstrated, in words."""
+        """Description of the task."""
         return "" if self._task is None else self._task.value
 
     @property
     def coarse(self) -> bool:
-        """Whether the end effector turns by the coarse orientation rule."""
+        """True if the end effector turns by the coarse orientation rule."""
         return self._coarse is None or self._coarse.value
 
     @property
@@ -375,7 +376,7 @@ class Panel:
 
     @property
     def drawn(self) -> tuple[DrawnRegion | None, bool]:
-        """The region drawn, active or not, and whether it is; None where nobody draws."""
+        """Drawn region and its state, true if active; None if regions cannot be drawn."""
         if self._region is None:
             return None, False
         return self._region.drawn, self._region.region is not None
@@ -396,7 +397,7 @@ class Panel:
 
     @property
     def forces(self) -> InteractionForceConfig:
-        """How strongly gizmos act."""
+        """Gains and bounds of gizmos."""
         mapping: Any = _MAPPINGS[self._mapping.value]
         share, base = self._strength.value / 100, self._initial_forces
         return replace(
@@ -404,10 +405,10 @@ class Panel:
         )
 
     def fits(self, uuid: str, updates: Mapping[str, Any]) -> bool:
-        """Whether a browser may set a control of the panel to a value.
+        """True if a browser may set a control of the panel to a value.
 
         Args:
-            uuid: Of the control; viser's, like the table it is looked up in.
+            uuid: Identifier of the control, assigned by viser.
             updates: New values of its properties.
         """
         handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)
@@ -423,7 +424,7 @@ class Panel:
         return isinstance(value, int | float) and handle.min <= value <= handle.max
 
     def direction(self) -> Float[np.ndarray, "3"]:
-        """Where keys move the end effector: a unit vector, or zero."""
+        """Direction of motion requested by keys: a unit vector, or zero."""
         return self._keys.direction()
 
     def tell(self, feedback: Feedback) -> None:

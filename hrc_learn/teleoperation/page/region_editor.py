@@ -45,16 +45,16 @@ def view_ray(
 def meet_plane(
     origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], axis: int, value: float
 ) -> Float[np.ndarray, "3"] | None:
-    """Where a ray meets a plane on which one coordinate is the same everywhere.
+    """Intersection of a ray with an axis-aligned plane.
 
     Args:
-        origin: Of the ray [m].
+        origin: Origin of the ray [m].
         direction: Unit vector.
-        axis: Which coordinate: 2 for a horizontal plane.
-        value: Of the coordinate on the plane [m].
+        axis: Axis normal to the plane: 2 for a horizontal plane.
+        value: Coordinate of the plane along that axis [m].
 
     Returns:
-        The point [m]; None if the ray leads away from the plane or along it.
+        The point [m]; None if the ray is parallel to the plane or points away from it.
     """
     if abs(direction[axis]) < 1e-9:
         return None
@@ -106,7 +106,7 @@ def region_over(
 
 
 FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.10))
-"""Where the region is before anybody has drawn one."""
+"""Initial region."""
 
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
@@ -264,7 +264,7 @@ class RegionEditor:
                 self.reshape(region_over(footprint, bottom, height))
 
     def _footprint(self, event: SceneRectSelectEvent) -> Float[np.ndarray, "4 3"] | None:
-        """Where the middles of a rectangle's edges lie on the table."""
+        """Projections of the midpoints of a rectangle's edges on the table."""
         (left, top), (right, bottom) = event.screen_min, event.screen_max
         x, y = (left + right) / 2, (top + bottom) / 2
         camera = event.client.camera
