@@ -95,7 +95,7 @@ def page(args: ServePage) -> None:
                     recorder,
                     world,
                     opened=opened,
-                    beside=devices,
+                    inputs=devices,
                     config=config,
                 )
                 _announce(console, page)

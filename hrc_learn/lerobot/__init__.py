@@ -1,8 +1,8 @@
-"""At home in LeRobot: importing this registers what its command lines then know by name.
+"""LeRobot integration: importing this package registers its policies, robots and teleoperators.
 
-`--policy.discover_packages_path=hrc_learn.lerobot` does so, and so does installing
-`plugins/lerobot_policy_dmp`. Networks, simulator, browser page and drivers are imported when
-they are asked for.
+LeRobot's commands find them by `--policy.discover_packages_path=hrc_learn.lerobot`, or once
+`plugins/lerobot_policy_dmp` is installed. Networks, simulator, browser page and drivers are
+imported on demand.
 """
 
 from hrc_learn.lerobot import camera_watch as camera_watch

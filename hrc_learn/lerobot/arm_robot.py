@@ -1,7 +1,7 @@
-"""An arm as LeRobot sees it: names and units of its values, and what all its robots share.
+"""Arms as LeRobot robots: names and units of their values, and the base class of all robots.
 
-Radians, metres and pixels; poses in the base frame as position and rotation vector. Names end
-in `.pos` or `.vel` because lerobot-rollout hands on no others.
+Units are radians, metres and pixels; poses are in the base frame, as position and rotation
+vector. Names end in `.pos` or `.vel` because lerobot-rollout passes on no others.
 """
 
 from __future__ import annotations
@@ -41,14 +41,16 @@ ActionSpace = Literal["joint", "ee"]
 """Positions of the joints, or of the end effector; the gripper's opening in either case."""
 
 DOWN = quaternion.log(gripper_down()).numpy()
-"""Rotation vector of a gripper that points down, by which those of others are told [rad]."""
+"""Rotation vector of a gripper that points down, the reference for choosing the signs of others
+[rad].
+"""
 
 
 class ArmValues:
     """The values of an arm by their names: those of its joints are called as the joints are.
 
     Attributes:
-        chain: Of the arm.
+        chain: Kinematics of the arm.
         joints: Names of the joints' positions [rad].
         velocities: Names of their velocities [rad/s].
     """
@@ -73,7 +75,7 @@ class ArmValues:
         """The action that sends the joints somewhere, and the gripper to an opening.
 
         Args:
-            space: Of the action.
+            space: Action space.
             joints: Positions [rad].
             width: Opening [m].
             near: Rotation vector before, which this one goes on from [rad].
@@ -125,7 +127,7 @@ class ArmValues:
         """Values of the arm's state by name.
 
         Args:
-            state: Of the arm.
+            state: State of the arm.
             names: Wanted, of those of this class, `HAND` and `GRIPPER`.
             near: Rotation vector of the end effector before [rad].
         """
@@ -232,45 +234,45 @@ class RobotRegistry:
 
 @cache
 def robot_registry() -> RobotRegistry:
-    """The registry of this process, which robots and teleoperators share."""
+    """Registry of connected robots in this process, used by robots and teleoperators."""
     return RobotRegistry()
 
 
 @dataclass(kw_only=True)
 class ArmRobotConfig(RobotConfig):
-    """Settings that simulated and real arms share."""
+    """Settings common to simulated and real arms."""
 
     fps: float = 50.0
     """Actions a second: the rate of the dataset, or of the rollout."""
     action_space: ActionSpace = "joint"
-    """What actions give: positions of the joints, or of the end effector ("ee")."""
+    """Space of actions: joint positions ("joint"), or the pose of the end effector ("ee")."""
     velocity: bool = False
-    """Whether joint velocities are observed."""
+    """Observe joint velocities."""
     hand: bool = False
-    """Whether the pose of the end effector is observed; it is where actions give it."""
+    """Observe the pose of the end effector; always observed if actions command it."""
     person: PersonConfig = field(default_factory=PersonConfig)
-    """Who leads the body while actions lead the end effector."""
+    """Person that guides the body while actions command the end effector."""
 
 
 class ArmRobot(Device, Robot):
-    """An arm led by positions of its joints, or of its end effector.
+    """Arm commanded by joint positions or by the pose of its end effector.
 
-    Actions of either space are obeyed, and values they do not name are left alone, so that
-    lerobot-rollout's way back to the first position works as well. What an action asks for is
-    done within the limits of the joints only; `send_action` returns what was done.
+    Actions of either space are accepted, and values that an action omits are kept, so that
+    lerobot-rollout can also return the arm to its first position. Motions respect the joint
+    limits only; `send_action` returns what was commanded.
 
-    With a person beside it (`ArmRobotConfig.person`) actions lead the end effector only, and
-    the person the body, at the same time (`ComplementaryMotion`).
+    With a person (`ArmRobotConfig.person`) actions command the end effector only, while the
+    person guides the body (`ComplementaryMotion`).
 
     Attributes:
-        work_arm: The arm, with its hand.
-        values: What it observes and is sent, by name.
-        space: Of the actions that it declares.
+        work_arm: The arm with its gripper.
+        values: Observed and commanded values, by name.
+        space: Declared action space.
         dt: Time between actions [s].
-        initial_configurations: How often everything has been put in place, which only a
-            simulation can.
-        complement: Lets a person lead the body, while connected; None: there is none.
-        judged: Whether what it does may be recorded, so that doubts are told.
+        initial_configurations: Number of resets of the scene; only a simulation can be reset.
+        complement: Combination with the person's input, while connected; None: there is no
+            person.
+        judged: True if its motion may be recorded, so that quality warnings are given.
     """
 
     complement: ComplementaryMotion | None = None
@@ -366,7 +368,7 @@ class ArmRobot(Device, Robot):
             self._loop.tick(state, (*self._touching(), *pressed(self.work_arm.chain, state)))
 
     def _touching(self) -> tuple[str, ...]:
-        """What the arm has met since the last action that it should not, in words."""
+        """Unexpected contacts of the arm since the last action, as text."""
         return ()
 
     @property
@@ -387,11 +389,11 @@ class ArmRobot(Device, Robot):
     @property
     @abstractmethod
     def servo(self) -> PositionServo:
-        """Which leads the arm by positions."""
+        """Position servo of the arm."""
 
     @property
     def in_real_time(self) -> bool:
-        """Whether the arm goes on moving while the loop is late."""
+        """True if the arm keeps moving while the loop is late."""
         return True
 
     @property
@@ -446,7 +448,7 @@ class ArmRobot(Device, Robot):
         return joints, width
 
     def _seen(self, state: ArmState) -> ArmState:
-        """What is told of a reading: the policy's own posture, if that is what it observes."""
+        """Observed part of a reading; the policy's own posture if that is configured."""
         if self.complement is None or self._person_config.observed == "joints":
             return state
         return replace(

@@ -42,8 +42,9 @@ from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CAMERA_WATCH = "hrc_learn_camera_watch"
 POSE_NAMES = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
-"""Of the values of a state that hold the tool's pose: position [m], rotation vector [rad]; a
-robot's end in `.pos`."""
+"""Names of the state values of the tool's pose: position [m], rotation vector [rad]. On a robot
+they end in `.pos`.
+"""
 FEATURE = "observation.image_feature"
 """Pixel u, v of the tool's marker, and whether it is seen, where the state has no `MARKER`."""
 
@@ -57,23 +58,24 @@ class CameraWatchStep(ProcessorStep):
     """
 
     reference: dict[str, Any]
-    """What `CameraReference.content` returned."""
+    """Camera reference as returned by `CameraReference.content`."""
     fps: float
     """Calls a second [1/s]."""
     pose_columns: list[int]
-    """Of the state, the values called `POSE_NAMES`, in that order."""
+    """Indices of `POSE_NAMES` in the state, in that order."""
     feature: str = FEATURE
     """Observation with the pixel and whether it is seen."""
     marker_columns: list[int] | None = None
-    """Of the state, the values called `MARKER`, in that order; None: `feature` has them."""
+    """Indices of `MARKER` in the state, in that order; None: `feature` has them."""
     correct: bool = False
-    """Whether the policy sees what it would if the camera had not been moved."""
+    """Correct pixels to those that the camera would see at its original pose."""
     object_columns: list[int] | None = None
-    """Of the state, the values called `PIXELS`, to be corrected too; None: there are none."""
+    """Indices of `PIXELS` in the state, which are corrected too; None: there are none."""
     object_height: float = 0.0
-    """Of the plane on which the object lies, as of `ObjectPlane` [m]."""
+    """Height of the plane on which the object lies, as in `ObjectPlane` [m]."""
     motion: CameraMotion | None = field(default=None, init=False, repr=False)
-    """As seen last, in this episode unless it is corrected; None: the camera stands still."""
+    """Latest detection, of this episode unless it is corrected; None: the camera has not moved.
+    """
 
     def __post_init__(self) -> None:
         if not self.fps > 0:
@@ -125,7 +127,7 @@ class CameraWatchStep(ProcessorStep):
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
     def _look(self, state: Float[Tensor, " values"], marker: Float[Tensor, "3"]) -> Pose | None:
-        """Where the tool is, if its marker is seen."""
+        """Position of the tool, if its marker is visible."""
         u, v, visible = marker.tolist()
         vector = state[self.pose_columns]
         if visible < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
@@ -180,7 +182,7 @@ def add_camera_watch(
         checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
         dataset: It was trained on, with the tool's pose and its marker's pixel in every frame.
         image_size: Width and height of the camera's images [px].
-        correct: Whether pixels of the marker, and of an object that was seen before the tool
+        correct: True if pixels of the marker, and of an object that was seen before the tool
             came and is taken where the tool is lowest, are corrected as well.
 
     Returns:
@@ -231,7 +233,7 @@ def add_camera_watch(
 
 
 def _columns(names: Sequence[str], wanted: Sequence[str]) -> list[int] | None:
-    """Where they are; None if one is not there."""
+    """Indices of names; None if one is missing."""
     wanted = [name.removesuffix(".pos") for name in wanted]
     return [names.index(name) for name in wanted] if {*wanted} <= {*names} else None
 

@@ -20,7 +20,7 @@ from hrc_learn.lerobot.robots.mujoco_arm import CAMERA, ImagesConfig, MovedCamer
 from hrc_learn.teleoperation.scenarios import ScenarioView, make_scenario
 
 _MORE_TIME = 1.25
-"""What a policy gets, in durations of a demonstration."""
+"""Time limit of a policy, in durations of a demonstration."""
 
 
 @EnvConfig.register_subclass("mujoco_arm")
@@ -33,31 +33,31 @@ class ArmEnvConfig(EnvConfig):
     """
 
     task: str | None = "placing"
-    """What is to be done: "placing" or "grasping"."""
+    """Task: "placing" or "grasping"."""
     arm: str = "panda"
-    """As of the robot."""
+    """Same as the robot's."""
     base: str = ""
-    """As of the robot."""
+    """Same as the robot's."""
     tip: str = ""
-    """As of the robot."""
+    """Same as the robot's."""
     fps: int = 50
-    """Of the dataset that the policy was trained on."""
+    """Frame rate of the training dataset [Hz]."""
     shelf: str = "middle"
-    """Where to place: "lower", "middle" or "upper"."""
+    """Target shelf: "lower", "middle" or "upper"."""
     action_space: ActionSpace = "joint"
-    """As of the robot."""
+    """Same as the robot's."""
     velocity: bool = False
-    """As of the robot."""
+    """Same as the robot's."""
     hand: bool = False
-    """As of the robot."""
+    """Same as the robot's."""
     pixels: bool = False
-    """As of the robot."""
+    """Same as the robot's."""
     marker: bool = False
-    """As of the robot."""
+    """Same as the robot's."""
     moved_camera: MovedCameraConfig = field(default_factory=MovedCameraConfig)
-    """As of the robot."""
+    """Same as the robot's."""
     images: ImagesConfig = field(default_factory=ImagesConfig)
-    """As of the robot."""
+    """Same as the robot's."""
     episode_length: int | None = None
     """Actions after which an episode has failed; None: a quarter more than a demonstration."""
 
@@ -130,7 +130,7 @@ class PandaEnvConfig(ArmEnvConfig):
 _PICTURE = (240, 180)
 """Size of the pictures of `render` [px]."""
 _STEADY = 0.3
-"""How long the job must stay done to count [s]: a thing that topples rests for a moment."""
+"""Time for which the task must stay done to count [s]: a toppling object rests for a moment."""
 
 
 class ArmEnv(gym.Env):
@@ -143,7 +143,7 @@ class ArmEnv(gym.Env):
         """Set up.
 
         Args:
-            config: Of the robot, with the scenario.
+            config: Configuration of the robot, with the scenario.
             max_episode_steps: Actions after which an episode has failed.
         """
         self._robot = MujocoArmRobot(config)

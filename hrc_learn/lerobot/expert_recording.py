@@ -40,7 +40,7 @@ def new_dataset(folder: Path, robot: ArmRobot) -> Iterator[LeRobotDataset]:
     """A dataset of what a robot observes and is sent, whole at the end or not there.
 
     Args:
-        folder: Of the new dataset; must not exist.
+        folder: Folder of the new dataset; must not exist.
         robot: Whose it is.
     """
     features = hw_to_dataset_features(robot.action_features, ACTION)
@@ -84,9 +84,9 @@ def record_expert(
     fail are thrown away and shown again, from the next seed.
 
     Args:
-        folder: Of the new dataset; must not exist.
-        config: Of the robot, with the scenario and the first seed.
-        episodes: To be written.
+        folder: Folder of the new dataset; must not exist.
+        config: Configuration of the robot, with the scenario and the first seed.
+        episodes: Number of episodes to write.
 
     Yields:
         After each demonstration: how many are written, and whether it succeeded.

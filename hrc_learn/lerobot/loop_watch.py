@@ -1,4 +1,4 @@
-"""What LeRobot's recordings of an arm are worth: late actions, limits, contacts, no motion."""
+"""Warnings about LeRobot recordings of an arm: late actions, limits, contacts, no motion."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LATE = 1.5
 PAUSE = 2.0
 """Longer without an action is no late one but a pause [s], as between two episodes."""
 TOLERATED = 0.02
-"""Share of late actions of which nothing is said."""
+"""Fraction of late actions that raises no warning."""
 EPISODE = 1.0
 """Shorter stretches are no episodes [s], and need not show anything."""
 
@@ -43,11 +43,11 @@ class LoopWatch:
         """Begin with nothing.
 
         Args:
-            name: Of the robot, for the warning.
+            name: Name of the robot, for the warning.
             fps: Actions a second that there should be.
             clock: Seconds.
-            chain: Of the arm, whose limits are watched; None: they are not known.
-            in_real_time: Whether the arm goes on moving while the loop is late.
+            chain: Kinematics of the arm, for checking joint limits; None skips this check.
+            in_real_time: True if the arm keeps moving while the loop is late.
         """
         self._name, self._clock, self._in_real_time = name, clock, in_real_time
         self._fps, self._quality = fps, RecordingQuality(fps, chain, LATE)
@@ -57,7 +57,7 @@ class LoopWatch:
 
         Args:
             state: Last reading of the arm; None: it was not read.
-            touching: What the arm touches that it should not, in words.
+            touching: Unexpected contacts of the arm, as text.
         """
         now = self._clock()
         if self._in_real_time and self._quality.ticks.gap(now) > PAUSE:

@@ -1,4 +1,4 @@
-"""The person beside a robot of LeRobot's, who leads its body while actions lead its hand."""
+"""Person near a LeRobot robot, who guides its body while actions command the end effector."""
 
 from __future__ import annotations
 
@@ -36,32 +36,34 @@ COLUMNS = {"observation.human_effort": nullspace_inputs, "observation.pushed_asi
 
 @dataclass
 class PersonConfig:
-    """A person who leads the body while actions, of any policy, lead the end effector."""
+    """Person that guides the body while actions, of any policy, command the end effector."""
 
     kind: PersonKind = "none"
-    """How they do so: "page", "gamepad", "keyboard", "scripted"; "none": nobody does."""
+    """Input device: "page", "gamepad", "keyboard", "scripted"; "none": no person."""
     after_push: Literal["return", "stay"] = "return"
-    """Whether the joints go back to where actions have them, or on beside them, when the person
-    lets go."""
+    """Behaviour after release: the joints return to those of the actions ("return"), or stay
+    offset from them ("stay").
+    """
     observed: Literal["posture", "joints"] = "posture"
-    """What is observed as the joints' positions and velocities: those of the policy's own
-    posture, as without the person; or the joints' as they are."""
+    """Observed joint positions and velocities: those of the policy's own posture, as without
+    the person, or the measured ones.
+    """
     record: bool = False
-    """Whether the null-space input, and how far it has moved the joints, is observed too."""
+    """Observe the null-space input, and the joint displacement that it caused."""
     host: str = "127.0.0.1"
     """Address to serve the page at. Whoever reaches it can move the arm."""
     port: int | None = None
     """Port to serve it at; the first free one from 8080 on if None."""
 
     def names(self, chain: SerialChain) -> tuple[str, ...]:
-        """Of what is observed of the person beside an arm."""
+        """Units of the values observed of a person near an arm."""
         if not self.record or self.kind == "none":
             return ()
         return (*nullspace_inputs(chain), *offsets(chain))
 
 
 def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
-    """Of the scripted person, as a seed has them."""
+    """Pulls of the scripted person, drawn from a seed."""
     from hrc_learn.teleoperation import random_pulls
 
     # Drawn apart, so that runs with and without pulls are alike but for them.
@@ -75,7 +77,7 @@ class Person(Human):
         """Open the device.
 
         Args:
-            config: Which.
+            config: Input device of the person.
             work_arm: The arm whose body is led.
 
         Raises:
@@ -113,7 +115,7 @@ class Person(Human):
             self._human = ScriptedPerturbation(self._chain, scripted_pulls(seed))
 
     def read(self, state: ArmState) -> HumanInput:
-        """What the person asks for."""
+        """Input of the person."""
         return self._human.read(state)
 
     def tell(self, feedback: Feedback) -> None:

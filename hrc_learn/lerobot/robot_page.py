@@ -1,4 +1,4 @@
-"""The page in a browser beside a robot of LeRobot's: it shows the arm where the robot is."""
+"""Browser page that shows the arm of a LeRobot robot."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class RobotPage:
         """Serve it.
 
         Args:
-            arm: That is shown.
+            arm: Arm to show.
             host: Address to serve at.
-            port: To serve at; None: the first free one from 8080 on.
-            note: What the page says.
-            guides: Whether the person leads the end effector too, and not the body alone.
+            port: Port of the page; None: the first free one from 8080 on.
+            note: Text shown on the page.
+            guides: True if the person also guides the end effector, and not the body only.
         """
         from hrc_learn.sim import MovingBodies, World
         from hrc_learn.sim.workplace import Workplace

@@ -1,7 +1,7 @@
-"""Rolling out a policy in simulated time, as lerobot-rollout does by the clock.
+"""Policy rollouts in simulated time; lerobot-rollout uses the wall clock.
 
-Recorded with what a person beside it does in columns of its own, for which LeRobot's own
-command has no place.
+They record the person's input in additional columns, which LeRobot's own command does not
+support.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class CheckpointPolicy:
 
         Args:
             folder: `pretrained_model` of a checkpoint.
-            robot: That it leads, with the observations and actions that it knows.
+            robot: Robot with the observations and actions that the policy knows.
 
         Raises:
             FileNotFoundError: There is no checkpoint.
@@ -91,7 +91,7 @@ def roll_out(
     Args:
         robot: Connected.
         leader: The policy.
-        seed: Of the initial configuration, and of the person's pulls.
+        seed: Seed of the initial configuration, and of the person's pulls.
 
     Yields:
         After each action: what was observed before it, and the action.
@@ -111,10 +111,10 @@ def record_rollouts(
     """Roll a policy out and record it, successful or not.
 
     Args:
-        folder: Of the new dataset; must not exist.
+        folder: Folder of the new dataset; must not exist.
         policy: Checkpoint, its folder `pretrained_model`.
-        config: Of the robot, with the scenario, the first seed and the person.
-        episodes: To be recorded.
+        config: Configuration of the robot, with the scenario, the first seed and the person.
+        episodes: Number of episodes to record.
 
     Yields:
         After each episode: whether the job was done.

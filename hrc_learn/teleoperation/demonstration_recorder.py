@@ -140,8 +140,8 @@ class DemonstrationRecorder:
         """Keep a frame while recording.
 
         Args:
-            frame: Its columns.
-            touching: What the arm touches that it should not, in words.
+            frame: Columns of the frame.
+            touching: Unexpected contacts of the arm, as text.
         """
         if not self.recording:
             return

@@ -24,8 +24,8 @@ from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
     bounded,
     capped,
-    leading_twist,
     pull_to_nullspace_input,
+    steering_twist,
 )
 
 
@@ -215,8 +215,8 @@ def rumble_strength(feedback: Feedback, config: RumbleConfig) -> tuple[float, fl
     """Strengths of the slow and of the quick motor of a gamepad, 0 to 1.
 
     Args:
-        feedback: Of the arm.
-        config: From which forces on.
+        feedback: Feedback of the arm.
+        config: Thresholds and strengths.
     """
     met, (least, most) = 0.0, config.contact
     if feedback.contact_force is not None:
@@ -257,8 +257,8 @@ def deflection(
     each axis by itself would bend slow motions towards the axes.
 
     Args:
-        stick: Its place, each axis -1 to 1.
-        dead_zone: Fraction of its way without effect.
+        stick: Deflection of the stick, each axis -1 to 1.
+        dead_zone: Fraction of its range without effect.
         curve: Power of what remains.
     """
     length = float(np.linalg.norm(stick))
@@ -290,8 +290,8 @@ class Gamepad(Human):
             chain: The arm that is guided.
             controller: The gamepad.
             update: Lets the library read the device.
-            config: How sticks act, and how it rumbles.
-            clock: Tells the time [s].
+            config: Response of the sticks, and rumble.
+            clock: Monotonic clock [s].
         """
         self._chain, self._controller, self._update = chain, controller, update
         self._clock, self._next_pulse = clock, float("-inf")
@@ -305,7 +305,7 @@ class Gamepad(Human):
 
         Args:
             chain: The arm that is guided.
-            index: Which gamepad, counted from 0.
+            index: Index of the gamepad, from 0.
 
         Raises:
             ValueError: There is no such gamepad.
@@ -363,8 +363,8 @@ class Gamepad(Human):
         )
         # A stick that points forward or up reads negative; the base's y axis points left.
         stick = np.array([-y, -x, -z])
-        way = deflection(stick, config.dead_zone, config.curve)
-        return leading_twist(self._chain, state.joint_position, way, config.forces)
+        direction = deflection(stick, config.dead_zone, config.curve)
+        return steering_twist(self._chain, state.joint_position, direction, config.forces)
 
     def _pressed(self) -> set[int]:
         """Buttons that have gone down since the last reading."""
@@ -400,7 +400,7 @@ class KeyboardState:
 
         Args:
             holds_for: Time that a press counts [s].
-            clock: Tells the time [s].
+            clock: Monotonic clock [s].
 
         Raises:
             ValueError: `holds_for` is not positive.
@@ -449,7 +449,7 @@ class TerminalKeyboard(Human):
         Args:
             chain: The arm that is guided.
             typed: Characters typed since it was last asked; does not wait.
-            keys: How long a press counts.
+            keys: State of the keys.
         """
         self._chain, self._typed = chain, typed
         self._keys, self._config = keys or KeyboardState(), InteractionForceConfig()
@@ -477,10 +477,10 @@ class TerminalKeyboard(Human):
                 self._gripper = _GRIPPER[key]
             else:
                 self._keys.press(key)
-        way = self._keys.direction()
+        direction = self._keys.direction()
         return HumanInput(
             nullspace_input=np.zeros(len(state.joint_position)),
-            twist=leading_twist(self._chain, state.joint_position, way, self._config),
+            twist=steering_twist(self._chain, state.joint_position, direction, self._config),
             gripper=self._gripper,
             requests=tuple(requests),
         )

@@ -49,10 +49,11 @@ def force_to_nullspace_input(
     Args:
         chain: The arm.
         joint_position: Joint positions [rad].
-        joint: Which joint is pulled, counted from 1.
+        joint: Index of the pulled joint, from 1.
         pull: Force [N] or velocity [m/s], in the base frame.
-        mapping: How it acts on the joints.
-        point: Where the link is pulled, in the base frame [m]; the joint's origin if None.
+        mapping: Mapping of the force to the joints.
+        point: Point at which the link is pulled, in the base frame [m]; the joint's origin if
+            None.
 
     Raises:
         ValueError: If the arm has no such joint.
@@ -143,9 +144,9 @@ def gizmo_nullspace_input(
         chain: The arm.
         joint_position: Joint positions [rad].
         joint: The joint that moves the link, counted from 1.
-        point: Where the link is held, in the base frame [m].
-        displacement: From there to the gizmo, in the base frame [m].
-        config: How strongly it acts.
+        point: Point at which the link is held, in the base frame [m].
+        displacement: Vector from there to the gizmo, in the base frame [m].
+        config: Gains and bounds.
 
     Raises:
         ValueError: If the arm has no such joint.
@@ -170,8 +171,8 @@ def pull_to_nullspace_input(
     Args:
         chain: The arm.
         joint_position: Joint positions [rad].
-        joint: Which joint is pulled, counted from 1.
-        force: In the base frame [N]; with "pinv" it stands for the velocity that a gizmo
+        joint: Index of the pulled joint, from 1.
+        force: Force in the base frame [N]; with "pinv" it stands for the velocity that a gizmo
             displaced as far asks for.
         config: The mapping.
 
@@ -191,9 +192,9 @@ def guiding_twist(
     """Twist of a hand-guided end effector with a velocity, turned towards an orientation.
 
     Args:
-        pose: Of the end effector.
+        pose: Pose of the end effector.
         velocity: Asked for [m/s]; capped with its direction kept.
-        orientation: To turn to (wxyz), such as the coarse rule's; None: no turn.
+        orientation: Target orientation (wxyz), such as the coarse rule's; None: no turn.
         config: Speeds.
     """
     angular = np.zeros(3)
@@ -203,32 +204,32 @@ def guiding_twist(
     return np.concatenate([capped(velocity, config.speed), angular])
 
 
-def leading_twist(
+def steering_twist(
     chain: SerialChain,
     joint_position: Float[np.ndarray, " joints"],
-    way: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
     config: InteractionForceConfig,
     *,
     coarse: bool = True,
     turn: Float[torch.Tensor, "4"] | None = None,
 ) -> Float[np.ndarray, "6"]:
-    """Twist of an end effector that a device leads; zero while it leads nowhere.
+    """Twist that steers the end effector in a direction; zero if the direction is zero.
 
     Args:
         chain: The arm.
         joint_position: Joint positions [rad].
-        way: Where to, as a fraction of the largest speed, in the base frame.
+        direction: Direction of motion in the base frame, as a fraction of the largest speed.
         config: Speeds.
-        coarse: Whether the end effector turns by the coarse orientation rule.
+        coarse: Turn the end effector by the coarse orientation rule.
         turn: Rotation added to that rule (wxyz); None: none.
     """
-    if not way.any():
+    if not direction.any():
         return np.zeros(6)
     tool = chain.forward(torch.from_numpy(joint_position))
     orientation = coarse_orientation(tool.position) if coarse else None
     if orientation is not None and turn is not None:
         orientation = quaternion.multiply(turn, orientation)
-    return guiding_twist(tool, config.speed * way, orientation, config)
+    return guiding_twist(tool, config.speed * direction, orientation, config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,7 +245,7 @@ class HandGuidingConfig:
     approach_rate: float = 1.5
     """Decay rate of the distance to a target [1/s]."""
     return_speed: float = 0.3
-    """Largest speed of a joint on its way to a posture [rad/s]."""
+    """Largest speed of a joint that moves to a posture [rad/s]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Settings of the safety filter, which knows the limits of the arm's driver."""
 
@@ -350,8 +351,8 @@ class HandGuidedArm:
         null_velocity = torch.from_numpy(effort / self.config.damping)
         task, null = resolved_rate(J, twist, null_velocity)
         desired = task + null
-        if (way := self._way_to_posture(q, human_input)) is not None:
-            desired = way
+        if (velocity := self._posture_velocity(q, human_input)) is not None:
+            desired = velocity
         velocity, self.safety, report = self._filter.step(
             self.safety, q, desired, self.config.dt, jacobian=J
         )
@@ -366,7 +367,7 @@ class HandGuidedArm:
         self._human.tell(self._feedback.told(state, J, pushed=pushed))
         return GuidedStep(state=state, human_input=human_input, pose=pose, command=command)
 
-    def _way_to_posture(
+    def _posture_velocity(
         self, q: Float[torch.Tensor, " joints"], human_input: HumanInput
     ) -> Float[torch.Tensor, " joints"] | None:
         """Joint velocity towards the posture to move to [rad/s]; None: there is none."""

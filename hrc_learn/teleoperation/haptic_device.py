@@ -116,10 +116,10 @@ class HapticDevice(Human):
 
         Args:
             chain: The arm that is led.
-            device: Of Force Dimension's interface.
-            config: How it acts.
-            number: Of the device; -1: the one opened last.
-            clock: Tells the time [s].
+            device: Interface of Force Dimension's library.
+            config: Scaling of motions and forces.
+            number: Number of the device; -1: the one opened last.
+            clock: Monotonic clock [s].
         """
         self._chain, self._device, self._number = chain, device, number
         self._config, self._clock = config or HapticDeviceConfig(), clock
@@ -135,7 +135,7 @@ class HapticDevice(Human):
 
         Args:
             chain: The arm that is led.
-            config: How the device acts.
+            config: Scaling of motions and forces.
 
         Raises:
             ValueError: There is no device, or the maker's SDK is not installed.

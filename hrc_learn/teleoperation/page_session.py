@@ -133,8 +133,8 @@ class PageSession:
     """Steps the simulated arm as the person at the page asks, and records demonstrations.
 
     Attributes:
-        world: That the arm is in.
-        finished: Whether the person is done.
+        world: World of the arm.
+        finished: True once the person has finished.
         arm: The hand-guided arm.
     """
 
@@ -146,7 +146,7 @@ class PageSession:
         world: World,
         *,
         opened: OpenedArm | None = None,
-        beside: tuple[Human, ...] = (),
+        inputs: tuple[Human, ...] = (),
         config: PageSessionConfig | None = None,
     ):
         """Start at the present posture of the arm.
@@ -170,7 +170,7 @@ class PageSession:
         self._opened = opened or world.opened_arm
         if self._jumps:
             world.hold(workplace.scene.objects[0].name, self._home)
-        human = InputFilter(CombinedInput(page.human, *beside), self._config.input_filter)
+        human = InputFilter(CombinedInput(page.human, *inputs), self._config.input_filter)
         chain = world.arm.robot.chain
         self.arm = HandGuidedArm(chain, self._opened.arm, human, self._config.guiding)
         page.farewell = (
@@ -289,7 +289,7 @@ def hand_columns(hands: Mapping[str, TrackedHand]) -> Frame:
     """Columns of the person's hands.
 
     Args:
-        hands: That are seen, by "left" and "right".
+        hands: Tracked hands, by "left" and "right".
     """
     columns: Frame = {}
     for name in ("left", "right"):
@@ -312,10 +312,10 @@ class TaskPage:
         """Connect page and world.
 
         Args:
-            world: That is shown.
+            world: World to show.
             page: Open.
             dt: Control step of the task [s].
-            title: What is done, in words.
+            title: Title of the task.
         """
         self._title = title
         self.human = page.human

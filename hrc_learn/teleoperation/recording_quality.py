@@ -84,7 +84,7 @@ class RecordingQuality:
 
         Args:
             fps: Frames a second that there should be.
-            chain: Of the arm, whose limits are watched; None: they are not known.
+            chain: Kinematics of the arm, for checking joint limits; None skips this check.
             late: Periods after which a frame is late.
         """
         self._period, self._late, self._chain = 1 / fps, late, chain
@@ -112,11 +112,11 @@ class RecordingQuality:
         """Note a frame.
 
         Args:
-            now: When it came [s].
-            stamp: When it was taken, by the arm's clock [s].
+            now: Arrival time [s].
+            stamp: Time of the reading, by the arm's clock [s].
             joint_position: Joint positions [rad].
             gripper: Opening [m].
-            touching: What the arm touches that it should not, in words.
+            touching: Unexpected contacts of the arm, as text.
         """
         self.ticks.tick(now)
         self._stamps.append(stamp)
@@ -200,7 +200,7 @@ def moving_part(
     """Frames from shortly before an arm begins to move until shortly after it has stopped.
 
     Args:
-        time: Of the frames [s].
+        time: Time of each frame [s].
         state: Joints [rad] and gripper [m].
 
     Returns:

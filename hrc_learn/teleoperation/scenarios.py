@@ -209,11 +209,11 @@ class ScenarioRun:
         """Begin.
 
         Args:
-            scenario: What is to be done.
+            scenario: Task to perform.
             fps: Commands a second of the world's time.
-            seed: Of the first initial configuration.
-            imperfections: Of arm, calibration and workplace, drawn anew from each seed; None:
-                none.
+            seed: Seed of the first initial configuration.
+            imperfections: Imperfections of arm, calibration and workplace, drawn anew from each
+                seed; None: none.
         """
         self.scenario, self.dt = scenario, 1.0 / fps
         self._sizes = imperfections or Imperfections.ideal()
@@ -316,11 +316,11 @@ class ScenarioRun:
         """Let the fixed camera stand elsewhere from now on, where it still sees the table.
 
         Args:
-            change: By how much, from where the scene has it.
+            change: Displacement from its pose in the scene.
             rng: Source of the direction.
 
         Raises:
-            ValueError: From nowhere so far away it sees the table.
+            ValueError: No camera pose at this distance sees the table.
         """
         self.camera = change.applied(self.scenario.workplace.scene.camera, self._watched(), rng)
         for name in ("_sensor", "_tool_sensor"):
@@ -354,9 +354,9 @@ class ScenarioView:
         """Set up a camera that sees table, arm and cabinet.
 
         Args:
-            run: What to look at.
-            width: Of the images [px].
-            height: Of the images [px].
+            run: Run to look at.
+            width: Width of the images [px].
+            height: Height of the images [px].
             kind: "egl" renders everything; "synthetic" draws the markers on the table only.
 
         Raises:

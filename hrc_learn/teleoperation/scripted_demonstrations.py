@@ -82,8 +82,8 @@ def guided_frames(
         chain: The arm's kinematics.
         opened: The arm, where the demonstration starts.
         human: Gives end-effector motion and null-space input.
-        duration: Of the demonstration [s].
-        config: How the arm is guided.
+        duration: Duration of the demonstration [s].
+        config: Settings of hand guiding.
         observe: Further columns of a frame, called when it is recorded.
 
     Yields:
@@ -114,7 +114,7 @@ def write_demonstrations(
     Args:
         path: Folder of the dataset.
         demonstrations: Frames of each.
-        task: What is demonstrated, in words.
+        task: Description of the task.
         fps: Frames per second.
         robot: The arm.
         features: Columns beyond the usual ones: key, and names of the components.
@@ -215,11 +215,11 @@ def demonstrate_servoing(
 
     Args:
         world: Reset for the demonstration.
-        workplace: Where.
+        workplace: Workplace of the demonstration.
         sensor: The camera's markers.
-        config: How.
+        config: Timing and heights.
         rng: Source of objects, paths and tremor.
-        open_arm: How the arm is led.
+        open_arm: Function that opens the arm's driver.
 
     Raises:
         ValueError: If the camera does not see the object anywhere.
@@ -343,11 +343,11 @@ def demonstrate_placing(
 
     Args:
         world: Reset for the demonstration.
-        workplace: Where.
-        shelf: Which.
-        config: How.
+        workplace: Workplace of the demonstration.
+        shelf: Index of the shelf.
+        config: Timing and heights.
         rng: Source of the tremor and of the initial position.
-        open_arm: How the arm is led.
+        open_arm: Function that opens the arm's driver.
 
     Returns:
         The recorded frames, and all contacts of arm or object with the cabinet on the way.
@@ -373,11 +373,11 @@ def demonstrate_placing_without_contact(
 
     Args:
         world: Reset for each demonstration.
-        workplace: Where.
-        shelf: Which.
-        config: How.
+        workplace: Workplace of the demonstration.
+        shelf: Index of the shelf.
+        config: Timing and heights.
         rng: Source of the tremor and of the initial position.
-        open_arm: How the arm is led.
+        open_arm: Function that opens the arm's driver.
 
     Returns:
         The recorded frames, and how many demonstrations were discarded.

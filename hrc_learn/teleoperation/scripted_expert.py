@@ -77,7 +77,7 @@ def random_pulls(
 
     Args:
         rng: Source of moments, durations and sides.
-        duration: How long they go on [s].
+        duration: Duration of the pulls [s].
     """
     pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
     while time < duration:
@@ -110,9 +110,9 @@ class ScriptedPerturbation(Human):
 
         Args:
             chain: The arm.
-            forces: When and where it is pulled.
+            forces: Times, places and forces of the pulls.
             begin: Time from which their intervals count [s]; None: once `begin` is called.
-            config: How a pull acts; with "pinv" a force asks for the velocity that a gizmo
+            config: Effect of a pull; with "pinv" a force asks for the velocity that a gizmo
                 displaced as far would ask for. None: as `InteractionForceConfig` has it.
         """
         self._config = config or InteractionForceConfig()
@@ -152,7 +152,7 @@ class GuidedPath:
 
         Args:
             waypoints: Positions to pass [m].
-            duration: From the first to the last [s].
+            duration: Time from the first to the last [s].
             start: Time at the first [s].
 
         Raises:
@@ -198,7 +198,7 @@ class Tremor:
         """Draw the phases.
 
         Args:
-            amplitude: Of the tremor's displacement [m]; the drift's is three times as large.
+            amplitude: Amplitude of the tremor [m]; the drift's is three times as large.
             rng: Source of the phases.
         """
         # Two tremors (Elble and Koller 1990: 8 to 12 Hz), and a drift of two slow waves.
@@ -243,8 +243,8 @@ class ScriptedExpert(Human):
 
         Args:
             chain: The arm.
-            path: Where the end effector goes.
-            forces: When and how the body is pulled.
+            path: Path of the end effector.
+            forces: Times, places and forces of pulls at the body.
             tremor: Unsteadiness of the end effector.
             orientation: Rule for the orientation; the paper's coarse one by default.
         """
@@ -297,8 +297,8 @@ class ScriptedDrawing(Human):
         """Prepare.
 
         Args:
-            script: What is drawn when. Where intervals overlap, the first that has a region,
-                a target or a turn decides about that.
+            script: Intervals with their drawn regions. If intervals overlap, the first that has
+                a region, a target or a turn decides about that.
             joints: Number of joints of the arm.
         """
         self._script, self._still = tuple(script), np.zeros(joints)

@@ -101,8 +101,8 @@ class TorqueBias:
         """Begin with what is usual.
 
         Args:
-            joints: Of the arm.
-            deviation: Of the noise of a torque [N m].
+            joints: Number of joints of the arm.
+            deviation: Standard deviation of torque noise [N m].
         """
         self._joints, self._deviation = joints, deviation
         first, self._drift = (

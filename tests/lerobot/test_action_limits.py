@@ -71,13 +71,13 @@ def largest(episodes, order):
     return columns
 
 
-@pytest.mark.parametrize("share", [None, 0.5])
-def test_limits_are_what_was_demonstrated_within_episodes(tmp_path, share):
+@pytest.mark.parametrize("scale", [None, 0.5])
+def test_limits_are_what_was_demonstrated_within_episodes(tmp_path, scale):
     shown = paths()
     dataset = write(tmp_path / "set", shown)
-    limits = demonstrated_limits(dataset, **({} if share is None else {"share": share}))
+    limits = demonstrated_limits(dataset, **({} if scale is None else {"scale": scale}))
     for name, order in (("velocity", 1), ("acceleration", 2), ("jerk", 3)):
-        expected = [(share or 1.0) * value for value in largest(shown, order)]
+        expected = [(scale or 1.0) * value for value in largest(shown, order)]
         assert getattr(limits, name) == pytest.approx(expected, rel=1e-9)
     assert limits.names == ["a.pos", "b.pos", "c.pos"]
     assert limits.fps == FPS
@@ -191,7 +191,7 @@ def test_what_is_known_is_put_together(tmp_path):
     (tmp_path / "me.json").write_text(json.dumps({"a": CALIBRATION["a"]}))
     plain = demonstrated_limits(dataset, 0.5)
     limits = gathered_limits(
-        dataset, share=0.5, urdf=tmp_path / "arm.urdf", calibration=tmp_path / "me.json"
+        dataset, scale=0.5, urdf=tmp_path / "arm.urdf", calibration=tmp_path / "me.json"
     )
     assert (limits.lower, limits.upper) == ([-100.0, None, 0.0], [100.0, None, 0.1])
     assert limits.velocity == [0.25, min(3.0, plain.velocity[1]), plain.velocity[2]]
@@ -221,8 +221,8 @@ def test_files_that_tell_no_limits_are_refused(tmp_path, read, content, message)
 def test_the_command_says_what_is_wrong_and_writes_what_it_found(tmp_path, capsys):
     dataset, out = write(tmp_path / "set", paths()), tmp_path / "limits.json"
     arguments = ["limits", "--dataset", str(dataset), "--out", str(out)]
-    assert main([*arguments, "--share", "0"]) == 1
-    assert "share must be positive" in capsys.readouterr().err
+    assert main([*arguments, "--scale", "0"]) == 1
+    assert "scale must be positive" in capsys.readouterr().err
     (tmp_path / "me.json").write_text(json.dumps({"z": CALIBRATION["a"]}))
     assert main([*arguments, "--calibration", str(tmp_path / "me.json")]) == 1
     assert "names z.pos, but the actions of the dataset are a.pos" in capsys.readouterr().err

@@ -77,7 +77,7 @@ def session_from(start, tmp_path):
     page = Page(panda, drawn, workplace.scene.boxes(), PageConfig(), task="show it")
     with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
         yield PageSession(
-            workplace, page, recorder, world, opened=world.opened_arm, beside=(Asking(),)
+            workplace, page, recorder, world, opened=world.opened_arm, inputs=(Asking(),)
         )
 
 

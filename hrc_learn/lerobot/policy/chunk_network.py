@@ -1,4 +1,4 @@
-"""From what is seen to chunks of a motion, and from those to what can go on from anywhere."""
+"""Networks from observations to motion chunks, and the basis that continues chunks smoothly."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,16 @@ from hrc_learn.dmp.motion_head import MotionHead
 # Chunks as a motion: a linear map of few numbers, with its derivatives.
 
 NOISE = 1e-2
-"""Of demonstrated actions over their spread: what it hides is not learned."""
+"""Noise of demonstrated actions relative to their spread; motions below it are not learned."""
 BASIS, ACTIONS_EACH = 10, 2.5
 """Basis functions of a chunk, and the fewest actions for each: plans are no finer than that."""
 BLEND_TIME = 0.05
-"""At most [s], or one action where that takes longer, unless it is given."""
+"""Longest default blend time [s]; one action where that takes longer."""
 BLEND_SHARE = 0.3
-"""Of the time between two basis functions. A plan that is off by e at that spacing h is off by
-some 20 e / h^2 in acceleration, which leads a motion astray by 20 e (blend_time / h)^2."""
+"""Blend time as a fraction of the spacing of basis functions. A plan with error e at spacing h
+has an acceleration error of some 20 e / h^2, which displaces the motion by 20 e (blend_time /
+h)^2.
+"""
 TINY = 1e-9
 """Added to what is inverted, so that it can be."""
 
@@ -35,8 +37,9 @@ class ChunkDecoder(nn.Module):
     """
 
     maps: Float[Tensor, "4 samples M"]
-    """From coefficients to position, velocity, acceleration and jerk at each action and, for
-    the state that a chunk ends in, at the one after the last."""
+    """Linear map from coefficients to position, velocity, acceleration and jerk at each action
+    and, for the final state of a chunk, at one action after the last.
+    """
     projection: Float[Tensor, "M samples"]
 
     def __init__(
@@ -50,7 +53,7 @@ class ChunkDecoder(nn.Module):
 
         Args:
             chunk_size: Actions of a chunk.
-            step: From one action to the next [s].
+            step: Time between actions [s].
             n_basis: N, weights a column; None: 10, or two for five actions.
             blend_time: About how long a motion takes to get from where it is to what is
                 planned [s]; None: 0.05 s or one action, or less where basis functions are so
@@ -114,9 +117,9 @@ class ChunkDecoder(nn.Module):
         of least  sum_t d(t)^2 + blend_time^6 d'''(t)^2  from that action on.
 
         Args:
-            coefficients: As planned.
+            coefficients: Planned coefficients.
             state: Position, velocity and acceleration.
-            index: Of the action at which the motion is in that state.
+            index: Index of the action at which the motion is in that state.
         """
         position, jerk = self.maps[0, index:], self.maps[3, index:]
         cost = position.T @ position + self.blend_time**6 * jerk.T @ jerk
@@ -132,11 +135,13 @@ class ChunkDecoder(nn.Module):
 # Several plans for one observation, and how likely each is.
 
 RIDGE = 1e-2
-"""Of the regression that a network starts from: a share of the spread of its inputs."""
+"""Ridge strength of the regression that initialises a network, relative to the spread of its
+inputs.
+"""
 SPREAD = 1e-3
-"""Of coefficients, at least: those that never change are not divided by nothing."""
+"""Smallest spread of coefficients; avoids division by zero for constant ones."""
 DIFFERENCE = 0.02
-"""Of plans at first, in the spread of the coefficients."""
+"""Initial spread of plans, relative to the spread of the coefficients."""
 FARTHEST = 10.0
 """Spreads beyond which inputs are taken for wrong, and for no more than that."""
 LEFT_OVER = 0.05
@@ -164,7 +169,7 @@ class ChunkNetwork(nn.Module):
 
     mean: Float[Tensor, "D M"]
     spread: Float[Tensor, "D M"]
-    """Of the coefficients of demonstrated chunks."""
+    """Statistics of the coefficients of demonstrated chunks."""
 
     def __init__(
         self,
@@ -179,18 +184,18 @@ class ChunkNetwork(nn.Module):
         hidden: int,
         dropout: float,
     ):
-        """Make one that stands still.
+        """Make a network whose plans stand still.
 
         Args:
-            numbers: Of the features, those that a linear function suits, in front.
-            features: Of an observation.
-            moving: Velocities.
-            columns: D, that move smoothly.
-            two_level: G, that know two levels only.
-            decoder: For coefficients and the length of a chunk.
-            n_plans: K.
+            numbers: Number of leading features that suit a linear function.
+            features: Number of features of an observation.
+            moving: Number of velocities.
+            columns: D, number of smooth columns.
+            two_level: G, number of columns with two levels only.
+            decoder: Decoder of the coefficients, with the length of a chunk.
+            n_plans: K, number of plans.
             hidden: Width of the network.
-            dropout: Share of its hidden features left out while it trains.
+            dropout: Dropout probability of its hidden features.
         """
         super().__init__()
         self.numbers, self.columns, self.n_plans = numbers, columns, n_plans
@@ -218,8 +223,8 @@ class ChunkNetwork(nn.Module):
         """Plans for what is seen.
 
         Args:
-            features: Of the observation.
-            velocity: Of numbers of it, each in its spread.
+            features: Features of the observation.
+            velocity: Velocities of its values, relative to their spreads.
             known: 1 where that is known, else 0.
         """
         features = features.clamp(-FARTHEST, FARTHEST)

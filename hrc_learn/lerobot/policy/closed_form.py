@@ -21,13 +21,13 @@ from hrc_learn.lerobot.policy.networks import ContextualMotion
 # A policy's first primitives, by regression instead of gradients.
 
 REGULARIZATIONS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Of the regression, chosen from by the error on demonstrations left out."""
+"""Ridge strengths of the regression, chosen by cross-validation."""
 FEWEST = 4
-"""Demonstrations from which a regression can be told from chance."""
+"""Fewest demonstrations for which a regression can be distinguished from chance."""
 SMALLEST_VARIATION = 0.05
-"""Share of its spread by which a number of the context must differ between demonstrations."""
+"""Fraction of its spread by which a context value must vary between demonstrations."""
 MARGIN = 0.5
-"""Share of the demonstrated range by which contexts may lie outside."""
+"""Fraction of the demonstrated range by which contexts may lie outside."""
 
 
 @torch.no_grad()
@@ -46,7 +46,7 @@ def fit_closed_form(
     Args:
         motion: Changed in place.
         demonstrations: Coordinates frame by frame.
-        contexts: Of each, whitened.
+        contexts: Whitened context of each.
         fps: Frames a second.
 
     Returns:
@@ -72,7 +72,7 @@ class Regression:
     base: Float[Tensor, "K"]
     slopes: Float[Tensor, "C K"]
     error: float
-    """Of demonstrations left out."""
+    """Cross-validated error."""
 
 
 def _fit_each(
@@ -119,7 +119,7 @@ def _slopes(fit: RidgeFit, varies: Tensor) -> Tensor:
 
 
 def _error(motion: ContextualMotion, difference: Float[Tensor, "n K"]) -> float:
-    """What a difference in coordinates makes of the motion, root mean square."""
+    """Motion error caused by a difference in coordinates, root mean square."""
     # The map to motions is linear in all but the duration, which shifts them in time.
     per_coordinate = difference[:, :-1].unflatten(-1, (motion.width, -1)).clone()
     per_coordinate[..., :-3] *= motion.response.spring.stiffness
@@ -178,7 +178,7 @@ class SampleWindows:
 
         Args:
             episodes: Columns by key, (frames, ...) each.
-            deltas: For each key wanted, offsets in frames; None: the frame itself, without
+            deltas: Offsets in frames for each key; None: the frame itself, without
                 an axis of time.
             fps: Frames a second.
         """

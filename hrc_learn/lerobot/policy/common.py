@@ -1,4 +1,4 @@
-"""What the policies ask of a dataset and of observations alike."""
+"""Dataset statistics, features and processors common to all policies."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -22,8 +22,10 @@ OUTLIER = 25.0
 """Spreads from the mean from which on a value is no motion: one glitch among n frames is
 sqrt(n) spreads away, a gripper that opens for every 600th frame as many."""
 TWO_LEVEL = 0.9
-"""Share of the largest variance between minimum and maximum (Bhatia and Davis 2000, "A better
-bound on the variance") from which on a column knows two levels: 1 if it is never between."""
+"""Fraction of the largest variance possible between minimum and maximum (Bhatia and Davis 2000,
+"A better bound on the variance") from which a column counts as two-level: 1 if it only takes
+its extremes.
+"""
 
 
 @dataclass
@@ -35,13 +37,14 @@ class MotionPolicyConfig(PreTrainedConfig):
     n_action_steps: int = 25
     """Actions carried out before the next chunk is predicted."""
     vision_backbone: str = "small"
-    """Of images: "small", four convolutions, or a ResNet of torchvision such as "resnet18";
-    no weights are downloaded."""
+    """Image backbone: "small", four convolutions, or a ResNet of torchvision such as
+    "resnet18"; no weights are downloaded.
+    """
     vision_weights: str | None = None
     """File of weights for such a ResNet to begin with, safetensors by torchvision's names;
     None: it begins with random ones, or has been given its weights."""
     vision_pretrained: bool = False
-    """Whether the ResNet was begun with weights of torchvision's; set by `vision_weights`."""
+    """True if the ResNet started from torchvision's weights; set by `vision_weights`."""
     n_keypoints: int = 32
     """Places in each image that the network looks for."""
     fit_episodes: list[int] | None = None
@@ -59,7 +62,7 @@ class MotionPolicyConfig(PreTrainedConfig):
             ("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
         )
     )
-    """Nothing: the policy whitens inside, where start and actions share one space."""
+    """Identity: the policy normalises internally, where start and actions have one space."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,7 +133,7 @@ def _names(features: dict[str, dict[str, Any]], key: str) -> list[str] | None:
 
 
 def make_encoder(config: MotionPolicyConfig, widths: Mapping[str, int]) -> ObservationEncoder:
-    """What sees for a policy; of one that is not loaded, with the weights that it begins with.
+    """Image backbone of a policy, with initial weights unless a checkpoint is loaded.
 
     Raises:
         ValueError: There is no such backbone, or no weights for it.
@@ -202,12 +205,12 @@ def require_statistics(
     width: int,
     names: tuple[str, ...] = ("mean", "std"),
 ) -> None:
-    """See whether a dataset's statistics have finite numbers for each component.
+    """Check that a dataset's statistics are finite for each component.
 
-    Warns of components with a value so far off that all others look alike beside it.
+    Warns of components with an outlier so large that all other values look alike.
 
     Raises:
-        ValueError: They have not.
+        ValueError: A statistic is missing or not finite.
     """
     for name in names:
         if name not in stats.get(key, {}):
@@ -240,10 +243,10 @@ def two_level_columns(mean: Tensor, std: Tensor, low: Tensor, high: Tensor) -> l
     """Columns that are at their least or their largest value, such as a gripper's.
 
     Args:
-        mean: Of each column, (A).
-        std: Its spread.
-        low: Its least value.
-        high: Its largest value.
+        mean: Mean of each column, (A).
+        std: Standard deviation of each column.
+        low: Minimum of each column.
+        high: Maximum of each column.
     """
     largest = (high - mean) * (mean - low)
     return ((std > 0) & (std.square() > TWO_LEVEL * largest)).nonzero().flatten().tolist()

@@ -9,7 +9,7 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 
 @dataclass
 class DecodingConfig:
-    """How a chunk becomes a motion."""
+    """Conversion of chunks to motions."""
 
     n_basis: int | None = None
     """Basis functions a coordinate and chunk; None: 10, or two for five actions."""

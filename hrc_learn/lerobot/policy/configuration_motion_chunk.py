@@ -18,19 +18,20 @@ class MotionChunkConfig(MotionPolicyConfig):
     hidden_dim: int = 256
     """Width of the network."""
     dropout: float = 0.1
-    """Share of the network's hidden features left out in training."""
+    """Dropout probability of hidden features in training."""
     history: int = 2
     """Frames over which the velocity of observation.state is seen, where every frame is shown
     (`select_action`); 0: it is not. Training loads a second frame of everything for it."""
     state_noise: float = 0.0
-    """Noise on observation.state in training, in its spreads. With 0.15, plans lead back from
-    beside what was demonstrated, which matters where demonstrations hardly differ, as those of
-    scripts do; people's own variation does the same, and noise blurs what they mean."""
+    """Noise on observation.state in training, relative to its spread. With 0.15, plans return
+    to the demonstrations from nearby states. This helps where demonstrations hardly vary, such
+    as scripted ones; human variation has the same effect, and noise would blur the intent.
+    """
     n_plans: int = 3
     """Plans for each observation, of which one is carried out: as many ways to go as the
     demonstrations may show from one place."""
     sample_plans: bool = False
-    """Whether a motion begins with a plan drawn by its likelihood, or with the likeliest."""
+    """First plan of a motion: drawn by likelihood if true, else the most likely one."""
     two_level_actions: list[int] | None = None
     """Components of the action that know two levels only, such as a gripper that is open or
     shut, and jump between them; None: those that the dataset's statistics show to be such."""
@@ -69,7 +70,7 @@ class MotionChunkConfig(MotionPolicyConfig):
         return list(range(self.chunk_size + 1))
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
-        """From full rate to nothing along a cosine."""
+        """Cosine decay of the learning rate to zero."""
         return CosineDecayWithWarmupSchedulerConfig(
             num_warmup_steps=min(100, self.scheduler_decay_steps),
             num_decay_steps=self.scheduler_decay_steps,

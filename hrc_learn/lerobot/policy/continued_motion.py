@@ -21,7 +21,7 @@ class MotionChunk:
     actions: Float[Tensor, "B samples A"]
 
     def after(self, steps: Int[Tensor, "B"]) -> "MotionChunk":
-        """What is left after so many actions; it stands still where there is no more."""
+        """Remainder after a number of actions; stands still beyond the end."""
         samples = self.states.shape[1]
         index = steps[:, None] + torch.arange(samples, device=steps.device)
         over = index > samples - 1
@@ -35,9 +35,9 @@ class MotionChunk:
 
 
 class ContinuedMotion:
-    """What is being carried out, from chunk to chunk: C2, whatever is planned.
+    """Motion executed across chunks, C2 for any plan.
 
-    Some columns of the actions are smooth and follow a movement primitive, others jump.
+    Smooth columns of the actions follow a movement primitive; two-level columns jump.
     """
 
     chunk: MotionChunk | None
@@ -52,9 +52,9 @@ class ContinuedMotion:
         """Begin with nothing under way.
 
         Args:
-            decoder: From coefficients to the samples of a chunk.
-            compose: From smooth columns (B, samples, D) and those that jump (B, samples, G) to
-                actions (B, samples, A).
+            decoder: Decoder of coefficients to the samples of a chunk.
+            compose: Function from smooth columns (B, samples, D) and those that jump (B,
+                samples, G) to actions (B, samples, A).
             decompose: And back.
         """
         self.decoder = decoder
@@ -66,16 +66,16 @@ class ContinuedMotion:
         self.chunk = None
 
     def after(self, steps: int) -> MotionChunk | None:
-        """What is left when so many actions of the last chunk were carried out."""
+        """Remainder after a number of actions of the last chunk."""
         if self.chunk is None:
             return None
         states = self.chunk.states
         return self.chunk.after(torch.full((len(states),), steps, device=states.device))
 
     def nearest(self, position: Float[Tensor, "B D"]) -> MotionChunk | None:
-        """What is left from the action of the last chunk on that is nearest to a position.
+        """Remainder from the action of the last chunk that is nearest to a position.
 
-        At least one action was carried out.
+        At least one action counts as executed.
         """
         if self.chunk is None:
             return None
@@ -83,7 +83,7 @@ class ContinuedMotion:
         return self.chunk.after(off.square().sum(-1).argmin(1) + 1)
 
     def left_over(self, actions: Float[Tensor, "*one n A"]) -> MotionChunk | None:
-        """What goes on in actions of the last chunk, or of whatever made them."""
+        """Continuation of the last chunk, or of other given actions."""
         samples = self.decoder.samples
         actions = actions.reshape(-1, actions.shape[-1])
         # LeRobot fills short ones up with zeros.
@@ -124,7 +124,7 @@ class ContinuedMotion:
         Args:
             planned: Coefficients of the smooth columns.
             stepped: Values of the columns that jump.
-            before: What is left of the chunk before; None: the motion begins.
+            before: Remainder of the previous chunk; None: the motion begins.
             beginning: State to begin in then; None: as planned.
             delay: Actions of `before` that will be carried out before this chunk is there.
         """

@@ -35,7 +35,7 @@ class ChunkMotion(ContinuedMotion):
         """Begin with nothing under way.
 
         Args:
-            config: With the frame rate and the columns that jump.
+            config: Configuration with the frame rate and the two-level columns.
             predicted: Samples of a chunk: its actions and the one after.
             width: A, components of an action.
         """
@@ -79,7 +79,7 @@ class ChunkMotion(ContinuedMotion):
 
 
 class DecodedPolicy:
-    """What both have in common, around a policy of LeRobot that predicts whole chunks."""
+    """Common part of both policies, a wrapper of a LeRobot policy of whole chunks."""
 
     config: Any
     motion: ChunkMotion
@@ -159,7 +159,7 @@ class _MotionACT(ACT):
         self._decode = motion.decode
 
     def forward(self, batch: dict[str, Any]) -> Any:
-        """As ACT."""
+        """Same as ACT."""
         actions, latent = super().forward(batch)
         return self._decode(actions), latent
 
@@ -180,7 +180,7 @@ class ActDmpPolicy(DecodedPolicy, ACTPolicy):
         """Build the policy.
 
         Args:
-            config: With the features known.
+            config: Configuration with known features.
             dataset_stats: Statistics that tell which components of the action jump.
             dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from.
 

@@ -41,12 +41,13 @@ logger = logging.getLogger(__name__)
 
 
 class DMPPolicy(PreTrainedPolicy):
-    """A movement primitive an episode, told by the first observation, corrected by the others.
+    """Policy that executes one movement primitive an episode, predicted from the first
+    observation and corrected by later ones.
 
-    Goal, weights, duration and, where it is not measured, start follow from what is seen; the
-    chunk follows from them, and from where the motion is, by one linear map. As each chunk
-    starts with the position and the velocity that the last one ended with, the motion is C1
-    whatever is predicted.
+    Goal, weights, duration and, where it is not measured, the start are predicted from
+    observations. A chunk follows from them and from the state of the motion by one linear map.
+    Each chunk starts with the position and velocity that the last one ended with, so the motion
+    is C1 for any prediction.
     """
 
     config_class = DMPConfig  # pyright: ignore[reportAssignmentType]
@@ -65,7 +66,7 @@ class DMPPolicy(PreTrainedPolicy):
         A policy that is loaded takes what it was trained with from its checkpoint.
 
         Args:
-            config: With the features known.
+            config: Configuration with known features.
             dataset_stats: Statistics that numbers are whitened by.
             dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from, and the
                 demonstrations where they lie on disk.
@@ -80,7 +81,7 @@ class DMPPolicy(PreTrainedPolicy):
         self.config = config
         self.planner = _planner(config, 1 / config.fps)
         self.left_out_error = math.nan
-        """Of demonstrations left out of the closed form, in the spread of the actions."""
+        """Cross-validated error of the closed form, relative to the spread of the actions."""
         if config.pretrained_path is None:
             require_any_statistics(dataset_stats, dataset_meta)
             self._whiten(dataset_stats)
@@ -104,8 +105,8 @@ class DMPPolicy(PreTrainedPolicy):
         Actions after the end of an episode count as none.
 
         Args:
-            batch: As LeRobot loads it by the config's delta indices: observations (B, 2, ...),
-                the first of the episode and the current one, `action` (B, chunk, A),
+            batch: Batch as LeRobot loads it by the config's delta indices: observations (B, 2,
+                ...), the first of the episode and the current one, `action` (B, chunk, A),
                 `action_is_pad` and `timestamp`.
             reduction: "none" for one loss each, (B), else their mean.
 
@@ -231,7 +232,7 @@ def write_closed_form_policy(
         dataset: LeRobot dataset with actions, and a state or an environment state.
         folder: Existing folder for the checkpoint.
         n_basis: Basis functions a coordinate.
-        episodes: To learn from; None: all.
+        episodes: Episodes to learn from; None: all.
 
     Returns:
         How many demonstrations, and the error of those left out, in the spread of the actions.

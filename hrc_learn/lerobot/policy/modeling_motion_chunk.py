@@ -43,26 +43,31 @@ logger = logging.getLogger(__name__)
 MEASURED = 0.5
 """Spreads by which actions may differ from the state of their name to be what it measures."""
 UNKNOWN = 0.3
-"""Share of samples trained without the velocity of the state, as after a reset, and so that
-policies are not sure of their own past, with which they would go on whatever they see."""
+"""Fraction of samples trained without the velocity of the state, as after a reset. It also
+keeps policies from relying on their own past motion regardless of observations.
+"""
 VELOCITY_WEIGHT = 0.005
-"""Of the error in velocity, spreads a second, beside that in position."""
+"""Weight of the velocity error, in spreads per second, relative to that of the position."""
 SCORE_WEIGHT = 0.1
-"""Of the scores of plans beside the plans: a classification learns faster."""
+"""Weight of the plan scores relative to the plans: a classification learns faster."""
 SAME_WAY = 3.0
-"""Distance from which on plans are different ways to go, in the error of the nearest: of nearer
-ones the mean is closer to what is shown than any, of others it is neither way. Three that share
-one normal distribution are 2.8 apart (Max 1960, "Quantizing for minimum distortion")."""
+"""Distance from which plans are distinct, relative to the error of the nearest. The mean of
+nearer plans is closer to the demonstration than any of them; the mean of distinct ones is not a
+valid plan. Three quantisation levels of one normal distribution are 2.8 apart (Max 1960,
+"Quantizing for minimum distortion").
+"""
 LEAST_ERROR = 1e-3
 """In spreads: where nothing moves there is none, and plans are the same way all the same."""
 FORGETTING = 0.01
-"""Of that error, each step of training."""
+"""Decay of that error's running mean at each training step."""
 
 SMALLEST_TURN = 0.05
 """Spread of orientations, at least [rad]: a hand that points down in all demonstrations
 trembles by 1e-5, and tilts by more as soon as anything differs from what was shown."""
 SLOWEST = 0.3
-"""Of the median velocity in spreads: columns that are slower are not blown up either."""
+"""Smallest scale of velocities, relative to the median velocity; slower columns are not
+amplified.
+"""
 MOST_CHUNKS = 50_000
 """That say enough of a linear function; more are spread evenly."""
 
@@ -102,7 +107,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         A policy that is loaded takes what it was trained with from its checkpoint.
 
         Args:
-            config: With the features known.
+            config: Configuration with known features.
             dataset_stats: Statistics that numbers are whitened by.
             dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from, and the
                 demonstrations where they lie on disk.
@@ -185,9 +190,9 @@ class MotionChunkPolicy(PreTrainedPolicy):
         Actions before the beginning of an episode and after its end count as none.
 
         Args:
-            batch: As LeRobot loads it by the config's delta indices: observations (B, 2, ...)
-                of `history` frames ago and of now, or (B, ...) of now alone; `action`
-                (B, chunk + 1, A) and `action_is_pad`.
+            batch: Batch as LeRobot loads it by the config's delta indices: observations (B, 2,
+                ...) of `history` frames ago and of now, or (B, ...) of now alone; `action` (B,
+                chunk + 1, A) and `action_is_pad`.
             reduction: "none" for one loss each, (B), else their mean.
 
         Returns:
@@ -292,7 +297,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         return {**batch, OBS_STATE: turned.reshape(state.shape)}
 
     def _velocity(self, states: Float[Tensor, "B frames F"]) -> Float[Tensor, "B F"]:
-        """From the first to the last of turned states `history` frames apart, whitened."""
+        """Whitened velocity between the first and the last state, `history` frames apart."""
         moved = (states[:, -1] - states[:, 0]) / self.encoder.std[: states.shape[-1]]
         return moved / (self.config.history * self._step * self.velocity_spread)
 
@@ -322,7 +327,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         return actions[:, :-1]
 
     def _plans(self, batch: Observation) -> Plans:
-        """For what is seen now, and how fast it has changed."""
+        """Plans for the present observation and its velocity."""
         features = self.encoder(self._turned(batch))
         velocity = features.new_zeros(len(features), len(self.velocity_spread))
         known = features.new_zeros(len(features))
@@ -348,13 +353,13 @@ class MotionChunkPolicy(PreTrainedPolicy):
             chosen = scores.argmax(-1)
         row = torch.arange(len(chosen), device=chosen.device)
         apart = (positions - positions[row, chosen][:, None]).square().mean((-2, -1))
-        share = scores.masked_fill(apart >= same**2, -torch.inf).softmax(-1)
-        return (share[..., None, None] * plans.coefficients).sum(1)
+        weight = scores.masked_fill(apart >= same**2, -torch.inf).softmax(-1)
+        return (weight[..., None, None] * plans.coefficients).sum(1)
 
     def _beginning(
         self, batch: Observation, planned: Float[Tensor, "B 3 D"]
     ) -> Float[Tensor, "B 3 D"]:
-        """As planned, but where the arm is measured, as far as it is."""
+        """Planned state, with measured positions where they are observed."""
         if OBS_STATE not in self.encoder.widths:
             return planned
         values = batch[OBS_STATE][:, None, self.measured.clamp_min(0)]

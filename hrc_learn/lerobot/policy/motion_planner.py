@@ -1,4 +1,4 @@
-"""From observations to chunks of one continuous motion; the policy without LeRobot."""
+"""Planner from observations to chunks of one continuous motion; the policy without LeRobot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -114,14 +114,14 @@ def _replaced(values: Tensor, columns: list[int], new: Tensor) -> Tensor:
 ROTATION = ("wx", "wy", "wz")
 """Last part of the names of a rotation vector's components, as LeRobot has them."""
 ENDINGS = ("", ".pos")
-"""What may follow it: lerobot-rollout hands on no names but those with an ending."""
+"""Possible endings of names: lerobot-rollout only passes on names with one."""
 
 
 def rotation_triples(names: Sequence[str] | None) -> list[list[int]]:
     """Components that make up rotation vectors, such as ee.wx, ee.wy, ee.wz.
 
     Args:
-        names: Of all components; None: unknown, so that there is none.
+        names: Names of all components; None: unknown.
     """
     index = {name: i for i, name in enumerate(names or ())}
     triples = []
@@ -139,14 +139,14 @@ def matched_columns(
     state_names: Sequence[str] | None,
     widths: tuple[int, int],
 ) -> list[int]:
-    """Where each component of the action is measured: columns of the state, -1 for nowhere.
+    """State columns that measure each component of the action; -1: not measured.
 
-    Where neither has names, states as wide as actions are taken for what they command. A
-    rotation vector is taken whole or not at all.
+    If neither has names and their widths agree, states are taken for measured actions. A
+    rotation vector is measured whole or not at all.
 
     Args:
-        action_names: None: unknown.
-        state_names: None: unknown.
+        action_names: Names of the action's components; None: unknown.
+        state_names: Names of the state's components; None: unknown.
         widths: Number of components of action and state.
     """
     actions, states = widths
@@ -168,14 +168,16 @@ STATE = "observation.state"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Start:
-    """What a chunk starts from, in the coordinates of the primitives."""
+    """Initial state of a chunk, in the coordinates of the primitives."""
 
     position: Float[Tensor, "B A"]
     velocity: Float[Tensor, "B A"]
     elapsed: Float[Tensor, "B"]
-    """When the motion was there, since the start of the episode [s]."""
+    """Time of this state since the start of the episode [s]."""
     lead: Float[Tensor, "B"]
-    """From then to the first action of the chunk [s]: one step, or none in the first chunk."""
+    """Time from this state to the first action of the chunk [s]: one step, or zero in the first
+    chunk.
+    """
 
     @property
     def clock(self) -> Float[Tensor, "B"]:
@@ -185,7 +187,7 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InitialPlan:
-    """What is kept of the first observation of an episode."""
+    """Quantities kept from the first observation of an episode."""
 
     context: Float[Tensor, "B C"]
     features: Float[Tensor, "B F"]
@@ -202,7 +204,7 @@ class Chunk:
     """Time of the first action since the start of the episode [s]."""
 
     def start_after(self, actions: int, step: float) -> Start:
-        """What the next chunk starts from when so many `actions` were carried out."""
+        """Initial state of the next chunk after a number of executed `actions`."""
         k = actions - 1
         return Start(
             position=self.position[:, k],
@@ -231,12 +233,12 @@ class MotionPlanner(nn.Module):
         """Put it together.
 
         Args:
-            encoder: Of observations.
-            encoding: From actions to coordinates.
-            motion: From what is seen to primitives of these coordinates.
-            measured: For each component of the action its column of `observation.state`, -1
+            encoder: Encoder of observations.
+            encoding: Encoding of actions in coordinates.
+            motion: Network from observations to primitives of these coordinates.
+            measured: Column of `observation.state` of each action component, -1
                 for those that are not measured.
-            step: From one action to the next [s].
+            step: Time between actions [s].
             chunk_size: Actions planned at once.
         """
         super().__init__()
@@ -268,15 +270,16 @@ class MotionPlanner(nn.Module):
     def condition(
         self, first: Observation, now: Observation, clock: Float[Tensor, "B"]
     ) -> Chunk:
-        """The chunk at a time of an episode that until then runs as its first observation told.
+        """Chunk at a time of an episode that so far followed the prediction at its first
+        observation.
 
-        So training starts chunks from where the policy's own motion comes to, as it does when
-        it runs, and not from what was shown, where noise has no velocity.
+        Training thus starts chunks from the policy's own motion, as execution does, and not
+        from the demonstration, whose noise has no valid velocity.
 
         Args:
-            first: The first observation of the episode.
-            now: The one at `clock`.
-            clock: Since the start of the episode [s].
+            first: First observation of the episode.
+            now: Observation at `clock`.
+            clock: Time since the start of the episode [s].
         """
         plan_start = self.initial_plan(first)
         begin = plan_start.start

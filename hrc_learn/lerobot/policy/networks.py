@@ -1,4 +1,4 @@
-"""What the policy learns: from observations to features, and from those to primitives."""
+"""Networks of the policies: from observations to features, and from features to primitives."""
 
 import math
 from collections import OrderedDict
@@ -20,7 +20,9 @@ from hrc_learn.dmp import Response, continue_motion
 # Convolutions that policies see with, by name; none downloads weights.
 
 GROUPS = 8
-"""Of channels normalised together; batches of few demonstrations say too little."""
+"""Channels in a group of group normalisation; batches of few demonstrations are too small for
+batch statistics.
+"""
 IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 """Mean and spread of red, green and blue that torchvision's weights were trained with."""
 
@@ -28,19 +30,19 @@ IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 def make_backbone(
     name: str, channels: int, *, pretrained: bool = False
 ) -> tuple[nn.Module, int]:
-    """From images to feature maps.
+    """Backbone from images to feature maps.
 
     Args:
         name: "small", or a ResNet of torchvision.
-        channels: Of the images.
-        pretrained: Whether weights of torchvision's own will be loaded: the normalisation is
-            theirs then, over batches that are long gone.
+        channels: Number of channels of the images.
+        pretrained: True if torchvision's weights will be loaded; the backbone then uses frozen
+            batch normalisation.
 
     Returns:
-        The backbone, and the channels of its maps.
+        The backbone, and the number of channels of its maps.
 
     Raises:
-        ValueError: There is no such backbone, or none that weights could be loaded into.
+        ValueError: There is no such backbone, or no weights can be loaded into it.
     """
     if name == "small":
         if pretrained:
@@ -85,7 +87,7 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
     """Load weights of a ResNet, by torchvision's names, from a file.
 
     Args:
-        backbone: As of `make_backbone`, pretrained.
+        backbone: Name of the backbone, as in `make_backbone`, pretrained.
         path: A state dict as safetensors.
 
     Raises:
@@ -116,10 +118,11 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
 
 SMALLEST_SPREAD = 1e-6
 """Components that vary by less have never changed."""
-SMALLEST_SHARE = 0.01
-"""Of the median spread of the numbers of a feature: those that vary by less are not blown up. A
-joint that is held still trembles by a thousandth of what others move, in another way wherever
-the arm has not been shown; blown up, that led an arm of ALOHA away from its cube."""
+SMALLEST_SCALE = 0.01
+"""Smallest scale of a feature's values, relative to their median spread. A joint that is held
+still trembles by a thousandth of the motion of others, differently at states never
+demonstrated; amplified, this moved an ALOHA arm away from its cube.
+"""
 type Observation = Mapping[str, Any]
 """Tensors by key; LeRobot's evaluation adds other things."""
 
@@ -179,7 +182,7 @@ class ObservationEncoder(nn.Module):
         """Begin with the weights of a file in the backbones of all cameras.
 
         Raises:
-            ValueError: As `load_backbone`.
+            ValueError: Same as `load_backbone`.
         """
         for camera in self.cameras.values():
             assert isinstance(camera, KeypointEncoder)
@@ -199,12 +202,12 @@ class ObservationEncoder(nn.Module):
         return torch.cat([self.numbers(observation), *seen], dim=-1)
 
 
-def divisors(std: Float[Tensor, "n"], share: float = SMALLEST_SHARE) -> Float[Tensor, "n"]:
-    """What the numbers of a feature are divided by: spreads, at least a share of the median."""
+def divisors(std: Float[Tensor, "n"], fraction: float = SMALLEST_SCALE) -> Float[Tensor, "n"]:
+    """Scales of a feature's values: spreads, bounded below by a fraction of the median."""
     varies = std > SMALLEST_SPREAD
     if not varies.any():
         return torch.ones_like(std)
-    least = share * std[varies].median()
+    least = fraction * std[varies].median()
     return torch.where(varies, std.clamp_min(least), 1.0)
 
 
@@ -231,10 +234,10 @@ class KeypointEncoder(nn.Module):
             image = 2 * image - 1
         maps = self.maps(self.backbone(image))
         height, width = maps.shape[-2:]
-        share = maps.flatten(-2).softmax(-1).unflatten(-1, (height, width))
+        weight = maps.flatten(-2).softmax(-1).unflatten(-1, (height, width))
         u = torch.linspace(-1, 1, width).to(maps)
         v = torch.linspace(-1, 1, height).to(maps)
-        return torch.cat([share.sum(-2) @ u, share.sum(-1) @ v], dim=-1)
+        return torch.cat([weight.sum(-2) @ u, weight.sum(-1) @ v], dim=-1)
 
 
 def _module_name(key: str) -> str:
@@ -244,7 +247,7 @@ def _module_name(key: str) -> str:
 HARMONICS = 4
 """Sines and cosines of the phase that the network sees."""
 DURATIONS = math.log(3)
-"""How far, as a logarithm, a duration may get from the one fitted."""
+"""Largest deviation of a predicted duration from the fitted one, as a logarithm."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -282,10 +285,10 @@ class ContextualMotion(nn.Module):
         """Make one that stands still.
 
         Args:
-            response: Of the primitives.
+            response: Response of the primitives.
             width: A, their coordinates.
             context: C, length of the context.
-            features: Of the first and the current observation together.
+            features: Features of the first and the current observation together.
             hidden: Width of the network.
         """
         super().__init__()
@@ -319,7 +322,7 @@ class ContextualMotion(nn.Module):
 
         Args:
             context: Numbers of the first observation.
-            features: Of the first observation and the current one.
+            features: Features of the first and the current observation.
             elapsed: Since the start of the episode [s].
         """
         # Outside of what was demonstrated a straight line leads anywhere.
@@ -332,7 +335,7 @@ class ContextualMotion(nn.Module):
         )
 
     def primitives(self, x: Float[Tensor, "*batch K"]) -> Primitives:
-        """What the coordinates stand for."""
+        """Encoding of the coordinates."""
         per_coordinate = x[..., :-1].unflatten(-1, (self.width, -1))
         duration = self._duration(x)
         return Primitives(

@@ -1,4 +1,4 @@
-"""What LeRobot does around `act_dmp` and `diffusion_dmp`: as around its own."""
+"""LeRobot processors of `act_dmp` and `diffusion_dmp`, those of ACT and diffusion."""
 
 from lerobot.policies.act.processor_act import (
     make_act_pre_post_processors as make_act_dmp_pre_post_processors,

@@ -1,4 +1,4 @@
-"""What LeRobot does to observations and actions around the policy `dmp`: batch and device."""
+"""LeRobot processors of the policy `dmp`: batching and device."""
 
 from typing import Any
 

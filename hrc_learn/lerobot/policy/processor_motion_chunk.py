@@ -1,4 +1,4 @@
-"""What LeRobot does around the policy `motion_chunk`: batch and device."""
+"""LeRobot processors of the policy `motion_chunk`: batching and device."""
 
 from typing import Any
 

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 
 
 _PATIENCE = 5.0
-"""How long the last stop is tried [s]; each velocity ends by itself long before."""
+"""Duration of attempts to stop the arm at the end [s]; each velocity command expires well
+before.
+"""
 # From reading the joints to the arm following [s], as `Imperfections.nominal()`. Measured with
 # franky against simulators: 2 ms from a command to the servos; the rest is for the network, the
 # scheduling and what computing a step takes, which no simulator has.
@@ -50,24 +52,25 @@ class FrankaPandaConfig(ArmRobotConfig):
     ip: str
     """Address of the control box."""
     dynamics: float = 0.3
-    """Share of the driver's own limits of acceleration and jerk."""
+    """Fraction of the driver's acceleration and jerk limits."""
     tcp_speed: float = 0.25
     """Cap on the speed of the tool centre point [m/s] (ISO 10218: reduced speed)."""
     timeout: float = 0.15
     """Silence of the loop after which the arm is stopped [s]."""
     own_process: bool = True
-    """Whether the driver runs in a process of its own, which stops the arm also when this one
-    hangs, is stopped or dies."""
+    """Run the driver in a process of its own, which also stops the arm when this process hangs,
+    is stopped or dies.
+    """
     grip_force: float = 20.0
-    """With which the gripper squeezes [N]."""
+    """Grasp force of the gripper [N]."""
     grip_speed: float = 0.1
-    """Of the fingers [m/s]."""
+    """Speed of the fingers [m/s]."""
     realtime: Realtime = "enforce"
-    """Whether a kernel without real-time scheduling is refused. Ignore it for simulators."""
+    """Refuse a kernel without real-time scheduling. Choose "ignore" for simulators."""
     collision: CollisionConfig = field(default_factory=CollisionConfig)
     """External load from which on the arm stops by a reflex."""
     load: Load | None = None
-    """At the flange, beyond the end effector; None: as the arm has been told before."""
+    """Load at the flange in addition to the end effector; None: as configured in the robot."""
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     """Cameras of LeRobot, by name."""
 
@@ -87,7 +90,7 @@ class FrankaPandaConfig(ArmRobotConfig):
         self.driver()  # which checks the rest
 
     def driver(self) -> FrankyConfig:
-        """How the driver leads the arm."""
+        """Settings of the driver."""
         return FrankyConfig(
             dynamics=self.dynamics,
             timeout=self.timeout,

@@ -34,8 +34,9 @@ class ImagesConfig:
     """Images of the simulated workplace."""
 
     kind: Literal["none", "auto", "egl", "synthetic"] = "none"
-    """Which camera: "egl" renders everything, "synthetic" draws the markers on the table only
-    and needs no OpenGL, "auto" renders where that is possible."""
+    """Camera type: "egl" renders everything; "synthetic" draws only the markers on the table
+    and needs no OpenGL; "auto" renders where possible.
+    """
     width: int = 160
     """[px]"""
     height: int = 120
@@ -47,11 +48,11 @@ class MovedCameraConfig:
     """The fixed camera stands elsewhere than in demonstrations, and still sees the table."""
 
     distance: float = 0.0
-    """By how much it is moved [m]."""
+    """Distance by which it is moved [m]."""
     angle: float = 0.0
-    """By how much it is turned [degrees]."""
+    """Angle by which it is turned [degrees]."""
     seed: int = 0
-    """Of the directions of both."""
+    """Random seed of both directions."""
 
 
 @RobotConfig.register_subclass("mujoco_panda")
@@ -70,19 +71,21 @@ class MujocoArmRobotConfig(ArmRobotConfig):
     tip: str = ""
     """Link of such a file that is the arm's flange; empty: its only end."""
     scenario: str = "placing"
-    """What is to be done: "placing" or "grasping"."""
+    """Task: "placing" or "grasping"."""
     shelf: str = "middle"
-    """Where to place: "lower", "middle" or "upper"."""
+    """Target shelf: "lower", "middle" or "upper"."""
     seed: int = 0
-    """Of the first initial configuration; each one after has the next."""
+    """Seed of the first initial configuration; each reset increments it."""
     pixels: bool = False
-    """Whether the pixel of the object is observed, as the fixed camera saw it at the beginning:
-    what a policy needs to grasp without images."""
+    """Observe the pixel of the object in the fixed camera at the start of the episode, which a
+    policy needs to grasp without images.
+    """
     marker: bool = False
-    """Whether the pixel of the marker on the tool is observed, as the fixed camera sees it now,
-    and whether it does: by this a camera that was moved is noticed."""
+    """Observe the present pixel of the tool's marker in the fixed camera, and its visibility;
+    used to detect that the camera has moved.
+    """
     moved_camera: MovedCameraConfig = field(default_factory=MovedCameraConfig)
-    """Where the fixed camera stands, from where demonstrations had it."""
+    """Displacement of the fixed camera from its pose in the demonstrations."""
     images: ImagesConfig = field(default_factory=ImagesConfig)
     """Images to be observed."""
     imperfections: float = 0.0
@@ -217,10 +220,11 @@ class MujocoArmRobot(ArmRobot):
         return self._marker
 
     def _begin_anew_in_time(self) -> None:
-        """With the recorder's next episode.
+        """True if the recorder starts its next episode.
 
-        It ends one at the first frame that would come late, and takes longer than a frame to
-        save it: so much may be allowed for a last frame, whatever else the machine has to do.
+        The recorder ends an episode at the first frame that would be late, and saving takes
+        longer than a frame. The threshold allows this much for a last frame, however busy the
+        machine is.
         """
         now, length = time.monotonic(), self.config.episode_time
         if not self.run.commands:
@@ -237,7 +241,7 @@ class MujocoArmRobot(ArmRobot):
         super().disconnect()
 
     def _warn_of_half_an_episode(self) -> None:
-        """Where the clock, or a late loop, ended it before the job was done."""
+        """True if the time limit or a late loop ended the episode before the task was done."""
         shown, whole = self.dt * self.run.commands, self.run.scenario.duration
         if not self.run.succeeded():
             logger.warning(

@@ -27,7 +27,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True)
     limits = commands.add_parser("limits", help="write a file of limits")
     limits.add_argument("--dataset", type=Path, required=True, help="how demonstrators moved")
-    limits.add_argument("--share", type=float, default=1.0, help="of it, to allow (default 1)")
+    limits.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        help="fraction of the demonstrated limits to allow (default 1)",
+    )
     limits.add_argument("--urdf", type=Path, help="positions and velocities of joints")
     limits.add_argument("--calibration", type=Path, help="positions, of LeRobot's calibration")
     limits.add_argument("--degrees", action="store_true", help="actions are in degrees")
@@ -48,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
 def _limits(options: argparse.Namespace) -> None:
     limits = gathered_limits(
         options.dataset,
-        share=options.share,
+        scale=options.scale,
         urdf=options.urdf,
         calibration=options.calibration,
         degrees=options.degrees,

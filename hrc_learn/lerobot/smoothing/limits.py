@@ -17,11 +17,13 @@ from jaxtyping import Float
 
 ACTION, STATE = "action", "observation.state"
 _UNUSUAL = 0.999
-"""Share of the differences that a limit is not less than: single glitches are no limit."""
+"""Quantile of the differences used as a limit; single glitches do not count."""
 _STILL = 1e-3
-"""Of the largest limit, what a value gets that never moved: no limit may be zero."""
+"""Limit of a value that never moved, relative to the largest limit; limits must be positive."""
 _ENCODER_STEPS = 4095
-"""Of a turn, of the servos that LeRobot calibrates in degrees (Feetech STS, Dynamixel X)."""
+"""Encoder steps of a turn, for servos that LeRobot calibrates in degrees (Feetech STS,
+Dynamixel X).
+"""
 
 type Range = tuple[float | None, float | None]
 """Lowest and highest position; None: no limit."""
@@ -49,7 +51,7 @@ class ActionLimits:
     upper: list[float | None]
     """Highest position; None: no limit."""
     state_columns: list[int]
-    """Where each value is measured in `observation.state`; -1: nowhere."""
+    """Columns of `observation.state` that measure each value; -1: not measured."""
 
     def __post_init__(self) -> None:
         if not 0 < self.fps < math.inf:
@@ -121,27 +123,28 @@ class ActionLimits:
 def gathered_limits(
     dataset: Path,
     *,
-    share: float = 1.0,
+    scale: float = 1.0,
     urdf: Path | None = None,
     calibration: Path | None = None,
     degrees: bool = False,
 ) -> ActionLimits:
-    """The demonstrators' limits, with positions and velocities of whatever else is known.
+    """Limits of the demonstrations, with limits of position and velocity from other sources.
 
     Args:
-        dataset: As of `demonstrated_limits`.
-        share: Likewise.
-        urdf: As of `urdf_limits`; None: there is none.
-        calibration: As of `calibrated_ranges`, whose ranges count before those of the URDF.
-        degrees: Whether the robot's actions are in degrees.
+        dataset: LeRobot dataset, as in `demonstrated_limits`.
+        scale: Factor of the demonstrated limits.
+        urdf: URDF file, as in `urdf_limits`; None: there is none.
+        calibration: Calibration file, as in `calibrated_ranges`; its ranges take precedence
+            over the URDF's.
+        degrees: True if the robot's actions are in degrees.
 
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: One cannot be read, or names nothing that the dataset has.
+        ValueError: A file cannot be read, or has no name in common with the dataset.
     """
-    if not share > 0:
-        raise ValueError(f"share must be positive, but is {share}")
-    limits = demonstrated_limits(dataset, share)
+    if not scale > 0:
+        raise ValueError(f"scale must be positive, but is {scale}")
+    limits = demonstrated_limits(dataset, scale)
     if urdf is not None:
         ranges, velocities = urdf_limits(urdf, degrees=degrees)
         _require_names(limits, {*ranges, *velocities}, urdf)
@@ -161,19 +164,19 @@ def _require_names(limits: ActionLimits, found: set[str], file: Path) -> None:
         )
 
 
-def demonstrated_limits(dataset: Path, share: float = 1.0) -> ActionLimits:
-    """The policy may move as abruptly as its demonstrators did, and no more.
+def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
+    """Limits within which the policy moves at most as abruptly as its demonstrators did.
 
     Limits are the 99.9th percentiles of differences of the actions within episodes, without
     limits of position.
 
     Args:
         dataset: LeRobot dataset that the policy was trained on.
-        share: Of what was demonstrated.
+        scale: Factor of the demonstrated limits.
 
     Raises:
         FileNotFoundError: There is no dataset.
-        ValueError: It cannot be read, or its actions hold still.
+        ValueError: It cannot be read, or its actions are constant.
     """
     info = read_json(dataset / "meta" / "info.json")
     features, fps = info["features"], float(info["fps"])
@@ -182,7 +185,7 @@ def demonstrated_limits(dataset: Path, share: float = 1.0) -> ActionLimits:
     episodes = _read_actions(dataset)
     names, width = _names(features, ACTION), episodes[0].shape[-1]
     names = names or [f"{ACTION}.{i}" for i in range(width)]
-    limits = [share * _largest(episodes, order, fps) for order in (1, 2, 3)]
+    limits = [scale * _largest(episodes, order, fps) for order in (1, 2, 3)]
     if not all((limit > 0).any() for limit in limits):
         raise ValueError(f"the actions of {dataset} hold still: there is no motion to go by.")
     velocity, acceleration, jerk = (
@@ -210,7 +213,7 @@ def urdf_limits(
 
     Args:
         urdf: File.
-        degrees: Whether the robot's actions are in degrees; a URDF has radians.
+        degrees: True if the robot's actions are in degrees; a URDF has radians.
 
     Returns:
         Lowest and highest position of `NAME.pos`, and its velocity.
@@ -250,8 +253,8 @@ def calibrated_ranges(
 
     Args:
         calibration: File that LeRobot keeps in `calibration/robots/TYPE/ID.json`.
-        degrees: Whether the robot is led in degrees, LeRobot's `use_degrees`; else in percent,
-            -100 to 100.
+        degrees: True if the robot is commanded in degrees, LeRobot's `use_degrees`; else in
+            percent, -100 to 100.
         grippers: Motors that are led in 0 to 100 in either case.
 
     Returns:
@@ -347,7 +350,9 @@ def _largest(episodes: Sequence[np.ndarray], order: int, fps: float) -> np.ndarr
 
 
 def _names(features: Mapping[str, Any], key: str) -> list[str]:
-    """From any of the forms met: flat, nested or in a dict; none where they do not fit."""
+    """Names in a feature's metadata: flat, nested or in a dict; none if their number does not
+    match.
+    """
     names = _flat(features[key].get("names") or [])
     return names if len(names) == math.prod(features[key]["shape"]) else []
 
@@ -361,7 +366,7 @@ def _flat(names: Any) -> list[str]:
 
 
 def _state_columns(features: Mapping[str, Any], names: list[str], width: int) -> list[int]:
-    """By name; where neither has names, states as wide as actions are what they command."""
+    """State column of each action value, matched by name; by index if neither has names."""
     if STATE not in features:
         return [-1] * width
     states = _names(features, STATE)

@@ -28,7 +28,7 @@ _LARGEST_VALID = 1e50
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionState:
-    """Where the motion is, carried from one position to the next."""
+    """State of the motion, carried from one position to the next."""
 
     position: Float[np.ndarray, "*batch D"]
     """Handed out last."""
@@ -39,9 +39,9 @@ class MotionState:
     reference: Float[np.ndarray, "*batch D"]
     """Asked for last."""
     reference_velocity: Float[np.ndarray, "*batch D"]
-    """With which it moved, as far as it was a motion [1/s]."""
+    """Velocity of the motion, zero after a jump [1/s]."""
     reference_acceleration: Float[np.ndarray, "*batch D"]
-    """Likewise [1/s^2]."""
+    """Acceleration of the motion, zero after a jump [1/s^2]."""
 
     @classmethod
     def moving(
@@ -96,7 +96,7 @@ class MotionFilter:
         """Prepare for one sampling rate.
 
         Args:
-            limits: Of every value.
+            limits: Limits of every value.
             dt: Time from one position to the next [s].
 
         Raises:
@@ -129,7 +129,8 @@ class MotionFilter:
 
         Args:
             state: After the position before.
-            asked: What is no number, or beyond all bounds, is taken for the value before it.
+            asked: Requested values. NaN and absurdly large ones are replaced by the previous
+                value.
         """
         dt = self.dt
         asked = np.where(np.abs(asked) < _LARGEST_VALID, asked, state.reference)
@@ -152,7 +153,7 @@ class MotionFilter:
     def broken(
         self, state: MotionState, asked: Float[np.ndarray, "*batch T D"]
     ) -> Bool[np.ndarray, "*batch T 4"]:
-        """Whether each of `LIMIT_KINDS` would be broken by going to positions exactly."""
+        """True for each of `LIMIT_KINDS` that exact positions would violate."""
         values = asked = np.asarray(asked, dtype=np.float64)
         flags = [((asked > self._upper) | (asked < self._lower)).any(-1)]
         for start, limit in (

@@ -36,8 +36,8 @@ class Changes:
 
     Attributes:
         steps: Actions handed out.
-        changed: Of them, those that differ from what was asked for.
-        broken: Of them, those asked for that would have broken each of `LIMIT_KINDS`.
+        changed: Number of actions that were changed.
+        broken: Number of requested actions that would have violated each of `LIMIT_KINDS`.
         largest: Largest change of each value, in its unit.
     """
 
@@ -57,8 +57,8 @@ class Changes:
         """Count what was done to a chunk.
 
         Args:
-            broken: Which of `LIMIT_KINDS` each action would have broken.
-            change: What was handed out, less what was asked for.
+            broken: True for each of `LIMIT_KINDS` that an action would have violated.
+            change: Difference between returned and requested action.
         """
         change = np.abs(change).reshape(-1, len(self.names))
         self.steps += len(change)
@@ -95,7 +95,7 @@ class WatchStateStep(ProcessorStep):
     """
 
     pair: str = "smooth"
-    """Name that both steps of a policy share."""
+    """Name by which both steps of a policy find each other."""
     state: Tensor | None = field(default=None, init=False, repr=False)
     """Newest state of the robot, (batch, values); None before the first observation."""
 
@@ -143,7 +143,7 @@ class SmoothActionsStep(ProcessorStep):
     fps: float
     """Actions a second, of the policy's data."""
     names: list[str]
-    """Of an action's values."""
+    """Names of an action's values."""
     velocity: list[float]
     """Limit of each value [1/s]."""
     acceleration: list[float]
@@ -155,11 +155,11 @@ class SmoothActionsStep(ProcessorStep):
     upper: list[float | None]
     """Highest of each value; None: no limit."""
     state_columns: list[int]
-    """Where each value is measured in `observation.state`; -1: nowhere."""
+    """Columns of `observation.state` that measure each value; -1: not measured."""
     pair: str = "smooth"
     """Name of the `WatchStateStep` that tells where the robot is."""
     changes: Changes = field(init=False, repr=False)
-    """What was changed since the last reset."""
+    """Report of changes since the last reset."""
 
     def __post_init__(self) -> None:
         limits = {f.name: getattr(self, f.name) for f in fields(ActionLimits)}
@@ -220,7 +220,7 @@ class SmoothActionsStep(ProcessorStep):
         return features
 
     def _start(self, asked: np.ndarray, whole: bool) -> MotionState:
-        """Where the motion goes on from."""
+        """State from which the motion continues."""
         measured = self._measured(asked)
         state = self._state
         if state is None or state.position.shape != measured.shape:
@@ -233,7 +233,7 @@ class SmoothActionsStep(ProcessorStep):
         return _where(jumped, MotionState.moving(measured), state)
 
     def _measured(self, asked: np.ndarray) -> Float[np.ndarray, "batch values"]:
-        """Where the robot is; values that are not measured are where they are sent."""
+        """Measured position of the robot; unmeasured values are taken as commanded."""
         here = np.nan_to_num(asked[..., 0, :])
         state = None if self.watch is None else self.watch.state
         if state is None or state.shape[0] != here.shape[0]:
@@ -247,7 +247,7 @@ class SmoothActionsStep(ProcessorStep):
         return np.where(self._columns >= 0, values, here)
 
     def _jumped(self, measured: np.ndarray) -> Bool[np.ndarray, " batch"]:
-        """Whether the robot was put somewhere, which no motion explains."""
+        """True if the robot was moved by other means than its motion."""
         assert self._before is not None  # there is one as soon as there is a state
         farthest = _JUMP * self._filter.velocity / self.fps
         moved = np.abs(measured - self._before) > farthest
@@ -299,7 +299,7 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
 
     Args:
         checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
-        limits: Of its actions.
+        limits: Limits of its actions.
 
     Raises:
         FileNotFoundError: The folder holds no processors.

@@ -26,8 +26,9 @@ _LATE = 2.0
 _WAIT = 0.5
 """Actions for which the next one is waited for before the motion comes to rest."""
 _FOLLOW = 0.1
-"""Share of its lateness by which an action moves the time of those that follow it, so that the
-jitter of a loop is not passed on, but its drift is."""
+"""Fraction of an action's lateness by which the times of later actions move; it suppresses
+jitter of the loop, but follows its drift.
+"""
 
 
 @dataclass(kw_only=True)
@@ -43,13 +44,15 @@ class SmoothRobotConfig(RobotConfig):
     rate: float = 250.0
     """Setpoints a second that the robot is sent."""
     degree: int = 3
-    """Of the curve through the actions: 0 holds each, 1 is LeRobot's interpolation, 2 and 3
-    have continuous velocity and acceleration."""
+    """Degree of the curve through the actions: 0 holds each, 1 is LeRobot's interpolation, 2
+    and 3 have continuous velocity and acceleration.
+    """
     latency: float | None = None
-    """How late the curve is, in actions; at most (degree + 1)/2, which is what None means."""
+    """Latency of the curve, in actions; at most (degree + 1)/2, the default."""
     clock: Literal["wall", "actions"] = "wall"
-    """Whether setpoints are sent in their time, by a thread, or all of an action at once, to a
-    simulated robot whose time passes with what it is sent."""
+    """True: a thread sends setpoints in real time. False: all setpoints of an action are sent
+    at once, for a simulated robot whose time advances with them.
+    """
 
 
 class SmoothRobot(Robot):
@@ -62,7 +65,7 @@ class SmoothRobot(Robot):
 
     Attributes:
         inner: The robot that is led.
-        upsampler: Which makes the setpoints.
+        upsampler: Upsampler of the actions.
         late: Setpoints that were sent more than a period late, as when a camera held the robot.
         sent: Setpoints in all.
     """
@@ -118,7 +121,7 @@ class SmoothRobot(Robot):
 
     @property
     def cameras(self) -> Any:
-        """Of the robot that is led."""
+        """Configuration of the wrapped robot."""
         return getattr(self.inner, "cameras", {})
 
     @property
@@ -215,7 +218,7 @@ class SmoothRobot(Robot):
         self.sent += 1
 
     def _lead(self) -> None:
-        """Send setpoints in their time, until told to stop."""
+        """Send setpoints in real time until stopped."""
         period = 1 / self.config.rate
         due = time.perf_counter()
         while not self._stop.wait(max(0.0, due - time.perf_counter())):

@@ -1,4 +1,4 @@
-"""From a policy's actions to setpoints at the rate of the motors, as late as one chooses."""
+"""Upsampling of a policy's actions to setpoints at the rate of the motors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ActionUpsampler:
     ahead, along the difference of the last two actions, which makes their noise larger.
 
     Attributes:
-        latency: Of the curve behind the actions [s].
+        latency: Latency of the curve behind the actions [s].
         position: Setpoint handed out last.
     """
 
@@ -41,10 +41,10 @@ class ActionUpsampler:
         """Begin with `reset`.
 
         Args:
-            limits: Of the actions, with how many of them there are a second.
+            limits: Limits of the actions, with their rate.
             rate: Setpoints a second; at least as many as actions.
-            degree: Of the curve, 0 to 3.
-            latency: Of the curve, in actions; None: (degree + 1)/2, the most there is.
+            degree: Degree of the curve, 0 to 3.
+            latency: Latency of the curve, in actions; None: (degree + 1)/2, the largest.
 
         Raises:
             ValueError: An argument is out of its range.
@@ -123,7 +123,7 @@ class ActionUpsampler:
         Where the rates do not divide, their number changes from one action to the next.
 
         Raises:
-            ValueError: As `push`.
+            ValueError: Same as `push`.
         """
         self.push(action)
         made, step = [], self.limits.fps / self.rate

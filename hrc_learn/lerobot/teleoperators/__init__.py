@@ -1,4 +1,4 @@
-"""Who leads an arm: a script that shows a job, or a person in a browser."""
+"""Teleoperators: a scripted demonstrator, or a person at the browser page."""
 
 from hrc_learn.lerobot.teleoperators.arm_teleoperators import ArmExpert as ArmExpert
 from hrc_learn.lerobot.teleoperators.arm_teleoperators import (

@@ -1,4 +1,4 @@
-"""Who leads an arm as a LeRobot teleoperator: a script, or a person in a browser."""
+"""LeRobot teleoperators: a scripted demonstrator, or a person at the browser page."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ class GuidedRobot:
     """Turns what a person asks for into positions that an arm is sent to, one after another.
 
     Attributes:
-        robot: That is led.
+        robot: Guided robot.
         initial_configuration: Number of the robot's that it started from.
     """
 
     def __init__(self, robot: ArmRobot, human: Human):
-        """Begin where the arm is.
+        """Start at the present pose of the arm.
 
         Args:
-            robot: That is led.
-            human: Who leads it.
+            robot: Guided robot.
+            human: Person that guides it.
         """
         from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
 
@@ -84,14 +84,14 @@ class GuidedRobot:
 
 @dataclass(kw_only=True)
 class ArmTeleoperatorConfig(TeleoperatorConfig):
-    """Settings of all who lead one of our arms."""
+    """Settings common to all teleoperators of our arms."""
 
     robot_id: str | None = None
-    """Which robot to lead, where several are connected."""
+    """Identifier of the guided robot, if several are connected."""
 
 
 class ArmTeleoperator(Device, Teleoperator):
-    """What those who lead one of our arms have in common."""
+    """Common part of the teleoperators of our arms."""
 
     def __init__(self, config: ArmTeleoperatorConfig):
         super().__init__(config)
@@ -113,7 +113,7 @@ class ArmTeleoperator(Device, Teleoperator):
         """Nothing is felt."""
 
     def _open(self) -> None:
-        """Nothing is held beside what is guided."""
+        """Do nothing: the guided robot is found at the first action."""
 
     def _close(self) -> None:
         self._guided = None
@@ -167,7 +167,7 @@ class ArmExpert(ArmTeleoperator):
 @TeleoperatorConfig.register_subclass("arm_page")
 @dataclass(kw_only=True)
 class ArmPageConfig(ArmTeleoperatorConfig):
-    """A person who leads an arm in a browser; `--teleop.type=arm_page`, as before
+    """Person that guides an arm in a browser: `--teleop.type=arm_page`, also registered as
     `panda_page`.
     """
 

@@ -182,7 +182,7 @@ def qr_code(text: str) -> str:
     """A QR code for a terminal: two rows of it in each line, dark on light.
 
     Args:
-        text: What it says; by OpenCV, which the simulator needs anyway.
+        text: Encoded text.
 
     Returns:
         Lines of text; empty where OpenCV cannot encode.

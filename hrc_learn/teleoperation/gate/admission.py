@@ -77,9 +77,9 @@ class Admission:
     def __init__(self, config: AddressConfig, port: int, *, tls: bool):
         """
         Args:
-            config: Where it is served.
-            port: That was free.
-            tls: Whether it is served by TLS.
+            config: Host and name of the page.
+            port: Port of the page.
+            tls: True if the page is served by TLS.
         """
         self.address = Address(
             scheme="https" if tls else "http", host=network_name(config), port=port

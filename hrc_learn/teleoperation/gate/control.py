@@ -32,7 +32,7 @@ class Link:
     silence: float = 0.0
     """Longest time without a sign of life [s]."""
     delay: float = 0.0
-    """Longest way there and back [s]."""
+    """Longest round trip [s]."""
     lag: float = 0.0
     """Longest time that their page did not react [s]."""
 
@@ -109,8 +109,9 @@ class Control:
 
         Args:
             client: Whose.
-            lag: How long ago their page last reacted [s]; a worker may go on when it hangs.
-            delay: How long the way there and back took [s]; zero where it was not measured.
+            lag: Time since their page last responded [s]; its worker may run on when the page
+                hangs.
+            delay: Round-trip time [s]; zero if it was not measured.
         """
         with self._lock:
             if client not in self._heard:
@@ -170,7 +171,7 @@ class Control:
 
     @property
     def present(self) -> bool:
-        """True if the controlling client has been heard from recently enough to move the arm."""
+        """True if the controlling client was heard from recently enough to move the arm."""
         return self._within(self._silence)
 
     @property

@@ -166,7 +166,7 @@ class Hands:
     tracked: tuple[TrackedHand, ...] = ()
     """Hands that are seen now."""
     sent: float = 0.0
-    """Clock of the client, returned with the status: how long the way there and back takes."""
+    """Clock of the client, returned with the status: to measure the round trip."""
 
     def __post_init__(self) -> None:
         if len(self.grips) > _MOST_GRIPS:

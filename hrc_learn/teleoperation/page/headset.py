@@ -35,10 +35,10 @@ class HeadsetHands:
         """Start with empty hands.
 
         Args:
-            held: Where held gizmos are noted.
-            turn: What a hand adds to the orientation of the end effector.
+            held: Record of held gizmos.
+            turn: Rotation that a hand adds to the end effector's orientation.
             links: Frames of the arm as they are now; None before the arm is known.
-            guides: Whether the end effector may be held.
+            guides: True if the end effector can be held.
         """
         self._held, self._turn, self._links, self._guides = held, turn, links, guides
         self._grips: dict[str, Grip] = {}

@@ -36,7 +36,7 @@ def capsule_mesh(capsule: Capsule, segments: int = 20) -> Mesh:
     """A cylinder with round ends.
 
     Args:
-        capsule: Its ends and radius.
+        capsule: Ends and radius.
         segments: Around the axis; half as many from pole to pole.
     """
     start, end = np.array(capsule.start), np.array(capsule.end)

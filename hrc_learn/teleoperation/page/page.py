@@ -37,7 +37,7 @@ from hrc_learn.teleoperation.gate.messages import (
     Point,
     TrackedHand,
 )
-from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, leading_twist
+from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, steering_twist
 from hrc_learn.teleoperation.page.headset import (
     HeadsetHands,
     scene_state,
@@ -98,7 +98,7 @@ class PageConfig(AddressConfig):
 # Between touched points: 1 cm off at 10 cm turns the arm by 6 degrees [m].
 _APART = 0.1
 _PULSES = RumbleConfig()  # a headset's controllers shake as a gamepad does
-_SLOW = 0.25  # way there and back from which a drag is seen to be followed late [s]
+_SLOW = 0.25  # round trip from which drags visibly lag [s]
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 
 
@@ -342,9 +342,9 @@ class Page:
         )
         twist = command.twist
         if not twist.any() and self.control.present:
-            way, joints = panel.direction(), state.joint_position
-            twist = leading_twist(
-                self._chain, joints, way, forces, coarse=panel.coarse, turn=turn
+            direction, joints = panel.direction(), state.joint_position
+            twist = steering_twist(
+                self._chain, joints, direction, forces, coarse=panel.coarse, turn=turn
             )
         self.human.post(
             HumanInput(
@@ -429,7 +429,7 @@ def slow_words(link: Link, config: PageConfig) -> str:
 
     Args:
         link: The leader's connection.
-        config: Of the page.
+        config: Settings of the page.
     """
     if link.lag > config.timeout / 2:
         return (

@@ -96,10 +96,10 @@ class PageScene:
         """Draw everything once.
 
         Args:
-            server: Of the page.
-            bodies: What moves, with its shapes.
-            boxes: What stands.
-            twin: Where the virtual twin stands, from the arm [m].
+            server: Server of the page.
+            bodies: Moving bodies with their shapes.
+            boxes: Fixed boxes.
+            twin: Position of the virtual twin relative to the arm [m].
         """
         self._scene = server.scene
         self.twin = np.array(twin)
@@ -151,8 +151,8 @@ class PageScene:
         """Put everything where it is.
 
         Args:
-            positions: Of the bodies [m].
-            orientations: Of the bodies (wxyz).
+            positions: Positions of the bodies [m].
+            orientations: Orientations of the bodies (wxyz).
             joints: Origins of the arm's frames, for the knobs [m].
         """
         nodes = zip(self._own, self._copies, positions, orientations, strict=True)
@@ -190,8 +190,8 @@ class PageScene:
         """Show where from and where to the arm is pulled, and how far it follows.
 
         Args:
-            arrows: From the points held to the pointers, in the base frame [m].
-            colour: Of the arrows and of the knobs held.
+            arrows: Arrows from the points held to the pointers, in the base frame [m].
+            colour: Colour of the arrows and of the knobs held.
             held: Joints that are held, counted from 1; None: the end effector.
         """
         for joint, before in self._knob_colours.items():
@@ -357,8 +357,8 @@ class Gizmos:
         """Say what rings the end effector's gizmo has.
 
         Args:
-            rings: Whether it has rings to turn it by.
-            absolute: Whether the end effector turns as its gizmo stands; otherwise what the
+            rings: True if it has rings to turn it by.
+            absolute: True if the end effector takes its gizmo's orientation; otherwise what the
                 rings are turned by is added to its orientation.
         """
         self._turns = absolute

@@ -106,8 +106,8 @@ def nullspace_input_html(d: Float[np.ndarray, " joints"], largest: float) -> str
     """A bar to the left or right for each joint.
 
     Args:
-        d: Of each joint [N m].
-        largest: That fills half the width [N m].
+        d: Null-space input of each joint [N m].
+        largest: Value that fills half the width [N m].
     """
     rows = []
     for k, value in enumerate(d):
@@ -250,17 +250,17 @@ class Panel:
         """Build the panel.
 
         Args:
-            server: Of the page.
+            server: Server of the page.
             boxes: Furniture that targets may be marked on.
-            forces: How strongly gizmos act to begin with.
+            forces: Initial gains of gizmos.
             request: Receives what buttons ask for.
             show_twin: Shows or hides the twin.
-            let_turn: Whether the end effector's gizmo can be turned, and whether the end
-                effector turns as it stands (see `Gizmos.let_turn`).
-            task: What is to be demonstrated, in words.
-            turn: What the rings of the end effector's gizmo add to its orientation.
-            guides: Whether the person guides the end effector and records.
-            draws: Whether they draw regions, mark targets and turn the end effector.
+            let_turn: Callback that sets whether the end effector's gizmo can be turned, and
+                whether the end effector turns as it stands (see `Gizmos.let_turn`).
+            task: Description of the task.
+            turn: Rotation added by the rings of the end effector's gizmo.
+            guides: True if the person guides the end effector and records.
+            draws: True if people draw regions, mark targets and turn the end effector.
         """
         self._gui, self._initial_forces = server.gui, forces
         gui = server.gui
@@ -443,7 +443,7 @@ class Panel:
         """Show status.
 
         Args:
-            status: Of the session.
+            status: Status of the session.
             nullspace_input: d that is asked for now [N m].
             rate: Steps that the loop takes [1/s].
             people: Browsers that show the page.

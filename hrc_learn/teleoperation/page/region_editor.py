@@ -31,8 +31,8 @@ def view_ray(
 
     Args:
         screen: Place, from (0, 0) at the upper left to (1, 1) at the lower right.
-        orientation: Of the camera (wxyz): x right, y down, z into the scene.
-        field_of_view: From the lower to the upper edge [rad].
+        orientation: Orientation of the camera (wxyz): x right, y down, z into the scene.
+        field_of_view: Vertical field of view [rad].
         aspect: Width over height of the screen.
     """
     half = math.tan(field_of_view / 2)
@@ -73,10 +73,10 @@ def meet_box(
     The slabs of Kay and Kajiya (1986).
 
     Args:
-        origin: Of the ray [m], outside the box.
+        origin: Origin of the ray [m], outside the box.
         direction: Unit vector.
-        centre: Of the box [m].
-        half_size: Of the box [m].
+        centre: Centre of the box [m].
+        half_size: Half size of the box [m].
     """
     # A component of zero leaves its slab never or always: both infinities say so.
     safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
@@ -95,7 +95,7 @@ def region_over(
     Args:
         points: Seen from above [m]; their heights do not matter.
         bottom: Height of the box's lower face [m].
-        height: Of the box [m].
+        height: Height of the box [m].
         smallest: Half size that no edge falls below [m].
     """
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
@@ -124,7 +124,7 @@ class RegionEditor:
         """Draw the first region, not active.
 
         Args:
-            server: Of the page; controls go into the folder that is open.
+            server: Server of the page; controls go into the folder that is open.
             boxes: Furniture that targets may be marked on.
         """
         self._server, self._scene, self._boxes = server, server.scene, tuple(boxes)
