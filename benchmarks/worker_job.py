@@ -33,7 +33,7 @@ from hrc_learn.skills.pick_and_place import RELEASE_TIME, PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan, plan_candidates
 
 # Above the object the arm servoes on its image; a median grasp takes so long in vision [s]
-# (docs/experiments.md, grasping).
+# (docs/benchmarks/experiments.md, grasping).
 _SERVOING = 1.5
 # Of the last way down to the board, on which the job feels for it [m/s]:
 # `WorkCell.move_until_contact`.

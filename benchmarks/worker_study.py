@@ -18,9 +18,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress
@@ -40,7 +42,8 @@ from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_file, new_folder, write_json
 from hrc_learn.teleoperation import ScriptedForce
-from hrc_learn.viz.figures import cycle_time_figure
+from hrc_learn.viz import palette
+from hrc_learn.viz.figure_parts import STYLE, WIDTH
 
 Mode = Literal["none", "expert", "automatic", "both"]
 MODES: tuple[Mode, ...] = ("none", "expert", "automatic", "both")
@@ -383,6 +386,44 @@ def run_study(
         making_way={mode: joined[mode] for mode in modes},
         stopping={distance: joined[name] for name, distance in stops.items()},
     )
+
+
+def cycle_time_figure(
+    making_way: Mapping[str, tuple[float, float]],
+    stopping: Mapping[float, tuple[float, float]],
+    *,
+    undisturbed: float,
+) -> Figure:
+    """Cycle time over the smallest distance from a worker.
+
+    Args:
+        making_way: Smallest distance [m] and cycle time [s] of arms that keep the protective
+            distance, by who moves the null space.
+        stopping: Those of arms that stop and wait, by the distance within which they rest [m].
+        undisturbed: Cycle time without a worker [s].
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 3.2))
+        axes = figure.subplots()
+        if stopping:
+            x, y = np.array(list(stopping.values())).T
+            axes.plot(1e3 * x, y, "o-", color=palette.GREY, ms=4, label="stops and waits")
+            for distance, (nearest, time) in stopping.items():
+                axes.annotate(
+                    f"{distance:g} m",
+                    (1e3 * nearest, time),
+                    xytext=(5, -9),
+                    textcoords="offset points",
+                    fontsize=7,
+                )
+        for k, (mode, (nearest, time)) in enumerate(making_way.items()):
+            colour = palette.SERIES[k % len(palette.SERIES)]
+            axes.plot(1e3 * nearest, time, "D", color=colour, label=f"null space: {mode}")
+        axes.axhline(undisturbed, color=palette.GREY, lw=0.8, ls=":", label="undisturbed")
+        axes.set_xlabel("smallest distance the arm closed in to, 5 % of the runs [mm]")
+        axes.set_ylabel("cycle time, median [s]")
+        axes.legend(loc="upper left", fontsize=8)
+    return figure
 
 
 if __name__ == "__main__":

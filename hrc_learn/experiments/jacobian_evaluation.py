@@ -1,6 +1,6 @@
-"""Initialization study: what a learned image Jacobian is worth as initial estimate.
+"""Evaluation of a learned image Jacobian in simulation.
 
-Closed loops that start from it and from guesses, and its error against the true one.
+Its error against the true one, and closed loops that start from it or from guesses.
 """
 
 import itertools
@@ -30,15 +30,15 @@ from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 @dataclass(frozen=True, kw_only=True)
 class StartsConfig:
-    """How initial conditions are drawn. Lengths [m], angles [rad]."""
+    """Distribution of initial conditions. Lengths [m], angles [rad]."""
 
     count: int = 200
-    """Of closed loops."""
+    """Number of closed loops."""
     largest_roll: float = math.pi
-    """Of the camera about its axis, either way, so that no guess is right by luck; 0: as in
-    the demonstrations."""
+    """Largest rotation of the camera about its axis, either way, so that no guess is right by
+    chance; 0: as in the demonstrations."""
     tilt: float = 0.1
-    """Of the end effector at the start, either way about each axis."""
+    """Largest tilt of the end effector at the start, either way about each axis."""
     reached: float = 5.0
     """Pixel error below which a loop counts as converged once it stays there [px]."""
     duration: float = 4.0
@@ -46,31 +46,31 @@ class StartsConfig:
     dt: float = 0.008
     """Control step [s]."""
     seed: int = 0
-    """Of initial conditions, targets, cameras and noise."""
+    """Seed of initial conditions, targets, cameras and noise."""
     imperfections: Imperfections = field(
         default_factory=lambda: Imperfections(frame_steps=4, latency_frames=1, noise=0.5)
     )
-    """Of the measurement."""
+    """Imperfections of the measurement."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TurnedCamera:
-    """The scene's camera, lens distortion and all, turned by another angle for each loop.
+    """Camera of the scene, with lens distortion, rotated by another angle for each loop.
 
-    The image is turned about the middle of the workspace, which is moved to the middle of the
-    image: a camera turned about its axis, with its sensor shifted.
+    The image is rotated about the middle of the workspace, which is moved to the middle of the
+    image: a camera rotated about its axis, with its sensor shifted.
     """
 
     model: CameraModel
     offset: Float[Tensor, "3"]
-    """Of the marker in the frame of the tool centre point [m]."""
+    """Offset of the marker in the frame of the tool centre point [m]."""
     middle: Pose
-    """Of the tool in the middle of the workspace."""
+    """Pose of the tool in the middle of the workspace."""
     roll: Float[Tensor, " starts"]
     """[rad]"""
 
     def project(self, tool: Pose) -> tuple[Float[Tensor, "starts 2"], Bool[Tensor, " starts"]]:
-        """Marker in the image [px], and whether it is inside the image."""
+        """Pixel of the marker [px], and a flag for points inside the image."""
         about = self._pixel(tool) - self._pixel(self.middle)
         half = about.new_tensor(IMAGE_SIZE) / 2
         turned = (turn_rows(self.roll) @ about[..., None])[..., 0]
@@ -107,14 +107,15 @@ class ClosedLoops:
         config: StartsConfig,
         robot: Arm,
     ) -> "ClosedLoops":
-        """Draw them at random.
+        """Draw closed loops at random.
 
         Args:
-            camera: The true one.
-            offset: Of the marker in the frame of the tool centre point [m].
+            camera: True camera.
+            offset: Offset of the marker in the frame of the tool centre point [m].
             workspace: Lower and upper corner of the box of starts and targets [m].
-            near: Joints with the end effector in it, near which starts are chosen [rad].
-            config: How.
+            near: Joint positions with the end effector in that box, near which starts are
+                chosen [rad].
+            config: Distribution of the initial conditions.
             robot: The arm.
         """
         rng, n = torch.Generator().manual_seed(config.seed), config.count
@@ -188,9 +189,9 @@ def compare_starts(
     """Convergence times [s] from the learned Jacobian and from a guess.
 
     Args:
-        network: Learned from demonstrations of the camera.
-        loops: What is run.
-        on_run: Told the name of each run as it begins.
+        network: Image Jacobian learned from demonstrations with the camera.
+        loops: Closed loops to run.
+        on_run: Called with the name of each run at its start.
 
     Returns:
         For `learned`, `guessed` (the paper's initial Jacobian, adapted alike) and `fixed`
@@ -239,9 +240,9 @@ def held_out_grid(
 
     Args:
         demonstrated: Positions of the end effector [m].
-        points: Along each axis, over the demonstrated range.
+        points: Number of points along each axis, over the demonstrated range.
         tilt: Largest tilt of the end effector from pointing down, about each axis [rad].
-        seed: Of the tilts.
+        seed: Seed of the tilts.
     """
     low, high = demonstrated.amin(dim=0), demonstrated.amax(dim=0)
     axes = [
@@ -263,13 +264,13 @@ def compare_with_truth(
     camera: CameraModel,
     offset: Float[np.ndarray, "3"],
 ) -> dict[str, float]:
-    """Errors of the estimate over its size, and whether its uncertainty is honest.
+    """Relative errors of the estimate, and calibration of its uncertainty.
 
     Args:
-        network: Learned, with its covariance.
-        poses: Of the tool, (n,).
-        camera: The true one.
-        offset: Of the marker in the frame of the tool centre point [m].
+        network: Learned image Jacobian with its covariance.
+        poses: Poses of the tool, (n,).
+        camera: True camera.
+        offset: Offset of the marker in the frame of the tool centre point [m].
 
     Returns:
         `relative_error_median` and `_p95`: |estimate - truth| / |truth|, Frobenius norms with

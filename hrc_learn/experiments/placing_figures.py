@@ -13,7 +13,7 @@ from hrc_learn.geometry import Box
 from hrc_learn.log import JointRanges
 from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import STYLE, WIDTH, draw_box, frame_space, near, space
-from hrc_learn.viz.figures import JointCurves, joint_grid_figure
+from hrc_learn.viz.figures import JointCurves, demonstrated_joints, joint_grid_figure
 
 _SHELF_COLOURS = (palette.ORANGE, palette.BLUE, palette.PURPLE, palette.GREEN)
 
@@ -92,7 +92,7 @@ def shelf_joints_figure(
         )
         for shelf, colour in colours.items()
     ]
-    demo = JointCurves.demonstrated(demonstration.time, demonstration.joint_position)
+    demo = demonstrated_joints(demonstration.time, demonstration.joint_position)
     return joint_grid_figure(names, [demo, *curves], limits)
 
 

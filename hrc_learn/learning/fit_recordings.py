@@ -221,7 +221,7 @@ def learning_recording(
             x=x,
             y=y,
             z=min(float(path[:, 2].min()) for path in paths) - _BELOW,
-            share=cells.relative.numpy(),
+            relative_error=cells.relative.numpy(),
         ),
         images=images or {},
     )

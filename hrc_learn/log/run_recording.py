@@ -17,7 +17,7 @@ from hrc_learn.vision import CameraModel
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointRanges:
-    """Ranges to draw beside joint positions."""
+    """Joint ranges, drawn with joint positions."""
 
     lower: Float[np.ndarray, " joints"]
     """[rad]"""
@@ -29,18 +29,18 @@ class JointRanges:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraRecording:
-    """What a camera saw, and what was made of it."""
+    """Images of a camera, and the feature detected in them."""
 
     model: CameraModel
-    """The true camera: drawn as a frustum; simulation only knows it."""
+    """True camera, known in simulation only; drawn as a frustum."""
     feature: Float[np.ndarray, "time 2"]
-    """Measured feature [px]; NaN while it was not seen."""
+    """Measured feature [px]; NaN while it was not visible."""
     target: Float[np.ndarray, "time 2"]
-    """Where the feature was wanted [px]; NaN while nothing was wanted."""
+    """Target of the feature [px]; NaN without a target."""
     image_time: Float[np.ndarray, " images"] = field(default_factory=lambda: np.empty(0))
     """[s]"""
     images: tuple[UInt8[np.ndarray, "h w 3"], ...] = ()
-    """RGB, a few a second."""
+    """RGB images, a few per second."""
 
     def __post_init__(self) -> None:
         if len(self.image_time) != len(self.images):
@@ -80,63 +80,63 @@ class RunRecording:
     demo_path: Float[np.ndarray, "samples 3"] | None = None
     """Tool centre point of the demonstration [m]."""
     plan_path: Float[np.ndarray, "plan_samples 3"] | None = None
-    """Path that the learned motion asked for [m]."""
+    """Planned path of the learned motion [m]."""
 
     bodies: tuple[Body, ...] = ()
-    """The arm's links, the gripper, carried objects."""
+    """Links of the arm, gripper, carried objects."""
     boxes: tuple[Box, ...] = ()
-    """Everything that stands still, in the base frame."""
+    """Static objects, in the base frame."""
     region: Box | None = None
-    """The Cartesian region in which the camera takes over."""
+    """Cartesian region in which visual servoing takes over."""
     active_region: Float[np.ndarray, "time 6"] | None = None
-    """Centre and half edges of the region of the controller's position at each step [m]; NaN
-    while no controller was in the loop."""
+    """Centre and half edges of the position region of the controller at each step [m]; NaN
+    without a controller in the loop."""
     drawn: Bool[np.ndarray, " time"] | None = None
-    """Whether a person had drawn that."""
+    """True while the region was drawn by a person."""
 
     camera: CameraRecording | None = None
     image_jacobian: Float[np.ndarray, "time 2 6"] | None = None
-    """Estimate by the learned model [px/m, px/rad]; NaN where the run made none."""
+    """Image Jacobian estimated by the learned model [px/m, px/rad]; NaN without an estimate."""
     true_image_jacobian: Float[np.ndarray, "time 2 6"] | None = None
-    """Of the true camera, simulation only [px/m, px/rad]."""
+    """Image Jacobian of the true camera, in simulation only [px/m, px/rad]."""
     weight_norm: Float[np.ndarray, " time"] | None = None
     """Frobenius norm of the image Jacobian's weights."""
     potentials: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
     """Potential of each region, or a Lyapunov function, by name."""
 
     potential_rate: Float[np.ndarray, " time"] | None = None
-    """Rate of the sum of the potentials that the estimated image Jacobian predicts [1/s]."""
+    """Rate of the sum of the potentials, predicted by the estimated image Jacobian [1/s]."""
 
     nullspace_input: Float[np.ndarray, "time joints"] | None = None
-    """Null-space input d of the person, on each joint [N m]."""
+    """Null-space input d of the person on each joint [N m]."""
     push: Float[np.ndarray, "time 2 3"] | None = None
-    """Point of the arm that the person pushes, and another in the direction in which they push
-    it [m]; NaN while nobody pushes."""
+    """Point of the arm that the person pushes, and a second point in the direction of the push
+    [m]; NaN without a push."""
     followed: Float[np.ndarray, " time"] | None = None
-    """Share of the push that the arm follows, 0 to 1; NaN while nobody pushes."""
+    """Fraction of the push that the arm follows, 0 to 1; NaN without a push."""
     hindered: Mapping[str, Bool[np.ndarray, " time"]] = field(default_factory=dict)
-    """Whether each hindrance keeps it from following, by name."""
+    """True while a hindrance keeps the arm from following, by name."""
     elbow_motion: Float[np.ndarray, " time"] | None = None
-    """How far the elbow is from where it would be undisturbed [m]."""
+    """Distance of the elbow from its undisturbed position [m]."""
     position_deviation: Float[np.ndarray, " time"] | None = None
-    """How far the end effector is from where it would be undisturbed [m]."""
+    """Distance of the end effector from its undisturbed position [m]."""
     rotation_deviation: Float[np.ndarray, " time"] | None = None
-    """The same for its orientation [rad]."""
+    """Angle of the end effector from its undisturbed orientation [rad]."""
 
     worker_distance: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
-    """Smallest distance between a worker and the robot with its load, as it is and as it is
-    seen, by name [m]; NaN while it is not known."""
+    """Smallest distance between a worker and the robot with its load, true and seen by the
+    robot, by name [m]; NaN while unknown."""
     worker_nearest: Float[np.ndarray, "time 2 3"] | None = None
-    """Points of the robot and of the worker that are the nearest to each other [m]."""
+    """Nearest points of robot and worker [m]."""
 
     safety: Mapping[str, Float[np.ndarray, " time"] | Bool[np.ndarray, " time"]] = field(
         default_factory=dict
     )
-    """Whether, or how strongly, each guard of the safety filter acted, by name."""
+    """Intervention of each guard of the safety filter, by name: a flag or a strength."""
     phases: tuple[Event, ...] = ()
-    """When the task entered each of its phases."""
+    """Start of each phase of the task."""
     remarks: tuple[Event, ...] = ()
-    """What was said to the person beside the arm."""
+    """Messages to the person near the arm."""
 
     def __post_init__(self) -> None:
         series: dict[str, np.ndarray | None] = {name: getattr(self, name) for name in _SERIES}

@@ -1,6 +1,4 @@
-"""A log that a control loop can afford, and what was logged: columns of equal length, one
-row a step.
-"""
+"""Log of a control loop: columns of equal length, one row per step, cheap to append to."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,7 +12,7 @@ from hrc_learn.store import new_file
 
 
 class Event(NamedTuple):
-    """Something worth a line of text, such as a task entering its next phase."""
+    """Event with a line of text, such as the start of a phase of the task."""
 
     time: float
     """[s]"""
@@ -22,10 +20,10 @@ class Event(NamedTuple):
 
 
 class LoggedSteps:
-    """Columns of whatever a loop measured, one row a step.
+    """Columns of the quantities that a loop measured, one row per step.
 
     Attributes:
-        events: What happened when, in order.
+        events: Events in order of time.
     """
 
     def __init__(self, blocks: Sequence[np.ndarray], length: int, events: Sequence[Event]):
@@ -33,8 +31,8 @@ class LoggedSteps:
 
         Args:
             blocks: Structured arrays of one type and length.
-            length: Rows in use.
-            events: What happened when.
+            length: Number of rows in use.
+            events: Events of the run.
         """
         self._blocks, self._length = list(blocks), length
         self.events = list(events)
@@ -51,13 +49,13 @@ class LoggedSteps:
         return name in self.names
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """One column, (T, ...): a copy, whatever is logged afterwards."""
+        """Copy of one column, (T, ...)."""
         if name not in self:
             raise KeyError(f"{name!r} is not logged; the columns are {list(self.names)}.")
         return np.concatenate([block[name] for block in self.blocks()])
 
     def blocks(self, start: int = 0) -> Iterator[np.ndarray]:
-        """The rows from `start` on, as structured arrays that share memory with the log.
+        """Rows from `start` on, as structured arrays that are views of the log.
 
         Another thread may read while the loop appends.
         """
@@ -69,7 +67,7 @@ class LoggedSteps:
                 yield rows
 
     def with_columns(self, **columns: Shaped[np.ndarray, "rows ..."]) -> "LoggedSteps":
-        """The same rows with further columns, copied.
+        """Copy with further columns.
 
         Raises:
             ValueError: If a column has another number of rows.
@@ -99,7 +97,7 @@ Value = np.ndarray | np.generic | float | int | bool
 
 
 class StepLog(LoggedSteps):
-    """Columns of whatever a loop measures, one row a step.
+    """Columns of the quantities that a loop measures, one row per step.
 
     The first row decides the columns and their shapes; every later row must bring the same
     ones. Numbers become float64, whatever their first value looks like (`time=0`); truth values
@@ -120,7 +118,7 @@ class StepLog(LoggedSteps):
         """Make an empty log.
 
         Args:
-            block: Rows to take memory for at a time.
+            block: Number of rows allocated at a time.
         """
         if block < 1:
             raise ValueError(f"block must be at least one row, but is {block}.")
@@ -132,12 +130,12 @@ class StepLog(LoggedSteps):
         self._first = 0  # rows before the last block
 
     def snapshot(self, rows: int | None = None) -> LoggedSteps:
-        """What is logged so far, which does not grow; shares memory with the log.
+        """View of the present rows, which does not grow.
 
         Another thread may take it while the loop appends.
 
         Args:
-            rows: The first rows only.
+            rows: Number of rows; None: all.
         """
         length = len(self) if rows is None else min(rows, len(self))
         return LoggedSteps(self._blocks, length, self.events)
@@ -164,7 +162,7 @@ class StepLog(LoggedSteps):
         self._length += 1
 
     def prepare(self, **examples: Value) -> np.ndarray:
-        """A row to be filled in place and given to `append_row`, holding the examples."""
+        """Row with example values, to be filled in place and passed to `append_row`."""
         if self._dtype is None:
             self._open(examples)
         elif set(examples) != set(self.names):
@@ -182,12 +180,12 @@ class StepLog(LoggedSteps):
         self._length += 1
 
     def event(self, time: float, text: str) -> None:
-        """Note that something happened at a time [s]."""
+        """Log an event at a time [s]."""
         self.events.append(Event(float(time), text))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "StepLog":
-        """Read what `save` wrote. The log can be appended to."""
+        """Read a saved log, which can be appended to."""
         with np.load(path, allow_pickle=False) as file:
             columns = {
                 key.removeprefix("column/"): file[key]

@@ -1,4 +1,4 @@
-"""Style and parts that the figures share."""
+"""Common style and parts of the figures."""
 
 from itertools import pairwise, product
 from typing import Any
@@ -33,29 +33,29 @@ STYLE: dict[Any, Any] = {
 """Settings of matplotlib for every figure."""
 
 WIDTH = 7.2
-"""Of a figure [inch]: the text width of a page."""
+"""Width of a figure [inch]: the text width of a page."""
 
 _SURROUNDINGS = 0.22  # how far around the paths boxes are drawn [m]
 
 
 def needed[T](value: T | None, name: str) -> T:
-    """The value, or an error that names the field that a figure cannot do without."""
+    """The value, or an error that names the missing field of the recording."""
     if value is None:
-        raise ValueError(f"this figure needs {name}, which the recording leaves out.")
+        raise ValueError(f"this figure needs {name}, which the recording does not have.")
     return value
 
 
 def scaled(
     values: Float[np.ndarray, " time"] | None, factor: float
 ) -> Float[np.ndarray, " time"] | None:
-    """Values in another unit, where there are any."""
+    """Values in another unit; None without values."""
     return None if values is None else factor * values
 
 
 def finite_span(
     axes: Axes, time: Float[np.ndarray, " time"], known: Bool[np.ndarray, " time"]
 ) -> None:
-    """Limit the time axis to where there is something to see."""
+    """Limit the time axis to the span of known values."""
     if known.any():
         axes.set_xlim(time[known][0], time[known][-1])
 
@@ -69,16 +69,16 @@ def active_intervals(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]
 def shade(
     axes: Axes, time: Float[np.ndarray, " time"], active: Bool[np.ndarray, " time"]
 ) -> None:
-    """Shade the spells in which something was active."""
+    """Shade the intervals in which something was active."""
     for first, last in active_intervals(active):
         axes.axvspan(time[first], time[last], color=palette.PERSON, alpha=0.13, lw=0)
 
 
 def draw_limits(axes: Axes, lower: float, upper: float) -> None:
-    """Lines at the limits of a joint, with what lies beyond them tinted.
+    """Draw lines at the limits of a joint, and tint the range beyond them.
 
-    The motion drawn before fills the picture: where a limit is far from it, both are written
-    instead.
+    The motion drawn before fills the panel: if a limit is far from it, both limits are written
+    as text instead.
     """
     low, high = axes.dataLim.intervaly
     around = max(0.25, 0.15 * (high - low))  # of a joint that hardly moves [rad]
@@ -96,7 +96,7 @@ def draw_limits(axes: Axes, lower: float, upper: float) -> None:
 
 
 def legend_in_free_cell(figure: Figure, grid: np.ndarray, used: int) -> None:
-    """One legend for all cells, in the first unused one, or above where all are used."""
+    """Draw one legend for all cells, in the first unused one, or above if all are used."""
     unique = {}
     for axes in grid[:used]:
         handles, labels = axes.get_legend_handles_labels()
@@ -113,7 +113,7 @@ def legend_in_free_cell(figure: Figure, grid: np.ndarray, used: int) -> None:
 
 
 def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
-    """Axes in three dimensions, in a cell of a grid: rows, columns, number of the cell."""
+    """Axes in three dimensions, in a cell of a grid (rows, columns, number of the cell)."""
     axes = figure.add_subplot(*position, projection="3d", computed_zorder=False)
     assert isinstance(axes, Axes3D)
     axes.view_init(elev=24, azim=35)
@@ -125,14 +125,14 @@ def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
 
 
 def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"], zoom: float = 1.12) -> None:
-    """Show the surroundings of some points, one metre as long on every axis."""
+    """Show the surroundings of some points, with the same scale on every axis."""
     low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set_box_aspect(tuple(high - low), zoom=zoom)  # pyright: ignore[reportArgumentType]
 
 
 def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
-    """The parts of the boxes that lie in the surroundings of some points."""
+    """Parts of the boxes in the surroundings of some points."""
     low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
     parts = []
     for box in boxes:

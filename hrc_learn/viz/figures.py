@@ -42,14 +42,14 @@ class JointCurves:
     colour: str = palette.RUN
     width: float = 1.4
 
-    @classmethod
-    def demonstrated(
-        cls, time: Float[np.ndarray, " time"], position: Float[np.ndarray, "time joints"]
-    ) -> "JointCurves":
-        """Thick grey curves of a demonstration."""
-        return cls(
-            label="demonstration", time=time, position=position, colour=palette.DEMO, width=3.5
-        )
+
+def demonstrated_joints(
+    time: Float[np.ndarray, " time"], position: Float[np.ndarray, "time joints"]
+) -> JointCurves:
+    """Thick grey curves of a demonstration."""
+    return JointCurves(
+        label="demonstration", time=time, position=position, colour=palette.DEMO, width=3.5
+    )
 
 
 def joint_grid_figure(
@@ -91,7 +91,7 @@ def joints_figure(run: RunRecording) -> Figure:
     """Joint positions over time, with the demonstration and the limits."""
     motions = []
     if run.demo_joint_position is not None:
-        motions.append(JointCurves.demonstrated(run.time, run.demo_joint_position))
+        motions.append(demonstrated_joints(run.time, run.demo_joint_position))
     motions.append(JointCurves(label="run", time=run.time, position=run.joint_position))
     return joint_grid_figure(run.joint_names, motions, run.joint_limits)
 
@@ -99,7 +99,7 @@ def joints_figure(run: RunRecording) -> Figure:
 def fit_joints_figure(fit: FitRecording) -> Figure:
     """Joint positions of the first four demonstrations and of their reproductions."""
     demos = [
-        JointCurves.demonstrated(time, position)
+        demonstrated_joints(time, position)
         for time, position in zip(fit.time, fit.demos, strict=True)
     ]
     reproductions = [
@@ -111,9 +111,9 @@ def fit_joints_figure(fit: FitRecording) -> Figure:
 
 
 def person_figure(run: RunRecording) -> Figure:
-    """Effort of the person, elbow motion, and what the end effector noticed of it.
+    """Effort of the person, elbow motion, and deviation of the end effector.
 
-    The spells in which the person acted are shaded.
+    The intervals in which the person acted are shaded.
     """
     effort = needed(run.nullspace_input, "nullspace_input")
     acting = np.linalg.norm(effort, axis=1) > 0
@@ -124,7 +124,7 @@ def person_figure(run: RunRecording) -> Figure:
         ("rotation [deg]", "", scaled(run.rotation_deviation, 180 / np.pi)),
     ]
     shown = [row for row in rows if row[2] is not None]
-    # Deviations are known while the person is about; without them the whole run is shown.
+    # Deviations are known while a person is present; without them the whole run is shown.
     known = [np.isfinite(values) for _, _, values in shown[1:] if values is not None]
     about = np.logical_or.reduce([acting, *known])
     with matplotlib.rc_context(STYLE):
@@ -192,26 +192,26 @@ def residual_figure(fit: FitRecording) -> Figure:
         if fit.n_basis is not None and fit.n_basis in fit.residual:
             _ring(axes, fit.n_basis, fit.residual[fit.n_basis], f"used: {fit.n_basis}")
         axes.set(yscale="log", xlabel="basis functions N", ylabel="normalised RMS error [-]")
-        axes.set_title("How well the primitive follows the demonstrations")
+        axes.set_title("Error of the primitive on the demonstrations")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 
 def seen_figure(seen: Mapping[int, Seen], most: int = 6, columns: int = 5) -> Figure:
-    """What the first camera saw of the first demonstrations, from their starts to their ends.
+    """Images of the first camera in the first demonstrations, from start to end.
 
     Args:
-        seen: By episode.
-        most: Episodes shown, a row each.
-        columns: Images of each, evenly over its time.
+        seen: Camera images by episode.
+        most: Largest number of episodes, one row each.
+        columns: Images per episode, evenly spaced in time.
 
     Raises:
-        ValueError: If no camera saw any.
+        ValueError: If there are no images.
     """
     rows = [(episode, *next(iter(saw.items()))) for episode, saw in seen.items() if saw]
     rows = rows[:most]
     if not rows:
-        raise ValueError("seen is empty: no camera saw a demonstration.")
+        raise ValueError("seen is empty: there are no images of demonstrations.")
     with matplotlib.rc_context(STYLE):
         height, width = _decoded(rows[0][2][1][0]).shape[:2]
         tall = WIDTH / columns * height / width + 0.22  # with its heading [inch]
@@ -240,10 +240,10 @@ def workspace_figure(
     x: Float[np.ndarray, " nx_and_1"],
     y: Float[np.ndarray, " ny_and_1"],
 ) -> Figure:
-    """Shares over cells of the horizontal plane, in percent, side by side.
+    """Fractions over cells of the horizontal plane, in percent, side by side.
 
     Args:
-        maps: Title and values of each, x first; NaN where nothing is known.
+        maps: Title and values of each map, x first; NaN in unknown cells.
         x: Edges of the cells [m].
         y: Edges of the cells [m].
     """
@@ -273,9 +273,9 @@ def learning_figure(held_out: Sequence[float], best: int, unit: str) -> Figure:
     """Held-out error over the rounds of learning.
 
     Args:
-        held_out: Error after each round, the first before any.
-        best: The round that was kept.
-        unit: Of the error.
+        held_out: Error after each round; the first value is that before learning.
+        best: Round whose result was kept.
+        unit: Unit of the error.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(0.62 * WIDTH, 2.5))
@@ -285,17 +285,17 @@ def learning_figure(held_out: Sequence[float], best: int, unit: str) -> Figure:
         axes.set(
             xlabel="round",
             ylabel=f"held-out error [{unit}]",
-            title="Error on demonstrations held out",
+            title="Error on held-out demonstrations",
         )
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
 
 
 def _ring(axes: Axes, x: float | int, y: float, words: str) -> None:
-    """A ring around a point, with words beside it."""
+    """Draw a ring around a point, with a label next to it."""
     axes.plot(x, y, "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
-    beside = {"xytext": (8, 8), "textcoords": "offset points"}
-    axes.annotate(words, (x, y), color=palette.LIMIT, **beside)
+    offset = {"xytext": (8, 8), "textcoords": "offset points"}
+    axes.annotate(words, (x, y), color=palette.LIMIT, **offset)
 
 
 def measures_figure(
@@ -308,7 +308,7 @@ def measures_figure(
     Args:
         measures: Values by name.
         episodes: Number of each demonstration.
-        units: Of the measures.
+        units: Unit of each measure.
     """
     rows = -(-len(measures) // 2)
     with matplotlib.rc_context(STYLE):
@@ -327,42 +327,4 @@ def measures_figure(
             if len(episodes) <= 20:
                 axes.set_xticks(places, [str(episode) for episode in episodes])
         figure.supxlabel("episode (line: median)", fontsize=9)
-    return figure
-
-
-def cycle_time_figure(
-    making_way: Mapping[str, tuple[float, float]],
-    stopping: Mapping[float, tuple[float, float]],
-    *,
-    undisturbed: float,
-) -> Figure:
-    """Cycle time over the smallest distance from a worker.
-
-    Args:
-        making_way: Smallest distance [m] and cycle time [s] of arms that keep the protective
-            distance, by who moves the null space.
-        stopping: Those of arms that stop and wait, by the distance within which they rest [m].
-        undisturbed: Cycle time without a worker [s].
-    """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 3.2))
-        axes = figure.subplots()
-        if stopping:
-            x, y = np.array(list(stopping.values())).T
-            axes.plot(1e3 * x, y, "o-", color=palette.GREY, ms=4, label="stops and waits")
-            for distance, (nearest, time) in stopping.items():
-                axes.annotate(
-                    f"{distance:g} m",
-                    (1e3 * nearest, time),
-                    xytext=(5, -9),
-                    textcoords="offset points",
-                    fontsize=7,
-                )
-        for k, (mode, (nearest, time)) in enumerate(making_way.items()):
-            colour = palette.SERIES[k % len(palette.SERIES)]
-            axes.plot(1e3 * nearest, time, "D", color=colour, label=f"null space: {mode}")
-        axes.axhline(undisturbed, color=palette.GREY, lw=0.8, ls=":", label="undisturbed")
-        axes.set_xlabel("smallest distance the arm closed in to, 5 % of the runs [mm]")
-        axes.set_ylabel("cycle time, median [s]")
-        axes.legend(loc="upper left", fontsize=8)
     return figure

@@ -1,6 +1,4 @@
-"""Films of runs: what is written over their pictures, a drawing where nothing can be rendered,
-and the MP4 file that browsers play.
-"""
+"""Films of runs: captions on the pictures, drawings without OpenGL, and the MP4 file."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -50,7 +48,7 @@ class Line:
     width: float = 0.006
     """[m]"""
     head: bool = False
-    """Whether it is an arrow."""
+    """True for an arrow."""
 
 
 def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
@@ -58,7 +56,7 @@ def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
 
     Args:
         pictures: RGB, all of the same even size.
-        rate: Of the pictures [1/s].
+        rate: Pictures per second [1/s].
 
     Raises:
         ValueError: If there is no picture, or one has an odd size.
@@ -100,14 +98,14 @@ def annotated(
     labels: Sequence[tuple[str, str]] = (),
     inset: UInt8[np.ndarray, "inset_height inset_width 3"] | None = None,
 ) -> Picture:
-    """A picture with a line of what happens, what its colours mean, and what the camera sees.
+    """Picture with caption, time, legend and the image of the camera.
 
     Args:
-        picture: RGB.
-        text: What happens, below it.
-        clock: Time, at the right of that.
-        labels: Names and colours ("#RRGGBB") of what is drawn, at the top left.
-        inset: Picture at the bottom right, above that line.
+        picture: RGB image.
+        text: Caption below.
+        clock: Time, to the right of the caption.
+        labels: Names and colours ("#RRGGBB") of the legend, at the top left.
+        inset: Image at the bottom right, above the caption.
     """
     image = Image.fromarray(picture)
     width, height = image.size
@@ -134,14 +132,14 @@ def annotated(
 
 
 class CameraInset:
-    """What the camera of a run saw at each step, with the marker and where it is wanted."""
+    """Camera image of a run at each step, with the marker and its target."""
 
     def __init__(self, camera: CameraRecording, width: int):
-        """Make the images small.
+        """Scale the images.
 
         Args:
-            camera: With images.
-            width: Of the film's pictures [px].
+            camera: Recording with images.
+            width: Width of the pictures of the film [px].
         """
         self._camera = camera
         self._scale = _INSET * width / camera.model.width
@@ -149,11 +147,11 @@ class CameraInset:
         self._images = [Image.fromarray(image).resize(size) for image in camera.images]
 
     def at(self, step: int, time: float) -> Picture:
-        """The picture at a step.
+        """Image at a step.
 
         Args:
-            step: Of the run.
-            time: Its time [s].
+            step: Step of the run.
+            time: Time of that step [s].
         """
         last = int(np.searchsorted(self._camera.image_time, time, side="right")) - 1
         image = self._images[max(last, 0)].copy()
@@ -182,7 +180,7 @@ def _aspect(model: CameraModel) -> float:
 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    # The one font that is surely there, as matplotlib ships it.
+    # Matplotlib ships this font, so that it is always available.
     return ImageFont.truetype(
         Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size
     )
@@ -195,9 +193,9 @@ def draw_run(
 
     Args:
         run: The run.
-        step: Of its moments.
-        camera: Where from; without distortion.
-        lines: Drawn over it.
+        step: Step of the run.
+        camera: Camera without distortion.
+        lines: Lines drawn over the scene.
     """
     image = Image.new("RGB", (camera.width, camera.height), _SKY)
     draw = ImageDraw.Draw(image)
@@ -220,7 +218,7 @@ class _Part:
     points: list[tuple[float, float]]
     colour: str | tuple[int, int, int]
     width: float | None = None
-    """Of a line [px]; None: a polygon."""
+    """Width of a line [px]; None for a polygon."""
 
     def draw(self, draw: ImageDraw.ImageDraw) -> None:
         if not np.isfinite(self.points).all():  # behind the camera
@@ -259,7 +257,7 @@ def _capsule(
 def _faces(
     box: Box, R: Float[np.ndarray, "3 3"], origin: Float[np.ndarray, "3"], camera: CameraModel
 ) -> list[tuple[float, _Part]]:
-    """Those turned to the camera, each with its depth [m]."""
+    """Visible faces of a box, each with its depth [m]."""
     parts = []
     eye = camera.pose[:3, 3]
     for axis in range(3):

@@ -1,7 +1,7 @@
-"""Demonstrations, and what was learned from them, as Rerun recordings.
+"""Rerun recordings of demonstrations and of models learned from them.
 
-Demonstrations are shown over one another and one by one, primitives beside their
-demonstrations, and image Jacobians learned in rounds by their convergence, neurons and errors.
+Demonstrations are shown together and one by one, primitives with their demonstrations, and
+image Jacobians by the convergence, neurons and errors of their learning rounds.
 """
 
 import os
@@ -70,7 +70,7 @@ def record_demonstrations(
     Args:
         path: File to write; it appears only when complete.
         shown: The demonstrations.
-        most: Of them that get a tab of their own; all are drawn in 3D and together.
+        most: Number of demonstrations with a tab of their own; all are drawn together.
     """
     views = [_together(shown), *(_alone(shown, d) for d in shown.demonstrations[:most])]
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Demonstrations")]
@@ -110,7 +110,7 @@ def record_demonstrations(
 
 @dataclass(frozen=True)
 class _Camera:
-    """What a camera saw, and where it is logged."""
+    """Images of a camera, and their entity path."""
 
     path: str
     name: str
@@ -123,7 +123,7 @@ def _cameras(demo: DemonstrationTrace) -> list[_Camera]:
 
 
 def _at(root: str, seen: Seen) -> list[_Camera]:
-    """Cameras of a demonstration whose curves are at a root."""
+    """Cameras of a demonstration, with entities below a root path."""
     return [
         _Camera(f"{root}/cameras/{slug(name)}", name, time, images)
         for name, (time, images) in seen.items()
@@ -131,7 +131,7 @@ def _at(root: str, seen: Seen) -> list[_Camera]:
 
 
 def _below_images(page: rrb.Container, title: str, cameras: list[_Camera]) -> rrb.Container:
-    """A tab below what cameras saw."""
+    """Layout of a tab below the camera images."""
     views = [rrb.Spatial2DView(origin=f"/{seen.path}", name=seen.name) for seen in cameras]
     return rrb.Vertical(rrb.Horizontal(*views), page, row_shares=(1, 3), name=title)
 
@@ -145,7 +145,7 @@ def _send_images(stream: rr.RecordingStream, cameras: list[_Camera]) -> None:
 
 
 def _together(shown: DemonstrationsRecording) -> DemonstrationView:
-    """Every joint, and the feature, of all demonstrations over one another."""
+    """Tab with every joint and the feature of all demonstrations together."""
     drawn = [
         (f"{name} [rad]", _limits(shown, j) + _over_one_another(shown, "joint_position", j))
         for j, name in enumerate(shown.joint_names)
@@ -166,7 +166,7 @@ def _together(shown: DemonstrationsRecording) -> DemonstrationView:
 def _over_one_another(
     shown: DemonstrationsRecording, quantity: str, column: int
 ) -> list[Timed]:
-    """A column of a quantity, of all demonstrations that have it."""
+    """Curves of one column of a quantity, for all demonstrations that have it."""
     timed = []
     for k, demo in enumerate(shown.demonstrations):
         values = getattr(demo, quantity)
@@ -186,12 +186,12 @@ def _limits(shown: DemonstrationsRecording, joint: int) -> list[Timed]:
 
 
 def _colour(k: int) -> str:
-    """Of a demonstration."""
+    """Colour of demonstration k."""
     return palette.SERIES_ON_DARK[k % len(palette.SERIES_ON_DARK)]
 
 
 def _alone(shown: DemonstrationsRecording, demo: DemonstrationTrace) -> DemonstrationView:
-    """Everything that was recorded of one demonstration."""
+    """Tab with all recorded quantities of one demonstration."""
     plots = []
     for title, name, names, values in (
         ("Joints [rad]", "joints", shown.joint_names, demo.joint_position),
@@ -215,7 +215,7 @@ def _send_dot(
     path: Float[np.ndarray, "time 3"],
     colour: str,
 ) -> None:
-    """A dot that moves along a path."""
+    """Send a dot that moves along a path."""
     look = rr.Points3D.from_fields(radii=[0.012], colors=[palette.rgba(colour)])
     stream.log(f"world/now/{name}", look, static=True)
     at = samples(time, _POSE_RATE)
@@ -224,7 +224,7 @@ def _send_dot(
 
 
 def _recorded(shown: DemonstrationsRecording) -> str:
-    """What was recorded, as Markdown."""
+    """Summary of the demonstrations, as Markdown."""
     rows = [
         (
             demo.episode,
@@ -245,7 +245,7 @@ def record_fit(path: str | os.PathLike[str], fit: FitRecording, *, most: int = 6
 
     Args:
         path: File to write; it appears only when complete.
-        fit: What was fitted.
+        fit: Demonstrations and reproductions.
         most: Demonstrations that get a tab of their own; all are drawn in 3D.
     """
     tabs = fit_tabs(fit, most)
@@ -304,14 +304,14 @@ def _send_strips(
     colour: str,
     radius: float,
 ) -> None:
-    """Lines that stand still [m]."""
+    """Send static lines [m]."""
     thinned, colours = [thin(path) for path in paths], [palette.rgba(colour)]
     strips = rr.LineStrips3D(thinned, radii=radius, colors=colours)
     stream.log(f"world/{name}", strips, static=True)
 
 
 def _fitted(fit: FitRecording) -> str:
-    """What was fitted, as Markdown."""
+    """Summary of the fit, as Markdown."""
     limits = fit.joint_limits is not None
     rows = [
         (i, f"{time[-1] - time[0]:.2f}", f"{1e3 * np.abs(reproduction - demo).max():.3g}")
@@ -332,17 +332,17 @@ def _fitted(fit: FitRecording) -> str:
 
 
 ROUND = "round"
-"""The timeline of learning: every round one step."""
+"""Timeline of learning, with one step per round."""
 
 _THICKNESS = 0.002  # of the error map's cells [m]
 
 
 def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -> None:
-    """Write it as an .rrd file with its layout; `rerun FILE` shows it.
+    """Write the rounds of learning as an .rrd file with its layout; `rerun FILE` shows it.
 
     Args:
         path: File to write; it appears only when complete.
-        learning: What was learned, and how.
+        learning: Recording of the rounds.
     """
     tab = learning_tab(learning)
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
@@ -411,24 +411,24 @@ def _rounds(numbers: np.ndarray) -> list[rr.TimeColumn]:
 def _cells(errors: ErrorMap) -> rr.Boxes3D:
     """Flat boxes, the darker the larger the error, with the error in percent on them."""
     x, y = (np.convolve(edges, (0.5, 0.5), mode="valid") for edges in (errors.x, errors.y))
-    known = np.isfinite(errors.share)
-    share, flat = errors.share[known], np.full(int(known.sum()), _THICKNESS)
+    known = np.isfinite(errors.relative_error)
+    relative, flat = errors.relative_error[known], np.full(int(known.sum()), _THICKNESS)
     middle = [grid[known] for grid in np.meshgrid(x, y, indexing="ij")]
     size = np.meshgrid(np.diff(errors.x), np.diff(errors.y), indexing="ij")
     # From a pale blue to one on which black figures can still be read.
-    shades = matplotlib.colormaps["Blues"](0.15 + 0.5 * share / share.max(initial=1e-12))
+    shades = matplotlib.colormaps["Blues"](0.15 + 0.5 * relative / relative.max(initial=1e-12))
     return rr.Boxes3D(
         centers=np.stack([*middle, np.full_like(flat, errors.z)], axis=-1),
         half_sizes=np.stack([*(grid[known] / 2 for grid in size), flat], axis=-1),
         colors=(255 * shades).astype(np.uint8),
-        labels=[f"{100 * value:.1f} %" for value in share],
+        labels=[f"{100 * value:.1f} %" for value in relative],
         show_labels=True,
         fill_mode=rr.components.FillMode.Solid,
     )
 
 
 def _learned(learning: LearningRecording) -> str:
-    """What came of it, as Markdown."""
+    """Summary of the learning, as Markdown."""
     lines = [f"# {learning.title}", ""]
     if learning.curves:
         last = len(learning.centers) - 1

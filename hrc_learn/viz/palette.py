@@ -1,4 +1,4 @@
-"""Colours of every dashboard and figure, which the colour-blind can tell apart.
+"""Colours of all dashboards and figures, distinguishable with colour blindness.
 
 M. Okabe and K. Ito, Color Universal Design, 2008.
 """
@@ -15,7 +15,7 @@ GREY = "#9AA0A6"
 YELLOW = "#F0E442"
 
 SERIES = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, GREY)
-"""One for each of up to seven joints or curves, on white paper."""
+"""Colours of up to seven joints or curves, on white paper."""
 
 SERIES_ON_DARK = (SKY, ORANGE, GREEN, VERMILION, PURPLE, YELLOW, GREY)
 """The same for dark screens, where blue would sink."""
@@ -23,14 +23,14 @@ SERIES_ON_DARK = (SKY, ORANGE, GREEN, VERMILION, PURPLE, YELLOW, GREY)
 DEMO = GREY
 """Demonstrations."""
 RUN = BLUE
-"""What the robot did, on white paper."""
+"""Motion of the robot, on white paper."""
 RUN_ON_DARK = SKY
 LIMIT = VERMILION
-"""Limits and targets that must not be crossed."""
+"""Limits that must not be crossed."""
 TARGET = GREEN
-"""Where something is wanted."""
+"""Targets and goals."""
 PERSON = ORANGE
-"""What a person did."""
+"""Actions of a person."""
 
 
 def rgba(colour: str) -> tuple[int, int, int, int]:
@@ -39,13 +39,13 @@ def rgba(colour: str) -> tuple[int, int, int, int]:
     return r, g, b, 255
 
 
-def followed_colour(share: float) -> str:
-    """Of a push of which an arm follows a share, 0 to 1: green all, vermilion nothing of it.
+def followed_colour(fraction: float) -> str:
+    """Colour for the followed fraction of a push, 0 to 1: vermilion for 0, green for 1.
 
-    In five steps, each of which can be told from the next.
+    In five distinguishable steps.
     """
     return (VERMILION, "#DE8000", ORANGE, "#A0A030", GREEN)[
-        round(4 * min(max(share, 0.0), 1.0))
+        round(4 * min(max(fraction, 0.0), 1.0))
     ]
 
 

@@ -1,4 +1,4 @@
-"""Which curves of a run are drawn where: one list that data and layout are both made from."""
+"""Assignment of the curves of a run to plots and tabs, for both data and layout."""
 
 import re
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ Colour = tuple[int, int, int, int]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Curves:
-    """Curves over time that share an entity and a unit."""
+    """Curves over time with a common entity and unit."""
 
     path: str
     names: tuple[str, ...]
@@ -23,7 +23,7 @@ class Curves:
     colours: tuple[Colour, ...]
     width: float = 1.5
     marks: bool = False
-    """Points rather than lines: what happens in a single step is seen as well."""
+    """Draw points rather than lines, so that single steps are visible."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,14 +31,14 @@ class Plot:
     """One coordinate system."""
 
     title: str
-    """What is shown, with its unit: plots have no axis labels."""
+    """Quantity with its unit: plots have no axis labels."""
     curves: tuple[Curves, ...]
     range: tuple[float, float] | None = None
-    """Of the vertical axis; fits the data when None."""
+    """Range of the vertical axis; None: that of the data."""
     legend: bool = False
-    """Where the title cannot name the colours."""
-    share: float = 1.0
-    """Height, in proportion to the other plots of the tab."""
+    """Show a legend, if the title cannot name the colours."""
+    height: float = 1.0
+    """Height relative to the other plots of the tab."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class Tab:
 
 
 def without_empty_plots(tab: Tab) -> Tab:
-    """The plots of a tab in which there is something to see."""
+    """Tab without its empty plots."""
     seen = [
         plot
         for plot in tab.plots
@@ -61,7 +61,7 @@ def without_empty_plots(tab: Tab) -> Tab:
 
 
 def run_tabs(run: RunRecording) -> list[Tab]:
-    """Every tab that the run has data for."""
+    """All tabs that the run has data for."""
     tabs = [
         _story(run),
         _servoing(run),
@@ -74,11 +74,11 @@ def run_tabs(run: RunRecording) -> list[Tab]:
 
 
 def _story(run: RunRecording) -> Tab:
-    """What the run is about, a curve each: the others tabs have the details."""
+    """Overview with one curve per topic; the other tabs show details."""
     plots = []
     if run.camera is not None:
         error = single("story/error", "distance", run.camera.error, palette.RUN_ON_DARK)
-        plots.append(Plot(title="Servoing: from feature to target [px]", curves=(error,)))
+        plots.append(Plot(title="Servoing: distance to the target [px]", curves=(error,)))
     if run.nullspace_input is not None:
         effort = np.abs(run.nullspace_input).max(axis=1)
         curve = single("story/effort", "largest of the joints", effort, palette.PERSON)
@@ -86,7 +86,7 @@ def _story(run: RunRecording) -> Tab:
     if run.position_deviation is not None:
         off = 1e3 * run.position_deviation
         curve = single("story/deviation", "deviation", off, palette.PURPLE)
-        plots.append(Plot(title="End effector: moved by the person [mm]", curves=(curve,)))
+        plots.append(Plot(title="End effector: displacement [mm]", curves=(curve,)))
     if run.worker_distance:
         name, true = next(iter(run.worker_distance.items()))
         curve = single("story/distance", name, 1e3 * true, palette.GREEN)
@@ -118,13 +118,13 @@ def _lyapunov(run: RunRecording) -> Tab:
     )
     if run.potential_rate is not None:
         rate = single("regions/rate", "dV/dt", run.potential_rate, palette.PURPLE)
-        title = "dV/dt, if the image Jacobian is as estimated [1/s]"
+        title = "dV/dt predicted by the estimated image Jacobian [1/s]"
         plots += (Plot(title=title, curves=(rate,)),)
     return Tab(title="Lyapunov", plots=plots)
 
 
 def _image_jacobian(run: RunRecording) -> list[Plot]:
-    """Its entries, beside the true ones where they are known."""
+    """Plots of the entries of the image Jacobian, with the true ones if known."""
     plots = []
     if run.image_jacobian is not None:
         for row, pixel in enumerate(("u", "v")):
@@ -167,19 +167,19 @@ def _person(run: RunRecording) -> list[Plot]:
         title = "Null-space effort d of the person, by joint [N m]"
         plots.append(Plot(title=title, curves=(effort,), legend=True))
     if run.followed is not None:
-        share = single("person/followed", "share", run.followed, palette.TARGET)
-        title = "Share of the push that the arm follows [-]"
+        share = single("person/followed", "fraction", run.followed, palette.TARGET)
+        title = "Followed fraction of the push [-]"
         plots.append(Plot(title=title, curves=(share,), range=(-0.05, 1.05)))
     if run.hindered:
-        # A line at a height of its own for each, where it acts.
+        # A line at a height of its own for each reason, where it acts.
         rows = [np.where(on, k + 1.0, np.nan) for k, on in enumerate(run.hindered.values())]
         reasons = several("person/hindered", run.hindered, np.column_stack(rows), width=4.0)
-        extent, title = (0.0, len(rows) + 1.0), "Why it does not follow, or only in part"
+        extent, title = (0.0, len(rows) + 1.0), "Reasons for not following, or only in part"
         plots.append(Plot(title=title, curves=(reasons,), range=extent, legend=True))
     moved, turned = run.position_deviation, run.rotation_deviation
     blue, deviation = palette.RUN_ON_DARK, "Deviation of the end effector"
     for path, values, unit, colour, title in (
-        ("elbow", run.elbow_motion, 1e3, palette.PERSON, "Elbow moved by the person [mm]"),
+        ("elbow", run.elbow_motion, 1e3, palette.PERSON, "Elbow: displacement [mm]"),
         ("position_deviation", moved, 1e3, blue, f"{deviation}, position [mm]"),
         (
             "rotation_deviation",
@@ -201,7 +201,7 @@ def _worker(run: RunRecording) -> list[Plot]:
     values = 1e3 * np.column_stack(list(run.worker_distance.values()))
     distance = several("worker/distance", run.worker_distance, values)
     title = "Distance of the worker from the robot and its load [mm]"
-    # What matters are the last few centimetres.
+    # The last few centimetres matter.
     near = several("worker/near", run.worker_distance, np.where(values < 300, values, np.nan))
     return [
         Plot(title=title, curves=(distance,), legend=True),
@@ -222,7 +222,7 @@ def _primitive(run: RunRecording) -> Tab:
 
 
 def joints_title(demo: bool, limits: bool, position: str = "position") -> str:
-    """Title that says what the colours of `joint_plot` mean; its plots are too small for it."""
+    """Title that explains the colours of `joint_plot`: its plots are too small for legends."""
     return f"Joints: {position} blue" + ", demonstration grey" * demo + ", limits red" * limits
 
 
@@ -259,13 +259,13 @@ def _safety(run: RunRecording) -> Tab:
     limits, names = run.joint_limits, run.joint_names
     if limits is not None:
         middle, half = (limits.upper + limits.lower) / 2, (limits.upper - limits.lower) / 2
-        shares = (run.joint_position - middle) / half
-        title = "Joints in their ranges: -1 the lower limit, 1 the upper [-]"
-        plots.append(_within("safety/position", title, names, shares))
+        fractions = (run.joint_position - middle) / half
+        title = "Joint positions in their ranges: -1 lower limit, 1 upper limit [-]"
+        plots.append(_within("safety/position", title, names, fractions))
         if limits.velocity is not None and run.joint_velocity is not None:
-            shares = run.joint_velocity / limits.velocity
-            title = "Joint velocities, in parts of their limits [-]"
-            plots.append(_within("safety/velocity", title, names, shares))
+            fractions = run.joint_velocity / limits.velocity
+            title = "Joint velocities, as fractions of their limits [-]"
+            plots.append(_within("safety/velocity", title, names, fractions))
     if run.safety:
         # A row of its own for each guard, with marks where it acted.
         acted = [np.nan_to_num(np.asarray(on, dtype=float)) > 0 for on in run.safety.values()]
@@ -273,7 +273,7 @@ def _safety(run: RunRecording) -> Tab:
         guards = [name.replace("_", " ") for name in run.safety]
         marks = several("safety/acted", guards, np.column_stack(rows), width=4.0)
         marks = replace(marks, marks=True)
-        title = "What the safety filter changed a command for"
+        title = "Interventions of the safety filter"
         plots.append(
             Plot(title=title, curves=(marks,), range=(0.0, len(rows) + 1.0), legend=True)
         )
@@ -281,22 +281,22 @@ def _safety(run: RunRecording) -> Tab:
 
 
 def _within(
-    path: str, title: str, names: Iterable[str], shares: Shaped[np.ndarray, "time joints"]
+    path: str, title: str, names: Iterable[str], fractions: Shaped[np.ndarray, "time joints"]
 ) -> Plot:
-    """Shares of limits, between -1 and 1."""
+    """Plot of fractions of limits, between -1 and 1."""
     red = palette.rgba(palette.LIMIT)
     bounds = Curves(
         path=f"{path}/limits",
         names=("limit", "limit"),
-        values=np.broadcast_to([-1.0, 1.0], (len(shares), 2)),
+        values=np.broadcast_to([-1.0, 1.0], (len(fractions), 2)),
         colours=(red, red),
     )
-    curves = (several(f"{path}/joints", names, shares), bounds)
+    curves = (several(f"{path}/joints", names, fractions), bounds)
     return Plot(title=title, curves=curves, range=(-1.1, 1.1), legend=True)
 
 
 def slug(name: str) -> str:
-    """A name as a part of an entity path, which slashes and blanks would break up."""
+    """Name as a part of an entity path, without slashes and blanks."""
     return re.sub(r"\W+", "_", name).strip("_")
 
 
@@ -316,7 +316,7 @@ def several(
     width: float = 1.5,
     light: bool = False,
 ) -> Curves:
-    """A curve for each column, each in a colour of its own, pale where `light`."""
+    """One curve for each column, each in a colour of its own, pale if `light`."""
     names = tuple(names)
     colours = palette.SERIES_ON_DARK
     chosen = [colours[i % len(colours)] for i in range(len(names))]

@@ -1,7 +1,6 @@
-"""What runs, fits, sweeps and demonstrations hand over to be shown: plain arrays, no robot
-model, no library.
+"""Recordings of demonstrations, fits and learning: plain arrays, no robot model, no library.
 
-Whatever is None or empty drops its panel or figure. Times are seconds from the run's start.
+A field that is None or empty drops its panel or figure.
 """
 
 from collections.abc import Mapping
@@ -15,12 +14,12 @@ from hrc_learn.log import JointRanges
 from hrc_learn.log.run_recording import check_samples
 
 Seen = Mapping[str, tuple[Float[np.ndarray, "_"], tuple[bytes, ...]]]
-"""What cameras saw, by their names: times [s], and a JPEG file for each."""
+"""Camera images by the name of the camera: times [s], and a JPEG file for each."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitRecording:
-    """Demonstrations beside what the fitted primitives make of them, on the same grids.
+    """Demonstrations and their reproductions by the fitted primitives, on the same grids.
 
     Raises:
         ValueError: If the numbers of demonstrations or of their samples disagree.
@@ -43,18 +42,19 @@ class FitRecording:
     residual: Mapping[int, float] = field(default_factory=dict)
     """Normalised RMS error of the fit for each number of basis functions tried."""
     n_basis: int | None = None
-    """The number of basis functions used."""
+    """Number of basis functions used."""
     unit: str = "rad"
-    """Of the joints, or "m" where they are positions."""
+    """Unit of the joints: "rad", or "m" for positions."""
     episodes: tuple[int, ...] = ()
-    """Of which dataset's episodes the demonstrations are, where that is known."""
+    """Episode of each demonstration in its dataset, if known."""
     images: Mapping[int, Seen] = field(default_factory=dict)
-    """What cameras saw, by episode."""
+    """Camera images by episode."""
 
     def __post_init__(self) -> None:
         if self.episodes and len(self.episodes) != len(self.demos):
             raise ValueError(
-                f"{len(self.demos)} demonstrations cannot be of {len(self.episodes)} episodes."
+                f"episodes names {len(self.episodes)} episodes for {len(self.demos)} "
+                "demonstrations; give one for each."
             )
         if not len(self.time) == len(self.demos) == len(self.reproductions) > 0:
             raise ValueError(
@@ -73,7 +73,7 @@ class FitRecording:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DemonstrationTrace:
-    """One demonstration; whatever was not recorded is None.
+    """One demonstration; quantities that were not recorded are None.
 
     Raises:
         ValueError: If a field has another number of samples than `time`.
@@ -95,7 +95,7 @@ class DemonstrationTrace:
     bodies: tuple[Body, ...] = ()
     """The arm along the demonstration."""
     images: Seen = field(default_factory=dict)
-    """What cameras saw."""
+    """Camera images."""
 
     def __post_init__(self) -> None:
         names = ("joint_position", "position", "feature", "human_effort", "gripper")
@@ -109,7 +109,7 @@ class DemonstrationTrace:
 
     @property
     def length(self) -> float | None:
-        """Of the path of the tool centre point [m]."""
+        """Length of the path of the tool centre point [m]."""
         if self.position is None:
             return None
         return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
@@ -128,30 +128,30 @@ class DemonstrationsRecording:
     demonstrations: tuple[DemonstrationTrace, ...]
     joint_limits: JointRanges | None = None
     notes: tuple[str, ...] = ()
-    """What was guessed or odd when they were read."""
+    """Notes of the reader: guesses and anomalies."""
 
     def __post_init__(self) -> None:
         if not self.demonstrations:
-            raise ValueError("there is no demonstration to show.")
+            raise ValueError("demonstrations must not be empty.")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorMap:
-    """Shares over cells of the horizontal plane."""
+    """Relative error over cells of the horizontal plane."""
 
     x: Float[np.ndarray, " nx_and_1"]
     """Edges of the cells [m]."""
     y: Float[np.ndarray, " ny_and_1"]
     """Edges of the cells [m]."""
     z: float
-    """Height at which they are drawn [m]."""
-    share: Float[np.ndarray, "nx ny"]
-    """Error over size of what was predicted; NaN in an empty cell."""
+    """Height at which the cells are drawn [m]."""
+    relative_error: Float[np.ndarray, "nx ny"]
+    """Error relative to the size of the predicted quantity; NaN in an empty cell."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LearningRecording:
-    """Rounds of learning, the first before anything was learned.
+    """Rounds of learning; the first one is the state before learning.
 
     Raises:
         ValueError: If curves or centres do not have a value for each round, or the best round
@@ -162,19 +162,19 @@ class LearningRecording:
     measured: Mapping[str, float] = field(default_factory=dict)
     """Values of the result, by name."""
     curves: Mapping[str, Float[np.ndarray, "_"]] = field(default_factory=dict)
-    """Of the rounds, by name with unit; none where nothing was learned in rounds."""
+    """Values over the rounds, by name with unit; none without rounds."""
     best: int = 0
-    """The round that was kept."""
+    """Round whose result was kept."""
     centers: Float[np.ndarray, "rounds neurons 3"] = field(
         default_factory=lambda: np.zeros((1, 0, 3))
     )
-    """Where the neurons stood in each [m]."""
+    """Centres of the neurons in each round [m]."""
     paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
-    """Of the end effector in demonstrations [m]."""
+    """Paths of the end effector in demonstrations [m]."""
     errors: ErrorMap | None = None
-    """On demonstrations held out."""
+    """Errors on held-out demonstrations."""
     images: Mapping[str, bytes] = field(default_factory=dict)
-    """JPEG files by what they show."""
+    """JPEG files by their titles."""
 
     def __post_init__(self) -> None:
         rounds = len(self.centers)

@@ -1,6 +1,4 @@
-"""Sending to Rerun: one .rrd file all or nothing, columns instead of single values, and the
-layouts of dashboards.
-"""
+"""Sending to Rerun: complete .rrd files, columns instead of single values, and layouts."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -34,8 +32,8 @@ def rrd_file(
 
     Args:
         path: The file.
-        title: What it shows.
-        blueprint: Its layout; None: what writes the stream sends it.
+        title: Title of the recording.
+        blueprint: Layout; None: the writer of the stream sends it.
     """
     stream = rr.RecordingStream("hrc_learn")
     with new_file(Path(path)) as part:
@@ -49,7 +47,7 @@ def rrd_file(
 
 
 def begin(stream: rr.RecordingStream, title: str) -> None:
-    """Name a recording, and say which way is up."""
+    """Send the name of a recording and the direction of up."""
     stream.send_recording_name(title)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
@@ -58,19 +56,19 @@ Logged = rr.AsComponents | tuple[rr.AsComponents, ...]
 
 
 class StaticShapes:
-    """Sends what has no time, once, and again only if it changed."""
+    """Sends static data once, and again only if they changed."""
 
     def __init__(self, stream: rr.RecordingStream):
         self._stream = stream
         self._sent: dict[str, object] = {}
 
     def send(self, path: str, value: object, make: Callable[[], Logged]) -> None:
-        """Send to an entity what has changed.
+        """Send data to an entity if they changed.
 
         Args:
-            path: The entity.
-            value: By which a change is told.
-            make: Of the value what is to be sent.
+            path: Path of the entity.
+            value: Value that identifies the data.
+            make: Makes the data to send.
         """
         if path in self._sent and self._sent[path] == value:
             return
@@ -94,7 +92,7 @@ def send_tab(stream: rr.RecordingStream, time: Float[np.ndarray, " time"], tab: 
 def send_curves(
     stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
 ) -> None:
-    """Send curves with their names and colours; they break off where they are NaN."""
+    """Send curves with their names and colours; NaN interrupts them."""
     stream.log(curves.path, style(curves), static=True)
     send_rows(stream, seconds(time), curves)
 
@@ -125,7 +123,7 @@ def body_path(body: Body) -> str:
 
 
 def send_shapes(still: StaticShapes, body: Body) -> None:
-    """Send what a body looks like."""
+    """Send the shapes of a body."""
     path, plain = body_path(body), body.boxes
     for k, mesh in enumerate(body.meshes):
         for j, part in enumerate(read_mesh(mesh.path)):
@@ -140,7 +138,7 @@ def send_shapes(still: StaticShapes, body: Body) -> None:
 
 
 def _drawn(mesh: MeshFile, part: MeshPart) -> rr.Mesh3D:
-    """A part of a mesh where it is on its body."""
+    """Part of a mesh at its place on the body."""
     placed = part.placed(mesh)
     return rr.Mesh3D(
         vertex_positions=placed.vertices,
@@ -203,12 +201,12 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
 
 
 def tab_view(tab: Tab, span: tuple[float, float] | None = None) -> rrb.Grid:
-    """Layout of one tab, with the time that its plots show; what is new when None [s]."""
+    """Layout of one tab, with the time span of its plots [s]; None: the newest data."""
     columns = max(1, min(tab.columns, len(tab.plots)))
     return rrb.Grid(
         contents=[plot_view(plot, span) for plot in tab.plots],
         grid_columns=columns,
-        row_shares=[plot.share for plot in tab.plots[::columns]],
+        row_shares=[plot.height for plot in tab.plots[::columns]],
         name=tab.title,
     )
 
@@ -245,7 +243,7 @@ def dashboard(
         right: The columns.
         row_shares: Heights of the views, in proportion.
         column_shares: Widths of all columns, in proportion.
-        timeline: That is shown.
+        timeline: Timeline of the views.
     """
     columns = [rrb.Vertical(contents=left, row_shares=row_shares[: len(left)]), *right]
     return rrb.Blueprint(
@@ -268,11 +266,11 @@ def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> li
 
 
 def frame_view(path: Float[np.ndarray, "n 3"], *, base: bool = True) -> rrb.EyeControls3D:
-    """An eye in front of the robot, to its left, that sees the whole path.
+    """Viewpoint in front of the robot, to its left, that shows the whole path.
 
     Args:
-        path: Points to see [m].
-        base: Whether to see the robot's base as well.
+        path: Points to show [m].
+        base: Show the base of the robot as well.
     """
     points = np.concatenate([path, np.zeros((1, 3))]) if base else path
     low, high = points.min(axis=0), points.max(axis=0)
@@ -309,7 +307,7 @@ class CameraStream:
 
         Args:
             stream: Into a file or to a viewer.
-            still: What was sent of the things that stand still.
+            still: Sender of the static shapes.
         """
         self._stream, self._still, self._images = stream, still, 0
 
@@ -350,8 +348,8 @@ class CameraStream:
         """Send feature, target and path of the feature.
 
         Args:
-            time: Of the whole run [s].
-            camera: What it saw in the whole run.
+            time: Time of the whole run [s].
+            camera: Camera recording of the whole run.
             at: Samples at which the marks are sent.
             ends: Samples at which the path so far is sent.
         """
@@ -369,7 +367,7 @@ class CameraStream:
                 draw_order=30.0,
             ),
         )
-        # A sample without points takes the mark away while the feature is not seen.
+        # A sample without points removes the mark while the feature is not seen.
         columns = rr.Points2D.columns(positions=camera.feature[at][seen[at]])
         self._stream.send_columns(
             f"{_ROOT}/feature", seconds(time[at]), columns.partition(seen[at].astype(int))
@@ -396,7 +394,7 @@ class CameraStream:
 
 
 def _cross(pixel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2 2"]]:
-    """Two strokes across a pixel; none where there is no target."""
+    """Two strokes across a pixel; none without a target."""
     if not np.isfinite(pixel).all():
         return []
     return [

@@ -1,6 +1,6 @@
-"""A run as a Rerun recording: the robot in 3D, what its camera saw, and every curve.
+"""Rerun recording of a run: the robot in 3D, its camera images, and all curves.
 
-The same dashboard shows a finished run from a file, and one that still goes on in a browser.
+The same dashboard shows a finished run from a file, and a running one in a browser.
 """
 
 import os
@@ -44,17 +44,17 @@ from hrc_learn.viz.rerun_stream import (
 
 
 def run_outline(run: RunRecording) -> tuple:
-    """What the layout depends on: runs with equal ones share a layout."""
+    """Key of the layout: runs with equal keys have the same layout."""
     plots = [(tab.title, [plot.title for plot in tab.plots]) for tab in run_tabs(run)]
     return plots, run.camera is not None, bool(run.phases)
 
 
 def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
-    """The robot and its camera beside tabs of curves.
+    """Layout with the robot and its camera on the left and tabs of curves on the right.
 
     Args:
-        run: What is shown.
-        finished: Whether plots show all of it, not just what comes.
+        run: The run.
+        finished: Plots show the whole run, not only the newest data.
     """
     span = (float(run.time[0]), float(run.time[-1])) if finished and len(run.time) > 1 else None
     scene = rrb.Spatial3DView(
@@ -91,10 +91,10 @@ _PATH_RATE = 6.0  # times a second at which the growing path is sent anew
 
 
 class RunStream:
-    """Sends what is new in a run, and the layout that shows it.
+    """Sends new data of a run, and its layout.
 
-    One call sends a finished run; one call every now and then, with ever longer recordings of
-    it, sends one that still goes on. What arrives is the same.
+    One call sends a finished run; repeated calls with longer recordings send a running one. The
+    result is the same.
     """
 
     def __init__(self, stream: rr.RecordingStream, finished: bool = False):
@@ -102,7 +102,7 @@ class RunStream:
 
         Args:
             stream: Into a file or to a viewer.
-            finished: Whether the run is over, so that plots show all of it.
+            finished: The run is over, so that plots show all of it.
         """
         self._stream, self._still, self._finished = stream, StaticShapes(stream), finished
         self._camera = CameraStream(stream, self._still)
@@ -110,7 +110,7 @@ class RunStream:
         self._outline: tuple | None = None
 
     def send(self, run: RunRecording) -> None:
-        """Send all of a run that was not sent before.
+        """Send the data of a run that were not sent before.
 
         Args:
             run: The same run as before, as long or longer.
@@ -186,7 +186,7 @@ class RunStream:
     def _send_region(
         self, run: RunRecording, region: Float[np.ndarray, "time 6"], first: int
     ) -> None:
-        """The region of the controller, where it changed, in another colour if it was drawn."""
+        """Send changes of the controller's region, with another colour for drawn ones."""
         drawn = np.zeros(len(region)) if run.drawn is None else run.drawn
         state = np.column_stack([region, drawn])
         same = (state[1:] == state[:-1]) | (np.isnan(state[1:]) & np.isnan(state[:-1]))
@@ -201,7 +201,7 @@ class RunStream:
         columns = rr.Boxes3D.columns(
             centers=region[shown, :3], half_sizes=region[shown, 3:], colors=colours
         )
-        # A step without a region takes the box away.
+        # A step without a region removes the box.
         counts = known.astype(int)
         self._stream.send_columns(path, seconds(run.time[at]), columns.partition(counts))
 
@@ -211,7 +211,7 @@ class RunStream:
         nearest: Float[np.ndarray, "time 2 3"],
         at: Int[np.ndarray, " chosen"],
     ) -> None:
-        """The line between the points of robot and worker that are nearest to each other."""
+        """Send the line between the nearest points of robot and worker."""
         path, colours = "world/worker_distance", [palette.rgba(palette.LIMIT)]
         self._still.send(
             path, None, lambda: rr.LineStrips3D.from_fields(radii=[0.004], colors=colours)
@@ -226,7 +226,7 @@ class RunStream:
         push: Float[np.ndarray, "time 2 3"],
         at: Int[np.ndarray, " chosen"],
     ) -> None:
-        """An arrow at the point of the arm that the person pushes."""
+        """Send an arrow at the point of the arm that the person pushes."""
         path, colours = "world/push", [palette.rgba(palette.PERSON)]
         self._still.send(
             path, None, lambda: rr.Arrows3D.from_fields(radii=[0.012], colors=colours)
@@ -254,7 +254,7 @@ def record_run(path: str | os.PathLike[str], run: RunRecording) -> None:
 
     Args:
         path: File to write; it appears only when complete.
-        run: What happened. Panels without data are left out.
+        run: The run. Panels without data are left out.
     """
     with rrd_file(path, run.title) as stream:
         RunStream(stream, finished=True).send(run)
@@ -271,8 +271,8 @@ class LogStream:
         """Send the layout.
 
         Args:
-            log: What a loop appends to; its column "time" holds the time [s].
-            stream: Where to send.
+            log: Log of a running loop; its column "time" holds the time [s].
+            stream: Recording stream.
             columns: Columns of the log to send.
         """
         self._log, self._stream, self._still = log, stream, StaticShapes(stream)
@@ -281,7 +281,7 @@ class LogStream:
         stream.send_blueprint(rrb.Blueprint(rrb.Grid(contents=views), collapse_panels=True))
 
     def send(self) -> None:
-        """Send the rows that were not sent before."""
+        """Send the new rows."""
         for rows in self._log.blocks(self._rows):
             if len(rows):
                 for name in self._columns:
@@ -299,7 +299,7 @@ def _plot(name: str, values: Shaped[np.ndarray, "rows curves"]) -> Plot:
     return Plot(title=name, curves=(curves,), legend=True)
 
 
-_SHARE = 0.2  # of a thread's time that may go into sending
+_DUTY_CYCLE = 0.2  # largest fraction of the time of a thread spent on sending
 
 
 class LiveSender:
@@ -316,9 +316,9 @@ class LiveSender:
         """Prepare the thread; it starts with the `with` block.
 
         Args:
-            send: Sends what is new.
-            period: How often [s]; less often where sending would take more than a fifth of
-                the time.
+            send: Sends the new data.
+            period: Time between two calls [s]; longer if sending would take more than a fifth
+                of the time.
         """
         self._send, self._period = send, period
         self._closing = threading.Event()
@@ -341,7 +341,7 @@ class LiveSender:
             while not self._closing.wait(pause):
                 began = time.monotonic()
                 self._send()
-                pause = max(self._period, (time.monotonic() - began) * (1 / _SHARE - 1))
+                pause = max(self._period, (time.monotonic() - began) * (1 / _DUTY_CYCLE - 1))
             self._send()
         except Exception as error:  # handed over to the thread that closes
             self._error = error
@@ -354,12 +354,12 @@ def live_dashboard(
     *,
     period: float = 0.25,
 ) -> Iterator[None]:
-    """Show a run while it goes on, as `record_run` keeps it afterwards.
+    """Show a run while it goes on, in the layout of `record_run`.
 
     Args:
-        stream: Where to send; `hrc_learn.viz.run_dashboard` gives one that a browser shows.
-        snapshot: The run so far, None before there is anything; called by another thread.
-        period: How often to send [s].
+        stream: Recording stream; `serve_stream` makes one for a browser.
+        snapshot: Returns the run so far, or None before its start; called by another thread.
+        period: Time between two updates [s].
     """
     sender = RunStream(stream)
     begun = False
@@ -379,24 +379,24 @@ def live_dashboard(
 
 
 class DashboardServer(NamedTuple):
-    """A stream that is served on this machine."""
+    """Recording stream served on this machine."""
 
     stream: rr.RecordingStream
     viewer: str
-    """Address of the viewer, for a browser."""
+    """Address of the viewer in a browser."""
     data: str
     """Address of the data, for `rerun ADDRESS`."""
 
 
 @contextmanager
 def serve_stream(port: int = 9090, data_port: int = 9876) -> Iterator[DashboardServer]:
-    """Serve a stream and a viewer for it, for as long as the `with` block lasts.
+    """Serve a recording stream and its viewer until the `with` block ends.
 
-    Who opens the page later sees all that was sent before, as far as a gigabyte goes.
+    A page that is opened later shows all earlier data, up to one gigabyte.
 
     Args:
-        port: Of the viewer's page.
-        data_port: Of the data that the page fetches.
+        port: Port of the page of the viewer.
+        data_port: Port of the data.
 
     Raises:
         ValueError: If a port is taken.
@@ -448,5 +448,5 @@ def _check_free(port: int) -> None:
             probe.bind(("127.0.0.1", port))
         except OSError as error:
             raise ValueError(
-                f"port {port} is taken: end what uses it, or choose another."
+                f"port {port} is in use: end the program that uses it, or choose another port."
             ) from error

@@ -71,7 +71,7 @@ def names_of(part) -> set[str]:
 def test_plots_of_nothing_are_left_out_of_what_is_over():
     nothing = np.full(len(sample_run().time), np.nan)
     run = sample_run(elbow_motion=nothing, potentials={"x": nothing}, potential_rate=None)
-    elbow, lyapunov = "Elbow moved by the person [mm]", "Lyapunov"
+    elbow, lyapunov = "Elbow: displacement [mm]", "Lyapunov"
     over, going_on = (names_of(run_layout(run, f).root_container) for f in (True, False))
     assert {elbow, lyapunov} <= going_on  # it may come
     assert not {elbow, lyapunov} & over
@@ -413,7 +413,7 @@ def test_a_port_that_is_taken_is_said():
         taken.bind(("", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=f"port {port} is taken"), serve_stream(port):
+        with pytest.raises(ValueError, match=f"port {port} is in use"), serve_stream(port):
             pass
 
 

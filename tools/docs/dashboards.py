@@ -54,8 +54,6 @@ class Args:
     """Of `hrc show DATASET --out FILE`."""
     fit: Path | None = None
     """Of `hrc fit`."""
-    sweep: Path | None = None
-    """Of `hrc sweep --recording`."""
     load: float = 90.0
     """Until the viewer has drawn all of a recording [s]."""
     out: Path = Path(__file__).parents[2] / "docs" / "images"
@@ -67,7 +65,6 @@ def main(args: Args) -> None:
         "dashboard": args.run,
         "demonstrations": args.demonstrations,
         "fit_dashboard": args.fit,
-        "sweep_dashboard": args.sweep,
     }
     for name, recording in recordings.items():
         if recording is None:

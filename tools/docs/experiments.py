@@ -1,4 +1,4 @@
-"""Refresh the pictures and tables of docs/concepts/experiments.md from the folders of runs.
+"""Refresh the pictures and tables of docs/benchmarks/experiments.md from the folders of runs.
 
 The page decides what is shown: each `images/KIND_NAME.png` in it is made from the picture NAME
 in the report of that kind of run, and the lines between `<!-- KIND measured -->` and
@@ -24,7 +24,7 @@ from hrc_learn import cli
 from hrc_learn.viz.report import Measurement, Report, read_report
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE = DOCS / "concepts" / "experiments.md"
+PAGE = DOCS / "benchmarks" / "experiments.md"
 WIDTH = 1000
 """Of the pictures, at most [px]."""
 COLOURS = 256
@@ -43,8 +43,6 @@ class Args:
     """Folder of `hrc run grasping`, likewise."""
     collaboration: Path | None = None
     """Folder of `hrc run collaboration`, likewise."""
-    curve: Path | None = None
-    """Folder of a run with `--curve`, likewise: success against the size of imperfections."""
     film: Path | None = None
     """Folder of a run with a film, likewise."""
     page: Path = PAGE
@@ -58,13 +56,10 @@ def main(args: Args) -> None:
         "placing": args.placing,
         "grasping": args.grasping,
         "collaboration": args.collaboration,
-        "curve": args.curve,
     }
     reports = {kind: read_report(run) for kind, run in runs.items() if run is not None}
     if not reports and args.film is None:
-        raise ValueError(
-            "no run: give --placing, --grasping, --collaboration, --curve or --film"
-        )
+        raise ValueError("no run: give --placing, --grasping, --collaboration or --film")
     text = args.page.read_text()
     pictures: dict[str, bytes] = {}
     if args.film is not None:

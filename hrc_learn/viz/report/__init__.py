@@ -1,8 +1,8 @@
-"""Reports: what was done and measured, as one page that can be mailed, printed and kept.
+"""Reports of runs, each one self-contained HTML page.
 
-A program fills a `Report` and hands it to `write_report`, which leaves `report.json`,
-pictures, `film.mp4` and the self-contained `report.html` in the run's folder.
-`read_report` takes them up again, and `reports_page` puts several on one page.
+A program fills a `Report`; `write_report` writes `report.json`, pictures, `film.mp4` and
+`report.html` to the folder of the run. `read_report` reads them again, and `reports_page` shows
+several on one page.
 """
 
 from hrc_learn.viz.report.content import Film as Film

@@ -1,4 +1,4 @@
-"""What a report holds: text, measured values beside their targets, pictures, versions."""
+"""Content of a report: text, measured values with their targets, pictures, versions."""
 
 import math
 import os
@@ -26,24 +26,24 @@ _LARGEST_SVG = 400_000  # beyond, curves of thousands of points: a PNG is smalle
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """One measured value and what it had to reach."""
+    """One measured value with its target."""
 
     name: str
-    """What was measured, in words."""
+    """Name of the quantity, in words."""
     value: float | int
     unit: str = ""
     target: float | int | None = None
-    """Bound that the value has to keep; None only reports it."""
+    """Bound of the value; None: it is only reported."""
     at_least: bool = False
-    """Whether the target is a lower bound; it is an upper one otherwise."""
+    """True if the target is a lower bound; it is an upper one otherwise."""
     claim: str = ""
-    """What the paper states about it, in words; empty where it says nothing."""
+    """Claim of the paper, in words; empty without one."""
     resolution: float = 0.0
-    """Smallest value that the measurement tells from zero; no finer digits are shown."""
+    """Resolution of the measurement; no finer digits are shown."""
 
     @property
     def ok(self) -> bool | None:
-        """Whether the target is kept, None without one. NaN keeps none."""
+        """True if the target is met, None without a target. NaN meets none."""
         if self.target is None:
             return None
         # A bool of Python's own: numpy's is neither True nor False to an `is`.
@@ -51,24 +51,24 @@ class Measurement:
 
     @property
     def shown(self) -> str:
-        """Value and unit, as a reader wants them: no digits below the resolution."""
+        """Value and unit for a reader, without digits below the resolution."""
         if abs(self.value) < self.resolution:
             return f"< {short(self.resolution)} {self.unit}".rstrip()
         rounded = replace(self, value=_rounded(self.value, self.resolution))
-        # A bound that was missed by less than the resolution must not look kept.
+        # A bound missed by less than the resolution must not look as if it was met.
         value = rounded.value if rounded.ok is self.ok else self.value
         return f"{short(value)} {self.unit}".rstrip()
 
     @property
     def bound(self) -> str:
-        """The target in the same way, empty without one."""
+        """Target and unit for a reader, empty without a target."""
         if self.target is None:
             return ""
         return f"{'≥' if self.at_least else '≤'} {short(self.target)} {self.unit}".rstrip()
 
     @property
     def key(self) -> str:
-        """Name and unit as one word, under which programs write the value with --json."""
+        """Name and unit as one word: the key of the value in JSON files."""
         words = re.findall(r"\w+", self.name.lower())
         return "_".join([*words, *([self.unit] if self.unit else [])])
 
@@ -78,18 +78,18 @@ class Picture:
     """A picture with its caption."""
 
     name: str
-    """Of its file, without an ending: letters, digits, hyphens and underscores."""
+    """Name of its file without suffix: letters, digits, hyphens and underscores."""
     drawing: "Figure | UInt8[np.ndarray, 'height width 3'] | bytes"
     """A matplotlib figure, an image, or a finished PNG file."""
     caption: str
     svg: bytes | None = None
-    """The same as vector graphics, which a page shows instead where there are any."""
+    """The picture as vector graphics, which a page prefers; None without them."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w-]+", self.name):
             raise ValueError(
-                f"a picture cannot be named {self.name!r}: "
-                "letters, digits, hyphens and underscores name files everywhere."
+                f"picture name {self.name!r} is not a portable file name: "
+                "use letters, digits, hyphens and underscores."
             )
 
     def png(self) -> bytes:
@@ -106,7 +106,7 @@ class Picture:
         return buffer.getvalue()
 
     def drawn(self) -> "Picture":
-        """The picture as files: a figure as PNG and, unless that is too much, as SVG."""
+        """Picture as files: a figure as PNG and, unless too large, as SVG."""
         return replace(self, drawing=self.png(), svg=self.svg or self._vector())
 
     def _vector(self) -> bytes | None:
@@ -142,7 +142,7 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """What a run did and measured.
+    """Results of a run.
 
     Raises:
         ValueError: If two pictures have the same name.
@@ -150,18 +150,18 @@ class Report:
 
     title: str
     summary: str
-    """What was done, in plain text; blank lines part paragraphs."""
+    """Description of the run, in plain text; blank lines part paragraphs."""
     table: Sequence[Measurement] = ()
-    """Everything measured, with targets where there are any."""
+    """All measured values."""
     sections: Sequence[Section] = ()
     film: Film | None = None
-    """Of the run."""
+    """Film of the run."""
     configuration: Mapping[str, object] = field(default_factory=dict)
-    """What the run was configured with; nested mappings are flattened."""
+    """Configuration of the run; nested mappings are flattened."""
     versions: Mapping[str, str] = field(default_factory=dict)
-    """Of the software, by name."""
+    """Versions of the software, by name."""
     command: str = ""
-    """The command line that does all this again."""
+    """Command line that repeats the run."""
 
     def __post_init__(self) -> None:
         names = [picture.name for section in self.sections for picture in section.figures]
@@ -171,17 +171,17 @@ class Report:
 
     @property
     def targets(self) -> int:
-        """How many values had a target."""
+        """Number of values with a target."""
         return sum(m.ok is not None for m in self.table)
 
     @property
     def missed(self) -> tuple[Measurement, ...]:
-        """What did not keep its target."""
+        """Values that missed their target."""
         return tuple(m for m in self.table if m.ok is False)
 
     @property
     def pictures(self) -> tuple[Picture, ...]:
-        """Those of all sections, in order."""
+        """Pictures of all sections, in order."""
         return tuple(picture for section in self.sections for picture in section.figures)
 
 
@@ -193,8 +193,8 @@ def leading(
     Those that missed their targets come first, however many; then others with a target.
 
     Args:
-        table: All of them.
-        count: How many are shown first, unless more missed.
+        table: All measurements.
+        count: Number of measurements shown first, unless more missed.
     """
     ranks = {False: 0, True: 1, None: 2}
     order = sorted(range(len(table)), key=lambda i: ranks[table[i].ok])
@@ -207,7 +207,7 @@ def leading(
 
 
 def _rounded(value: float | int, resolution: float) -> float | int:
-    """To the last decimal that a resolution justifies; 0 justifies all."""
+    """Value rounded to its resolution; 0 leaves it unchanged."""
     if resolution == 0 or not math.isfinite(value):
         return value
     return round(value, math.ceil(-math.log10(resolution)))
@@ -241,7 +241,7 @@ _PACKAGES = (
 
 
 def software_versions() -> dict[str, str]:
-    """Versions of Python and of what results depend on, by name."""
+    """Versions of Python and of the packages that results depend on, by name."""
     found = {"python": platform.python_version()}
     for name in _PACKAGES:
         try:
@@ -252,15 +252,15 @@ def software_versions() -> dict[str, str]:
 
 
 def show_command(path: str | os.PathLike[str]) -> str:
-    """The line that opens the dashboard of a run or a recording, to be pasted into a shell.
+    """Shell command that opens the dashboard of a run or a recording.
 
-    It names the program of the Python that this is where another, or none, is on the path.
+    It names the program by its path if another one, or none, is on the search path.
     """
     python = Path(sys.executable)
-    beside = python.with_name("hrc")
-    if shutil.which("hrc") == str(beside):
+    program = python.with_name("hrc")
+    if shutil.which("hrc") == str(program):
         return shlex.join(["hrc", "show", str(path)])
-    words = [str(beside)] if beside.is_file() else [str(python), "-m", "hrc_learn.cli"]
+    words = [str(program)] if program.is_file() else [str(python), "-m", "hrc_learn.cli"]
     return shlex.join([*(_shortest(word) for word in words), "show", str(path)])
 
 
@@ -270,7 +270,7 @@ def _shortest(word: str) -> str:
 
 
 _ROWS = 8
-"""Of a table in the terminal: a screen keeps them in view with what follows."""
+"""Rows of a table in the terminal, few enough to stay in view."""
 
 
 def show_measurements(
@@ -281,14 +281,14 @@ def show_measurements(
     more: int = 0,
     elsewhere: str = "--verbose, or the report",
 ) -> None:
-    """Print measured values beside their targets.
+    """Print measured values with their targets.
 
     Args:
         table: The values.
-        everything: All of them, not just the missed and the first of the others.
-        title: Of the table.
-        more: How many values there are besides.
-        elsewhere: Where those that are not shown can be read.
+        everything: Print all values, not only the missed and the first of the others.
+        title: Title of the table.
+        more: Number of further values that are not in the table.
+        elsewhere: Place of the values that are not shown.
     """
     from rich.console import Console
     from rich.table import Table

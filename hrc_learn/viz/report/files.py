@@ -1,8 +1,7 @@
 """Reports as files: one self-contained HTML page, and the folder of a run.
 
-The page has no script, no font, no picture from elsewhere: it can be mailed, printed, and read
-on a phone without a network. The folder is written once, and read again to put runs beside
-one another.
+The page has no external script, font or picture: it can be mailed, printed, and read offline.
+The folder is read again to compare runs.
 """
 
 import base64
@@ -30,13 +29,13 @@ from hrc_learn.viz.report.content import (
 )
 
 
-def reports_page(title: str, reports: Sequence[Report], beside: Sequence[str] = ()) -> str:
+def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = ()) -> str:
     """One page about one or several runs, as HTML.
 
     Args:
-        title: Of the page.
-        reports: In order. Several are listed with their verdicts first.
-        beside: Files in the page's folder that a page of one run links to.
+        title: Title of the page.
+        reports: Reports in order. Several are first listed with their verdicts.
+        linked: Files in the folder of the page, to which a page of one run links.
 
     Raises:
         ValueError: If there is no report.
@@ -44,7 +43,7 @@ def reports_page(title: str, reports: Sequence[Report], beside: Sequence[str] = 
     if not reports:
         raise ValueError("a page needs at least one report.")
     if len(reports) == 1:
-        body = _report(reports[0], "run1", beside)
+        body = _report(reports[0], "run1", linked)
     else:
         articles = [
             f"<article>{_report(report, f'run{i}')}</article>"
@@ -63,26 +62,25 @@ def reports_page(title: str, reports: Sequence[Report], beside: Sequence[str] = 
 
 
 def _side_by_side(reports: Sequence[Report]) -> str:
-    """A table, as HTML, of everything that two runs or more measured; empty without any.
+    """HTML table of all quantities that two or more runs measured; empty without any.
 
-    A column stands for a run, numbered as in the overview. A value that missed its target is
-    marked.
+    Each column is a run, numbered as in the overview. Missed targets are marked.
     """
     tables = [{m.name: m for m in report.table} for report in reports]
-    shared = [name for name, n in Counter(n for t in tables for n in t).items() if n > 1]
-    if not shared:
+    common = [name for name, n in Counter(n for t in tables for n in t).items() if n > 1]
+    if not common:
         return ""
-    compared = [i for i, table in enumerate(tables) if table.keys() & set(shared)]
+    compared = [i for i, table in enumerate(tables) if table.keys() & set(common)]
     heads = "".join(f'<th class="n"><a href="#run{i + 1}">{i + 1}</a></th>' for i in compared)
     rows = []
-    for name in shared:
+    for name in common:
         cells = "".join(_cell(tables[i].get(name)) for i in compared)
         rows.append(f"<tr><td>{escape(name)}</td>{cells}</tr>")
     return f"<h2>Side by side</h2>{_table(f'<th>Measured</th>{heads}', rows)}"
 
 
 def _table(heads: str, rows: Sequence[str]) -> str:
-    """A table that scrolls by itself where the page is narrow."""
+    """HTML table that scrolls on a narrow page."""
     return (
         f'<div class="scroll"><table><thead><tr>{heads}</tr></thead>'
         f"<tbody>{'\n'.join(rows)}</tbody></table></div>"
@@ -96,7 +94,7 @@ def _cell(m: Measurement | None) -> str:
     return f"<td{missed}>{escape(m.shown)}</td>"
 
 
-def _report(report: Report, anchor: str, beside: Sequence[str] = ()) -> str:
+def _report(report: Report, anchor: str, linked: Sequence[str] = ()) -> str:
     return "\n".join(
         [
             f'<h1 id="{anchor}">{escape(report.title)}</h1>',
@@ -104,7 +102,7 @@ def _report(report: Report, anchor: str, beside: Sequence[str] = ()) -> str:
             _paragraphs(report.summary),
             "" if report.film is None else _film(report.film),
             _measurements(report.table),
-            _links(beside),
+            _links(linked),
             *(_section(section) for section in report.sections),
             *(
                 [f"<h2>Reproduce</h2>\n<pre>{escape(report.command)}</pre>"]
@@ -127,11 +125,11 @@ def _verdict(report: Report) -> str:
 
 
 _FIRST = 6
-"""Values of a report that are seen without unfolding anything."""
+"""Number of values shown unfolded."""
 
 
 def _measurements(table: Sequence[Measurement]) -> str:
-    """The first values as a table, the others folded."""
+    """First values as a table, the others folded."""
     if not table:
         return ""
     first, others = leading(table, _FIRST)
@@ -143,7 +141,7 @@ def _measurements(table: Sequence[Measurement]) -> str:
 
 
 def _values(table: Sequence[Measurement]) -> str:
-    """Values beside their targets, and beside the paper's claims if there are any."""
+    """Values with their targets, and the claims of the paper if there are any."""
     claims = any(m.claim for m in table)
     heads = '<th>Measured</th><th class="n">Value</th><th class="n">Target</th><th></th>'
     if claims:
@@ -151,13 +149,13 @@ def _values(table: Sequence[Measurement]) -> str:
     return _table(heads, [_row(m, claims) for m in table])
 
 
-def _links(beside: Sequence[str]) -> str:
-    """What else the run has left in the folder of the page."""
-    if not beside:
+def _links(linked: Sequence[str]) -> str:
+    """Links to the other files in the folder of the page."""
+    if not linked:
         return ""
-    links = ", ".join(f'<a href="{quote(name)}">{escape(name)}</a>' for name in beside)
+    links = ", ".join(f'<a href="{quote(name)}">{escape(name)}</a>' for name in linked)
     opens = " <code>hrc show</code> with this folder opens the recording."
-    shown = opens if any(name.endswith(".rrd") for name in beside) else ""
+    shown = opens if any(name.endswith(".rrd") for name in linked) else ""
     return f"<p>In this folder: {links}.{shown}</p>"
 
 
@@ -236,12 +234,12 @@ _PAGE = """<!DOCTYPE html>
 
 
 REPORT = "report.json"
-"""File that tells the folder of a run that has a report."""
+"""File that marks the folder of a run with a report."""
 PAGE = "report.html"
 FIGURES = "figures"
 FILM = "film.mp4"
 LINKED = (".rrd", ".mp4", ".npz")
-"""Recordings, films and logs, which the page links to where they lie beside it."""
+"""Suffixes of recordings, films and logs in the folder, to which the page links."""
 FORMAT = "hrc_learn report"
 VERSION = 1
 
@@ -249,11 +247,11 @@ VERSION = 1
 def write_report(folder: str | os.PathLike[str], report: Report) -> None:
     """Write `report.json`, pictures, `film.mp4` and the self-contained `report.html`.
 
-    Pictures are `figures/*.png`, and `*.svg` besides where they are figures of few lines.
+    Pictures are `figures/*.png`, and `*.svg` linkeds where they are figures of few lines.
 
     Args:
-        folder: Of the run. Each file appears only when it is complete, `report.json` last.
-        report: What was done and measured.
+        folder: Folder of the run. Each file appears only when complete, `report.json` last.
+        report: Content of the report.
     """
     folder = Path(folder)
     report = _drawn(report)
@@ -271,15 +269,15 @@ def write_report(folder: str | os.PathLike[str], report: Report) -> None:
         with new_file(folder / FILM) as part:
             part.write_bytes(report.film.mp4)
     with new_file(folder / PAGE) as part:
-        beside = sorted(file.name for file in folder.iterdir() if file.suffix in LINKED)
-        part.write_text(reports_page(report.title, [report], beside), encoding="utf-8")
+        linked = sorted(file.name for file in folder.iterdir() if file.suffix in LINKED)
+        part.write_text(reports_page(report.title, [report], linked), encoding="utf-8")
     with new_file(folder / REPORT) as part:
         text = json.dumps(_to_json(report), indent=2, ensure_ascii=False, allow_nan=False)
         part.write_text(text + "\n", encoding="utf-8")
 
 
 def read_report(folder: str | os.PathLike[str]) -> Report:
-    """Read what `write_report` left in a folder.
+    """Read the report in a folder.
 
     Raises:
         FileNotFoundError: If there is no such folder, or a picture or the film is missing.
@@ -291,25 +289,25 @@ def read_report(folder: str | os.PathLike[str]) -> Report:
     path = folder / REPORT
     if not path.is_file():
         raise ValueError(
-            f"{folder} holds no {REPORT}: it is not the folder of a run, or of one that failed "
-            "before there was anything to report."
+            f"{folder} has no {REPORT}: it is not the folder of a run, or the run failed "
+            "before its report."
         )
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{path} is not a report of ours.")
+        raise ValueError(f"{path} is not a report of hrc_learn.")
     if content["version"] != VERSION:
         raise ValueError(
-            f"{path} is of version {content['version']}; this package reads {VERSION}. "
-            "Read it with the package that wrote it, or run the program again."
+            f"{path} has version {content['version']}, but this package reads {VERSION}: "
+            "read it with the package that wrote it, or repeat the run."
         )
     return _from_json(content, folder)
 
 
 def _drawn(report: Report) -> Report:
-    """The report with every figure drawn, so that none is drawn twice."""
+    """Report with every figure drawn, so that none is drawn twice."""
     sections = [
         replace(section, figures=[p.drawn() for p in section.figures])
         for section in report.sections
@@ -375,11 +373,11 @@ def _bytes_if_there(path: Path) -> bytes | None:
 
 
 def _finite(value: float | int) -> float | int | None:
-    """JSON has no numbers that are not finite."""
+    """The value, or None if it is not finite, which JSON cannot represent."""
     return value if math.isfinite(value) else None
 
 
 def _plain(value: object) -> object:
-    """What JSON knows as it is, everything else as text."""
+    """JSON value, with all other types converted to text."""
     known = isinstance(value, (bool, int, str, type(None)))
     return value if known or (isinstance(value, float) and math.isfinite(value)) else str(value)
