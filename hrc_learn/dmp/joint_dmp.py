@@ -121,8 +121,7 @@ class JointDMP(MotionPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive):
                 (T_i, D) with a list of (T_i,), for demonstrations of different lengths. Its
                 floating-point dtype is that of the primitive; the fit runs in float64.
             n_basis: N, unless `basis` is given. None: 50, and noise is removed from the
-            samples;
-                see `FitOptions.smooth`.
+                samples; see `FitOptions.smooth`.
             velocity: Recorded velocity per second, like `position`. Without it, the default
                 method also fits the start velocity, and the others differentiate positions.
             mask: (*B, T), false at samples to ignore, such as padding and dropouts.

@@ -189,7 +189,7 @@ class ServoTarget:
     def raised_pixel(
         self, image_jacobian: Float[np.ndarray, "2 6"], height: float
     ) -> Float[np.ndarray, "2"]:
-        """Target of the marker with the end effector on the line at a height [m] [px]."""
+        """Target pixel of the marker with the end effector on the line at a height [m]."""
         return self.target(image_jacobian, self.tool_orientation, self._offset(height))
 
     def deviation(self, pose: Pose, before: Pose) -> float:

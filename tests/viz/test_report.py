@@ -268,7 +268,7 @@ def test_the_first_values_are_those_missed_and_those_with_targets(capsys):
     shown = capsys.readouterr().out
     assert "v7" in shown
     assert "v8" not in shown
-    assert "12 more: --verbose" in shown
+    assert "12 more: the report" in shown
     show_measurements([replace(GOOD, name=f"v{i}") for i in range(20)], everything=True)
     assert "v19" in capsys.readouterr().out
 

@@ -279,7 +279,7 @@ def show_measurements(
     *,
     title: str = "Measured",
     more: int = 0,
-    elsewhere: str = "--verbose, or the report",
+    elsewhere: str = "the report",
 ) -> None:
     """Print measured values with their targets.
 
