@@ -107,8 +107,8 @@ class GripperThread:
             failure = self._failure
         self.close()
         raise failure or GripperError(
-            f"the gripper has not reported its width for {startup:g} s: is it mounted, switched "
-            "on and homed?"
+            f"the gripper has not reported its width for {startup:g} s: is it mounted, "
+            "switched on and homed?"
         )
 
     @property
