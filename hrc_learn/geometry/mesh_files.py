@@ -101,7 +101,7 @@ def _part(triangles: _Triangles, colour: Colour | None) -> MeshPart:
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     triangles, across = (rows[np.any(across != 0, axis=-1)] for rows in (triangles, across))
     corners = triangles.reshape(-1, 3)
-    # Corners at one place share a normal where no sharp edge lies between their faces. A
+    # Corners at one place have one normal where no sharp edge lies between their faces. A
     # micrometre apart is one place: files in text are rounded there.
     _, place = np.unique(np.round(corners, 6), axis=0, return_inverse=True)
     face = across / np.linalg.norm(across, axis=-1, keepdims=True)

@@ -171,8 +171,8 @@ def null_projection(
     directions all the same: those of the range, and some of the null space.
 
     Args:
-        J: With at least as many columns as rows.
-        w: To project.
+        J: Jacobian with at least as many columns as rows.
+        w: Vector to project.
     """
     if not torch.compiler.is_compiling():
         Q = torch.linalg.qr(J.mT).Q
@@ -186,7 +186,7 @@ def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n
     The first m span the range of J^T, and where its rank is below m some of the null space.
 
     Args:
-        J: With at least as many columns as rows.
+        J: Jacobian with at least as many columns as rows.
     """
     if not torch.compiler.is_compiling():
         return torch.linalg.qr(J.mT, mode="complete").Q

@@ -207,8 +207,8 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
     return v - (2 * torch.pi * turns * sign)[..., None] * axis
 
 
-# What a turning axis adds to the rate of a rotation vector. For q = exp(-e) g with angular
-# velocity -v, the rotation vector e has the rate
+# Contribution of a turning axis to the rate of a rotation vector. For q = exp(-e) g with
+# angular velocity -v, the rotation vector e has the rate
 #
 #     e' = v + n(e, v),   n = e x v / 2 + c(|e|) e x (e x v),   c(a) = (1 - a/2 cot(a/2)) / a^2
 #
@@ -221,7 +221,7 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
 
 # Below this angle squared the series are exact to rounding and the closed forms are not.
 _SMALL = 0.1
-# Fraction of v across e that must be seen in e' for e' to be told from v.
+# Fraction of v across e that must be seen in e' for e' to be distinguishable from v.
 _SINGULAR = 1e-3
 
 
@@ -235,7 +235,7 @@ def axis_drift(
     square = (e * e).sum(-1, keepdim=True)
     far = square.clamp_min(_SMALL)
     cosine, sinc = cos_and_sinc(far / 4)
-    # How much shorter v is across e, seen in e' the other way round.
+    # Ratio of the component of v across e, as seen in e' the other way round.
     singular = sinc.abs() < _SINGULAR
     cosecant = torch.where(singular, 0.0, 1 / torch.where(singular, 1.0, sinc))
     series = polynomial(

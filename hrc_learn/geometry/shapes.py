@@ -84,9 +84,9 @@ def arm_bodies(
 
     Args:
         position: Origins of the joint frames, from the base to the tool [m].
-        orientation: Their unit quaternions (w, x, y, z).
-        radius: Of the capsules [m].
-        colour: Of the capsules.
+        orientation: Unit quaternions of the bodies (w, x, y, z).
+        radius: Radius of the capsules [m].
+        colour: Colour of the capsules.
     """
     origin = np.zeros_like(position[:, :1])
     upright = np.zeros_like(orientation[:, :1])

@@ -22,7 +22,7 @@ from hrc_learn.kinematics._description import (
 from hrc_learn.kinematics.chain import JointKind
 
 _GREY: Colour = (0.7, 0.7, 0.72, 1.0)
-# Of the motion of a finger so many postures are contained by the capsules.
+# Number of finger positions, from closed to open, that the capsules contain.
 _FINGER_POSTURES = 5
 
 

@@ -28,7 +28,7 @@ _SLACK = 1e-6
 _WORTH = 0.2
 # Corners of the prism around a round shape: 2 % wider at the corners.
 _CORNERS = 16
-# Where a link is cut, as fractions of its extent along an axis.
+# Cuts of a link, as fractions of its extent along an axis.
 _CUTS = ((), (0.25,), (0.35,), (0.5,), (0.65,), (0.75,), (0.2, 0.8), (0.3, 0.7))
 # Rounds of the search for a capsule's axis, tries in each, and how far the tries go [rad].
 _ROUNDS, _TRIES, _TILT = 8, 24, 0.5
@@ -39,13 +39,12 @@ _POSTURES = 2000
 # Pairs of links that come no nearer in any sampled posture are left out [m].
 _FAR = 0.1
 _ALWAYS = 0.99
-# Of the positions of two joints between two links in which their capsules overlap: more than
-# this part tells nothing of where the links meet.
+# Capsules of two links that overlap in a larger fraction of the positions of the two joints in
+# between carry no information about contacts.
 _MOST = 0.5
-# Of each of the two joints between two links so many positions are looked at: every 5 degrees
-# of a whole turn.
+# Positions of each of the two joints between two links: every 5 degrees of a whole turn.
 _GRID = 73
-# Steps of the search for a plane between two hulls: those not parted by then count as touching.
+# Steps of the search for a separating plane; hulls not separated by then count as touching.
 _PARTING_STEPS = 200
 
 
@@ -390,6 +389,6 @@ def _parted(
             break
         # The point of the segment from v to w that is nearest to the origin.
         way = v - w
-        share = (v * way).sum(-1) / (way * way).sum(-1).clamp(min=1e-30)
-        v = v - share.clamp(0, 1)[:, None] * way
+        fraction = (v * way).sum(-1) / (way * way).sum(-1).clamp(min=1e-30)
+        v = v - fraction.clamp(0, 1)[:, None] * way
     return parted

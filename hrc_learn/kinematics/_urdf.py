@@ -27,10 +27,10 @@ def read_urdf(
     """Read a file.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
         package_dirs: Folders in which `package://NAME/` is looked for, before those above the
             file and those of ROS_PACKAGE_PATH.
-        meshes: Whether to look for the files of meshes; without, links have no such shapes.
+        meshes: False skips mesh files; links then have no mesh shapes.
 
     Raises:
         ValueError: The file is not URDF, or a number or an attribute in it is missing.

@@ -38,8 +38,8 @@ def transform_and_jacobian(
         q: Joint positions [rad], of sliding joints [m].
         mounts: Frame of each joint at zero in the frame of the joint before (the base).
         tip: Tool centre point in the frame of the last joint.
-        sliding: Which joints move along their z axis; the others, by default all, turn about
-            it.
+        sliding: Mask of joints that move along their z axis; the others, by default all, turn
+            about it.
 
     Returns:
         Both with the batch last in memory.

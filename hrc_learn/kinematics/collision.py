@@ -30,7 +30,7 @@ _TRIED = [
     Constant(torch.arange(1, _PARTS, dtype=torch.float64) / _PARTS ** (k + 1))
     for k in range(_ROUNDS)
 ]
-# By which a bound on a distance may be wrong by rounding [m]: that of float32 within reach.
+# Rounding error of a bound on a distance [m]: that of float32 within reach.
 _ROUNDING = 1e-6
 
 
@@ -57,9 +57,9 @@ class CapsuleArm:
 
     Attributes:
         chain: The arm.
-        capsules: Of its links.
+        capsules: Capsules of the links.
         links: Number of the link of each capsule.
-        radius: Of each capsule [m].
+        radius: Radius of each capsule [m].
         overlapping: Pairs of links that overlap by design, besides neighbours.
     """
 
@@ -73,7 +73,7 @@ class CapsuleArm:
 
         Args:
             chain: The arm.
-            capsules: Of its links.
+            capsules: Capsules of the links.
             overlapping: Pairs of links that overlap by design, besides neighbours.
         """
         self.chain = chain
@@ -190,7 +190,7 @@ class CapsuleArm:
 
         Args:
             q: Joint position [rad].
-            centre: Of the box, or of each of several [m].
+            centre: Centre of the box, or of each of several boxes [m].
             half_size: Half of its edges [m].
             frames: `SerialChain.link_frames` there, where they are known.
         """
@@ -240,7 +240,7 @@ def nearest_on_segments(
     a, e = ((v * v).sum(-1).clamp(min=tiny) for v in (along, across))
     b, c, f = (along * across).sum(-1), (along * offset).sum(-1), (across * offset).sum(-1)
     determinant = (a * e - b * b).clamp(min=0)
-    # Of nearly parallel segments any point of the first may be the nearest; a smaller
+    # For nearly parallel segments any point of the first may be the nearest; a smaller
     # determinant is rounding.
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant))
@@ -408,9 +408,9 @@ def separation(
     Args:
         arm: The arm's capsules.
         q: Joint positions [rad].
-        ends: Of the axes of the person's capsules, in the base frame [m].
-        radius: Of these capsules [m].
-        grasped: What the arm holds; None: nothing.
+        ends: Ends of the axes of the person's capsules, in the base frame [m].
+        radius: Radii of these capsules [m].
+        grasped: Object held by the arm; None: no object.
 
     Raises:
         ValueError: A radius is negative or not finite.

@@ -51,7 +51,7 @@ PANDA_LIMITS = _limits(
 )
 """Franka's "Robot and interface specifications", control-parameters-joint-fer.csv."""
 
-# What all sources for the Research 3 agree on.
+# Limits that all sources for the Research 3 agree on.
 _FR3 = {
     "velocity": (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
     "acceleration": (10.0,) * 7,
@@ -103,7 +103,7 @@ def strictest(*vintages: JointLimits) -> JointLimits:
         o = sqrt((velocity + o_k)^2 - 2 d w) - velocity.
 
     Args:
-        vintages: With the same limits of velocity and deceleration.
+        vintages: Limits with the same velocity and deceleration.
 
     Raises:
         ValueError: Those differ.

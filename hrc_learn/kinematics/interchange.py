@@ -24,7 +24,7 @@ def to_urdf(chain: SerialChain, name: str = "arm") -> str:
 
     Args:
         chain: Arm to describe.
-        name: Of the robot.
+        name: Name of the robot.
 
     Returns:
         URDF with links as bare frames: no masses, meshes or collision shapes.

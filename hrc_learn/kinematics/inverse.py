@@ -84,9 +84,9 @@ def task_error(
     Of "position+axis" the shortest turn of the tool's axis, of "position" none.
 
     Args:
-        T: Where the tool is, base frame.
+        T: Pose of the tool in the base frame.
         pose: Wanted.
-        task: What of it matters.
+        task: Constrained part of the pose.
     """
     if task == "pose":
         return Pose.from_matrix(T).twist_to(pose)
@@ -145,8 +145,8 @@ def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
         task: Constrained part of the tool's pose.
     """
     limits, rng = chain.limits, torch.Generator().manual_seed(0)
-    share = torch.rand(_SAMPLES, len(chain.joint_names), generator=rng, dtype=torch.float64)
-    q = limits.lower + share * (limits.upper - limits.lower)
+    fraction = torch.rand(_SAMPLES, len(chain.joint_names), generator=rng, dtype=torch.float64)
+    q = limits.lower + fraction * (limits.upper - limits.lower)
     return len(chain.joint_names) - int(null_space_dimension(chain, q, task, below=_LED).amin())
 
 
@@ -166,8 +166,8 @@ def task_basis(
 
     Args:
         J: Geometric Jacobian of the tool.
-        orientation: Of the tool.
-        task: What of its pose is led.
+        orientation: Orientation of the tool.
+        task: Constrained part of the pose.
         rank: `task_rank` of the arm.
     """
     rows = _LINEAR.like(J).expand(*J.shape[:-2], 3, 6)
@@ -195,11 +195,11 @@ def solve_inverse(
 
     Args:
         chain: The arm.
-        pose: Of the tool centre point in the base frame.
+        pose: Poses of the tool centre point in the base frame.
         near: Configuration to stay close to [rad, m]; the ready posture if None.
-        task: What of the pose matters.
-        tolerance: Of the position [m] and the orientation [rad].
-        seed: Of the random starts.
+        task: Constrained part of the pose.
+        tolerance: Largest error of the position [m] and the orientation [rad].
+        seed: Seed of the random starts.
     """
     batch = pose.position.shape[:-1]
     joints = len(chain.joint_names)
@@ -256,10 +256,10 @@ def solutions_from(
 
     Args:
         chain: The arm.
-        pose: Of the tool centre point.
+        pose: Poses of the tool centre point.
         starts: Joint positions [rad, m].
-        task: What of the pose matters.
-        tolerance: Of the position [m] and the orientation [rad].
+        task: Constrained part of the pose.
+        tolerance: Largest error of the position [m] and the orientation [rad].
 
     Returns:
         In the order of the starts; NaN for those that do not lead there.
@@ -280,14 +280,14 @@ def solutions_from(
 def follow_poses(
     chain: SerialChain, path: Pose, start: Float[Tensor, "*rows joints"]
 ) -> tuple[Float[Tensor, "steps *rows joints"], Float[Tensor, "steps *rows"]]:
-    """Joint positions along a path of the tool, led there from pose to pose.
+    """Joint positions along a path of the tool, by differential inverse kinematics.
 
     Joints move as little as they can from one pose to the next, as an arm's do whose tool is
     led in velocity; at their limits they stay behind.
 
     Args:
         chain: The arm.
-        path: Of the tool centre point, (steps, *#rows).
+        path: Poses of the tool centre point, (steps, *#rows).
         start: Joint positions at the first pose [rad, m].
 
     Returns:

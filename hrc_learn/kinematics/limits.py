@@ -133,12 +133,12 @@ def complete_limits(
     of velocity or torque that they do not know, is none.
 
     Args:
-        names: Of the joints.
-        kinds: Of the joints, see `JointKind`.
-        known: Of each joint `lower`, `upper`, `velocity`, `acceleration`, `jerk` and `torque`
+        names: Names of the joints.
+        kinds: Kinds of the joints, see `JointKind`.
+        known: For each joint, `lower`, `upper`, `velocity`, `acceleration`, `jerk` and `torque`
             [rad, m, s, N m, N], as far as they are known.
-        source: Where these come from.
-        overrides: What replaces them, by name of joint; of all joints under `default`.
+        source: Name of the source of these limits.
+        overrides: Replacements by joint name; for all joints under `default`.
 
     Raises:
         ValueError: A joint that slides has no range, a range is empty, or an override names no
@@ -152,23 +152,23 @@ def complete_limits(
             raise ValueError(f"{name} has no limit {', '.join(sorted(wrong))}: give {_COLUMNS}")
     table: dict[str, list[float]] = {column: [] for column in _COLUMNS}
     for name, kind, row in zip(names, kinds, known, strict=True):
-        told = {**row, **overrides.get("default", {}), **overrides.get(name, {})}
+        given = {**row, **overrides.get("default", {}), **overrides.get(name, {})}
         slides = kind == "prismatic"
-        lower, upper = told.get("lower"), told.get("upper")
+        lower, upper = given.get("lower"), given.get("upper")
         if kind == "continuous":
             lower = -_TURN if lower is None else lower
             upper = _TURN if upper is None else upper
         if lower is None or upper is None or not lower < upper:
             raise ValueError(
                 f"{source}: joint {name} has the range {lower} to {upper}; give it lower and "
-                f"upper by limits=, or in the file {Path(source).stem}.limits.toml beside it"
+                f"upper by limits=, or in the file {Path(source).stem}.limits.toml next to it"
             )
-        velocity = told.get("velocity") or (
+        velocity = given.get("velocity") or (
             DEFAULT_SLIDING_VELOCITY if slides else DEFAULT_VELOCITY
         )
-        acceleration = told.get("acceleration") or velocity / _SECONDS_TO_FULL_SPEED
-        jerk = told.get("jerk") or acceleration / _SECONDS_TO_FULL_ACCELERATION
-        torque = told.get("torque") or math.inf
+        acceleration = given.get("acceleration") or velocity / _SECONDS_TO_FULL_SPEED
+        jerk = given.get("jerk") or acceleration / _SECONDS_TO_FULL_ACCELERATION
+        torque = given.get("torque") or math.inf
         for column, value in zip(
             _COLUMNS, (lower, upper, velocity, acceleration, jerk, torque), strict=True
         ):

@@ -119,7 +119,7 @@ def arm_angle_and_motion(
     Args:
         chain: The arm.
         q: Joint positions [rad].
-        jacobian: Of the tool, at q.
+        jacobian: Jacobian of the tool at q.
 
     Returns:
         The angle [rad], and joint velocities [rad/s]; these are bounded near configurations
@@ -132,7 +132,7 @@ def arm_angle_and_motion(
     direction = torch.nn.functional.normalize(column, dim=-1)
     step = _STEP * direction
     angle, after, before = arm_angle(chain, torch.stack([q, q + step, q - step]))
-    # Where the angle wraps around between both ends, the short way counts.
+    # The shorter difference, should the angle wrap around between both ends.
     difference = torch.remainder(after - before + torch.pi, 2 * torch.pi) - torch.pi
     rate = (difference / (2 * _STEP)).unsqueeze(-1)
     return angle, direction * rate / (rate * rate + _DAMPING)
@@ -150,8 +150,8 @@ def best_postures(
     lower, upper = chain.limits.lower, chain.limits.upper
     distance = torch.minimum(solutions - lower, upper - solutions).amin(-1)
     smallest = torch.linalg.svdvals(chain.jacobian(solutions))[:, -1]
-    room = (distance / _GOOD_DISTANCE).clamp(max=1)
-    score = room + (smallest / _GOOD_SINGULAR_VALUE).clamp(max=1)
+    margin = (distance / _GOOD_DISTANCE).clamp(max=1)
+    score = margin + (smallest / _GOOD_SINGULAR_VALUE).clamp(max=1)
     chosen: list[Tensor] = []
     for posture in solutions[score.argsort(descending=True, stable=True)]:
         if all(torch.linalg.vector_norm(posture - other) > _ALIKE for other in chosen):
@@ -173,8 +173,8 @@ def clear_posture(
     least near to a contact.
 
     Args:
-        postures: To choose from, the best first.
-        start: Where the arm is [rad].
+        postures: Candidates [rad], the best first.
+        start: Present joint positions [rad].
         clearance: Distance from all contacts [m] at joint positions (*points, n).
         least: Distance to keep [m]; nearer to the start what the start has is enough.
         samples: Points looked at along the path.

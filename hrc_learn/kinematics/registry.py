@@ -1,4 +1,4 @@
-"""Robot arms by name: where their descriptions are, and what those do not tell."""
+"""Registered robot arms: location of their descriptions, and values that these lack."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def arm(
         base: Link or body to be the base, of files; None: the root.
         tip: Link, body or site to be the flange, of files; None: the only end there is.
         tool: Tool centre point in the frame of the flange.
-        limits: What replaces limits, see `Arm.from_description`.
+        limits: Replacements of limits, see `arm_from_file`.
         ready: A comfortable posture [rad, m].
 
     Raises:

@@ -45,7 +45,7 @@ def coarse_orientation(
     moves to the right (-y) points to the right.
 
     Args:
-        position: Of the end effector [m].
+        position: Position of the end effector [m].
         reach: Y_0 [m].
         tilt: beta_0 [rad].
 
@@ -71,7 +71,7 @@ def turn_about_vertical(
         From -pi to pi.
     """
     w, _, _, z = quaternion.multiply(orientation, quaternion.conjugate(reference)).tolist()
-    # Of the rotation between both, the part about z (swing-twist decomposition).
+    # Part about z of the rotation between both (swing-twist decomposition).
     return math.remainder(2 * math.atan2(z, w), 2 * math.pi)
 
 

@@ -135,12 +135,12 @@ class ArmModelConfig:
         if self.robot.name in _SERVOS:
             stiffness, damping = _SERVOS[self.robot.name]
             return stiffness[joint], damping[joint]
-        stiffness = _STIFFNESS * float(self.robot.chain.limits.torque[joint])
+        stiffness = _STIFFNESS * float(self.robot.limits.torque[joint])
         return stiffness, _DAMPING * stiffness
 
     def armature(self, joint: int) -> float:
         """Inertia of the motor and its gear, at the joint [kg m^2]."""
-        torque = float(self.robot.chain.limits.torque[joint])
+        torque = float(self.robot.limits.torque[joint])
         # Small motors have lighter rotors; those of 50 N m and more are taken for the Panda's.
         return 0.1 * min(1.0, torque / 50.0) if self.robot.name not in _SERVOS else 0.1
 
@@ -170,10 +170,10 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
     base = spec.worldbody.add_body(name="link0")
     _add_capsules(base, robot, 0, mass=None)
     still = torch.zeros(n, dtype=torch.float64)
-    frames = robot.chain.link_poses(still).matrix().numpy()
+    frames = robot.link_poses(still).matrix().numpy()
     body = base
     parent_frame = np.eye(4)
-    for i, name in enumerate(robot.chain.joint_names):
+    for i, name in enumerate(robot.joint_names):
         body = _add_body(body, f"link{i + 1}", np.linalg.inv(parent_frame) @ frames[i])
         parent_frame = frames[i]
         _add_joint(spec, body, name, i, config)
@@ -216,8 +216,8 @@ def whole_arm(config: ArmModelConfig) -> CapsuleArm:
     half = plate.marker.plate_size / 2
     across = half / _STRIPS
     radius = float(np.hypot(across, _THICKNESS))
-    # From the hand's frame, at the flange, to that of the tool.
-    centre = np.array(plate.position) - [0.0, 0.0, float(robot.chain.tcp[2, 3])]
+    # Transform from the gripper's frame, at the flange, to that of the tool.
+    centre = np.array(plate.position) - [0.0, 0.0, float(robot.tcp[2, 3])]
     capsules = []
     for k in range(_STRIPS):
         x = -half + (2 * k + 1) * across
@@ -264,7 +264,7 @@ def _add_capsules(body, robot: Arm, link: int, mass: float | None) -> None:
 
 
 def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: ArmModelConfig) -> None:
-    chain, limits = config.robot.chain, config.robot.chain.limits
+    chain, limits = config.robot, config.robot.limits
     slides = chain.kinds[i] == "prismatic"
     stiffness, damping = config.servo(i)
     body.add_joint(
@@ -367,19 +367,19 @@ class MujocoArm:
         """Find its joints and servos.
 
         Args:
-            model: With the arm of `add_arm`.
-            data: Its state.
+            model: Model with the arm of `add_arm`.
+            data: State of the model.
             robot: The arm's kinematics and limits.
-            imperfections: Of its encoders, its driver and its joints; None: none.
+            imperfections: Errors of encoders, driver and joints; None: none.
         """
-        self.robot, chain = robot, robot.chain
+        self.robot = robot
         self._errors = imperfections or Imperfections().draw(
             np.random.default_rng(0), robot.joints
         )
-        self._channel = CommandChannel(self._errors, chain.limits.acceleration.numpy())
+        self._channel = CommandChannel(self._errors, robot.limits.acceleration.numpy())
         self._model = model
         self._data = data
-        names = chain.joint_names
+        names = robot.joint_names
         self.joints = np.array([model.joint(n).qposadr[0] for n in names])
         self._velocities = np.array([model.joint(n).dofadr[0] for n in names])
         self._position_servos = np.array([model.actuator(f"{n}_position").id for n in names])
@@ -460,9 +460,9 @@ class MujocoArm:
     def _feel(self, dt: float) -> None:
         """Filter the external torques of the last physics step."""
         lag, torque = self._errors.sizes.torque_lag, self._external_torque()
-        share = 1.0 if self._felt is None or lag == 0 else -math.expm1(-dt / lag)
+        fraction = 1.0 if self._felt is None or lag == 0 else -math.expm1(-dt / lag)
         self._felt = (
-            torque if self._felt is None else self._felt + share * (torque - self._felt)
+            torque if self._felt is None else self._felt + fraction * (torque - self._felt)
         )
 
     @property

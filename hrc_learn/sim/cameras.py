@@ -89,8 +89,8 @@ class OffscreenRenderer:
 
         Args:
             world: As it is whenever it is rendered, or a run that is shown again.
-            width: Of the images [px].
-            height: Of the images [px].
+            width: Width of the images [px].
+            height: Height of the images [px].
 
         Raises:
             RenderingUnavailableError: If there is no EGL (on Linux) or no OpenGL to be had.
@@ -115,7 +115,7 @@ class OffscreenRenderer:
         """The image of an undistorted camera of the renderer's size, RGB.
 
         Args:
-            camera: Where from.
+            camera: Camera to render.
             arrows: Drawn besides what is in the world.
             touching: Names of geoms that stand out, as they touch something.
         """
@@ -249,7 +249,7 @@ def open_camera(
     """The world's fixed camera.
 
     Args:
-        world: What to look at.
+        world: World to render.
         kind: "egl" renders everything; "synthetic" draws the markers only and needs no
             OpenGL; "auto" renders where that is possible.
         model: Another camera than the world's own.
@@ -280,7 +280,7 @@ def open_camera(
     )
 
 
-# How far above the marker the board is held, towards the camera: clear of the gripper [m].
+# Height of the board above the marker, towards the camera: clear of the gripper [m].
 _BOARD_HEIGHT = 0.10
 
 
@@ -340,14 +340,14 @@ class ChangingCamera:
     """Implements the `Camera` protocol by one camera after the other.
 
     Attributes:
-        history: When each of them came to be the one, and its true model.
+        history: Start time and true model of each camera so far.
     """
 
     def __init__(self, model: CameraModel, opened: Callable[[CameraModel], Camera]):
         """Begin with a camera.
 
         Args:
-            model: Of the first.
+            model: Model of the first camera.
             opened: Opens a camera.
         """
         self._open = opened

@@ -61,12 +61,12 @@ class PinholeCamera:
         """Camera that looks at a point from a distance.
 
         Args:
-            point: In the middle of the image [m].
+            point: Point in the middle of the image [m].
             height: Distance of the camera from it [m].
             roll: Turn about the optical axis, from the paper's camera [rad].
             tilt: Angle of the optical axis with the vertical [rad].
             bearing: Horizontal direction in which the camera leans, from base x [rad].
-            marker: In the frame of the tool centre point [m].
+            marker: Position of the marker in the frame of the tool centre point [m].
             options: The remaining fields.
         """
         zero = torch.zeros_like(roll + tilt + bearing)

@@ -40,14 +40,14 @@ UNHURRIED = HumanSpeeds(reaching=0.9)
 """Hand speeds during handovers: half the largest ones, so that a handover takes about a second.
 """
 
-# How far over the bench the thing is held out, from its edge, and how high [m]: a forearm over
+# Offset from the bench's edge and height at which the object is held out [m]: a forearm over
 # it, at the height of the elbow.
 _OVER_BENCH, _HEIGHT = (0.26, 0.42), (0.24, 0.36)
 # To his right of where he stands [m], and x between which an arm reaches it well.
 _ASIDE, _WITHIN = (-0.22, 0.04), (0.08, 0.42)
-# Leans beyond which nobody holds things out [rad]; places tried until one is within reach.
+# Largest lean while holding an object out [rad]; places tried until one is within reach.
 _LEANS, _TRIED = 0.45, 200
-# Of the way on to the robot's hand, share of the speed of other movements.
+# Speed of the final approach to the gripper, as a fraction of that of other movements.
 _CAREFUL = 0.3
 
 

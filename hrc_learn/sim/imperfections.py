@@ -21,7 +21,7 @@ from hrc_learn.vision import ImageNoise
 
 # Heights are drawn for as many objects, so that further draws do not depend on their number.
 _MOST_OBJECTS = 8
-# By which the simulated servos follow late, whatever else is [s]: with it a path is kept to
+# Constant lag of the simulated servos [s]: with it a path is kept to
 # 0.4 mm, without to 1.5 mm.
 _SIMULATED_SERVOS = 0.01
 # From a control step to the arm braking as hard as it does [s]; and what may stand out from the
@@ -166,7 +166,7 @@ class Imperfections:
         """Safety filter settings for the delays and limits of this arm's driver and person
         tracker.
         """
-        # Of normally distributed delays one in 700 is more than three deviations late.
+        # One in 700 normally distributed delays exceeds the mean by three deviations.
         delay = self.command_delay + 3 * self.command_jitter + self.servo_lag
         separation = SeparationConfig(
             reaction_time=max(delay, _SIMULATED_SERVOS) + _RAMP,
@@ -241,7 +241,7 @@ class DrawnImperfections:
         hand.pos = hand.pos + shift
         hand.quat = _turned(hand.quat, self.tool_turn)
         if self.payload > 0:
-            # At the palm; a small sphere's inertia, which matters little beside its mass.
+            # At the palm; a small sphere's inertia, which matters less than its mass.
             load = hand.add_body(name="payload", pos=(0.0, 0.0, 0.03))
             load.add_geom(
                 name="payload",

@@ -25,10 +25,10 @@ from hrc_learn.vision import CameraModel
 type Clearances = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Distance of an arm from the furniture and from itself at joint positions [m]."""
 
-# What is good: distance from limits [rad], smallest singular value [m/rad], distance from
-# furniture and from itself [m], speed of joints by their limits.
-_ROOM, _SINGULAR, _CLEAR, _APART, _SPEED = 0.25, 0.08, 0.04, 0.01, 0.8
-# From which distance on the tool has not followed: of the larger of metres and radians.
+# Values of quality 1: distance from limits [rad], smallest singular value [m/rad], distance
+# from furniture and from itself [m], speed of joints by their limits.
+_MARGIN, _SINGULAR, _CLEAR, _APART, _SPEED = 0.25, 0.08, 0.04, 0.01, 0.8
+# Tracking error beyond which a pose is not reached, the larger of metres and radians.
 _LOST = 5e-3
 # Samples of a path to a shelf, of one across the table, and of half a turn above it.
 _STEPS, _ACROSS, _HALF_TURN = 60, 8, 24
@@ -38,10 +38,10 @@ _DURATION = 14.0  # which the way to a shelf takes [s]
 def clearance_quality(
     clearances: Clearances, q: Float[Tensor, "*batch joints"]
 ) -> Float[Tensor, "*batch"]:
-    """Room to furniture and to the arm itself; 0: touching, 1 and more: plenty.
+    """Margin to furniture and to the arm itself; 0: contact, 1 and more: ample.
 
     Args:
-        clearances: Of the arm.
+        clearances: Clearances of the arm.
         q: Joint positions [rad].
     """
     furniture, itself = clearances(q)
@@ -55,32 +55,31 @@ def _quality(
     error: Float[Tensor, "steps *rows"],
 ) -> Float[Tensor, "steps *rows"]:
     """Quality from 0 (pose not reached, or contact) to 1 (ample margins)."""
-    chain = robot.chain
-    room = torch.minimum(q - chain.limits.lower, chain.limits.upper - q).amin(-1)
-    smallest = torch.linalg.svdvals(chain.jacobian(q))[..., -1]
+    margin = torch.minimum(q - robot.limits.lower, robot.limits.upper - q).amin(-1)
+    smallest = torch.linalg.svdvals(robot.jacobian(q))[..., -1]
     clear = clearance_quality(clearances, q)
-    shares = torch.stack([room / _ROOM, smallest / _SINGULAR, clear])
-    return torch.where(error < _LOST, shares.amin(0).clamp(0.0, 1.0), 0.0)
+    ratios = torch.stack([margin / _MARGIN, smallest / _SINGULAR, clear])
+    return torch.where(error < _LOST, ratios.amin(0).clamp(0.0, 1.0), 0.0)
 
 
-def way_quality(
+def path_quality(
     robot: Arm,
     clearances: Clearances,
     points: Float[Tensor, "points 3"],
     level_at: float,
     start: Float[Tensor, "postures joints"],
 ) -> Float[Tensor, " postures"]:
-    """Least quality along a way to a shelf, the hand tilted by the rule of the expert.
+    """Smallest quality along a path to a shelf, the gripper tilted by the expert's rule.
 
     Args:
         robot: The arm.
-        clearances: Of it.
-        points: Of the tool centre point, from home [m].
+        clearances: Clearances of the arm.
+        points: Path of the tool centre point, from home [m].
         level_at: Distance to the right of the base at which the hand is level [m].
         start: Joint positions at the first point [rad].
 
     Returns:
-        From 0, where the arm does not get there or touches something, to 1, plenty of room.
+        Quality from 0 (pose not reached, or contact) to 1 (ample margins).
     """
     lengths = (points[1:] - points[:-1]).norm(dim=-1)
     ends = torch.cat([torch.zeros(1, dtype=torch.float64), lengths.cumsum(0)])
@@ -88,12 +87,12 @@ def way_quality(
     columns = [np.interp(at.numpy(), ends.numpy(), column) for column in points.T.numpy()]
     position = torch.from_numpy(np.stack(columns, axis=-1))
     path = Pose(position, coarse_orientation(position, level_at))
-    q, error = follow_poses(robot.chain, path, start)
+    q, error = follow_poses(robot, path, start)
     least = _quality(robot, clearances, q, error).amin(0)
     # A minimum-jerk motion is 1.875 times as fast as on average.
     speed = (q[1:] - q[:-1]).abs() * 1.875 * _STEPS / _DURATION
-    share = (speed / robot.chain.limits.velocity).amax(-1).amax(0)
-    return torch.where(share > _SPEED, least * (_SPEED / share), least)
+    load = (speed / robot.limits.velocity).amax(-1).amax(0)
+    return torch.where(load > _SPEED, least * (_SPEED / load), least)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +104,7 @@ class MarkedTurns:
     turns: tuple[float, float]
     """Least and greatest turn about the vertical [rad], half a turn apart."""
     quality: float
-    """Least there, from 0 to 1."""
+    """Smallest quality in that range, from 0 to 1."""
     seen: float
     """Fraction of poses that are reached with the marker in view."""
 
@@ -119,15 +118,15 @@ def marked_turns(
     reach: tuple[float, float],
     hover: Float[Tensor, " joints"],
 ) -> MarkedTurns:
-    """Side of the marker and half turn of the hand that do best above a table.
+    """Best side of the marker and best half turn of the gripper above a table.
 
     Args:
         robot: The arm.
-        clearances: Of it.
-        camera: Which has to see the marker.
-        plate: Which carries it, on one of two sides that it may be on.
-        middle: Of the tool centre point above the middle of the table.
-        reach: How far from there it goes, along x and y [m].
+        clearances: Clearances of the arm.
+        camera: Camera that must see the marker.
+        plate: Plate with the marker, on one of its two possible sides.
+        middle: Pose of the tool centre point above the middle of the table.
+        reach: Largest distances from there, along x and y [m].
         hover: Joint positions there [rad].
     """
     q, error = _turned_above_table(robot, middle, reach, hover)
@@ -138,7 +137,7 @@ def marked_turns(
         for first in range(_HALF_TURN + 1):
             window = slice(first, first + _HALF_TURN + 1)
             seen, least = float(good[window].mean()), float(reached[window].amin())
-            # Of windows as good as each other, to 1 %, the one in the middle.
+            # Among windows of equal quality, to 1 %, the one in the middle.
             off_middle = abs(first - _HALF_TURN / 2) / _HALF_TURN
             score = (round(seen, 2), least - off_middle)
             if best is None or score > best[0]:
@@ -152,14 +151,14 @@ def marked_turns(
 def _turned_above_table(
     robot: Arm, middle: Pose, reach: tuple[float, float], hover: Float[Tensor, " joints"]
 ) -> tuple[Float[Tensor, "turns places joints"], Float[Tensor, "turns places"]]:
-    """Joint positions above five places, for all turns of the hand from -180 to 180 degrees."""
-    chain, (a, b) = robot.chain, reach
+    """Joint positions above five places, for turns of the gripper by -180 to 180 degrees."""
+    chain, (a, b) = robot, reach
     aside = torch.tensor(
         [[0.0, 0.0, 0.0], [a, b, 0.0], [a, -b, 0.0], [-a, b, 0.0], [-a, -b, 0.0]]
     ).double()
-    share = torch.linspace(0.0, 1.0, _ACROSS, dtype=torch.float64)
+    fraction = torch.linspace(0.0, 1.0, _ACROSS, dtype=torch.float64)
     across = Pose(
-        middle.position + share[:, None, None] * aside,
+        middle.position + fraction[:, None, None] * aside,
         middle.orientation.expand(_ACROSS, len(aside), 4),
     )
     q, _ = follow_poses(chain, across, hover.expand(len(aside), -1))
@@ -201,12 +200,12 @@ def marker_seen(
         plate: Plate in the frame of the gripper.
         q: Joint positions [rad].
     """
-    tool = robot.chain.forward(q)
-    # From the hand's frame, at the flange, to that of the tool.
+    tool = robot.forward(q)
+    # Transform from the gripper's frame, at the flange, to that of the tool.
     half = plate.marker.plate_size / 2
     corners = torch.tensor([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]).double() * half
     turn = torch.tensor(plate.orientation, dtype=torch.float64)
-    back = torch.tensor([0.0, 0.0, float(robot.chain.tcp[:3, 3].norm())], dtype=torch.float64)
+    back = torch.tensor([0.0, 0.0, float(robot.tcp[:3, 3].norm())], dtype=torch.float64)
     centre = torch.tensor(plate.position, dtype=torch.float64) - back
     points = centre + quaternion.rotate(turn, corners)
     world = tool.position[..., None, :] + quaternion.rotate(

@@ -1,8 +1,7 @@
-"""Watches whether what MuJoCo computes can still be believed.
+"""Detection of simulations that have diverged.
 
-MuJoCo goes on when a simulation diverges: it writes a line to a log, puts everything back to
-the first pose at time zero, and counts a warning. What is measured of such a run is about
-something else.
+MuJoCo goes on when a simulation diverges: it writes a line to a log, resets the state to the
+first pose at time zero, and counts a warning. Measurements of such a run are meaningless.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ import numpy as np
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 FASTEST = 1e3
-"""Speed of a coordinate beyond which nothing here moves [m/s or rad/s]: the arm's joints reach
-2.6 rad/s, and a fall takes 100 s to it. MuJoCo itself objects at 1e10 only."""
+"""Largest plausible speed of a coordinate [m/s or rad/s]: the arm's joints reach 2.6 rad/s, and
+a fall takes 100 s to reach it. MuJoCo itself objects at 1e10 only."""
 
 _WARNINGS = {
     # In the order in which a step can give them.
@@ -31,13 +30,13 @@ _WARNINGS = {
 
 
 class PhysicsError(RuntimeError):
-    """A simulation diverged or was reset from inside: nothing measured of it holds.
+    """A simulation diverged or was reset by MuJoCo: its measurements are invalid.
 
-    Not a task that failed, so no skill tries again; an experiment counts the run as failed.
+    Skills do not retry, as the task did not fail; an experiment counts the run as failed.
 
     Attributes:
-        time: When it was noticed, in simulated time [s].
-        body: Where it began, as far as that is known; empty if it is not.
+        time: Simulated time of the detection [s].
+        body: Body where it began; empty if unknown.
     """
 
     def __init__(self, reason: str, time: float, body: str = ""):
@@ -51,32 +50,31 @@ class PhysicsError(RuntimeError):
 
 
 class PhysicsWatch:
-    """Looks at a simulation after each step, and more closely now and then."""
+    """Checks a simulation after each step, and more thoroughly on request."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
         """Watch a simulation.
 
-        A state that is no state is then left as it is, for whoever looks for the cause, not put
-        back to the first one.
+        Disables MuJoCo's automatic reset, so that an invalid state remains for inspection.
 
         Args:
             model: The model.
-            data: Its state.
+            data: State of the model.
         """
         self._model, self._data = model, data
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.restart()
 
     def restart(self) -> None:
-        """Take the present state for a healthy one: time and warnings count from here."""
+        """Accept the present state as valid: time and warnings count from here."""
         self._time = self._data.time
         self._warnings = np.array(self._data.warning.number)
 
     def after_step(self) -> None:
-        """Find a speed that nothing has, before it spreads to other bodies.
+        """Detect an implausible speed before it spreads to other bodies.
 
         Raises:
-            PhysicsError: There is one, or one is not a number.
+            PhysicsError: A speed is implausible or not a number.
         """
         speed = np.abs(self._data.qvel)
         # Written so that NaN is found too.
@@ -86,7 +84,7 @@ class PhysicsWatch:
             raise self._error(f"it moves at {speed[dof]:.3g} m/s or rad/s", self._body(dof))
 
     def check(self) -> None:
-        """Look at state, warnings and time since the last look.
+        """Check state, warnings and time since the last check.
 
         Raises:
             PhysicsError: A value is not finite, MuJoCo warned, or time went backwards.
@@ -99,7 +97,7 @@ class PhysicsWatch:
         numbers = np.array(data.warning.number)
         for kind, (reason, has_place) in _WARNINGS.items():
             if numbers[kind] != self._warnings[kind]:
-                # Where it began: by the end of the step it may be everywhere.
+                # The body where it began: by the end of the step it may be everywhere.
                 place = int(data.warning.lastinfo[kind])
                 body = self._body(place, has_place) if has_place else ""
                 raise self._error(f"MuJoCo warns that {reason}", body)

@@ -44,12 +44,12 @@ network requirements)."""
 
 
 class DrivenCycle(NamedTuple):
-    """A cycle of a motion, as the arm was led in it."""
+    """One cycle of a motion, with its command."""
 
     motion: int
     """Number that the driver has given to the motion."""
     velocity: Float[np.ndarray, " joints"]
-    """Commanded, or gone on with where no answer has come [rad/s]."""
+    """Commanded joint velocities, extrapolated where no answer has come [rad/s]."""
     position: Float[np.ndarray, " joints"]
     """Previous joint positions, as sent to the driver [rad]."""
     answered: bool
@@ -114,7 +114,7 @@ class ArmServer:
         self.address: str = self._server.hostname
         simulator.init()
         simulator.start()
-        self._server.process_commands()  # nobody's: a step wants a command before it
+        self._server.process_commands()  # none yet, but a step needs a command before it
         self._due = world.time
         # Until when the thread may go on; None: as long as calls of the driver take.
         self._until: float | None = world.time
@@ -353,7 +353,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
             super().__init__()
             self.answered = False
             self._target: np.ndarray | None = None
-            # Of this cycle and of the two before it.
+            # Velocities of this cycle and of the two before it.
             self._velocity = self._last = self._before = np.zeros(7)
             self._width_goal: float | None = None
             self._finger_speed = 0.0
@@ -423,7 +423,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
         def _drive(self, velocity: np.ndarray) -> None:
             self._velocity = velocity
             world.arm.command(velocity)
-            self.torque_control([0.0] * 7)  # what is told of commanded torques
+            self.torque_control([0.0] * 7)  # reported commanded torques
 
         def _torque_control(self, torques: np.ndarray) -> None:
             pass

@@ -165,7 +165,7 @@ class DrawnWorld:
     Where there are no meshes, capsules are drawn.
 
     Attributes:
-        model: To be rendered.
+        model: Model to render.
         data: As the world was at the last `update`.
     """
 
@@ -197,7 +197,7 @@ class DrawnWorld:
         """Let geoms of the world stand out, or the bodies that are drawn in their place.
 
         Args:
-            geoms: Their names; all others have their own colour again.
+            geoms: Names of the geoms; all others regain their own colour.
             colour: RGBA, 0 to 1.
         """
         self.model.geom_rgba[:] = self._colours
@@ -217,7 +217,7 @@ class RecordedWorld:
     at without the world that it ran in.
 
     Attributes:
-        model: To be rendered. Its bodies have no joints; each is put where it was.
+        model: Model to render. Its bodies have no joints; each is put where it was.
         data: As the run was at the last `show`.
     """
 
@@ -294,7 +294,7 @@ def add_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, mesh: MeshFile) -> None:
         shape.usernormal = placed.normals.ravel()
         shape.userface = placed.faces.ravel()
         shape.userfacenormal = placed.faces.ravel()
-        # Of an open surface there is no volume to compute an inertia from.
+        # An open surface has no volume to compute an inertia from.
         shape.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         material = spec.add_material(name=name, specular=_SPECULAR, shininess=_SHININESS)
         material.rgba = (1.0, 1.0, 1.0, 1.0)

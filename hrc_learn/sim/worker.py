@@ -85,7 +85,7 @@ _PAIRS = {
 # On which side of the body the parts of a pair are, along y.
 _SIDES = np.array([[1.0], [-1.0]])
 
-# How much of an arm or leg is stretched at most: a straight one has no bend to speak of.
+# Largest extension of an arm or leg: the bend of a straight one is undefined.
 _STRETCHED = 0.995
 # To which side elbows and knees point, in the worker's frame; the sign of y is the side's.
 _ELBOW, _KNEE = (-0.8, 0.2, -0.7), (1.0, 0.1, 0.0)
@@ -97,7 +97,7 @@ _SECOND = np.array([[_FOREARM], [_FOREARM], [_SHANK], [_SHANK]])
 _GRIP = 0.9
 # The pelvis goes back as the trunk leans forward, or he would fall over: fraction of stature.
 _BALANCE = 0.06
-# How much less the head leans than the trunk: people look up from what they lean over.
+# Reduction of the head's lean relative to the trunk: people look up while they lean.
 _HEAD_LEANS = 0.7
 _LIFT = 0.04  # of a foot in its swing, fraction of stature
 
@@ -152,8 +152,8 @@ class Worker:
     """A body.
 
     Attributes:
-        config: Whose it is.
-        radius: Of each capsule [m], in the order of `PARTS`.
+        config: Stature and build of the worker.
+        radius: Radius of each capsule [m], in the order of `PARTS`.
     """
 
     def __init__(self, config: WorkerConfig | None = None):

@@ -117,9 +117,9 @@ class WorkerSensor:
         """Begin to watch now.
 
         Args:
-            visit: Where the worker truly is.
-            clock: Tells the time [s].
-            sizes: Of noise, delay and loss.
+            visit: True motion of the worker.
+            clock: Current time [s].
+            sizes: Sizes of noise, delay and loss.
             rng: Source of noise and loss.
             rate: Images a second.
 

@@ -23,13 +23,13 @@ _HALF_STEP = 1e-4
 STEP = 0.40
 HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
 """Height of a hand that puts down or takes what stands on the bench [m]."""
-# How far markers are to the sides of what the arm is at work above [m].
+# Distance of markers to the sides of the arm's working point [m].
 _BESIDE_GRIPPER = (0.11, 0.22)
 # Places for a marker that are tried: of ten one may be within reach where an arm hinders.
 _MARKERS_TRIED = 200
 # A minimum-jerk motion is at its fastest this many times as fast as on average.
 _PEAK = 1.875
-# How far the head of a leaning person is from the hip, fraction of the stature.
+# Distance of the head of a leaning person from the hip, as a fraction of the stature.
 _HEAD_FROM_HIP = 0.47
 
 
@@ -370,7 +370,7 @@ def _marker(
 ) -> np.ndarray:
     """A place around what is under the arm that he can reach, low over the bench [m]."""
     for _ in range(_MARKERS_TRIED):
-        # To either side of the gripper that hovers there: nobody reaches through it.
+        # To either side of the gripper that hovers there: a hand cannot reach through it.
         x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
         point = under + np.array([x, rng.uniform(-0.10, 0.12), HAND_OVER_BENCH])
         target = own(point)

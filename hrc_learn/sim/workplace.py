@@ -1,7 +1,7 @@
-"""Poses of the task in the simulated scene, home, table and shelves, as they suit an arm.
+"""Poses of the task in the simulated scene: home, table and shelves, laid out for an arm.
 
-No place is written down per arm. Tables and cabinets at several distances are looked at, the
-usual ones first, until the arm has a posture in which it does the work (`layout_quality`).
+No pose is stored per arm. Layouts with tables and cabinets at several distances are evaluated,
+the usual ones first, until one suits the arm (`layout_quality`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -27,7 +27,7 @@ from hrc_learn.sim.layout_quality import (
     MarkedTurns,
     clearance_quality,
     marked_turns,
-    way_quality,
+    path_quality,
 )
 from hrc_learn.sim.scene import HAND_MARKER, SceneConfig, marked_plate
 
@@ -40,18 +40,18 @@ def _vector(*values: float) -> Float[Tensor, " n"]:
 _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
 
-# Distances of table and cabinet from the base, as shares of the usual ones, and where the
+# Distances of table and cabinet from the base, relative to the usual ones, and where the
 # cabinet stands besides: further along the base's x axis, and higher [m].
 _SCALES = (1.0, 0.85, 0.7, 0.55)
-# How far from the middle of the table an arm must get in view of the camera [m]: with room to
+# Distance from the middle of the table to reach in view of the camera [m]: with a margin to
 # spare, then no further than objects are put.
 _REACHES = (0.14, 0.1)
 _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
-# How far behind the boards' front edge objects are put [m]: thick wrists stay outside.
+# Distances of objects behind the boards' front edge [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
 # Quality with which a layout is taken without looking at others.
 _ENOUGH = 0.3
-_UNSEEN = 10.0  # what a share of poses without a view of the marker costs of it
+_UNSEEN = 10.0  # loss of quality per fraction of poses without a view of the marker
 # Postures at home that are looked at; of the best, and of those above the table, so many.
 _POSTURES, _TRIED = 16, 6
 _LIFT, _INSIDE = 0.03, 0.3  # of the expert's way over the edge of a board
@@ -140,7 +140,7 @@ class Workplace:
         """Joint positions at home.
 
         Args:
-            offset: Of the end effector from home [m].
+            offset: Offset of the end effector from home [m].
             q7_offset: Change of joint 7, which moves the elbow about the line to the wrist
                 [rad].
 
@@ -151,9 +151,7 @@ class Workplace:
         if offset is not None:
             home = Pose(home.position + offset, home.orientation)
         if self.robot.is_franka:
-            return self.robot.chain.inverse(
-                home, self.home_q7 + q7_offset, near=_LEANING_FORWARD
-            )
+            return self.robot.inverse(home, self.home_q7 + q7_offset, near=_LEANING_FORWARD)
         return self.robot.inverse(home, near=_vector(*self.home_posture))
 
     def hover(self) -> Pose:
@@ -175,7 +173,7 @@ class Workplace:
         pulled.
         """
         if self.robot.is_franka:
-            return self.robot.chain.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
+            return self.robot.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
         return self.robot.inverse(self.hover(), near=_vector(*self.hover_posture))
 
     def hover_postures(self) -> list[Float[Tensor, " joints"]]:
@@ -206,7 +204,7 @@ class Workplace:
         """
         centre, half_size = self._furniture.like(q).split(3, dim=-1)
         robot = self.robot
-        frames = robot.chain.link_frames(q)
+        frames = robot.link_frames(q)
         furniture = robot.body.box_distance(q, centre, half_size, frames)
         return furniture, robot.whole.self_distance(q, frames)
 
@@ -246,8 +244,8 @@ class Workplace:
         """End effector where it releases an object on a shelf, level and into the cabinet.
 
         Args:
-            name: Of the shelf.
-            half_size: Of the object [m]; that of the scene's first object when None.
+            name: Name of the shelf.
+            half_size: Half size of the object [m]; that of the scene's first object when None.
 
         Raises:
             ValueError: If there is no such shelf, or the place is not on its board.
@@ -294,7 +292,7 @@ class CellLayout:
     workplace: Workplace
     """Workplace with furniture, postures, side of the marker and turns above the table."""
     quality: float
-    """Least room on the way, from 0, where something fails, to 1, where there is plenty."""
+    """Smallest margin along the paths, from 0 (failure) to 1 (ample)."""
     seen: float
     """Fraction of poses above the table, within its turns, that are reached with the marker in
     view.
@@ -309,7 +307,7 @@ def layout_for(robot: Arm) -> CellLayout:
     """The best layout for an arm, the usual one if that is good enough.
 
     Raises:
-        UnreachableError: In none it gets to the table and to all shelves.
+        UnreachableError: In no layout the arm reaches the table and all shelves.
     """
     best: CellLayout | None = None
     for layout in _layouts(robot):
@@ -319,15 +317,15 @@ def layout_for(robot: Arm) -> CellLayout:
             return best
     if best is None:
         raise UnreachableError(
-            f"the {robot.name} does not get from home to the table and to all shelves, with "
+            f"the {robot.name} does not reach the table and all shelves from home, with "
             f"distances of {_SCALES[-1]:g} to {_SCALES[0]:g} times the usual ones: it is too "
-            "small for this work cell, or its joints are in each other's way."
+            "small for this work cell, or its links obstruct each other."
         )
     return best
 
 
 def _layouts(robot: Arm) -> Iterator[CellLayout]:
-    """Layouts in which an arm does the work, the likely ones first."""
+    """Layouts that suit an arm, the likely ones first."""
     unlikely = []
     for reach in _REACHES:
         for scale in _SCALES:
@@ -385,7 +383,7 @@ def _placed(
         front=depth - level_at,
         shelves={name: scale * z + higher for name, z in cabinet.shelves.items()},
         top=cabinet.top + higher,
-        # The door is there for an elbow to be led around it, as that of six joints cannot be.
+        # The door tests null-space motion of the elbow, which six joints do not have.
         door_reach=scale * cabinet.door_reach * (usual.arm.robot.null_space != "none"),
     )
     (x, y, z), (a, b, c) = table.centre, table.half_size
@@ -411,7 +409,7 @@ def _placed(
 
 
 def _above_table(workplace: Workplace) -> _Above:
-    """Joint positions above the table, and how the hand turns there; the best first."""
+    """Joint positions above the table, and the turns of the gripper there; the best first."""
     robot, scene = workplace.robot, workplace.scene
     try:
         postures = robot.postures(workplace.hover())[:_POSTURES]
@@ -443,15 +441,15 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
         at_home = robot.postures(workplace.home())[:_POSTURES]
     except UnreachableError:
         return None
-    ways = [_way_to_shelf(workplace, name) for name in workplace.shelf_names()]
+    paths = [_path_to_shelf(workplace, name) for name in workplace.shelf_names()]
     clearances, level_at = workplace.arm_clearances, workplace.level_at
     to_shelves = torch.stack(
-        [way_quality(robot, clearances, way, level_at, at_home) for way in ways]
+        [path_quality(robot, clearances, path, level_at, at_home) for path in paths]
     ).amin(0)
     best: CellLayout | None = None
     for k in to_shelves.argsort(descending=True).tolist()[:_TRIED]:
         home, quality = at_home[k], float(to_shelves[k])
-        # Of those that are good enough the one nearest to home.
+        # Among those that are good enough, the one nearest to home.
         nearest = sorted(above, key=lambda pair: float((pair[0] - home).abs().max()))
         for hover, marked in nearest if quality > 0 else ():
             between = torch.lerp(home, hover, torch.linspace(0, 1, 25).double()[:, None])
@@ -472,7 +470,7 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
     return best
 
 
-def _way_to_shelf(workplace: Workplace, name: str) -> Float[Tensor, "points 3"]:
+def _path_to_shelf(workplace: Workplace, name: str) -> Float[Tensor, "points 3"]:
     """Path of the end effector from home over the edge of a board, as the expert demonstrates
     it [m].
     """

@@ -124,8 +124,8 @@ _PADS = ("finger_left_pad", "finger_right_pad")
 _TOUCHING = 1e-4
 # Cosine of the angle between the normal of a contact and that of a flat face: of 3 degrees.
 _FLAT = math.cos(math.radians(3.0))
-# Of an object in the tool's frame: its x lies along the fingers' line of closing, its top
-# towards the gripper.
+# Orientation of an object in the tool's frame: its x lies along the fingers' line of closing,
+# its top towards the gripper.
 _IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 # Touches that are looked through for those of a moment; more begin in no control step.
 _REMEMBERED = 64
@@ -136,7 +136,7 @@ class World:
     """A workplace that can be reset, advanced in time, looked at and asked about contacts.
 
     Attributes:
-        config: What stands in it.
+        config: Scene.
         arm: The arm and its gripper.
         cabinet_contacts: Touches of the arm or its hand with the cabinet or an obstacle.
         object_contacts: Touches of objects with them.
@@ -151,8 +151,8 @@ class World:
         """Build it.
 
         Args:
-            config: What stands in it, as it is believed to.
-            imperfections: How what there is departs from that; None: in nothing.
+            config: Nominal scene.
+            imperfections: Deviations from the nominal scene; None: none.
         """
         self.config = config or SceneConfig()
         self.imperfections = imperfections or Imperfections().draw(
@@ -197,7 +197,7 @@ class World:
 
     @property
     def opened_arm(self) -> OpenedArm:
-        """The simulated arm, to be led without a driver."""
+        """The simulated arm, commanded without a driver."""
         return OpenedArm(arm=self.arm, gripper=self.arm, advance=self.advance)
 
     @property
@@ -291,10 +291,10 @@ class World:
         self._watch.restart()
 
     def follow(self, state: ArmState, carried: str | None = None) -> None:
-        """Show an arm that is led elsewhere, at once; nothing is simulated.
+        """Show the state of an arm that is controlled elsewhere; no physics.
 
         Args:
-            state: Of that arm.
+            state: State of that arm.
             carried: The object that goes along, at its present pose in the gripper.
         """
         in_hand = None
@@ -336,8 +336,8 @@ class World:
         """Put an obstacle, or the occluder, somewhere at once; `NOWHERE` takes it away.
 
         Args:
-            name: Of the obstacle.
-            centre: In the base frame [m].
+            name: Name of the obstacle.
+            centre: Centre in the base frame [m].
         """
         self.data.mocap_pos[self.model.body(name).mocapid[0]] = centre
         mujoco.mj_kinematics(self.model, self.data)
@@ -350,8 +350,8 @@ class World:
         """Put the worker somewhere at once.
 
         Args:
-            ends: Of the axes of his capsules, in the order of `PARTS` [m].
-            item: Where the thing is that he puts on the table [m]; None: it stays.
+            ends: Ends of the axes of the worker's capsules, in the order of `PARTS` [m].
+            item: Position of the object put on the table [m]; None: unchanged.
 
         Raises:
             ValueError: If there is no worker in the scene.

@@ -72,7 +72,7 @@ class Lens:
 
     Attributes:
         model: The camera to imitate.
-        pinhole: What to render: same pose, no distortion, square pixels, centred principal
+        pinhole: Camera to render: same pose, no distortion, square pixels, centred principal
             point, just large enough to fill every pixel of `model`.
     """
 
@@ -279,7 +279,7 @@ def _by_id(markers: Iterable[Marker]) -> dict[int, Marker]:
     for marker in markers:
         if marker.id in by_id:
             raise ValueError(
-                f"Markers {by_id[marker.id]} and {marker} share id {marker.id}: a detector "
+                f"Markers {by_id[marker.id]} and {marker} both have id {marker.id}: a detector "
                 "could not tell them apart. Give each marker of a scene its own id."
             )
         by_id[marker.id] = marker

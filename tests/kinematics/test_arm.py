@@ -334,7 +334,7 @@ def test_hulls_are_parted_where_a_plane_fits_between(gap):
     assert bool((_parted(corners, corners, R, shift) == (gap > 0)).all())
 
 
-@pytest.mark.parametrize("name", ["z1", "ur5", "ur10", "ur5e"])
+@pytest.mark.parametrize("name", ["z1", "ur5"])
 def test_most_postures_of_an_arm_are_no_contact_with_itself(name):
     a = installed(name)
     q = random_positions(a.chain, 1000, seed=6)
