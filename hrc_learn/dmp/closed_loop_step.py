@@ -131,7 +131,7 @@ def step(
         forced = torch.from_numpy(response.forced.at(now))
     else:
         ds = ds if isinstance(ds, Tensor) else torch.full_like(s, ds)
-        forced = response.forced.to(s.device)(now)
+        forced = response.forced.to(s.device)(s)
     E, coast = _propagators(spring, ds, response.coasting(now))
     forced = forced.to(target) @ weights.mT
     if coast is not None:

@@ -174,7 +174,7 @@ class ContextualDMP(nn.Module):
         self.held_out = held_out
         self.features = features
 
-    @classmethod
+    @classmethod  # pyright: ignore[reportArgumentType]
     def fit(
         cls,
         time: Times,
@@ -187,7 +187,7 @@ class ContextualDMP(nn.Module):
         regularization: float = 1e-6,
         joint_names: Sequence[str] | None = None,
         units: str = "rad",
-        **options: Unpack[FitOptions],
+        **options: Unpack[FitOptions],  # pyright: ignore[reportGeneralTypeIssues]
     ) -> "ContextualDMP":
         """Learn from one demonstration per context.
 

@@ -21,8 +21,9 @@ from torch.utils._pytree import tree_map
 
 from hrc_learn import store
 from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
-from hrc_learn.dmp.orientation_dmp import OrientationState
+from hrc_learn.dmp.orientation_dmp import OrientationDMP, OrientationState
 from hrc_learn.dmp.orientation_error import to_orientation
 from hrc_learn.dmp.pose_dmp import BODY, POSITION, PoseDMP, PoseState
 from hrc_learn.dmp.stepper import STATES, Stepper
@@ -83,7 +84,7 @@ def export_dmp(dmp: MotionPrimitive, *, goal_filter: float | None = None) -> Exp
     """
     if dmp.duration.ndim:
         raise ValueError(f"export takes one primitive, got a batch {tuple(dmp.duration.shape)}")
-    stepper = Stepper(dmp) if isinstance(dmp, tuple(STATES)) else None
+    stepper = Stepper(dmp) if isinstance(dmp, JointDMP | OrientationDMP | PoseDMP) else None
     return ExportedDMP(dmp=dmp, stepper=stepper, program=_program(dmp, goal_filter))
 
 

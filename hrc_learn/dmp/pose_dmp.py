@@ -291,8 +291,8 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
     ) -> DMPState:
         """Columns with the error to another reference, for the same motion of the pose."""
         values = columns.position, columns.rate, motion.second_derivative(columns)
-        errors = (x[..., ERROR] for x in values)
-        turned = orientation_error.retarget(*errors, old, new)
+        error, error_rate, second = (x[..., ERROR] for x in values)
+        turned = orientation_error.retarget(error, error_rate, second, old, new)
         position, rate, second = (
             _with_columns(x, ERROR, part) for x, part in zip(values, turned, strict=True)
         )

@@ -379,7 +379,7 @@ def _skew(v: Vector3) -> Float64[np.ndarray, "3 3"]:
 
 
 def _retarget(
-    error: Vector3, rate: Vector3, old_goal: Quaternion, goal: Quaternion
+    error: Vector3, rate: Vector3, old_goal: Quaternion | None, goal: Quaternion
 ) -> tuple[Vector3, Vector3]:
     """Error to a new goal and its rate, for the same orientation and angular velocity."""
     new = _nearest_turn(_to_error(_to_orientation(error, old_goal), goal), error)

@@ -21,7 +21,7 @@ class PlottableTensor(Tensor):
     Its slices are plottable too; the result of any other operation is an ordinary tensor.
     """
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self.detach().cpu().numpy(), dtype=dtype)
