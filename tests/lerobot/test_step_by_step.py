@@ -21,7 +21,7 @@ NOT_RUN = ("pip ", "export ")
 
 
 def lines():
-    guide = (ROOT / "docs" / "concepts" / "lerobot.md").read_text(encoding="utf-8")
+    guide = (ROOT / "docs" / "howto" / "lerobot.md").read_text(encoding="utf-8")
     section = guide.split("## Step by step")[1].split("\n## ")[0]
     (block,) = re.findall(r"```console\n(.*?)```", section, re.DOTALL)
     return [line.removeprefix("$ ") for line in block.splitlines()]

@@ -1,4 +1,4 @@
-"""Refresh the pictures of docs/concepts/teleoperation.md: the page and the view of a headset.
+"""Refresh the pictures of docs/howto/teleoperation.md: the page and the view of a headset.
 
 A mouse in a headless Chromium leads the simulated arm and is photographed meanwhile; then two
 hands of an emulated headset do, from picture to picture of a film, as drawing without a GPU
