@@ -31,7 +31,7 @@ def smooth(args: Smooth) -> None:
         raise ValueError(f"--scale must be positive, got {args.scale}")
     limits = gathered_limits(
         args.dataset,
-        share=args.scale,
+        scale=args.scale,
         urdf=args.urdf,
         calibration=args.calibration,
         degrees=args.degrees,
