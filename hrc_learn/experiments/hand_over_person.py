@@ -172,7 +172,8 @@ def _movements(
         if len(times) >= _FEWEST_IMAGES and times[-1] > reach.begin:
             u = (np.array(times) - times[0]) / (times[-1] - times[0])
             met = plan.place if reach.kind == HAND_OVER else home
-            robot = home + minimum_jerk(u)[0][:, None] * (met - home)
+            progress = minimum_jerk(torch.from_numpy(u))[0].numpy()
+            robot = home + progress[:, None] * (met - home)
             found.append((np.array(times) - times[0], np.stack(hand), robot, reach.kind))
     return found
 
