@@ -32,13 +32,13 @@ from hrc_learn.skills.grasping import (
 from hrc_learn.skills.pick_and_place import RELEASE_TIME, PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan, plan_candidates
 
-# Above the object the arm servoes on its image; a median grasp takes so long in vision [s]
-# (docs/benchmarks/experiments.md, grasping).
+# Time of servoing above the object, the median of grasping (docs/benchmarks/experiments.md)
+# [s].
 _SERVOING = 1.5
-# Of the last way down to the board, on which the job feels for it [m/s]:
+# Speed of the last descent to the board, which feels for it [m/s]:
 # `WorkCell.move_until_contact`.
 _FEELING_SPEED = 0.02
-# Mean speed of straight ways for which no other one is given [m/s]: `WorkCell.move_straight`.
+# Default speed of straight lines [m/s]: `WorkCell.move_straight`.
 _LIFTING_SPEED = 0.15
 # Places tried for each cycle.
 _ATTEMPTS = 20
@@ -46,7 +46,7 @@ _ATTEMPTS = 20
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JobCycle:
-    """A cycle without anybody beside the arm."""
+    """One cycle of the job, without people near the arm."""
 
     shelf: str
     dt: float
@@ -54,9 +54,9 @@ class JobCycle:
     path: Float[np.ndarray, "steps 7"]
     """Joint positions, a sample for each control step, from rest to rest [rad]."""
     holding: Bool[np.ndarray, " steps"]
-    """Whether the arm holds the object."""
+    """True while the arm holds the object."""
     load: GraspedBox
-    """What it holds then."""
+    """Object in the gripper during that time."""
 
     @property
     def duration(self) -> float:
@@ -76,13 +76,13 @@ def plan_cycle(
     """Plan a cycle with the scene's first object.
 
     Args:
-        workplace: Where.
+        workplace: Table, shelves and arm.
         placing: Learned motion to the shelf.
-        world: In which plans are checked for collisions; it is used up.
-        shelf: Where to put the object.
-        position: Of the object on the table [m].
+        world: Simulation in which plans are checked for collisions; it is used up.
+        shelf: Goal of the object.
+        position: Position of the object on the table [m].
         dt: Control step [s].
-        config: How the job is done.
+        config: Settings of the job.
 
     Raises:
         UnreachableError: The arm reaches the object or the shelf nowhere within its limits.
@@ -145,14 +145,14 @@ def random_cycles(
 ) -> Iterator[JobCycle]:
     """Cycles with the object anywhere on the table, to one shelf after the other.
 
-    Places from which every plan would collide are drawn again.
+    Positions from which every plan would collide are drawn again.
 
     Args:
-        workplace: Where.
+        workplace: Table, shelves and arm.
         placing: Learned motion to the shelves.
-        count: How many.
-        reach: Of the object from the middle of the table, along x and y [m].
-        rng: Source of where it lies.
+        count: Number of cycles.
+        reach: Largest distance of the object from the middle of the table, along x and y [m].
+        rng: Source of its position.
         dt: Control step [s].
     """
     names = workplace.shelf_names()

@@ -355,7 +355,7 @@ class _Batch:
                 yield rows, found, columns
 
     def _pulled(self, step: int, measured: Tensor) -> Float[Tensor, "live joints"]:
-        """Null-space input of the experts who pull at the elbow now [N m]."""
+        """Null-space input of the experts' pulls at the elbow [N m]."""
         time, pulls = step * self._config.dt, self._job.pulls
         d = torch.zeros_like(measured)
         active = [k for k, run in enumerate(self.live.tolist()) if pulls[run].strength(time)]

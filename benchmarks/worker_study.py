@@ -240,7 +240,7 @@ def draw_job(
 
 
 def expert_pull(visit: WorkerVisit) -> ScriptedForce:
-    """Pull of an expert who draws joint 4 away from the worker while he reaches under the arm.
+    """Pull of an expert: joint 4 away from the worker during the reach under the arm.
 
     As in Experiment 3 of the paper.
     """

@@ -1,4 +1,4 @@
-"""Visits of many workers as tables over time: where each is, and what a tracker tells of him.
+"""Visits of many workers as tables over time: true positions and tracker observations.
 
 A batch of runs looks them up once a control step, where a simulator would compute each anew.
 """
@@ -17,44 +17,44 @@ from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.worker_tracking import IMAGE_RATE
 
-# Worker that left stands still: of then the tables hold so much, and repeat the last part of
-# it, a whole number of images and of control steps [s].
+# A worker who has left stands still. The tables hold this much of that time, and repeat its
+# last part, a whole number of images and of control steps [s].
 _AFTER, _REPEATED = 2.0, 1.0
 
 
 class Workers(NamedTuple):
-    """Bodies beside several arms at one time."""
+    """Bodies near several arms at one time."""
 
     ends: Float[Tensor, "runs H 2 3"]
-    """Of the axes of their capsules, in the base frame [m]."""
+    """Ends of the axes of their capsules, in the base frame [m]."""
     velocity: Float[Tensor, "runs H 2 3"]
-    """Of the ends [m/s]."""
+    """Velocities of the ends [m/s]."""
     radius: Float[Tensor, "runs H"]
-    """[m]"""
+    """Radii [m]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorkerTables:
-    """Of the visits beside several arms, one for each."""
+    """Tables of the visits near several arms, one for each."""
 
     dt: float
     """Control step [s]."""
     radius: Float[Tensor, "runs H"]
-    """Of the capsules [m]."""
+    """Radii of the capsules [m]."""
     first: Int[Tensor, " runs"]
     """Control step of the first row of the truth."""
     rows: Int[Tensor, " runs"]
-    """Rows that each has; he rests before and after."""
+    """Number of rows; the worker rests before and after."""
     ends: Float[Tensor, "runs steps H 2 3"]
-    """Where he truly is [m]."""
+    """True positions of the ends [m]."""
     velocity: Float[Tensor, "runs steps H 2 3"]
-    """[m/s]"""
+    """True velocities [m/s]."""
     seen_ends: Float[Tensor, "runs images H 2 3"]
-    """Where the tracker saw him [m]."""
+    """Observed positions [m]."""
     seen_velocity: Float[Tensor, "runs images H 2 3"]
-    """[m/s]"""
+    """Observed velocities [m/s]."""
     seen_time: Float[Tensor, "runs images"]
-    """When [s]."""
+    """Times of the observations [s]."""
     newest: Int[Tensor, "runs steps"]
     """Number of the newest image that has arrived by each control step; -1: none yet."""
     observed: Int[Tensor, " runs"]
@@ -71,8 +71,8 @@ class WorkerTables:
         """Compute the visits, each seen by a tracker of its own.
 
         Args:
-            visits: Who comes, and when.
-            sizes: Of the tracker's noise, delay and loss.
+            visits: Visits, one for each arm.
+            sizes: Noise, delay and loss of the tracker.
             chances: Sources of its noise, one for each visit.
             dt: Control step, of which a second is a whole number [s].
         """
@@ -101,7 +101,7 @@ class WorkerTables:
 
     @classmethod
     def nobody(cls, runs: int, dt: float) -> "WorkerTables":
-        """As if each arm had somebody beside it who stands far away and is seen as he is."""
+        """Tables of workers who stand far away and are observed without error."""
         far = torch.full((runs, 1, len(PARTS), 2, 3), 1e3, dtype=torch.float64)
         still, zero = torch.zeros_like(far), torch.zeros(runs, dtype=torch.int64)
         return cls(
@@ -119,7 +119,7 @@ class WorkerTables:
         )
 
     def truth(self, step: int, runs: Int[Tensor, " some"]) -> Workers:
-        """Where the workers beside some of the arms are at a control step."""
+        """Workers near some of the arms at a control step."""
         last = self.rows[runs] - 1
         row = torch.minimum((step - self.first[runs]).clamp(min=0), last)
         return Workers(self.ends[runs, row], self.velocity[runs, row], self.radius[runs])
@@ -127,10 +127,10 @@ class WorkerTables:
     def seen(
         self, step: int, runs: Int[Tensor, " some"]
     ) -> tuple[Workers, Float[Tensor, " some"]]:
-        """What the trackers beside some of the arms have told by a control step.
+        """Newest observations of the workers near some of the arms at a control step.
 
         Returns:
-            The newest observation, and its age [s]; NaN as long as there is none.
+            The observations, and their age [s]; NaN as long as there is none.
         """
         until, period = self.observed[runs], round(_REPEATED / self.dt)
         beyond = step - until
@@ -158,7 +158,7 @@ class _Computed:
 def _images(
     visit: WorkerVisit, sizes: Imperfections, chance: np.random.Generator, dt: float
 ) -> tuple[list[PersonObservation], Int[np.ndarray, " steps"]]:
-    """What a tracker sees of a visit, and the newest image at each control step."""
+    """Observations of a visit, and the newest one at each control step."""
     duration, now = visit.end + _AFTER, 0.0
     computed = _Computed(visit, IMAGE_RATE, duration)
     sensor = WorkerSensor(computed, lambda: now, sizes, chance)
