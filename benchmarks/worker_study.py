@@ -35,7 +35,7 @@ from worker_tables import WorkerTables
 from hrc_learn import cli
 from hrc_learn.controller import WayMakingConfig
 from hrc_learn.controller.arm_loop_state import ArmLoopConfig
-from hrc_learn.experiments.collaboration.worker import draw_visit
+from hrc_learn.experiments.worker_in_run import draw_visit
 from hrc_learn.sim import Imperfections, WorkerVisit, whole_arm
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill

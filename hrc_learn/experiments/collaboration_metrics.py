@@ -9,7 +9,6 @@ from typing import get_args
 
 import numpy as np
 
-from hrc_learn.experiments.collaboration.worker import worker_contacts
 from hrc_learn.experiments.collaboration_trial import CollaborationRun
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.run_measures import (
@@ -24,6 +23,7 @@ from hrc_learn.experiments.run_measures import (
     worker_distance,
 )
 from hrc_learn.experiments.trials import Trial
+from hrc_learn.experiments.worker_in_run import worker_contacts
 from hrc_learn.sim import Touch
 from hrc_learn.sim.hand_over import HandOver, Reach
 from hrc_learn.skills.pick_and_place import HOME, RELEASE, Mishap, PickPlaceJob

@@ -9,22 +9,17 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
-from hrc_learn.experiments.collaboration.reach_space import (
-    ReachSpace,
-    reach_spaces,
-    space_over_bench,
-)
-from hrc_learn.experiments.collaboration.worker import (
-    draw_visit,
-    move_worker,
-    separation_margin,
-)
 from hrc_learn.experiments.elbow_pulls import PullEffect, pull_effects
 from hrc_learn.experiments.hand_over_person import (
     GivingPerson,
     giver,
     shown_hand_overs,
     waiting_pose,
+)
+from hrc_learn.experiments.reach_space import (
+    ReachSpace,
+    reach_spaces,
+    space_over_bench,
 )
 from hrc_learn.experiments.simulated_cell import (
     UNOBSERVED,
@@ -37,6 +32,11 @@ from hrc_learn.experiments.table_objects import (
     check_shelves,
     draw_object_poses,
     points_to_see,
+)
+from hrc_learn.experiments.worker_in_run import (
+    draw_visit,
+    move_worker,
+    separation_margin,
 )
 from hrc_learn.protocols import Human
 from hrc_learn.sim import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.experiments.collaboration.reach_space import (
+from hrc_learn.experiments.reach_space import (
     CLEAR,
     bench_places,
     free_volume,
@@ -16,7 +16,7 @@ from hrc_learn.experiments.collaboration.reach_space import (
     reach_spaces,
     space_over_bench,
 )
-from hrc_learn.experiments.collaboration.worker import draw_visit
+from hrc_learn.experiments.worker_in_run import draw_visit
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, panda
 from hrc_learn.log import StepLog

@@ -10,7 +10,7 @@ import sampling
 import torch
 
 from hrc_learn.controller import SafetyConfig, SeparationConfig
-from hrc_learn.experiments.collaboration.worker import draw_visit
+from hrc_learn.experiments.worker_in_run import draw_visit
 from hrc_learn.kinematics import GraspedBox, panda, separation
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import Imperfections, WorkerDistance, WorkerSensor, World, whole_arm

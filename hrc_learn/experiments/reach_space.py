@@ -1,4 +1,4 @@
-"""Space that an arm leaves to a worker who reaches under it: free volume and posture.
+"""Space left to a worker reaching under the arm: free volume and posture.
 
 Both depend on the arm alone, at the moments at which the worker has a hand at a marker. The
 worker's stance and lean are searched for, so that arms compare whatever the worker did there.

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hrc_learn.controller import SeparationConfig
-from hrc_learn.experiments.collaboration.worker import (
+from hrc_learn.experiments.worker_in_run import (
     draw_visit,
     move_worker,
     separation_margin,

@@ -1,1 +1,0 @@
-"""Experiment 3 of the paper: the whole job beside a person."""
