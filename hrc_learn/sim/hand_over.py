@@ -28,13 +28,13 @@ from hrc_learn.sim.worker_visit import (
 )
 
 RIGHT = 1
-"""The hand that he uses, as numbered in the worker's capsules."""
+"""Hand that holds the object, as numbered in the worker's capsules."""
 HELD_OUT = np.array([0.0, -0.09, -0.03])
 """Offset from the grip of the hand to the middle of an object held by its near end, in the base
 frame [m]; the worker faces -y. A hand's capsule is thicker than its fingers.
 """
 BENCH, BACK, HAND_OVER = "to the bench", "back", "hand over"
-"""Kinds of his movements."""
+"""Kinds of hand movements."""
 
 UNHURRIED = HumanSpeeds(reaching=0.9)
 """Hand speeds during handovers: half the largest ones, so that a handover takes about a second.
@@ -43,7 +43,7 @@ UNHURRIED = HumanSpeeds(reaching=0.9)
 # Offset from the bench's edge and height at which the object is held out [m]: a forearm over
 # it, at the height of the elbow.
 _OVER_BENCH, _HEIGHT = (0.26, 0.42), (0.24, 0.36)
-# To his right of where he stands [m], and x between which an arm reaches it well.
+# Offset to the right of the worker [m], and x between which an arm reaches it well.
 _ASIDE, _WITHIN = (-0.22, 0.04), (0.08, 0.42)
 # Largest lean while holding an object out [rad]; places tried until one is within reach.
 _LEANS, _TRIED = 0.45, 200
@@ -66,7 +66,7 @@ class HandOver:
     """The planned part of a handover; the rest depends on the robot."""
 
     visit: WorkerVisit
-    """His postures; at the end of them he holds the thing out."""
+    """Postures up to the one that holds the object out."""
     reaches: tuple[Reach, ...]
     carried: tuple[tuple[float, float], ...]
     """Intervals in which the hand holds the object [s]; between them it lies on the bench."""
@@ -88,14 +88,14 @@ class HandOver:
         )
 
     def thing_at(self, time: float) -> Float[np.ndarray, "3"]:
-        """Middle of the thing as long as he has it, or has laid it down [m]."""
+        """Middle of the object, in the hand or laid down [m]."""
         latest = [span for span in self.carried if span[0] <= time]
         first, last = latest[-1] if latest else self.carried[0]
         ends = self.visit.ends_at(min(max(time, first), last))
         return self.visit.worker.grip(ends, RIGHT) + HELD_OUT
 
     def brought_to(self, place: Float[np.ndarray, "3"], now: float) -> HandOver:
-        """He brings the thing to a place from now on, as far as he reaches [m, s]."""
+        """Bring the object to a place from this time on, as far as the arm reaches [m, s]."""
         visit, last = self.visit, self._last()
         target = _own(visit.worker, last.place, last.heading, place - HELD_OUT)
         lean = visit.worker.lean_to(target, RIGHT)
@@ -105,7 +105,7 @@ class HandOver:
         return self._continued(script)
 
     def left(self, now: float) -> HandOver:
-        """He lets go of the thing and walks away from now on [s]."""
+        """Release the object and walk away from this time on [s]."""
         visit, last = self.visit, self._last()
         worker = visit.worker
         script = PoseWriter(last, now, self.speeds, worker.config.stature)
@@ -177,7 +177,7 @@ def random_hand_over(
     )
     script = PoseWriter(start, rng.uniform(*begin), pace, h)
     script.go(place=stand)
-    # Down on the bench, near its edge, to his right.
+    # Down on the bench, near its edge, to the worker's right.
     x, y = stand[0] + rng.uniform(-0.25, 0.0), edge - rng.uniform(0.10, 0.16)
     spot = np.array([x, y, top + thickness]) - HELD_OUT
     bench_hand = _own(worker, stand, facing, spot)

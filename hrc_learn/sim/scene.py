@@ -255,7 +255,7 @@ def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
     add_plate(spec, body, f"{item.name}_marker", top)
 
 
-# Bit of what touches a worker. Furniture lacks it: he leans on the table as he likes.
+# Collision bit of a worker. Furniture lacks it: the worker may lean on the table.
 _FEELS_WORKER = 2
 
 

@@ -1,7 +1,7 @@
 """A worker: a body of capsules with the sizes of people, put into postures.
 
-His own frame lies on the floor under the pelvis: x forward, y to his left, z up. Arms and legs
-follow from hands and feet by the inverse kinematics of two links.
+The worker's frame lies on the floor under the pelvis: x forward, y to the left, z up. Arms and
+legs follow from hands and feet by the inverse kinematics of two links.
 """
 
 from __future__ import annotations
@@ -93,9 +93,9 @@ _ELBOW, _KNEE = (-0.8, 0.2, -0.7), (1.0, 0.1, 0.0)
 _BENT_TO = np.array([(x, side * y, z) for x, y, z in (_ELBOW, _KNEE) for side in (1, -1)])
 _FIRST = np.array([[_UPPER_ARM], [_UPPER_ARM], [_THIGH], [_THIGH]])
 _SECOND = np.array([[_FOREARM], [_FOREARM], [_SHANK], [_SHANK]])
-# Fraction of the hand's length at which things are held.
+# Position of the grip, as a fraction of the hand's length.
 _GRIP = 0.9
-# The pelvis goes back as the trunk leans forward, or he would fall over: fraction of stature.
+# Backward shift of the pelvis per lean, for balance, as a fraction of the stature.
 _BALANCE = 0.06
 # Reduction of the head's lean relative to the trunk: people look up while they lean.
 _HEAD_LEANS = 0.7

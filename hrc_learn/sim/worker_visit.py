@@ -77,16 +77,16 @@ class WorkerCapsules(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorkerVisit:
-    """Postures between which he moves with the least jerk."""
+    """Key postures, joined by minimum-jerk motions."""
 
     worker: Worker
     """Whose body it is."""
     time: Float[np.ndarray, " poses"]
     """Times of the key postures [s]; the worker rests before the first and after the last."""
     poses: Float[np.ndarray, "poses 10"]
-    """Place [m], heading and lean [rad], and both hands in his own frame [m]."""
+    """Place [m], heading and lean [rad], and both hands in the worker's frame [m]."""
     step: float
-    """Length of his steps [m]."""
+    """Step length [m]."""
     side: int
     """Hand that carries the object for the bench: 0 left, 1 right."""
     released: float
@@ -152,7 +152,7 @@ class WorkerVisit:
     def ends_at(
         self, time: float | Float[np.ndarray, "*time"]
     ) -> Float[np.ndarray, "*time parts 2 3"]:
-        """Ends of the axes of his capsules in the base frame [m].
+        """Ends of the axes of the capsules in the base frame [m].
 
         Args:
             time: One or several times [s].
@@ -206,7 +206,7 @@ def turned_about_base(
 
 
 class PoseWriter:
-    """Adds pose after pose, each as soon as his speeds allow."""
+    """Appends postures, each as early as the worker's speeds allow."""
 
     def __init__(self, start: WorkerPose, begin: float, speeds: HumanSpeeds, stature: float):
         self.now, self._speeds, self._stature = start, speeds, stature
@@ -269,7 +269,7 @@ def random_visit(
     h, side = worker.config.stature, int(rng.uniform() < 0.8)  # most people are right-handed
     top = bench.centre[2] + bench.half_size[2]
     edge = bench.centre[1] + bench.half_size[1]
-    # As near to the bench as the body lets him, a little to one side of what is under the arm.
+    # As near to the bench as the body allows, a little to one side of what is under the arm.
     stand = np.array(
         [under[0] + rng.uniform(-0.18, 0.18), edge + 0.1 * h + rng.uniform(0, 0.05)]
     )
@@ -357,7 +357,7 @@ def random_visit(
 
 
 def _hand_for(target: np.ndarray) -> int:
-    """The one on the side of what he reaches for."""
+    """The hand on the side of the point to reach."""
     return int(target[1] < 0)
 
 
@@ -368,7 +368,7 @@ def _marker(
     under: np.ndarray,
     is_reached: Callable[[np.ndarray, int, float], bool],
 ) -> np.ndarray:
-    """A place around what is under the arm that he can reach, low over the bench [m]."""
+    """A reachable point around the arm's working point, low over the bench [m]."""
     for _ in range(_MARKERS_TRIED):
         # To either side of the gripper that hovers there: a hand cannot reach through it.
         x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
