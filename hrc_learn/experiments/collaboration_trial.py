@@ -160,7 +160,7 @@ class CollaborationRun:
     visit: WorkerVisit | None = None
     """True motion of the worker; None without a worker."""
     hand_over: HandOver | None = None
-    """Actions of the person who handed an object over; None without a hand-over."""
+    """Actions of the person in a hand-over; None without one."""
     held_flat: frozenset[str] = frozenset()
     """Objects that both pads held on opposite faces, after lifting and still at the release."""
 
@@ -346,13 +346,13 @@ def _scripted_person(
 
 
 class _Stage:
-    """World of a collaboration, with its objects and the person who comes.
+    """World of a collaboration, with its objects and people.
 
     Attributes:
         world: World at rest, with all objects at their random poses.
         visit: Visit of the worker; None without a worker.
         giving: Person who hands over the last object; None without a hand-over.
-        watch: Watch for that person by the robot's tracker; None if nobody comes.
+        watch: Watch for that person by the robot's tracker; None without a person.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Effects of a person who pulls the elbow at any moment of a job.
+"""Effects of pulls at the elbow at any moment of a job.
 
 While the arm follows a motion or holds its end effector, its path is known, and so is its
 distance from that path. Visual servoing has no path: there the grasp offset is the measure.

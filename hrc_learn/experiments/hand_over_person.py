@@ -1,4 +1,4 @@
-"""Simulated person who hands an object to the robot, and the model learned from hand-overs."""
+"""Simulated person handing an object to the robot, and the model learned from hand-overs."""
 
 from collections.abc import Sequence
 
@@ -35,12 +35,12 @@ _RESTING_SPEED, _GIVE_UP_AFTER = 0.02, 25.0
 
 
 def giver(seed: int) -> Worker:
-    """Person who comes in the run with this seed."""
+    """Person of the run with this seed."""
     return Worker(WorkerConfig.draw(np.random.default_rng([seed, 4])))
 
 
 class GivingPerson:
-    """Moves a person with an object in their hand, who reacts to the robot's hand.
+    """Moves a person with an object in their hand, reacting to the robot's hand.
 
     Attributes:
         hand_over: Actions of the person, as far as decided.

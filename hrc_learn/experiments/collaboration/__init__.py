@@ -1,0 +1,1 @@
+"""Experiment 3 of the paper: people in the whole job."""
