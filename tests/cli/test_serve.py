@@ -58,7 +58,7 @@ def test_a_driver_of_another_arm_is_bad_input(tmp_path):
     file.write_text(to_urdf(bare().chain, "cut"), encoding="utf-8")
     outcome = hrc("serve", "--robot", file, "--tip", "flange", "--arm", "franky", "--ip", "sim")
     assert outcome.status == 2
-    assert "--arm franky drives Franka's arms, not the cut" in outcome.error
+    assert "--arm franky drives Franka arms only, not the cut" in outcome.error
 
 
 @pytest.mark.parametrize(

@@ -57,9 +57,9 @@ def runs(tmp_path):
 
 def test_one_page_is_made_from_several_runs(runs, tmp_path):
     out, figures = tmp_path / "new" / "page.html", tmp_path / "figures.json"
-    done("report", *runs, "--out", out, "--title", "Both", "--json", figures)
+    done("report", *runs, "--out", out, "--json", figures)
     html = out.read_text(encoding="utf-8")
-    for part in ("<h1>Both</h1>", "Run number 1", "Run number 2", "Side by side"):
+    for part in ("<h1>Runs</h1>", "Run number 1", "Run number 2", "Side by side"):
         assert part in html
     assert html.count("data:image/png") == 2
     assert json.loads(figures.read_text()) == {
@@ -79,7 +79,7 @@ def test_a_single_run_has_its_own_page(runs, tmp_path):
 def test_what_is_no_run_is_bad_input(runs, tmp_path):
     out = tmp_path / "page.html"
     (line,) = done("report", runs[0], tmp_path, "--out", out, status=2).error.splitlines()
-    assert f"{tmp_path} holds no report.json" in line
+    assert f"{tmp_path} has no report.json" in line
     assert not out.exists()
 
 
