@@ -281,8 +281,8 @@ class ArmRobot(Device, Robot):
         super().__init__(config)
         if config.person.kind != "none" and work_arm.null_space == "none":
             raise ValueError(
-                f"person.kind: nobody can lead the body of a {work_arm.name} beside its hand: "
-                f"a full pose of the hand leaves its {work_arm.joints} joints no motion."
+                f"person.kind: a {work_arm.name} has no null space to guide: a full pose of "
+                f'its end effector fixes the {work_arm.joints} joints. Choose "none".'
             )
         self.work_arm, self.values = work_arm, ArmValues(work_arm.chain)
         self.space: ActionSpace = config.action_space
@@ -342,9 +342,9 @@ class ArmRobot(Device, Robot):
             seen = self._seen(state)
             joints = [name for name in names if name not in HAND]
             values |= self.values.observed(seen, joints)
-            told = (*self.complement.nullspace_input, *self.complement.offset)
+            values_of_person = (*self.complement.nullspace_input, *self.complement.offset)
             if self.person_names:
-                values |= zip(self.person_names, map(float, told), strict=True)
+                values |= zip(self.person_names, map(float, values_of_person), strict=True)
         return values
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
@@ -353,7 +353,7 @@ class ArmRobot(Device, Robot):
         where, width = self.values.target_of(action)
         joints = self._joints_at(where) if isinstance(where, Pose) else where
         if self.complement is not None:
-            joints, width = self._beside_person(self.complement, where, joints, width)
+            joints, width = self._with_person(self.complement, where, joints, width)
         sent = self._command(joints, width)
         return self.values.action_of(self.space, sent, width, self._rotation)
 
@@ -402,7 +402,7 @@ class ArmRobot(Device, Robot):
         return None
 
     def read_state(self) -> ArmState:
-        """The newest reading of the arm, for whoever leads it."""
+        """Latest reading of the arm, for teleoperators."""
         self._need_connection()
         return self._seen(self.arm.read())
 
@@ -416,7 +416,7 @@ class ArmRobot(Device, Robot):
         return self.work_arm.whole.self_distance(joint_position)
 
     def _invite(self, config: PersonConfig) -> None:
-        """Let a person lead the body."""
+        """Connect the person that guides the body."""
         from hrc_learn.controller.null_space_motion import YieldingConfig
         from hrc_learn.skills.complementary_motion import ComplementaryMotion
 
@@ -430,7 +430,7 @@ class ArmRobot(Device, Robot):
             self.clearance,
         )
 
-    def _beside_person(
+    def _with_person(
         self,
         complement: ComplementaryMotion,
         where: Float[np.ndarray, " joints"] | Pose,

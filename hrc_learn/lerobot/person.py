@@ -1,4 +1,4 @@
-"""Person near a LeRobot robot, who guides its body while actions command the end effector."""
+"""Person near a LeRobot robot: guides its body while actions command the end effector."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 PersonKind = Literal["none", "scripted", "page", "gamepad", "keyboard"]
 """No person, a script that pulls the elbow at random moments of a simulation, or the device of
-a real one. Gamepad and keyboard, which lead an end effector elsewhere, lead the elbow here."""
+a real one. Gamepad and keyboard guide the elbow here instead of the end effector."""
 
 
 def nullspace_inputs(chain: SerialChain) -> tuple[str, ...]:
@@ -51,7 +51,7 @@ class PersonConfig:
     record: bool = False
     """Observe the null-space input, and the joint displacement that it caused."""
     host: str = "127.0.0.1"
-    """Address to serve the page at. Whoever reaches it can move the arm."""
+    """Address of the page. Anyone that can reach it can move the arm."""
     port: int | None = None
     """Port to serve it at; the first free one from 8080 on if None."""
 
@@ -78,7 +78,7 @@ class Person(Human):
 
         Args:
             config: Input device of the person.
-            work_arm: The arm whose body is led.
+            work_arm: The arm whose body is guided.
 
         Raises:
             ValueError: There is none.
@@ -95,7 +95,7 @@ class Person(Human):
             case "page":
                 from hrc_learn.lerobot.robot_page import RobotPage
 
-                note = "A policy leads the end effector. Pull at a link or a knob."
+                note = "A policy commands the end effector. Pull a link or a knob."
                 self._page = RobotPage(
                     self._work_arm, config.host, config.port, note, guides=False
                 )

@@ -29,7 +29,7 @@ _MORE_TIME = 1.5
 
 @runtime_checkable
 class Leader(Protocol):
-    """Whatever leads a robot by actions: a policy, a replay."""
+    """Source of a robot's actions: a policy, a replay."""
 
     def reset(self) -> None:
         """Begin an episode."""

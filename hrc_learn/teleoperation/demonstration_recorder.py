@@ -212,7 +212,7 @@ class DemonstrationRecorder:
     def _write_draft(self, frames: list[Frame], task: str) -> float:
         """Time that it took [s]."""
         began = time.perf_counter()
-        # What cannot be written is told when it is saved.
+        # Write errors are reported when the demonstration is saved.
         with contextlib.suppress(ValueError, OSError):
             self._writer.write_draft(task, frames)
         return time.perf_counter() - began

@@ -69,7 +69,7 @@ class CombinedInput(Human):
 
 
 class LinkGuide(Human):
-    """Leads a link in the null space by a device that leads the end effector elsewhere.
+    """Pulls a link in the null space with a device that otherwise guides the end effector.
 
     The device's speed, as a fraction of its largest, is that fraction of the largest force on
     the link. The end effector is left alone.

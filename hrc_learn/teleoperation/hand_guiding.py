@@ -380,8 +380,8 @@ class HandGuidedArm:
             self._posture = None
         # All joints slow down together, which keeps the line straight.
         fastest = self.config.approach_rate * float(ahead.abs().max())
-        share = min(1.0, self.config.return_speed / max(fastest, TINY))
-        return share * self.config.approach_rate * ahead
+        scale = min(1.0, self.config.return_speed / max(fastest, TINY))
+        return scale * self.config.approach_rate * ahead
 
     def _attraction(
         self, human_input: HumanInput, position: Float[torch.Tensor, "3"]

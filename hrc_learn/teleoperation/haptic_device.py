@@ -1,4 +1,4 @@
-"""A haptic device that leads the end effector and pushes back, as the paper's Omega does.
+"""Haptic device that guides the end effector with force feedback, like the paper's Omega.
 
 Not run on hardware: `forcedimension-core`, the extra `haptic`, drives it where the maker's SDK
 is installed; tests drive the same interface without a device.
@@ -115,7 +115,7 @@ class HapticDevice(Human):
         """Take an open device; `HapticDevice.open` finds one.
 
         Args:
-            chain: The arm that is led.
+            chain: Kinematics of the guided arm.
             device: Interface of Force Dimension's library.
             config: Scaling of motions and forces.
             number: Number of the device; -1: the one opened last.
@@ -123,7 +123,8 @@ class HapticDevice(Human):
         """
         self._chain, self._device, self._number = chain, device, number
         self._config, self._clock = config or HapticDeviceConfig(), clock
-        self._led: tuple[np.ndarray, np.ndarray] | None = None  # hand and tool at the clutch
+        # Positions of hand and tool at which the clutch was closed.
+        self._clutched: tuple[np.ndarray, np.ndarray] | None = None
         self._tool = np.zeros(3)
         self._pull: _Pull | None = None
         self._closing = Event()
@@ -134,7 +135,7 @@ class HapticDevice(Human):
         """Open the first device by forcedimension-core, which the extra `haptic` brings.
 
         Args:
-            chain: The arm that is led.
+            chain: Kinematics of the guided arm.
             config: Scaling of motions and forces.
 
         Raises:
@@ -171,23 +172,23 @@ class HapticDevice(Human):
         tool = self._chain.forward(torch.from_numpy(state.joint_position))
         self._tool = tool.position.numpy()
         if hand is None or self._device.getButton(config.clutch, self._number) != 1:
-            self._led = None
+            self._clutched = None
             return still
-        if self._led is None:
-            self._led = hand, self._tool
-        began, led = self._led
-        pointer = led + config.scale * (hand - began)
+        if self._clutched is None:
+            self._clutched = hand, self._tool
+        began, start = self._clutched
+        pointer = start + config.scale * (hand - began)
         velocity = config.forces.rate * (pointer - self._tool)
         twist = guiding_twist(tool, velocity, coarse_orientation(tool.position), config.forces)
         return HumanInput(nullspace_input=still.nullspace_input, twist=twist)
 
     def tell(self, feedback: Feedback) -> None:
         """Let the hand feel how far the arm is behind, and what it meets."""
-        if self._led is None:
+        if self._clutched is None:
             self._pull = None
             return
-        began, led = self._led
-        rest = began + (self._tool - led) / self._config.scale
+        began, start = self._clutched
+        rest = began + (self._tool - start) / self._config.scale
         push = np.zeros(3)
         if feedback.contact_force is not None and not feedback.contact_expected:
             push = self._config.contact * feedback.contact_force

@@ -34,13 +34,13 @@ from hrc_learn.viz.palette import GREEN, rgba
 
 # Of the fields drawn on the boards [m]: thin, but thick enough not to flicker with the board.
 _THICKNESS = 0.002
-# Control steps from one status shown beside a job to the next: ten times a second at 10 ms.
+# Control steps between two statuses of a job: ten times a second at 10 ms.
 _SHOW_EVERY = 10
-# Between the postures on a way that are looked at for contacts: 0.05 rad, 5 cm at 1 m reach.
+# Distance of postures checked for contacts along a path: 0.05 rad, 5 cm at 1 m reach.
 _LOOK = 0.05
-# Without anybody at the page a recording goes on for so long [s]: pages load anew in less.
+# A recording continues for this long without a client [s]: reloading a page takes less.
 _LEFT_FOR = 5.0
-# Of a planned way, as many points as make it look smooth.
+# Points of a drawn path, enough to look smooth.
 _WAY_POINTS = 24
 # How long what the arm says to the person is shown [s]: two lines are read in half of that.
 _REMARK_STAYS = 6.0
@@ -232,12 +232,12 @@ class PageSession:
             self._watched, self._alone = False, 0
         elif self._page.control.people:
             self._watched, self._alone = True, 0
-        elif self._watched:  # not by somebody at a gamepad alone
+        elif self._watched:  # not with a gamepad only
             self._alone += 1
             if self._alone * self._config.guiding.dt > _LEFT_FOR:
                 self._recorder.handle("stop")
                 self._remark = (
-                    f"the recording was stopped: nobody was here for {_LEFT_FOR:.0f} s"
+                    f"the recording was stopped: no browser was open for {_LEFT_FOR:.0f} s"
                 )
 
     def _go_home(self) -> None:
@@ -251,7 +251,7 @@ class PageSession:
         touches = self.world.collisions_along(way)
         if touches:
             met = f"{touches[0].first} would meet {touches[0].second}"
-            self._remark = f"on the straight way home, {met}: lead the arm out first"
+            self._remark = f"on the straight way home, {met}: guide the arm out first"
         else:
             self.arm.move_to(torch.from_numpy(home))
 

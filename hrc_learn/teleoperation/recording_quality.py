@@ -124,16 +124,17 @@ class RecordingQuality:
         self._touched.update({*touching})
         chain = self._chain
         if chain is not None and len(joint_position) == len(self._lower):
-            room = np.minimum(joint_position - self._lower, self._upper - joint_position)
+            margin = np.minimum(joint_position - self._lower, self._upper - joint_position)
             self._at_limit.update(
-                chain.joint_names[k] for k in np.flatnonzero(room < _AT_LIMIT)
+                chain.joint_names[k] for k in np.flatnonzero(margin < _AT_LIMIT)
             )
 
     @property
     def pace(self) -> float:
         """Time that passed for the arm, by that which passed for the person.
 
-        A simulated arm that its machine cannot keep up with is led faster than it looks.
+        A simulation slower than real time makes the recorded motion faster than the
+        demonstrated one.
         """
         first, last = self.ticks.first, self.ticks.last
         if first is None or last is None or last == first:
@@ -158,22 +159,23 @@ class RecordingQuality:
         if not len(gaps):
             return ""
         missing = float((np.rint(gaps / self._period) - 1).clip(0).sum())
-        share = missing / (missing + len(self._stamps))
-        if share > _MOST_LOST or gaps.max() - self._period > _LONGEST_GAP:
+        fraction = missing / (missing + len(self._stamps))
+        if fraction > _MOST_LOST or gaps.max() - self._period > _LONGEST_GAP:
             return (
-                f"{100 * share:.0f} % of its frames are lost, up to {gaps.max():.2f} s in a row"
+                f"{100 * fraction:.0f} % of its frames are lost, "
+                f"up to {gaps.max():.2f} s in a row"
             )
         return ""
 
     def met(self) -> list[str]:
         """Limits and contacts that a demonstration is doubted for, in words."""
         stood = {k: n * self._period for k, n in self._at_limit.items()}
-        told = [
+        doubts = [
             f"{joint} was at its limit for {seconds:.1f} s"
             for joint, seconds in stood.items()
             if seconds > _LONGEST_AT_LIMIT
         ]
-        return told + [
+        return doubts + [
             f"{name} for {frames * self._period:.2f} s"
             for name, frames in self._touched.most_common(_NAMED)
         ]

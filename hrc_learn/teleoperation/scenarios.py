@@ -1,6 +1,6 @@
 """Scenarios to learn in the simulated workplace: reset, demonstration, execution, success.
 
-Success is read from MuJoCo's contacts and poses, whoever did the job.
+Success is read from MuJoCo's contacts and poses.
 """
 
 from __future__ import annotations

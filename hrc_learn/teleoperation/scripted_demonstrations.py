@@ -278,7 +278,7 @@ _ATTEMPTS = 3
 # the arm's lag leave.
 _ARRIVED = 0.02
 
-# The elbow is pulled around the open door: first away from the cabinet, then over beside it.
+# The elbow is pulled around the open door: first away from the cabinet, then over to its side.
 ELBOW_FORCES = (
     ScriptedForce(start=0.5, duration=5.0, towards=(0.20, 0.25, 0.58)),
     ScriptedForce(start=4.5, duration=11.0, towards=(0.25, -0.10, 0.65)),

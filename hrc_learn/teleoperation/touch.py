@@ -93,8 +93,8 @@ class TorqueBias:
     # By which they wander within a second: loads are taken up, and the error of a model of
     # gravity changes with the posture [N, N m].
     _DRIFT = (0.3, 0.1, 0.03)
-    # Of the friction of a joint at rest, as a share of its size: it may be anything up to it,
-    # to either side.
+    # Standard deviation of the friction of a joint at rest, relative to its size: it may take
+    # any value up to it, in either direction.
     _STICKS = 0.7
 
     def __init__(self, joints: int, deviation: float):
@@ -211,7 +211,7 @@ def evidence_of_none(
 
 
 # Forces of people, and moments that they have about the tool centre point: of a hand that
-# grasps the gripper up to 10 cm beside it [N, N m].
+# grasps the gripper up to 10 cm off its centre [N, N m].
 _PUSHES, _MOMENTS = 25.0, 2.5
 # By how much the logarithm of its evidence must be larger for the hand to be what is pushed:
 # the task waits for nothing if it is not.
@@ -382,8 +382,8 @@ class Touch(Human):
     def _nullspace_input(self, arm: _Posture) -> Float[np.ndarray, " joints"]:
         """Null-space torques [N m], faded in above the dead band."""
         beyond = float(np.linalg.norm(self.force)) / self._config.elbow_force - 1.0
-        share = self._config.gain * min(max(beyond, 0.0), 1.0)
-        return share * (arm.null @ (arm.null.T @ self._felt))
+        gain = self._config.gain * min(max(beyond, 0.0), 1.0)
+        return gain * (arm.null @ (arm.null.T @ self._felt))
 
     def _pauses(self, meets: bool) -> bool:
         """True while the task is paused."""

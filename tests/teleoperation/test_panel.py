@@ -112,7 +112,7 @@ def test_what_the_arm_feels_is_said_while_nobody_pushes():
     )
     # Friction feels like a small force; unknown people are said to be.
     assert feedback_html(Feedback(contact_force=np.array([0.0, 15.0, 0.0]))) == ""
-    assert "nobody knows where" in feedback_html(Feedback(person_distance=float("nan")))
+    assert "at an unknown distance" in feedback_html(Feedback(person_distance=float("nan")))
 
 
 def test_numbers_are_shown_as_far_as_they_are_steady():

@@ -1,4 +1,4 @@
-"""Chunks as one motion: each begins in the state that the actions before it lead to."""
+"""Chunks as one motion: each starts in the state at the end of the previous actions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -98,7 +98,7 @@ class ContinuedMotion:
                     return self.after(k)
         if not len(actions):
             return None
-        # Somebody else's: as fast as they change, and standing still after the last.
+        # Actions of another source: velocity by differences, at rest after the last.
         index = torch.arange(samples, device=actions.device).clamp(max=len(actions) - 1)
         position, stepped = self._decompose(actions[index][None])
         position = position.double()
@@ -119,7 +119,7 @@ class ContinuedMotion:
         beginning: Float[Tensor, "B 3 D"] | None = None,
         delay: int = 0,
     ) -> Float[Tensor, "B samples A"]:
-        """Lead from what is carried out to what is planned, and keep that as under way.
+        """Continue the executed motion to the plan, and store the result as the current motion.
 
         Args:
             planned: Coefficients of the smooth columns.

@@ -240,7 +240,7 @@ def write_closed_form_policy(
     Raises:
         ValueError: The dataset cannot be read or holds nothing to learn a policy from.
     """
-    from lerobot.datasets import LeRobotDatasetMetadata  # who only runs a policy needs none
+    from lerobot.datasets import LeRobotDatasetMetadata  # not needed to run a policy
 
     if not (dataset / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"there is no LeRobot dataset in {dataset}")

@@ -258,7 +258,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         if inference_delay < 0:
             raise ValueError(f"inference_delay must not be negative, got {inference_delay}")
         require_numbers(self.config, self.encoder.widths, batch)
-        self._states.clear()  # Who asks for chunks does not show every frame.
+        self._states.clear()  # Callers that request chunks do not pass every frame.
         plans = self._plans(batch)
         if prev_chunk_left_over is not None:
             before = self.motion.left_over(prev_chunk_left_over)
@@ -317,7 +317,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
     def _go_on(
         self, batch: Observation, plans: Plans, before: MotionChunk | None, delay: int
     ) -> Float[Tensor, "B chunk A"]:
-        """Keep the motion that leads from what is carried out to a plan."""
+        """Store the motion from the executed actions to a plan."""
         planned = self._chosen(plans, before)
         beginning = None
         if before is None:

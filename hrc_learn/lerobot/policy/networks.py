@@ -325,7 +325,7 @@ class ContextualMotion(nn.Module):
             features: Features of the first and the current observation.
             elapsed: Since the start of the episode [s].
         """
-        # Outside of what was demonstrated a straight line leads anywhere.
+        # Linear extrapolation outside the demonstrations is unbounded.
         c = torch.minimum(torch.maximum(context, self.low), self.high) - self.centre
         x = self.base + c @ self.slopes
         phase = elapsed / self._duration(x)

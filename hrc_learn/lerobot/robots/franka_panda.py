@@ -103,7 +103,7 @@ class FrankaPandaConfig(ArmRobotConfig):
 
 
 class FrankaPanda(ArmRobot):
-    """A Franka Panda led by positions, through its velocity interface.
+    """A Franka Panda commanded by positions, through its velocity interface.
 
     NOT RUN ON HARDWARE. Between an action and the arm stand, in this order: the limits of the
     joints' motion (`ActionChunkFilter`), the safety filter with a cap on the speed of the tool,

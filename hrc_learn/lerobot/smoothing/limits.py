@@ -255,7 +255,7 @@ def calibrated_ranges(
         calibration: File that LeRobot keeps in `calibration/robots/TYPE/ID.json`.
         degrees: True if the robot is commanded in degrees, LeRobot's `use_degrees`; else in
             percent, -100 to 100.
-        grippers: Motors that are led in 0 to 100 in either case.
+        grippers: Motors with commands of 0 to 100 in either case.
 
     Returns:
         Lowest and highest position of `NAME.pos`.

@@ -33,9 +33,9 @@ class MotionState:
     position: Float[np.ndarray, "*batch D"]
     """Handed out last."""
     velocity: Float[np.ndarray, "*batch D"]
-    """Difference quotient that led to it [1/s]."""
+    """Difference quotient of the last step [1/s]."""
     acceleration: Float[np.ndarray, "*batch D"]
-    """Difference quotient that led to the velocity [1/s^2]."""
+    """Difference quotient of the velocity at the last step [1/s^2]."""
     reference: Float[np.ndarray, "*batch D"]
     """Asked for last."""
     reference_velocity: Float[np.ndarray, "*batch D"]
@@ -109,10 +109,10 @@ class MotionFilter:
         self.velocity = np.asarray(limits.velocity, dtype=np.float64)
         self.jerk = np.asarray(limits.jerk, dtype=np.float64)
         A = np.asarray(limits.acceleration, dtype=np.float64)
-        j, room = self.jerk, 0.05 * (upper - lower)
-        # The larger of both terms of the way that braking needs at rest stays below the room,
+        j, margin = self.jerk, 0.05 * (upper - lower)
+        # The larger of both terms of the way that braking needs at rest stays below the margin,
         # so that together they take at most a tenth of the range.
-        ramped = np.minimum(np.cbrt(8 * j**2 * room), np.sqrt(2 * j * room / dt))
+        ramped = np.minimum(np.cbrt(8 * j**2 * margin), np.sqrt(2 * j * margin / dt))
         self.acceleration = np.minimum(A, ramped)
         A = self.acceleration
         self._lower, self._upper = lower, upper
@@ -185,10 +185,10 @@ class MotionFilter:
     def _allowed(self, wanted: np.ndarray, state: MotionState) -> np.ndarray:
         """The nearest acceleration with which the limits are kept, now and later [1/s^2]."""
         A, j, dt = self.acceleration, self.jerk, self.dt
-        room = self._walls + self._sides * state.position[..., None, :]
-        # Past a limit the motion is led back as fast as from the same distance inside it.
-        speed = np.sqrt(self._knee**2 + 2 * A * np.abs(room)) - self._knee
-        speed = np.copysign(speed, room) - self._reserve
+        margin = self._walls + self._sides * state.position[..., None, :]
+        # Past a limit the motion returns as fast as from the same distance inside it.
+        speed = np.sqrt(self._knee**2 + 2 * A * np.abs(margin)) - self._knee
+        speed = np.copysign(speed, margin) - self._reserve
         speed = np.minimum(np.maximum(speed, -self._fastest), self._fastest)
         slack = speed + self._sides * state.velocity[..., None, :]
         offset = A + j * dt

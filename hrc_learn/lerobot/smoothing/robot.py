@@ -1,4 +1,4 @@
-"""Any robot of LeRobot, led at the rate of its motors on a smooth path through the actions."""
+"""LeRobot robot wrapper: a smooth path through the actions at the rate of the motors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class SmoothRobotConfig(RobotConfig):
     """`--robot.type=smooth --robot.of=so101_follower --robot.options='{port: /dev/ttyACM0}'`"""
 
     of: str = ""
-    """Type of the robot that is led, as of --robot.type."""
+    """Type of the wrapped robot, as in --robot.type."""
     options: dict[str, Any] = field(default_factory=dict)
     """Its settings, as YAML: what else would be given as --robot.NAME=VALUE."""
     limits: Path | None = None
@@ -56,7 +56,7 @@ class SmoothRobotConfig(RobotConfig):
 
 
 class SmoothRobot(Robot):
-    """Leads another robot from action to action on a smooth path within limits.
+    """Moves another robot from action to action on a smooth path within limits.
 
     It has that robot's observations and actions, so that every program of LeRobot, with every
     way of inference, uses it as that robot. Setpoints are what is sent to the motors; an action
@@ -64,7 +64,7 @@ class SmoothRobot(Robot):
     at the last one. The path begins, at `connect` and after each `begin`, where the robot is.
 
     Attributes:
-        inner: The robot that is led.
+        inner: The wrapped robot.
         upsampler: Upsampler of the actions.
         late: Setpoints that were sent more than a period late, as when a camera held the robot.
         sent: Setpoints in all.
@@ -93,7 +93,7 @@ class SmoothRobot(Robot):
         given = {k: v for k, v in settings.items() if v is not None} | config.options
         inner = draccus.decode(RobotConfig, {"type": config.of, **given})
         self.inner = make_robot_from_config(inner)
-        # Datasets and calibrations are of the robot that is led.
+        # Datasets and calibrations are those of the wrapped robot.
         self.name = self.robot_type = self.inner.name  # pyright: ignore[reportAttributeAccessIssue]
         if set(limits.names) != set(self.inner.action_features):
             raise ValueError(
@@ -133,11 +133,11 @@ class SmoothRobot(Robot):
         return self.inner.is_calibrated
 
     def calibrate(self) -> None:
-        """Calibrate the robot that is led."""
+        """Calibrate the wrapped robot."""
         self.inner.calibrate()
 
     def configure(self) -> None:
-        """Configure the robot that is led."""
+        """Configure the wrapped robot."""
         self.inner.configure()
 
     def connect(self, calibrate: bool = True) -> None:
@@ -149,7 +149,7 @@ class SmoothRobot(Robot):
             self._thread.start()
 
     def begin(self) -> None:
-        """Begin the path anew where the robot is, at rest, as after it was led by hand.
+        """Begin the path anew where the robot is, at rest, as after moving it by hand.
 
         Raises:
             ValueError: The robot does not report where a value of its actions is.
@@ -227,7 +227,7 @@ class SmoothRobot(Robot):
                     now = time.perf_counter()
                     if self._started is not None or self._actions:
                         self._send(self.upsampler.setpoint(self._phase(now)))
-            except Exception as error:  # whatever a driver raises is told to who leads it
+            except Exception as error:  # any error of a driver is raised to the caller
                 self._error = error
                 logger.error("smooth motion stopped: %s", error)
                 return

@@ -74,7 +74,7 @@ class ActionUpsampler:
         return self._state.position
 
     def reset(self, position: Float[np.ndarray, "*batch D"]) -> None:
-        """Begin at rest where the robot is; several robots are led at once where there are.
+        """Start at rest at the present position; several robots move at once if there are.
 
         Raises:
             ValueError: It has another number of values than the limits.

@@ -172,13 +172,13 @@ class ArmPageConfig(ArmTeleoperatorConfig):
     """
 
     host: str = "127.0.0.1"
-    """Address to serve the page at. Whoever reaches it can move the arm."""
+    """Address of the page. Anyone that can reach it can move the arm."""
     port: int | None = None
     """Port to serve at; the first free one from 8080 on if None."""
 
 
 class ArmPage(ArmTeleoperator):
-    """A person leads the end effector, the elbow and the gripper in a browser.
+    """A person guides the end effector, the elbow and the gripper in a browser.
 
     Shows the arm where the robot reports it, simulated or real. "Home" begins the scenario of a
     `mujoco_arm` anew; what concerns recording is left to LeRobot.

@@ -173,7 +173,7 @@ class CurationPage:
         for episode in episodes:
             cameras = self._images.available(episode["episode"])
             episode["cameras"] = [self._images.cameras.index(key) for key in cameras]
-        # The most usual episode is shown beside every other.
+        # The most typical episode is shown next to every other.
         known = [q for q in self.ranking.episodes if "distance" in q.measures and not q.broken]
         usual = min(known, key=lambda q: q.measures["distance"], default=None)
         return {

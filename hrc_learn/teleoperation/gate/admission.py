@@ -13,13 +13,13 @@ from urllib.parse import parse_qs, urlsplit
 
 from hrc_learn.teleoperation.gate.address import Address, AddressConfig, network_name
 
-_WRONG_TOKENS, _FORGIVEN = 20.0, 1.0  # at once, and one a second: nobody guesses 144 bits
+_WRONG_TOKENS, _FORGIVEN = 20.0, 1.0  # at once, then one a second: 144 bits cannot be guessed
 
 _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
     "connect-src 'self' blob: data:; frame-ancestors 'none'; form-action 'none'"
 )
-"""Nothing is fetched from, sent to or framed by anybody else."""
+"""The page loads from, sends to and is framed by its own origin only."""
 
 HEADERS = {
     "Content-Security-Policy": _POLICY,

@@ -105,7 +105,7 @@ class GateCallbacks:
     """Callbacks of the page for validated messages; the gate's thread calls them."""
 
     heard: Callable[[Message], None]
-    """A message of the client that leads."""
+    """A message of the controlling client."""
     fits: Callable[[GuiUpdate], bool]
     """True if a control of viser's panel accepts a value."""
     status: Callable[[], Mapping[str, Any]]
@@ -213,10 +213,10 @@ class Gate:
             await self._end.wait()
             words = json.dumps({"type": "end", "words": self._farewell})
             for session in list(self._sessions.values()):
-                with suppress(Exception):  # whoever is gone need not be told
+                with suppress(Exception):  # the client may be gone
                     await asyncio.wait_for(session.send(words), 0.5)
 
-    # Who is let in.
+    # Admission.
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket through."""
@@ -264,7 +264,7 @@ class Gate:
             del table[client]
 
     async def _session(self, connection: ServerConnection, client: str) -> None:
-        """Our own clients: signs of life, wishes to lead, hands; the status comes back."""
+        """Serve our own clients: signs of life, control requests and hands in, status out."""
         self.control.join(client)
         wants = {"scene": False}
 
@@ -306,7 +306,7 @@ class Gate:
             case Lead():
                 self.control.hand_over(client)
             case _:
-                # Who watches may have led when they sent this: it is no offence.
+                # A watching client may have had control when it sent this: no error.
                 idle = isinstance(message, Hands) and not message.grips
                 if self.control.act(client, idle=idle):
                     self._callbacks.heard(message)

@@ -60,7 +60,7 @@ class Hello:
 
 @dataclass(frozen=True, kw_only=True)
 class Lead:
-    """Ask to lead, or hand over."""
+    """Request for control, or hand-over."""
 
     wish: Literal["ask", "hand_over"]
 

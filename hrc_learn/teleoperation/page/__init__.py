@@ -1,4 +1,4 @@
-"""A page in a browser from which a person leads the arm; needs the extra `ui`."""
+"""Browser page from which a person guides the arm; needs the extra `ui`."""
 
 from hrc_learn.teleoperation.page.page import Page as Page
 from hrc_learn.teleoperation.page.page import PageConfig as PageConfig

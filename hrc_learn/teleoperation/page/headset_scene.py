@@ -67,7 +67,7 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
 
     def add(name: str, mesh: Mesh, colour: Colour) -> None:
         material = trimesh.visual.material.PBRMaterial(
-            baseColorFactor=[round(255 * share) for share in colour],
+            baseColorFactor=[round(255 * channel) for channel in colour],
             metallicFactor=0.0,
             roughnessFactor=0.75,
             alphaMode="OPAQUE" if colour[3] >= 1 else "BLEND",

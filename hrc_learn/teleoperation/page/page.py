@@ -224,7 +224,7 @@ class Page:
         self._closing = Event()
         self._error: BaseException | None = None
         self.farewell = "The session has ended."
-        self._led, self._led_lock = self.control.turn, Lock()
+        self._last_turn, self._last_turn_lock = self.control.turn, Lock()
         self._asked = 0.0
         self._scene_state: dict[str, Any] = {}
         self._thread = Thread(target=self._guarded, name="page refresh", daemon=True)
@@ -244,7 +244,7 @@ class Page:
             raise self._error
 
     def _stop_viewer(self) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):  # it says so, to nobody's use
+        with contextlib.redirect_stdout(io.StringIO()):  # suppresses its banner
             self._server.stop()
 
     @property
@@ -376,9 +376,9 @@ class Page:
 
     def _new_leader(self) -> None:
         """Release what was held before control last changed."""
-        with self._led_lock:
-            if (led := self.control.turn) != self._led:
-                self._led = led
+        with self._last_turn_lock:
+            if (turn := self.control.turn) != self._last_turn:
+                self._last_turn = turn
                 self._held_gizmos.clear()
                 self._turn.drop()
                 self._hands.forget()

@@ -128,7 +128,7 @@ class AddedTurn:
                 self.holder = None
 
     def drop(self) -> None:
-        """Let go of it, whoever holds it."""
+        """Release it, for any holder."""
         with self._lock:
             self.holder = None
 

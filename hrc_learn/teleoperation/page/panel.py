@@ -58,9 +58,9 @@ def can_do(status: PageStatus, task: str) -> str:
     if status.doing:
         return ""
     if status.recording == "ready":
-        return "Press Start, then lead the arm: drag its hand, a link or a knob."
+        return "Press Start, then guide the arm: drag its gripper, a link or a knob."
     if status.recording == "recording":
-        return "Lead the arm, then press Stop."
+        return "Guide the arm, then press Stop."
     return (
         "Save it or discard it." if task.strip() else "Say in Task what is shown, then save it."
     )
@@ -125,8 +125,8 @@ def nullspace_input_html(d: Float[np.ndarray, " joints"], largest: float) -> str
     return _block("Null-space input d [N m]", "".join(rows))
 
 
-# Below which a contact is not told [N]: friction of the simulated joints feels like 17 N. And
-# the least change of a gripper's opening that is a slip rather than noise [m].
+# Smallest contact force shown [N]: simulated joint friction feels like 17 N. And the smallest
+# change of a gripper's opening that is a slip rather than noise [m].
 _LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
 
 
@@ -141,8 +141,8 @@ def feedback_html(feedback: Feedback) -> str:
     """
     rows = []
     if feedback.pushed:
-        share = round(10 * feedback.followed) * 10
-        badge = _badge(followed_colour(feedback.followed), f"follows by {share} %")
+        percent = round(10 * feedback.followed) * 10
+        badge = _badge(followed_colour(feedback.followed), f"follows by {percent} %")
         why = "; ".join(html.escape(reason.text) for reason in feedback.reasons)
         rows.append(f"{badge}&ensp;{why}")
     rows += [
@@ -167,7 +167,7 @@ def felt_words(feedback: Feedback) -> list[str]:
     distance = feedback.person_distance
     if distance is not None:
         known = math.isfinite(distance)
-        where = f"{max(distance, 0.0):.1f} m away" if known else "nobody knows where"
+        where = f"{max(distance, 0.0):.1f} m away" if known else "at an unknown distance"
         felt.append(f"nearest person: {where}, pace {10 * round(10 * feedback.pace)} %")
     return felt
 
@@ -399,9 +399,9 @@ class Panel:
     def forces(self) -> InteractionForceConfig:
         """Gains and bounds of gizmos."""
         mapping: Any = _MAPPINGS[self._mapping.value]
-        share, base = self._strength.value / 100, self._initial_forces
+        scale, base = self._strength.value / 100, self._initial_forces
         return replace(
-            base, mapping=mapping, rate=share * base.rate, stiffness=share * base.stiffness
+            base, mapping=mapping, rate=scale * base.rate, stiffness=scale * base.stiffness
         )
 
     def fits(self, uuid: str, updates: Mapping[str, Any]) -> bool:

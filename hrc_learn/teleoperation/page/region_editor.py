@@ -111,7 +111,7 @@ FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.1
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
 _MARK: Any = "target"
-# Half sizes of a region: sliders end where the arm does, and a point needs some room [m].
+# Half sizes of a region: sliders end at the reach of the arm; a point needs a margin [m].
 _LARGEST, _SMALLEST = 0.5, 0.02
 # Height of a target above what was clicked on: an object's height and a little [m].
 _LIFTED = 0.08
