@@ -444,7 +444,7 @@ class ArmRobot(Device, Robot):
             if isinstance(where, Pose) and complement.posture is not None:
                 joints = joints_near(self.work_arm.chain, where, complement.posture).numpy()
             joints, width = complement.next(self.arm.read(), joints, width)
-        self._person.show(self)
+        self._person.show(self.arm, self.world)
         return joints, width
 
     def _seen(self, state: ArmState) -> ArmState:

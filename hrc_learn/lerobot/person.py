@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from hrc_learn.kinematics import Arm, SerialChain
+from hrc_learn.protocols import Arm as Driver
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 
 if TYPE_CHECKING:
-    from hrc_learn.lerobot.arm_robot import ArmRobot
-    from hrc_learn.lerobot.robot_page import RobotPage
+    from hrc_learn.sim import World
     from hrc_learn.teleoperation import ScriptedForce
 
 PersonKind = Literal["none", "scripted", "page", "gamepad", "keyboard"]
@@ -70,6 +71,60 @@ def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
     return random_pulls(np.random.default_rng([seed, 1]))
 
 
+class RobotPage:
+    """Serves a page, and shows a robot on it: a simulated one with all that is around it.
+
+    Attributes:
+        page: Served until it is closed.
+    """
+
+    def __init__(
+        self, arm: Arm, host: str, port: int | None, note: str, *, guides: bool = True
+    ):
+        """Serve it.
+
+        Args:
+            arm: Arm to show.
+            host: Address to serve at.
+            port: Port of the page; None: the first free one from 8080 on.
+            note: Text shown on the page.
+            guides: True if the person also guides the end effector, and not the body only.
+        """
+        from hrc_learn.sim import MovingBodies, World
+        from hrc_learn.sim.workplace import Workplace
+        from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
+
+        self._served = ExitStack()
+        self._ghost = self._shown = World(Workplace.of(arm).scene)
+        self._bodies = MovingBodies(self._ghost)
+        drawn = self._bodies.drawn(*(poses[None] for poses in self._bodies.poses()))
+        config = PageConfig(host=host, port=port)
+        page = Page(arm.chain, drawn, self._ghost.config.boxes(), config, guides=guides)
+        self.page = self._served.enter_context(page)
+        self.page.show(PageStatus(title="LeRobot", note=note))
+
+    def show(self, driver: Driver, world: World | None) -> None:
+        """Show the present posture of the arm.
+
+        Args:
+            driver: Driver of the arm, read if there is no world.
+            world: Simulated world with everything around the arm; None for a real arm.
+        """
+        from hrc_learn.sim import MovingBodies
+
+        if world is None:
+            state = driver.read()
+            world = self._ghost
+            world.reset(state.joint_position, gripper_width=state.gripper_width)
+        if world is not self._shown:
+            self._shown, self._bodies = world, MovingBodies(world)
+        self.page.place(*self._bodies.poses())
+
+    def close(self) -> None:
+        """Serve it no more."""
+        self._served.close()
+
+
 class Person(Human):
     """Reads the device of a person, shows them the arm, and gives the device back."""
 
@@ -93,8 +148,6 @@ class Person(Human):
 
         match config.kind:
             case "page":
-                from hrc_learn.lerobot.robot_page import RobotPage
-
                 note = "A policy commands the end effector. Pull a link or a knob."
                 self._page = RobotPage(
                     self._work_arm, config.host, config.port, note, guides=False
@@ -122,10 +175,10 @@ class Person(Human):
         """Tell the person at their device."""
         self._human.tell(feedback)
 
-    def show(self, robot: ArmRobot) -> None:
-        """Show the person where the arm is."""
+    def show(self, driver: Driver, world: World | None) -> None:
+        """Show the arm on the person's page, as in `RobotPage.show`."""
         if self._page is not None:
-            self._page.show(robot)
+            self._page.show(driver, world)
 
     def close(self) -> None:
         """Give the device back."""

@@ -161,8 +161,8 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         def read(self, state):
             return person.HumanInput(nullspace_input=np.array([4.0, 0, -4, 0, 3, 0, 0]))
 
-        def show(self, robot):
-            self.shown = robot
+        def show(self, driver, world):
+            self.shown = driver
 
         def close(self):
             self.closed = True
@@ -179,7 +179,7 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         assert (elbow(read)[1] - elbow(read)[0]).norm() > 0.1
         hand = panda.forward(read).position
         assert (hand[1] - hand[0]).norm() < 3e-3
-        assert device.shown is robot
+        assert device.shown is robot.arm
     assert device.closed
 
 

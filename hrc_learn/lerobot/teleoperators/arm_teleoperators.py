@@ -21,7 +21,7 @@ from hrc_learn.lerobot.arm_robot import (
     Device,
     robot_registry,
 )
-from hrc_learn.lerobot.robot_page import RobotPage
+from hrc_learn.lerobot.person import RobotPage
 from hrc_learn.lerobot.robots import MujocoArmRobot
 from hrc_learn.protocols import ArmState, Human, HumanInput
 
@@ -219,7 +219,7 @@ class ArmPage(ArmTeleoperator):
             self._shown.close()
             self._serve(robot.work_arm)
         action, asked = self._guided_robot(robot, lambda: self.page.human).next()
-        self._shown.show(robot)
+        self._shown.show(robot.arm, robot.world)
         if "home" in asked.requests and isinstance(robot, MujocoArmRobot):
             robot.begin(robot.run.seed + 1)
         return action

@@ -40,9 +40,9 @@ from hrc_learn.teleoperation.gate.messages import (
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, steering_twist
 from hrc_learn.teleoperation.page.headset import (
     HeadsetHands,
+    headset_contents,
     scene_state,
 )
-from hrc_learn.teleoperation.page.headset_scene import headset_contents
 from hrc_learn.teleoperation.page.page_operator import (
     AddedTurn,
     GizmoCommand,

@@ -8,8 +8,8 @@ import pytest
 
 from hrc_learn.geometry import Body, Box, Capsule
 from hrc_learn.teleoperation.gate.messages import Hands, MessageError, session_message
-from hrc_learn.teleoperation.page import PageConfig, headset_scene
-from hrc_learn.teleoperation.page.headset_scene import headset_contents, scene_glb
+from hrc_learn.teleoperation.page import PageConfig, headset
+from hrc_learn.teleoperation.page.headset import headset_contents, scene_glb
 from hrc_learn.teleoperation.page_session import hand_columns
 
 AT_REST = {"position": np.zeros((1, 3)), "orientation": np.array([[1.0, 0.0, 0.0, 0.0]])}
@@ -83,7 +83,7 @@ def test_the_file_holds_each_shape_in_the_frame_of_its_body():
 
 
 def test_the_client_is_told_what_can_be_held(tmp_path, monkeypatch):
-    monkeypatch.setattr(headset_scene, "CLIENT", tmp_path)
+    monkeypatch.setattr(headset, "CLIENT", tmp_path)
     assert headset_contents([LINK], []) == {}  # it has not been built
     (tmp_path / "built").mkdir()
     for name in ("index.html", "style.css", "built/client.js", "built/licences.txt"):
