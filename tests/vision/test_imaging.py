@@ -215,7 +215,7 @@ def test_only_what_changes_is_drawn_anew():
 @pytest.mark.parametrize(
     ("markers", "background", "message"),
     [
-        ([MARKER, Marker(7, 0.03)], None, "share id 7"),
+        ([MARKER, Marker(7, 0.03)], None, "both have id 7"),
         ([MARKER], np.zeros((10, 10, 3), dtype=np.uint8), "must be 1440x1080"),
     ],
 )
