@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from hrc_learn.kinematics import MotionLimits
 
-# Fraction of v_max left unused: sums of rounded numbers must not exceed it in the last digit.
+# Fraction of v_max left unused, so that rounding errors do not exceed v_max.
 _ROUNDING = 1e-12
-# Margin that libfranka subtracts from position-dependent velocity limits, for the same reason
-# (kJointVelocityLimitsTolerance, 0.21) [rad/s].
+# Margin [rad/s] that libfranka 0.21 also subtracts from position-dependent velocity limits to
+# absorb rounding errors (kJointVelocityLimitsTolerance).
 _TOLERANCE = 1e-3
 
 
@@ -27,46 +27,51 @@ class LimitBarrier(nn.Module):
         v_hat <= min(h(delta), v_max + A^2/(2 j)),   h(delta) = sqrt(c^2 + 2 A delta) - c,
         c = A / rate     <=>     Q(v_hat) = v_hat^2/(2 A) + v_hat/rate <= delta
 
-    v_hat is the speed from which braking with A *at once* ends at the same place as ramping
-    the acceleration down to -A, so one curve h serves. Without a jerk limit v_hat = v.
+    To brake, a joint ramps its acceleration a down to -A. Braking *at once* with A, but from
+    v_hat instead of v, takes a distance that is longer by (a + A)^3/(6 j^2). So one curve h is
+    safe for every a. Without a jerk limit v_hat = v.
 
-    The set is invariant in discrete time. Let v_hat_k hold at step k, the joint move by
-    v_k dt, and the next acceleration be max(a_k - j dt, -A). Then v_hat_{k+1} <= v_hat_k -
-    A dt, and for every dt <= 1/rate
+    The set is invariant in discrete time. Assume that step k starts inside the set with
+    v_hat_k, that the joint moves by v_k dt, and that the next acceleration is
+    max(a_k - j dt, -A). Then v_hat_{k+1} <= v_hat_k - A dt, and for every dt <= 1/rate
 
         Q(v_hat - A dt) = Q(v_hat) - v_hat dt - A dt (1/rate - dt/2) <= delta - v_k dt,
 
-    and below A dt the joint moves by at most v_hat dt <= rate dt delta <= delta. So a step that
-    keeps all limits always exists. dt is the time between two steps; if it is measured, steps
-    of any length keep the limits. The proof assumes joints that move by v dt, and a start
-    inside the set. At rest v_hat = A^2/(2 j), so the start must satisfy
+    If v_hat < A dt, the joint moves by at most v_hat dt <= rate dt delta <= delta. So a step
+    that keeps all limits always exists. dt is the time between two steps, at most 1/rate; if it
+    is measured, the steps may differ in length. The proof assumes that joints move by v dt and
+    start inside the set. At rest v_hat = A^2/(2 j), so the start must satisfy
 
         delta >= A^3/(8 j^2) + A^2/(2 j rate),
 
-    which is 3 mrad for a Panda at 5 1/s, covered by the margin. The first term, the distance
-    on which the acceleration ramps down, matters where A/j is long, as for slow axes.
+    which is 3 mrad for a Panda with rate = 5 1/s, less than the margin. The first term is the
+    distance that the joint travels while the acceleration ramps down. It matters for axes with
+    a long ramp time A/j.
 
-    *Starts outside.* From rest nearer to a limit, or past it, a joint moves inwards only. With
-    `rests_outside=False` it must; with True it may also rest. Then the set is
-    v_hat <= max(h(delta), A^2/(2 j)), and a joint that comes to rest within its margin does so
-    at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. That set is
-    invariant as well: braking lowers v_hat.
+    *Starts outside.* A joint may start at rest nearer to a limit than this, or beyond it. Such
+    a joint never moves outwards. With `rests_outside=False` the barrier drives it inwards. With
+    `rests_outside=True` it may also stay at rest; the set is then
+    v_hat <= max(h(delta), A^2/(2 j)). A joint that comes to rest within its margin then stops
+    at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. This set is also
+    invariant, because braking lowers v_hat.
 
-    *Delay and jitter.* Joints that follow a command after a delay T continue at a speed of at
-    most v + A T while they brake. A wall that recedes by T v_hat, which braking lowers by T A
-    dt in a step, compensates it: Q(v_hat) + T v_hat <= delta, so 1/rate + T replaces 1/rate. If
-    a step lasts (1 + jitter) dt, the deceleration is A/(1 + jitter), which replaces A in Q.
+    *Delay and jitter.* If joints follow a command after a delay T, their speed while braking is
+    at most v + A T. To compensate, the barrier moves the wall inwards by T v_hat. Each braking
+    step reduces this shift by T A dt. The condition becomes Q(v_hat) + T v_hat <= delta, so
+    1/rate + T replaces 1/rate. If a step lasts (1 + jitter) dt, the deceleration is
+    A/(1 + jitter), which replaces A in Q.
 
-    *Position-dependent velocity limits.* With o and d of `MotionLimits.velocity_bounds` and
-    the margin m they are a curve of the same kind:
+    *Position-dependent velocity limits.* With o and d from `MotionLimits.velocity_bounds` and
+    the margin m, these limits have a lower bound of the same form as h:
 
         sqrt(2 d (delta + m)) - o >= sqrt(o^2 + 2 d delta) - o   if m >= o^2/(2 d).
 
-    The right-hand side falls as o grows, to h with the knee c >= o, and h grows with A. So the
-    limits hold at every position, and joints brake in time, if Q has min(A, d) in place of A
-    and at least o/d in place of 1/rate, and the margin is wide enough. The offset o includes
-    the margin that libfranka subtracts, and the required m includes the A^2/(2 j) with which
-    joints may come to rest in it. All of these are constants: a step costs nothing more.
+    The right-hand side decreases with o, and for A = d and o = c it equals h. h increases
+    with A. So the limits hold at every position, and joints brake in time, on two conditions:
+    in Q, min(A, d) replaces A and max(1/rate, o/d) replaces 1/rate; and m satisfies the
+    inequality above. Here o includes the margin that libfranka subtracts. For the margin,
+    A^2/(2 j) is added to o, because a joint may come to rest within the margin. All of these
+    values are constants, so they do not add computation to a step.
     """
 
     velocity: Tensor
@@ -86,8 +91,7 @@ class LimitBarrier(nn.Module):
     twice_acceleration: Tensor
     """2 A of Q [rad/s^2]."""
     reserve: Tensor
-    """Speed gained while the braking builds up, A^2/(2 j) [rad/s]; zero without a jerk
-    limit."""
+    """v_hat - v at a = 0, which is A^2/(2 j) [rad/s]; zero without a jerk limit."""
 
     def __init__(
         self,
@@ -100,7 +104,7 @@ class LimitBarrier(nn.Module):
         delay: float = 0.0,
         jitter: float = 0.0,
     ):
-        """Prepare the constants.
+        """Compute the constants of the barrier.
 
         Args:
             limits: Limits of the joints.
@@ -144,8 +148,8 @@ class LimitBarrier(nn.Module):
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity [rad/s] of a steady motion (a = 0) inside the set."""
         delta = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
-        # h(|delta|) with the sign of delta: past its wall the joint is driven back as fast as
-        # it may approach from the same distance inside, and the root stays real.
+        # h(|delta|) with the sign of delta. A joint past its wall returns at the speed at which
+        # it may approach the wall from the same distance inside. |delta| keeps the root real.
         square = torch.addcmul(self.knee_square, self.twice_acceleration, delta.abs())
         speed = torch.copysign(square.sqrt() - self.knee, delta)
         if self.jerk_limited:
@@ -174,7 +178,8 @@ class LimitBarrier(nn.Module):
         lower, upper = bounds
         slack = torch.stack([velocity - lower, upper - velocity], dim=-2)
         offset = (self.acceleration + self.jerk * dt).unsqueeze(-2)
-        # Negative far outside the set, where no acceleration is enough: the clamp brakes hard.
+        # Far outside the set no acceleration suffices, and the square is negative. Clamping it
+        # to zero brakes hard.
         square = torch.addcmul(offset * offset, self.jerk, slack, value=2)
         down, up = (square.clamp(min=0).sqrt() - offset).unbind(-2)
         return -down, up
@@ -187,7 +192,7 @@ class LimitBarrier(nn.Module):
         bounds: tuple[Tensor, Tensor],
         dt: float | Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch n"]:
-        """The nearest acceleration that keeps the limits now and later [rad/s^2].
+        """The acceleration nearest to `wanted` that keeps the limits now and later [rad/s^2].
 
         Args:
             wanted: Acceleration wanted [rad/s^2].
@@ -196,7 +201,8 @@ class LimitBarrier(nn.Module):
             bounds: `velocity_bounds` now.
             dt: Step [s], one for all arms or one for each.
         """
-        # The reachable range comes last: outside its set the barrier may ask for more.
+        # Clamp to the reachable range last, because outside the set the barrier may require an
+        # acceleration beyond it.
         inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
         return inside.clamp(*self._reachable_acceleration(last, dt))
 
@@ -219,8 +225,8 @@ class LimitBarrier(nn.Module):
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity of the next step that keep all limits [rad/s].
 
-        Where the limits of position and velocity ask for more than those of acceleration and
-        jerk allow, the nearest velocity that those allow.
+        If the acceleration and jerk limits do not permit a velocity that the position and
+        velocity limits require, the bounds are the nearest velocity that they permit.
 
         Args:
             velocity: Velocity of the last step [rad/s].

@@ -1,9 +1,10 @@
-"""Upload of a dataset to the Hugging Face Hub, checked and with a dataset card.
+"""Check a dataset and upload it to the Hugging Face Hub with a dataset card.
 
-Three things make a repository of the Hub a usable dataset: the card (`README.md`), whose header
-the Hub searches and shows; the tag of the format's version, by which LeRobot finds it; and
-`.gitattributes`, without which a clone holds tables and videos as ordinary blobs. The tag moves
-last, so that a reader never sees a partial upload.
+A dataset repository needs three things besides its data: a card, a tag and Git attributes.
+The Hub indexes and displays the header of the card (`README.md`). LeRobot looks for a tag with
+the version of the format. `.gitattributes` makes Git store tables and videos in Git LFS
+rather than as ordinary blobs. The upload sets the tag last, so that LeRobot does not load a
+partial upload.
 """
 
 from collections import Counter
@@ -20,9 +21,10 @@ if TYPE_CHECKING:
     from huggingface_hub import DatasetCard, HfApi
 
 UPLOADED = ("data/**", "videos/**", "images/**", "meta/**", "LICENSE*", "*.md")
-"""Files that belong to a dataset; other files in the folder are not sent."""
+"""Files that belong to a dataset. `push_dataset` does not upload other files."""
 _OWNED = ("data/*", "videos/*", "images/*", "meta/*")
-"""Files of an earlier upload, removed if they no longer exist; * matches folders too."""
+"""Files that the upload deletes from the repository if the folder no longer has them; * also
+matches subfolders."""
 _LARGE = ("*.parquet", "*.mp4", "*.png", "*.jpg")
 ATTRIBUTES = "".join(f"{name} filter=lfs diff=lfs merge=lfs -text\n" for name in _LARGE)
 """`.gitattributes` of a dataset."""
@@ -30,22 +32,22 @@ _CARD = "README.md"
 _SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
 """Bounds of the Hub's size categories [frames]: "n<1K", "1K<n<10K", ..."""
 _MOST_TASKS = 20
-"""Tasks listed in the card."""
+"""Largest number of tasks that the card lists."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Push:
-    """An upload, planned or done."""
+    """A planned or completed upload."""
 
     repo: str
     tag: str
     """Version of the format, which LeRobot looks for."""
     files: dict[str, int]
-    """File, relative to the dataset -> size [bytes]."""
+    """Size [bytes] of each file, by its path relative to the dataset."""
     card: str
     report: ValidationReport
     url: str = ""
-    """Address of the repository; "" if nothing was sent."""
+    """Address of the repository; "" if nothing was uploaded."""
 
     @property
     def bytes(self) -> int:
@@ -66,35 +68,36 @@ def push_dataset(
 ) -> Push:
     """Check a dataset and upload it, or update its repository.
 
-    The folder itself is not changed. An existing `README.md` is kept, its header completed.
+    The local folder does not change. If it contains a `README.md`, the upload keeps the text
+    and completes the header.
 
     Args:
         path: Folder of the dataset.
         repo: "OWNER/NAME" of the repository, created if it does not exist.
-        private: Make a new repository private; an existing one stays as it is.
+        private: Make a new repository private; an existing one keeps its visibility.
         license: Identifier of the licence, such as "cc-by-4.0".
         tags: Tags besides "LeRobot" and the robot's name.
-        unsound: Send a dataset that has errors.
-        dry_run: Send nothing.
-        api: Client of the Hub; None takes endpoint and token from the environment.
+        unsound: Upload the dataset even if it has errors.
+        dry_run: Check the dataset and prepare the card, but upload nothing.
+        api: Client of the Hub; None creates one with the environment's endpoint and token.
 
     Raises:
-        DatasetError: The dataset has errors.
-        ValueError: `repo` is no valid name.
-        huggingface_hub.errors.HfHubHTTPError: The Hub refuses.
+        DatasetError: The dataset has errors and `unsound` is False.
+        ValueError: `repo` is not a valid repository name.
+        huggingface_hub.errors.HfHubHTTPError: The Hub rejects a request.
     """
     from huggingface_hub import HfApi
     from huggingface_hub.utils import validate_repo_id
 
     if repo.count("/") != 1:
-        raise ValueError(f"repository {repo!r} must be OWNER/NAME")
+        raise ValueError(f"repository name {repo!r} must have the form OWNER/NAME")
     validate_repo_id(repo)
     folder = open_folder(path)
     report = check_dataset(path)
     if report.errors and not unsound:
         raise DatasetError(
-            f"has {len(report.errors)} errors, the first: {report.errors[0]}. Repair it, or "
-            f"send it as it is (--unsound)",
+            f"has {len(report.errors)} errors, the first: {report.errors[0]}. Repair the "
+            f"dataset, or upload it with its errors (--unsound)",
             file=folder.root,
         )
     push = Push(
@@ -120,7 +123,7 @@ def _upload(api: "HfApi", root: Path, push: Push) -> None:
     if attributes := _missing_attributes(api, push.repo):
         head.append(CommitOperationAdd(".gitattributes", attributes.encode()))
     where: Any = {"repo_id": push.repo, "repo_type": "dataset"}
-    # The attributes must exist before the files that they declare large.
+    # Git LFS applies only to files that are uploaded after `.gitattributes`.
     api.create_commit(operations=head, commit_message="Describe the dataset", **where)
     api.upload_folder(
         folder_path=root,
@@ -133,7 +136,7 @@ def _upload(api: "HfApi", root: Path, push: Push) -> None:
 
 
 def _move_tag(api: "HfApi", push: Push) -> None:
-    """Set the tag of the format's version to the uploaded commit."""
+    """Move the tag with the format version to the uploaded commit."""
     known = api.list_repo_refs(push.repo, repo_type="dataset").tags
     if any(tag.name == push.tag for tag in known):
         api.delete_tag(push.repo, tag=push.tag, repo_type="dataset")
@@ -148,7 +151,7 @@ def _files(root: Path) -> Iterator[tuple[str, int]]:
 
 
 def _missing_attributes(api: "HfApi", repo: str) -> str:
-    """Completed `.gitattributes` of the repository; "" if it lacks nothing."""
+    """The repository's `.gitattributes` with missing lines added; "" if none is missing."""
     name, there = ".gitattributes", ""
     if api.file_exists(repo, name, repo_type="dataset"):
         file = api.hf_hub_download(repo, name, repo_type="dataset")
@@ -165,11 +168,11 @@ def dataset_card(
     license: str | None = None,
     tags: Sequence[str] = (),
 ) -> "DatasetCard":
-    """Card of the dataset: its own with a completed header, or a new one.
+    """The dataset card: the `README.md` of the folder with a completed header, or a new card.
 
     Args:
         folder: The dataset.
-        report: Its check, with the contract of its columns.
+        report: Result of `check_dataset`, including the meaning and unit of each column.
         repo: "OWNER/NAME" on the Hub.
         license: Identifier of the licence.
         tags: Tags besides "LeRobot" and the robot's name.
@@ -191,7 +194,7 @@ def dataset_card(
     head.task_categories = head.task_categories or ["robotics"]
     head.size_categories = [_size_category(sum(entry.length for entry in folder.episodes))]
     if not getattr(head, "configs", None):
-        # Read by the Hub's viewer and by `datasets.load_dataset`.
+        # The Hub's dataset viewer and `datasets.load_dataset` read `configs`.
         head.configs = [{"config_name": "default", "data_files": "data/*/*.parquet"}]
     card.data = head
     return card
@@ -230,7 +233,10 @@ def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterato
     if report.contract is not None:
         header, *rows = report.contract.rows()
         yield "\n## Columns\n"
-        yield "LeRobot declares no units; these were declared or inferred from the values.\n"
+        yield (
+            "LeRobot datasets declare no units. These units were declared by the author or "
+            "inferred from the values.\n"
+        )
         yield f"| {' | '.join(header)} |"
         yield f"|{' --- |' * len(header)}"
         yield from (f"| {' | '.join(map(_cell, row))} |" for row in rows)

@@ -1,4 +1,4 @@
-"""Limits of the joints of an arm, and the rule for those that its description lacks."""
+"""Joint limits of an arm, and defaults for limits that its URDF or MJCF does not give."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from torch import Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class MotionLimits:
-    """Limits of each joint's motion, float64; velocities and up are symmetric.
+    """Limits of each joint's motion, float64.
 
-    Of whatever else is moved as well, in its own unit in place of radians.
+    Limits of velocity, acceleration and jerk are the same in both directions. The class also
+    describes axes other than joints; their unit of position then replaces the radian.
 
-    Some arms lower their velocity limits towards the limits of position, to be able to stop:
-    there `velocity_offset` and `deceleration` are given, both or neither, and
-    `velocity_bounds` is what holds. Without them it is `velocity` everywhere.
+    Some arms reduce the velocity limit near a position limit, so that the joint can stop in
+    time. For these arms, set both `velocity_offset` and `deceleration`; `velocity_bounds`
+    then returns the reduced limits. Otherwise, set neither: `velocity` is the limit at every
+    position.
     """
 
     lower: Float[Tensor, " joints"]
@@ -35,19 +37,19 @@ class MotionLimits:
     jerk: Float[Tensor, " joints"]
     """[rad/s^3]"""
     velocity_offset: Float[Tensor, " joints"] | None = None
-    """o of `velocity_bounds` [rad/s]; None: the limits of velocity are the same everywhere."""
+    """Offset o in `velocity_bounds` [rad/s]; None if velocity limits do not vary."""
     deceleration: Float[Tensor, " joints"] | None = None
-    """d of `velocity_bounds` [rad/s^2]."""
+    """Deceleration d in `velocity_bounds` [rad/s^2]."""
 
     def __post_init__(self):
         if (self.velocity_offset is None) != (self.deceleration is None):
             raise ValueError(
-                "velocity_offset and deceleration together tell how velocity limits depend on "
-                "the position: give both, or neither"
+                "velocity_offset and deceleration define position-dependent velocity limits: "
+                "give both, or neither"
             )
 
     def slowed[Limits: MotionLimits](self: Limits, fraction: float) -> Limits:
-        """The same limits with velocities of at most a fraction of theirs, at each position."""
+        """Limits with the velocity limit multiplied by a fraction at every position."""
         o, d = self.velocity_offset, self.deceleration
         return replace(
             self,
@@ -61,14 +63,15 @@ class MotionLimits:
     ) -> tuple[Float[Tensor, "*batch joints"], Float[Tensor, "*batch joints"]]:
         """Lowest and highest velocity [rad/s] allowed at a position.
 
-        With the distance x to the limit of position ahead it is
+        Let x be the distance to the position limit in the direction of motion. The highest
+        speed in this direction is
 
-            min(velocity, max(0, sqrt(2 d max(0, x)) - o)),
+            min(velocity, max(0, sqrt(2 d max(0, x)) - o)).
 
-        Franka's formula for the Research 3 ("Robot and interface specifications"): the speed
-        from which a joint stops before the limit with the deceleration d, less an offset. Zero
-        from o^2/(2 d) before the limit. Differentiable; at a limit the slope is zero, not
-        infinite.
+        This is Franka's formula for the Research 3 ("Robot and interface specifications"). The
+        root is the speed from which the deceleration d stops the joint at the limit; the offset
+        o reduces it. The speed is zero within a distance of o^2/(2 d) from the limit. The
+        bounds are differentiable: at a limit their slope is zero, not infinite.
 
         Args:
             q: Joint positions [rad].
@@ -78,7 +81,8 @@ class MotionLimits:
             return (-velocity).expand(q.shape), velocity.expand(q.shape)
         o, d = self.velocity_offset.to(q), self.deceleration.to(q)
         ahead = torch.stack([q - self.lower.to(q), self.upper.to(q) - q])
-        # Nearer than that nothing is left, and the root has no slope at zero.
+        # At 2 d x <= o^2 the allowed speed is zero. The maximum also keeps the root away from
+        # zero, where its slope would be infinite.
         speed = (2 * d * ahead).maximum(o * o).sqrt() - o
         lower, upper = speed.minimum(velocity)
         return -lower, upper
@@ -91,7 +95,7 @@ class JointLimits(MotionLimits):
     torque: Float[Tensor, " joints"]
     """[N m]"""
     vintage: str
-    """Publisher and date of these numbers: manufacturers revise them."""
+    """Publisher and date of these values, because manufacturers revise them."""
 
     @property
     def middle(self) -> Float[Tensor, " joints"]:
@@ -99,20 +103,20 @@ class JointLimits(MotionLimits):
         return (self.lower + self.upper) / 2
 
     def contain(self, q: Float[Tensor, "*batch joints"]) -> Bool[Tensor, "*batch"]:
-        """True where all joints are within their range, limits included."""
+        """True where all joints are within their limits or at them."""
         lower, upper = self.lower.to(q), self.upper.to(q)
         return torch.all((q >= lower) & (q <= upper), dim=-1)
 
 
-# What a description does not tell, and why these: slower than the slowest joint of any arm
-# registered here but Kinova's, and ISO 10218-1's reduced speed for what slides; full speed
-# after 0.2 s and full acceleration after 20 ms, both a choice of ours (the Panda's: 0.13 to
-# 0.29 s and 2 ms).
+# Defaults for limits that a description does not give. The velocity of revolute joints is lower
+# than that of the slowest joint of every registered arm except Kinova's. The velocity of
+# prismatic joints is the reduced speed of ISO 10218-1. We chose the times to full speed and to
+# full acceleration; those of the Panda are 0.13 to 0.29 s and 2 ms.
 DEFAULT_VELOCITY = 1.0  # [rad/s]
 DEFAULT_SLIDING_VELOCITY = 0.25  # [m/s]
 _SECONDS_TO_FULL_SPEED = 0.2
 _SECONDS_TO_FULL_ACCELERATION = 0.02
-# A joint without limits turns at most once to either side of zero, as its cables would have it.
+# A joint without position limits turns at most once in each direction, to protect cables.
 _TURN = 2 * math.pi
 _COLUMNS = ("lower", "upper", "velocity", "acceleration", "jerk", "torque")
 
@@ -125,31 +129,35 @@ def complete_limits(
     source: str,
     overrides: Mapping[str, Mapping[str, float]] | None = None,
 ) -> JointLimits:
-    """Limits from what a description tells, the rest by rule.
+    """Joint limits from a description, completed with defaults.
 
-    Where there is none: velocity 1 rad/s, or 0.25 m/s; acceleration the one that reaches the
-    velocity in 0.2 s; jerk the one that reaches the acceleration in 20 ms; torque unlimited; a
-    continuous joint one turn to either side. Zero, which some descriptions write for a limit
-    of velocity or torque that they do not know, is none.
+    The default velocity limit is 1 rad/s, or 0.25 m/s for a prismatic joint. The default
+    acceleration reaches the velocity limit in 0.2 s, and the default jerk reaches the
+    acceleration limit in 20 ms. The default torque is unlimited. A continuous joint may turn
+    once in each direction. A zero limit of velocity, acceleration, jerk or torque counts as
+    missing, because some descriptions write zero for an unknown limit.
 
     Args:
         names: Names of the joints.
         kinds: Kinds of the joints, see `JointKind`.
         known: For each joint, `lower`, `upper`, `velocity`, `acceleration`, `jerk` and `torque`
-            [rad, m, s, N m, N], as far as they are known.
-        source: Name of the source of these limits.
-        overrides: Replacements by joint name; for all joints under `default`.
+            [rad, m, s, N m, N]; None or no entry if unknown.
+        source: Name or path of the description, for error messages and `JointLimits.vintage`.
+        overrides: For each joint name, the limits that replace known ones. Those under
+            `default` apply to all joints.
 
     Raises:
-        ValueError: A joint that slides has no range, a range is empty, or an override names no
-            joint or no limit.
+        ValueError: A revolute or prismatic joint has no range, a range is empty, or an override
+            names an unknown joint or an unknown limit.
     """
     overrides = overrides or {}
     for name, row in overrides.items():
         if name != "default" and name not in names:
             raise ValueError(f"limits are given for {name!r}, but the joints are {names}")
         if wrong := set(row) - set(_COLUMNS):
-            raise ValueError(f"{name} has no limit {', '.join(sorted(wrong))}: give {_COLUMNS}")
+            raise ValueError(
+                f"unknown limits of {name}: {', '.join(sorted(wrong))}; known are {_COLUMNS}"
+            )
     table: dict[str, list[float]] = {column: [] for column in _COLUMNS}
     for name, kind, row in zip(names, kinds, known, strict=True):
         given = {**row, **overrides.get("default", {}), **overrides.get(name, {})}
@@ -160,8 +168,8 @@ def complete_limits(
             upper = _TURN if upper is None else upper
         if lower is None or upper is None or not lower < upper:
             raise ValueError(
-                f"{source}: joint {name} has the range {lower} to {upper}; give it lower and "
-                f"upper by limits=, or in the file {Path(source).stem}.limits.toml next to it"
+                f"{source}: joint {name} has the range {lower} to {upper}; set lower and upper "
+                f"with limits=, or in {Path(source).stem}.limits.toml in the same folder"
             )
         velocity = given.get("velocity") or (
             DEFAULT_SLIDING_VELOCITY if slides else DEFAULT_VELOCITY
@@ -178,7 +186,7 @@ def complete_limits(
 
 
 def read_limits(path: Path) -> dict[str, dict[str, float]]:
-    """Limits written in TOML: a table a joint, and `default` for all.
+    """Read limits from a TOML file with one table per joint; `default` applies to all joints.
 
         [default]
         acceleration = 5.0
@@ -186,7 +194,7 @@ def read_limits(path: Path) -> dict[str, dict[str, float]]:
         velocity = 2.0
 
     Raises:
-        ValueError: The file is no such TOML.
+        ValueError: The file is not valid TOML, or a table holds values other than numbers.
     """
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
