@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from programs_as_modules import load_program
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "hrc_learn").rglob("*.py"))
@@ -265,66 +266,10 @@ def test_no_package_builds_on_itself():
         placed.add(package)
 
 
-def imported_modules(source: Path) -> set[str]:
-    """Modules of ours that a file imports anywhere, in functions too, but for type checkers."""
-    found: set[str] = set()
-
-    def visit(node: ast.AST) -> None:
-        for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.dump(child.test):
-                continue
-            if isinstance(child, ast.ImportFrom):
-                base = imported_from(child, source)
-                names = {f"{base}.{alias.name}" for alias in child.names}
-                # `from package import module` imports the module, other names their package.
-                found.update(name if name in MODULES else base for name in names)
-            elif isinstance(child, ast.Import):
-                found.update(alias.name for alias in child.names)
-            visit(child)
-
-    visit(parse(source))
-    return found
-
-
-MODULES = {
-    ".".join(source.relative_to(ROOT).with_suffix("").parts)
-    for source in SOURCES
-    if source.name != "__init__.py"
-}
-
-
-def circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Groups of modules that import each other, around whatever detours."""
-    reached: dict[str, set[str]] = {}
-    for start in graph:
-        seen, waiting = set(), [start]
-        while waiting:
-            for module in graph[waiting.pop()] - seen:
-                seen.add(module)
-                waiting.append(module)
-        reached[start] = seen
-    groups = {
-        tuple(sorted(b for b in reached[a] if a in reached[b]))
-        for a in graph
-        if a in reached[a]
-    }
-    return [list(group) for group in sorted(groups)]
-
-
-def test_circles_are_found():
-    graph = {"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set()}
-    assert circles(graph) == [["b", "c"]]
-
-
 def test_no_module_imports_itself_around_others():
-    """Imports in functions count: they only hide a circle from the interpreter."""
-    graph = {
-        ".".join(source.relative_to(ROOT).with_suffix("").parts): imported_modules(source)
-        for source in SOURCES
-        if source.name != "__init__.py"
-    }
-    graph = {module: (used & MODULES) - {module} for module, used in graph.items()}
-    assert not circles(graph)
+    """Imports in functions and for type checkers count: they only hide a circle."""
+    measure_code = load_program("tools/measure_code.py")
+    assert not measure_code.circles(measure_code.read_package(ROOT / "hrc_learn"))
 
 
 def test_the_package_itself_imports_its_parts_only():

@@ -1,24 +1,12 @@
 """The tool that measures the layout, on a package whose figures can be counted by eye."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import pytest
-
-TOOL = Path(__file__).parents[1] / "tools" / "measure_code.py"
+from programs_as_modules import load_program
 
 
 @pytest.fixture(scope="module")
 def tool():
-    spec = importlib.util.spec_from_file_location("measure_code", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
+    return load_program("tools/measure_code.py")
 
 
 @pytest.fixture
