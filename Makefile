@@ -39,10 +39,12 @@ docs: .venv/.installed
 format: .venv/.installed
 	$(PYTHON) -m ruff check --fix-only --quiet .
 	$(PYTHON) -m ruff format .
+	$(PYTHON) tools/measure_code.py hrc_learn --update
 
 check: .venv/.installed
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
+	$(PYTHON) tools/measure_code.py hrc_learn --check
 	$(PYTHON) -m pyright
 	$(PYTHON) tools/build_docs.py
 

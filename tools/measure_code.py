@@ -83,19 +83,25 @@ class Figures:
 
 
 BUDGET: dict[str, float] = {
-    "code": 45_000,
-    "modules": 235,
+    "code": 53_000,
+    "modules": 305,
     "long_functions": 20,
-    "shared_file_names": 0,
+    "shared_file_names": 3,
     "circles": 0,
     "fragments": 0.03,
     "idiom": 0.3,
+    "docs_words": 45_000,
+}
+"""Largest allowed figures. They are lowered towards `AIM` as code goes; nothing raises them but
+the lines that CONTRIBUTING.md lists for the code."""
+
+AIM: dict[str, float] = BUDGET | {
+    "code": 45_000,
+    "modules": 235,
+    "shared_file_names": 0,
     "docs_words": 35_000,
 }
-"""Largest allowed figures. The code may grow by the lines that CONTRIBUTING.md lists as raises.
-
-For scale: BoTorch has 34.7k lines of code in 172 modules, LeRobot 93.7k in 408.
-"""
+"""Figures to reach. For scale: BoTorch has 34.7k lines of code in 172 modules."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -339,9 +345,10 @@ def budget_table(values: dict[str, float], limits: dict[str, float]) -> str:
         "code": round(values["code"], -2),
         "docs_words": 500 * round(values["docs_words"] / 500),
     }
-    lines = ["| figure | now | at most |", "|---|---|---|"]
+    lines = ["| figure | now | at most | aim |", "|---|---|---|---|"]
     lines += [
-        f"| {words} | {shape.format(rounded[key])} | {shape.format(limits[key])} |"
+        f"| {words} | {shape.format(rounded[key])} | {shape.format(limits[key])} | "
+        f"{shape.format(AIM[key])} |"
         for key, (words, shape) in ROWS.items()
     ]
     return "\n".join(lines) + "\n"
