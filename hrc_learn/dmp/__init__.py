@@ -2,6 +2,7 @@
 
 from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp import orientation_error as orientation_error
+from hrc_learn.dmp import ude_formulation as ude_formulation  # registers its formulation
 from hrc_learn.dmp._system.bases import ExponentialPhase as ExponentialPhase
 from hrc_learn.dmp._system.bases import GaussianBasis as GaussianBasis
 from hrc_learn.dmp._system.bases import PeriodicBasis as PeriodicBasis

@@ -63,6 +63,8 @@ class CoordinateAdapter[Value, Path, State](ABC):
     The argument `motion` is always the linear primitive that the columns belong to.
     """
 
+    linear: ClassVar[bool] = True
+    """True if the columns move as a linear primitive does."""
     error_columns: ClassVar[slice | None] = None
     """Columns with the error of an orientation, if any."""
     options: ClassVar[frozenset[str]] = frozenset()
@@ -136,6 +138,23 @@ class CoordinateAdapter[Value, Path, State](ABC):
     ) -> Any:
         """Second derivatives of the columns [1/s^2] for a coupling term."""
         return coupling
+
+    def rollout(
+        self,
+        motion: LinearPrimitive,
+        boundary: Boundary,
+        duration: Tensor,
+        time: Times | None,
+        forcing_gain: Scalars | None,
+    ) -> Any:
+        """Motion of the columns."""
+        return motion.rollout_columns(boundary, duration, time, forcing_gain)
+
+    def step(
+        self, motion: LinearPrimitive, columns: DMPState, dt: Scalars, **inputs: Any
+    ) -> DMPState:
+        """State of the columns after `dt` [s]; inputs as in `LinearPrimitive.step_columns`."""
+        return motion.step_columns(columns, dt, **inputs)
 
 
 class MotionPrimitive[Value, Path, State](nn.Module, ABC):
@@ -245,7 +264,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             if time is not None:
                 raise ValueError("give times or an interval dt, not both")
             time = regular_times(dt, tau)
-        motion_columns = motion.rollout_columns(columns, tau, time, forcing_gain)
+        motion_columns = adapter.rollout(motion, columns, tau, time, forcing_gain)
         return adapter.trajectory(motion_columns, frame)
 
     def initial_state(
@@ -305,7 +324,8 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         """
         adapter = self.adapter
         columns, frame, target = self._retargeted(state, goal, goal_body)
-        columns = self.motion.step_columns(
+        columns = adapter.step(
+            self.motion,
             columns,
             dt,
             goal=target,
@@ -366,7 +386,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
                 basis.
         """
         via = self.via_points(time, value, velocity, body=body, body_velocity=body_velocity)
-        return self.with_motion(through_via_points(self.motion, via, within))
+        return self.with_motion(through_via_points(self.linear_motion(), via, within))
 
     def via_points(
         self,
@@ -395,7 +415,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         Raises:
             ValueError: Negative times, or shapes that do not fit.
         """
-        motion, adapter = self.motion, self.adapter
+        motion, adapter = self.linear_motion(), self.adapter
         time = seconds(time, motion.start.device)
         options = _given(adapter, body=body, body_velocity=body_velocity)
         duration = motion.duration.double()[..., None]
@@ -421,7 +441,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         Raises:
             ValueError: The scaling depends on the boundary, so the weights would differ.
         """
-        motion = self.motion
+        motion = self.linear_motion()
         if motion.forcing_scale.depends_on_boundary:
             raise ValueError(
                 f"scaling {motion.scaling!r} depends on start and goal: fit with 'none'"
@@ -445,7 +465,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         Raises:
             ValueError: A rhythm, which has no end to start from.
         """
-        motion = self.motion
+        motion = self.linear_motion()
         if motion.basis.periodic:
             raise ValueError("a rhythm cannot be reversed: it has no end to start from")
         s = torch.linspace(0, 1, REFIT_SAMPLES * motion.basis.count + 1, dtype=torch.float64)
@@ -463,6 +483,19 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         x = x.view(*motion.weights.shape[:-1], -1)
         timestamps = 1 - motion.timestamps.flip(-1)
         return self.with_motion(motion.with_coordinates(x, timestamps=timestamps))
+
+    def linear_motion(self) -> LinearPrimitive:
+        """Linear primitive of the columns.
+
+        Raises:
+            ValueError: The columns do not move linearly, as in the formulation of Ude et al.
+        """
+        if not self.adapter.linear:
+            raise ValueError(
+                f"formulation {getattr(self, 'formulation', '?')!r} is not linear: fit with "
+                f"'log' instead"
+            )
+        return self.motion
 
     def save(self, folder: str | FilePath) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""

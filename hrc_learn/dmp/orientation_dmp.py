@@ -1,7 +1,8 @@
 """Movement primitive of an orientation, whose linear columns are its error to a reference.
 
 e'' = alpha (beta (0 - e) - e') + f, exact at all angles (Koutras and Doulgeri 2019). The
-reference is the goal by default; see `orientation_error.py` for the error.
+reference is the goal by default; see `orientation_error.py` for the error and
+`ude_formulation.py` for the other formulation.
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from hrc_learn.dmp._arguments import Mask, Points, Quaternions, Times, to_tensor
 from hrc_learn.dmp._system.trajectory import ArrayOutputs, output
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.fitting.motion_fit import FitOptions
-from hrc_learn.dmp.fitting.samples import padded
+from hrc_learn.dmp.fitting.samples import Samples, check_samples, padded
 from hrc_learn.dmp.joint_dmp import JointDMP, via_values
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import (
@@ -112,6 +113,10 @@ class OrientationCoordinates(
     """Unit quaternion at the end of the demonstration, (*batch, 4)."""
     error_columns: ClassVar[slice] = slice(0, 3)
 
+    @staticmethod
+    def refit(motion: LinearPrimitive, errors: Samples) -> None:
+        """Adapt fitted weights to a formulation that is not linear; this one is."""
+
     def reference(self, motion: LinearPrimitive) -> Float[Tensor, "*batch 4"]:
         """Reference of the demonstrated error."""
         return reference_of(motion.goal, self.goal)
@@ -202,29 +207,47 @@ def via_errors(reference: Tensor, error: Tensor, value: Any, velocity: Any) -> C
     return ColumnPoints(via.masked_fill(free, torch.nan), rate.masked_fill(unknown, torch.nan))
 
 
+FORMULATIONS: dict[str, type[OrientationCoordinates]] = {"log": OrientationCoordinates}
+"""Formulations by name; `ude_formulation.py` adds its own."""
+
+
+class UnknownFormulationError(ValueError):
+    """There is no formulation with this name."""
+
+
 class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, OrientationState]):
     """Movement primitive of an orientation.
 
     The error e to a reference, the goal by default, is the state of a linear primitive that is
-    exact at all angles. Both signs of a quaternion give the same motion. Values are unit
-    quaternions (w, x, y, z), (*batch, 4); velocities and couplings are angular, in the base
-    frame, (*batch, 3). A new start or goal is reached in the sense of rotation of the
-    demonstration. The fit report has residuals of the components of the error [rad], which
-    bound those of the angle.
+    exact at all angles, or of the formulation of Ude et al. 2014; see `formulation`. Both signs
+    of a quaternion give the same motion. Values are unit quaternions (w, x, y, z), (*batch, 4);
+    velocities and couplings are angular, in the base frame, (*batch, 3). A new start or goal is
+    reached in the sense of rotation of the demonstration. The fit report has residuals of the
+    components of the error [rad], which bound those of the angle.
     """
 
     goal: Tensor
     motion: JointDMP
+    formulation: str
+    """`"log"` or `"ude"`: the state on which forcing term and spring act."""
 
-    def __init__(self, motion: JointDMP, goal: Float[Tensor, "*batch 4"]):
+    def __init__(
+        self, motion: JointDMP, goal: Float[Tensor, "*batch 4"], formulation: str = "log"
+    ):
         """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
             motion: Motion of the error [rad], D = 3. If its own goal is not zero, the reference
                 of the error is exp(that) * goal, as for primitives with different goals.
             goal: Unit quaternion (w, x, y, z) at the end.
+            formulation: `"log"` or `"ude"`.
+
+        Raises:
+            ValueError: Unknown formulation.
         """
         super().__init__()
+        _check_formulation(formulation)
+        self.formulation = formulation
         self.motion = motion
         self.register_buffer("goal", goal)
 
@@ -235,6 +258,8 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
         orientation: Quaternions,
         n_basis: int | None = None,
         mask: Mask | None = None,
+        *,
+        formulation: str = "log",
         **options: Unpack[FitOptions],
     ) -> "OrientationDMP":
         """Fit one primitive to each demonstration.
@@ -245,20 +270,27 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
                 must be less than half a turn apart.
             n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
             mask: (*B, T), false at samples to ignore.
+            formulation: `"log"`, exact, or `"ude"`, integrated, for turns below 360 degrees.
             options: Options of the fit; see `FitOptions`.
 
         Raises:
-            ValueError: Bad samples; the message names them.
+            ValueError: Bad samples (the message names them), or an unknown formulation.
         """
+        _check_formulation(formulation)
         time, mask, (orientation,) = padded(time, mask, orientation)
         error, goal = fitted_error(time, orientation, mask)
         motion = JointDMP.fit(time, error, n_basis, mask=mask, **options)
-        return cls(motion, goal)
+        if not FORMULATIONS[formulation].linear:
+            if options.get("robust"):
+                # The robust fit replaces samples that may be outliers.
+                error = motion.rollout().position.detach()
+            FORMULATIONS[formulation].refit(motion, check_samples(time, error, mask=mask))
+        return cls(motion, goal, formulation)
 
     @property
     def adapter(self) -> OrientationCoordinates:
         """Errors to a reference."""
-        return OrientationCoordinates(self.goal)
+        return FORMULATIONS[self.formulation](self.goal)
 
     @property
     def start(self) -> Float[Tensor, "*batch 4"]:
@@ -275,14 +307,25 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
     ) -> S:
         """Primitive with another motion of the error, to this reference or another."""
         reference = self.reference if frame is None else frame
-        return type(self)(motion, to_orientation(motion.goal, reference))
+        return type(self)(motion, to_orientation(motion.goal, reference), self.formulation)
+
+    def _own_config(self) -> dict[str, Any]:
+        return {"formulation": self.formulation}
 
     def _own_tensors(self) -> dict[str, Tensor]:
         return {"goal_orientation": self.goal}
 
     @classmethod
     def _restored[S: "OrientationDMP"](cls: type[S], saved: SavedModel) -> S:
-        # Files may name the formulation "log" of this class, when there was another one.
-        if (name := saved.config.get("formulation", "log")) != "log":
-            raise saved.invalid_field("formulation", f"{name!r} is not supported, only 'log'")
-        return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
+        # Older files have no formulation, because there was only one.
+        name = saved.get("formulation", str) if "formulation" in saved.config else "log"
+        try:
+            return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"), name)
+        except UnknownFormulationError as error:
+            raise saved.invalid_field("formulation", error) from None
+
+
+def _check_formulation(name: str) -> None:
+    if name not in FORMULATIONS:
+        known = ", ".join(FORMULATIONS)
+        raise UnknownFormulationError(f"unknown formulation {name!r}; choose from {known}")

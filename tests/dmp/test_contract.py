@@ -1,10 +1,13 @@
 """Every kind of primitive, held to the same contract."""
 
+import pytest
 import torch
 from demo_motions import arm_motion, turning_motion
 from dmp_contract import DMPContract
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, SplineBasis
+from hrc_learn.dmp import ude_formulation as ude
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -152,3 +155,66 @@ class TestJointOnSplines(TestJoint):
 class TestOrientationOnItsApproach(TestOrientation):
     def fit(self, *demonstration, **kwargs):
         return OrientationDMP.fit(*demonstration, approach=1.0, **kwargs)
+
+
+class TestOrientationOfUde(TestOrientation):
+    """Integrated: what is exact elsewhere holds to the error of the method here."""
+
+    reproduction = 1e-4
+    fast_gradients = True
+    maps_over_durations = False
+
+    @pytest.mark.slow
+    def test_times_and_durations_of_their_own_are_a_loop(self):
+        super().test_times_and_durations_of_their_own_are_a_loop()
+
+    @pytest.mark.slow
+    def test_maps_and_derives_in_any_way(self):
+        super().test_maps_and_derives_in_any_way()
+
+    def test_reversed_goes_the_same_way_back(self, dmp):
+        with pytest.raises(ValueError, match="not linear"):
+            dmp.reversed()
+
+    @pytest.mark.slow
+    def test_motion_settles_at_the_goal_from_anywhere(self, dmp):
+        super().test_motion_settles_at_the_goal_from_anywhere(dmp)
+
+    @pytest.fixture(autouse=True)
+    def coarse(self, monkeypatch):
+        monkeypatch.setattr(ude, "MAXIMUM_STEP", 1 / 80)
+        # Its many short steps take four times as long with their shapes checked, which the
+        # tests of the formulation do.
+        with shapes_unchecked():
+            yield
+
+    def fit(self, *demonstration, **kwargs):
+        return OrientationDMP.fit(*demonstration, formulation="ude", **kwargs)
+
+    def test_gradients_are_exact(self, monkeypatch):
+        # Coarse: the derivative of what is computed is exact at any step length.
+        monkeypatch.setattr(ude, "MAXIMUM_STEP", 0.1)
+        super().test_gradients_are_exact()
+
+    @pytest.mark.parametrize("n_steps", [150])
+    def test_steps_end_where_the_rollout_does(self, dmp, n_steps):
+        arguments = self.arguments(*self.ends(4))
+        state = dmp.initial_state(**arguments, duration=2.0)
+        with torch.no_grad(), shapes_unchecked():
+            for _ in range(n_steps):
+                state = dmp.step(state, 1.7 / n_steps)
+            there = self.outputs(dmp.rollout(time=[1.7], **arguments, duration=2.0))
+        for name, value in self.state_outputs(state).items():
+            torch.testing.assert_close(value, there[name][0], rtol=0, atol=1e-5, msg=name)
+
+    def test_slowing_down_stays_on_the_path(self, dmp):
+        state = dmp.initial_state()
+        with torch.no_grad(), shapes_unchecked():
+            for k in range(200):
+                waiting = 3.0 if k % 2 else None
+                state = dmp.step(state, 0.003 * dmp.duration, phase_stopping=waiting)
+        s = torch.tensor([100 * 0.003 * (1 + 1 / 4)], dtype=torch.float64)
+        there = self.outputs(dmp.rollout(time=s * dmp.duration))
+        for name, value in self.state_outputs(state).items():
+            factor = 4 if name.startswith("rate of") else 1
+            torch.testing.assert_close(factor * value, there[name][0], rtol=0, atol=1e-6)

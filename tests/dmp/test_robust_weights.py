@@ -123,12 +123,14 @@ def test_masked_and_batched_demonstrations_fit_as_if_alone():
     torch.testing.assert_close(both.weights[1], alone.weights)
 
 
-def test_orientations_too():
+@pytest.mark.parametrize("formulation", ["log", "ude"])
+def test_orientations_too(formulation):
     time, clean = turning_motion(n_samples=200)
     orientation = clean.clone()
     spike = quaternion.exp(torch.tensor([0.4, 0.0, -0.2], dtype=torch.float64))
     orientation[40:180:20] = quaternion.multiply(spike, orientation[40:180:20])
-    dmp = OrientationDMP.fit(time, orientation, 20, robust="tukey")
+    options = {"n_basis": 20, "robust": "tukey", "formulation": formulation}
+    dmp = OrientationDMP.fit(time, orientation, **options)
     assert quaternion.angle(dmp.rollout().orientation, clean).max() < 5e-3
 
 
