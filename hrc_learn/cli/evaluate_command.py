@@ -16,6 +16,7 @@ from hrc_learn.cli._tables import named
 from hrc_learn.cli.arguments import Evaluate, FitPrimitives, columns
 from hrc_learn.cli.fit_commands import fit_silently
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
+from hrc_learn.jacobian import RBFImageJacobian
 from hrc_learn.learning.channels import (
     CHANNELS,
     Motions,
@@ -203,6 +204,27 @@ _TILT = 0.1
 
 def _evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
     """Compare an image Jacobian with the simulator's true one."""
+    torch.set_num_threads(1)
+    figures = _image_jacobian_figures(args, VisualServoSkill.load(model).jacobian)
+    targets = {
+        "upright_relative_error_median": (MOST_ERROR, False),
+        "speed_up_over_fixed": (LEAST_SPEED_UP, True),
+    }
+    rows = [
+        replace(named(name, figures[name]), target=target, at_least=at_least)
+        for name, (target, at_least) in targets.items()
+        if name in figures
+    ]
+    others = [named(name, value) for name, value in figures.items() if name not in targets]
+    show_measurements(
+        [*rows, *others], title=f"Image Jacobian {model}", elsewhere="--json FILE"
+    )
+    write_values(args.json, figures)
+    return int(any(row.ok is False for row in rows))
+
+
+def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[str, float]:
+    """Errors on two grids of poses, and times of closed loops to the target."""
     # MuJoCo, which the evaluation of primitives does not need.
     from hrc_learn.experiments.jacobian_evaluation import (
         ClosedLoops,
@@ -214,8 +236,6 @@ def _evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
     from hrc_learn.sim import World
     from hrc_learn.sim.workplace import Workplace
 
-    torch.set_num_threads(1)
-    network = VisualServoSkill.load(model).jacobian
     demos = load_demos(args.dataset)
     if demos[0].position is None:
         raise ValueError(f"{args.dataset}: no end-effector positions to place a grid around.")
@@ -240,18 +260,4 @@ def _evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
                 loops,
                 on_run=lambda name: status.update(f"Closed loops, {name} Jacobian"),
             )
-    targets = {
-        "upright_relative_error_median": (MOST_ERROR, False),
-        "speed_up_over_fixed": (LEAST_SPEED_UP, True),
-    }
-    rows = [
-        replace(named(name, figures[name]), target=target, at_least=at_least)
-        for name, (target, at_least) in targets.items()
-        if name in figures
-    ]
-    others = [named(name, value) for name, value in figures.items() if name not in targets]
-    show_measurements(
-        [*rows, *others], title=f"Image Jacobian {model}", elsewhere="--json FILE"
-    )
-    write_values(args.json, figures)
-    return int(any(row.ok is False for row in rows))
+    return figures

@@ -4,7 +4,7 @@ An experiment that is given no model uses the demo's, which is learned first if 
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -311,10 +311,30 @@ def learn(
     Raises:
         RuntimeError: The scripted expert fails.
     """
-    from hrc_learn.cli import fit_commands, record_command
-
-    placing, servoing = out / "placing_demos", out / "aiming_demos"
     robot = robot or WithRobot()
+    ledger, options = Ledger(out / "steps.json"), {"robot": robot.robot, "tip": robot.tip}
+    for number, step in enumerate(_learning_steps(out, robot), start=1):
+        if not again and ledger.holds(step.result, options, *step.reads):
+            _announce(console, number, steps, f"{step.title}: up to date in {step.result}")
+            continue
+        _announce(console, number, steps, step.title)
+        step.work()
+        ledger.enter(step.result, options, *step.reads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Step:
+    """One step of `learn`."""
+
+    title: str
+    work: Callable[[], None]
+    result: Path
+    reads: tuple[Path, ...] = ()
+
+
+def _learning_steps(out: Path, robot: WithRobot) -> Iterator[_Step]:
+    """Demonstrations of placing and servoing, and the models of both."""
+    from hrc_learn.cli import fit_commands, record_command
 
     def record(scenario: Any, folder: Path) -> None:
         arguments = Record(
@@ -323,35 +343,31 @@ def learn(
         if record_command.record(arguments):
             raise RuntimeError(f"the scripted expert failed to demonstrate {scenario}")
 
-    def fit_primitives() -> None:
-        arguments = FitPrimitives(dataset=placing, out=out / "placing", overwrite=True)
-        fit_commands.fit_primitives(arguments)
-
-    def fit_image_jacobian() -> None:
-        arguments = FitImageJacobian(dataset=servoing, out=out / "aiming", overwrite=True)
-        fit_commands.fit_image_jacobian(arguments)
-
-    ledger, options = Ledger(out / "steps.json"), {"robot": robot.robot, "tip": robot.tip}
-    for number, (title, work, made, reads) in enumerate(
-        (
-            ("Demonstrations of placing", lambda: record("placing", placing), placing, ()),
-            (
-                "Demonstrations of servoing with an uncalibrated camera",
-                lambda: record("servoing", servoing),
-                servoing,
-                (),
-            ),
-            ("Movement primitives of placing", fit_primitives, out / "placing", (placing,)),
-            ("Image Jacobian of servoing", fit_image_jacobian, out / "aiming", (servoing,)),
-        ),
-        start=1,
-    ):
-        if not again and ledger.holds(made, options, *reads):
-            _announce(console, number, steps, f"{title}: up to date in {made}")
-            continue
-        _announce(console, number, steps, title)
-        work()
-        ledger.enter(made, options, *reads)
+    placing, servoing = out / "placing_demos", out / "aiming_demos"
+    yield _Step(
+        title="Demonstrations of placing",
+        work=lambda: record("placing", placing),
+        result=placing,
+    )
+    yield _Step(
+        title="Demonstrations of servoing with an uncalibrated camera",
+        work=lambda: record("servoing", servoing),
+        result=servoing,
+    )
+    primitives = FitPrimitives(dataset=placing, out=out / "placing", overwrite=True)
+    yield _Step(
+        title="Movement primitives of placing",
+        work=lambda: fit_commands.fit_primitives(primitives),
+        result=primitives.folder,
+        reads=(placing,),
+    )
+    jacobian = FitImageJacobian(dataset=servoing, out=out / "aiming", overwrite=True)
+    yield _Step(
+        title="Image Jacobian of servoing",
+        work=lambda: fit_commands.fit_image_jacobian(jacobian),
+        result=jacobian.folder,
+        reads=(servoing,),
+    )
 
 
 def _announce(console: Console, step: int, steps: int, title: str) -> None:
