@@ -5,11 +5,6 @@ from hrc_learn.hardware.arm_process import DriverError as DriverError
 from hrc_learn.hardware.camera_delay import DelayMotion as DelayMotion
 from hrc_learn.hardware.camera_delay import MeasuredDelay as MeasuredDelay
 from hrc_learn.hardware.camera_delay import measure_delay as measure_delay
-from hrc_learn.hardware.cameras import CameraError as CameraError
-from hrc_learn.hardware.cameras import CaptureCamera as CaptureCamera
-from hrc_learn.hardware.cameras import VideoEndedError as VideoEndedError
-from hrc_learn.hardware.cameras import VideoFile as VideoFile
-from hrc_learn.hardware.cameras import open_camera as open_camera
 from hrc_learn.hardware.ending import ending_at_rest as ending_at_rest
 from hrc_learn.hardware.franka_arm import FrankaArm as FrankaArm
 from hrc_learn.hardware.franka_arm import FrankaConfig as FrankaConfig
@@ -24,3 +19,8 @@ from hrc_learn.hardware.franky_arm import RealtimeError as RealtimeError
 from hrc_learn.hardware.gripper import GripperError as GripperError
 from hrc_learn.hardware.gripper import GripperThread as GripperThread
 from hrc_learn.hardware.lerobot_camera import LeRobotCamera as LeRobotCamera
+from hrc_learn.hardware.opencv_cameras import CameraError as CameraError
+from hrc_learn.hardware.opencv_cameras import CaptureCamera as CaptureCamera
+from hrc_learn.hardware.opencv_cameras import VideoEndedError as VideoEndedError
+from hrc_learn.hardware.opencv_cameras import VideoFile as VideoFile
+from hrc_learn.hardware.opencv_cameras import open_camera as open_camera

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.cameras import CameraError
+from hrc_learn.hardware.opencv_cameras import CameraError
 from hrc_learn.protocols import Arm, Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, centre
 

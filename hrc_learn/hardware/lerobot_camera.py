@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from hrc_learn.hardware.cameras import RGB, CameraError, as_rgb, check_times
+from hrc_learn.hardware.opencv_cameras import RGB, CameraError, as_rgb, check_times
 from hrc_learn.protocols import TimedCamera
 
 

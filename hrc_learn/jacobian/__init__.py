@@ -34,11 +34,11 @@ from hrc_learn.jacobian.model_selection import EvidenceRound as EvidenceRound
 from hrc_learn.jacobian.model_selection import HeldOutSamples as HeldOutSamples
 from hrc_learn.jacobian.model_selection import cross_validate as cross_validate
 from hrc_learn.jacobian.model_selection import maximize_evidence as maximize_evidence
+from hrc_learn.jacobian.motion_samples import ImageDemonstration as ImageDemonstration
+from hrc_learn.jacobian.motion_samples import KeyFrameConfig as KeyFrameConfig
+from hrc_learn.jacobian.motion_samples import image_demonstrations as image_demonstrations
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian
 from hrc_learn.jacobian.network import stack_networks as stack_networks
 from hrc_learn.jacobian.perspective import MarkerCamera as MarkerCamera
 from hrc_learn.jacobian.perspective import depth_gradient as depth_gradient
 from hrc_learn.jacobian.perspective import fit_focal_length as fit_focal_length
-from hrc_learn.jacobian.samples import ImageDemonstration as ImageDemonstration
-from hrc_learn.jacobian.samples import KeyFrameConfig as KeyFrameConfig
-from hrc_learn.jacobian.samples import image_demonstrations as image_demonstrations

@@ -23,9 +23,9 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian.fitting import RBFCenters
+from hrc_learn.jacobian.motion_samples import FOLDS, ImageDemonstration
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.perspective import MarkerCamera
-from hrc_learn.jacobian.samples import FOLDS, ImageDemonstration
 
 # Prior standard deviation of a motion [rad, m]: that of a tripod that was knocked. It resolves
 # rotations and translations that look alike in the image.

@@ -18,8 +18,8 @@ from torch.utils._pytree import tree_map
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import is_number, matmul
+from hrc_learn.jacobian.motion_samples import KeyFrameConfig, component_scale
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import KeyFrameConfig, component_scale
 from hrc_learn.pytree import pytree
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian.samples import (
+from hrc_learn.jacobian.motion_samples import (
     ImageDemonstration,
     KeyFrameConfig,
     RegressionStatistics,

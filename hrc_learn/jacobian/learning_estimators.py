@@ -28,8 +28,8 @@ from hrc_learn.jacobian.estimator import (
     evaluate,
 )
 from hrc_learn.jacobian.fitting import weight_covariance
+from hrc_learn.jacobian.motion_samples import component_scale
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import component_scale
 from hrc_learn.pytree import pytree
 
 

@@ -27,8 +27,7 @@ from hrc_learn.jacobian.fitting import (
     weight_covariance,
     weights_without_each,
 )
-from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import (
+from hrc_learn.jacobian.motion_samples import (
     ImageDemonstration,
     MotionSamples,
     RegressionStatistics,
@@ -36,6 +35,7 @@ from hrc_learn.jacobian.samples import (
     samples_by_fold,
     statistics_by_fold,
 )
+from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import pytree
 
 

@@ -19,7 +19,7 @@ from hrc_learn.jacobian.fitting import (
     prior_precision,
     radial_basis,
 )
-from hrc_learn.jacobian.samples import (
+from hrc_learn.jacobian.motion_samples import (
     ImageDemonstration,
     component_scale,
     image_demonstrations,

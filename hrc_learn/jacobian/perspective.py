@@ -26,8 +26,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian.motion_samples import ImageDemonstration
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import ImageDemonstration
 
 # Prior standard deviation of the logarithm of the focal length, about the image width: lenses
 # of 30 to 80 degrees are within one standard deviation.

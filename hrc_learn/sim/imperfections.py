@@ -113,7 +113,7 @@ class Imperfections:
 
     @classmethod
     def nominal(cls) -> Imperfections:
-        """Those of an ordinary laboratory; docs/experiments.md gives the sources."""
+        """Those of an ordinary laboratory; docs/concepts/experiments.md gives the sources."""
         return cls(
             encoder_noise=1e-4,
             encoder_offset=2e-3,

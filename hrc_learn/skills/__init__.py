@@ -27,11 +27,11 @@ from hrc_learn.skills.placing import check_plan as check_plan
 from hrc_learn.skills.placing import plan_candidates as plan_candidates
 from hrc_learn.skills.servo_target import ServoTarget as ServoTarget
 from hrc_learn.skills.servo_target import VisualServoConfig as VisualServoConfig
+from hrc_learn.skills.task_workplace import CollisionChecker as CollisionChecker
+from hrc_learn.skills.task_workplace import GraspObject as GraspObject
+from hrc_learn.skills.task_workplace import Workplace as Workplace
 from hrc_learn.skills.visual_servoing import VisualServo as VisualServo
 from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
 from hrc_learn.skills.visual_skill import VisualTarget as VisualTarget
 from hrc_learn.skills.work_cell import WorkCell as WorkCell
 from hrc_learn.skills.work_cell import WorkCellConfig as WorkCellConfig
-from hrc_learn.skills.workplace import CollisionChecker as CollisionChecker
-from hrc_learn.skills.workplace import GraspObject as GraspObject
-from hrc_learn.skills.workplace import Workplace as Workplace

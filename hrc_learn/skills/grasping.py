@@ -24,10 +24,10 @@ from hrc_learn.skills.failures import BlockedPathError, MissedGraspError, TaskFa
 from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig, no_perspective
+from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
 from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
 from hrc_learn.skills.work_cell import WorkCell
-from hrc_learn.skills.workplace import GraspObject, Workplace
 
 OPEN, CLOSED = 0.08, 0.0
 """Commanded gripper widths [m]: the full stroke; and zero, which squeezes the object."""

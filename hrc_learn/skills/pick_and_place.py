@@ -38,9 +38,9 @@ from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
 from hrc_learn.skills.receiving import Receipt, Receiving
 from hrc_learn.skills.servo_target import ServoTarget
+from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell
-from hrc_learn.skills.workplace import GraspObject, Workplace
 
 Mishap = Literal[
     "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"

@@ -26,8 +26,8 @@ from hrc_learn.skills.grasping import (
     holds,
     move_fingers,
 )
+from hrc_learn.skills.task_workplace import GraspObject
 from hrc_learn.skills.work_cell import WorkCell
-from hrc_learn.skills.workplace import GraspObject
 
 HAND_OVER = "hand over"
 """Name of the kind of movement to respond to."""

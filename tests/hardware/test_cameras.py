@@ -16,7 +16,7 @@ from hrc_learn.hardware import (
     VideoFile,
     open_camera,
 )
-from hrc_learn.hardware.cameras import taken_by
+from hrc_learn.hardware.opencv_cameras import taken_by
 from hrc_learn.protocols import Camera, TimedCamera
 
 RATE = 20.0

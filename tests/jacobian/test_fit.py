@@ -13,7 +13,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.jacobian.fitting import prior_precision
-from hrc_learn.jacobian.samples import (
+from hrc_learn.jacobian.motion_samples import (
     KeyFrameConfig,
     MotionSamples,
     key_frames,

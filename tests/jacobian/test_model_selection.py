@@ -19,7 +19,7 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.jacobian.fitting import weight_covariance
 from hrc_learn.jacobian.model_selection import NegativeLogEvidence
-from hrc_learn.jacobian.samples import KeyFrameConfig, MotionSamples
+from hrc_learn.jacobian.motion_samples import KeyFrameConfig, MotionSamples
 
 CAMERA = Pinhole.overhead(roll=0.7)
 
