@@ -110,7 +110,7 @@ def test_alone_everything_is_as_without():
     assert (distributed.rank(), distributed.count()) == (0, 1)
     assert distributed.sum_over_processes(x) is x
     assert distributed.differentiable_sum(x) is x
-    assert list(distributed.share("abc")) == [(0, "a"), (1, "b"), (2, "c")]
+    assert list(distributed.local_items("abc")) == [(0, "a"), (1, "b"), (2, "c")]
     with distributed.processes() as rank:
         assert rank == 0
         assert not torch.distributed.is_initialized()

@@ -432,7 +432,7 @@ def test_folders_that_are_no_runs_are_refused(tmp_path):
     for text, complaint in (
         ("{", r"report\.json is damaged"),
         ('{"title": "x"}', "is not a report of hrc_learn"),
-        ('{"format": "hrc_learn report", "version": 99}', "is of version 99"),
+        ('{"format": "hrc_learn report", "version": 99}', "has version 99"),
     ):
         (tmp_path / "report.json").write_text(text)
         with pytest.raises(ValueError, match=complaint):

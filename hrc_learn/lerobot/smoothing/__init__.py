@@ -4,11 +4,11 @@ Imports only itself, NumPy, PyTorch and LeRobot: the distribution `lerobot-smoot
 (`plugins/lerobot_smooth`) is this folder under the name `lerobot_smooth`.
 """
 
-from .limits import ActionLimits as ActionLimits
-from .limits import calibrated_ranges as calibrated_ranges
-from .limits import demonstrated_limits as demonstrated_limits
-from .limits import gathered_limits as gathered_limits
-from .limits import urdf_limits as urdf_limits
+from .action_limits import ActionLimits as ActionLimits
+from .action_limits import calibrated_ranges as calibrated_ranges
+from .action_limits import demonstrated_limits as demonstrated_limits
+from .action_limits import gathered_limits as gathered_limits
+from .action_limits import urdf_limits as urdf_limits
 from .motion_filter import LIMIT_KINDS as LIMIT_KINDS
 from .motion_filter import MotionFilter as MotionFilter
 from .motion_filter import MotionState as MotionState

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from .limits import ActionLimits, gathered_limits
+from .action_limits import ActionLimits, gathered_limits
 from .processor import add_smoothing, remove_smoothing
 
 

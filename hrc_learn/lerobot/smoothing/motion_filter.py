@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .limits import ActionLimits
+from .action_limits import ActionLimits
 
 LIMIT_KINDS = ("position", "velocity", "acceleration", "jerk")
 """Limits that positions may break, in the order of the last axis of a report's flags."""

@@ -22,7 +22,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from .limits import ActionLimits, read_json, write_json
+from .action_limits import ActionLimits, read_json, write_json
 from .motion_filter import LIMIT_KINDS, MotionFilter, MotionState
 
 # What smoothing has changed, added up.

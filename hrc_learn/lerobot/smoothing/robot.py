@@ -15,7 +15,7 @@ import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from .limits import ActionLimits
+from .action_limits import ActionLimits
 from .upsampling import ActionUpsampler
 
 logger = logging.getLogger(__name__)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from .limits import ActionLimits
+from .action_limits import ActionLimits
 from .motion_filter import MotionFilter, MotionState
 
 LARGEST_DEGREE = 3
