@@ -95,7 +95,7 @@ class Pulled:
 
     elbow: float
     """How far the elbow was moved [m]."""
-    room: float
+    margin: float
     """How far limits, furniture and the direction of the pull would have let it [m]."""
 
 
@@ -201,14 +201,14 @@ def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoArmRobot) -
         if pull.end > run.time[-1]:
             continue
         during = posture[torch.from_numpy(rows)]
-        rooms = [
+        margins = [
             elbow_margin(q, pull, panda, clearance=robot.clearance)
             for q in during[:: len(during) // 3]
         ]
         effects.append(
             Pulled(
                 elbow=float(elbow[torch.from_numpy(rows)].norm(dim=-1).max()),
-                room=float(np.median(rooms)),
+                margin=float(np.median(margins)),
             )
         )
     return effects

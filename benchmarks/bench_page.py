@@ -101,7 +101,7 @@ class Reader:
     def _run(self) -> None:
         last = np.zeros(7)
         while not self._closing.wait(_POLL):
-            d = self._page.human.read(self._state).nullspace_input
+            d = self._page.human.read(self._state).effort(7)
             if np.abs(d - last).max() > 1e-9:
                 self.changes.append(time.time())
                 last = d
@@ -160,7 +160,7 @@ def by_mouse(
     with chromium(folder) as tab, Reader(page, state) as reader:
         browser = Browser(tab, page, pixels=pixels)
         x, y = browser.pixel(elbow)
-        held = lambda: page.human.read(state).nullspace_input.any()  # noqa: E731
+        held = lambda: page.human.read(state).effort(7).any()  # noqa: E731
         with browser.dragging(elbow, by=(40, -10), until=held):
             for k in range(int(seconds / 0.25)):
                 moved.append(time.time())
@@ -219,7 +219,7 @@ def soaked(page: Page, state: ArmState, person: Headset, minutes: float) -> dict
     server, client = memory(person)
     motions = lost = let_go = 0.0
     for minute in range(max(round(minutes), 1)):
-        if not page.human.read(state).nullspace_input.any():
+        if not page.human.read(state).effort(7).any():
             let_go += 1
             person.pinch("left", closed=False)
             person.pinch("left")
@@ -253,7 +253,7 @@ def main(args: Args) -> None:
             # Ahead by 1.1 m on a table of 0.72 m, with x to the person.
             person.reach("left", [y, 0.72 + z, -1.1 + x])
             person.pinch("left")
-            if not page.human.read(state).nullspace_input.any():
+            if not page.human.read(state).effort(7).any():
                 person.reach("left", [y + 0.05, 0.72 + z, -1.1 + x])
             rows["hand"] = by_hand(page, state, person, args.seconds)
             with watched(page, args.watchers):

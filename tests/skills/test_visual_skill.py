@@ -175,5 +175,7 @@ def test_a_skill_knows_its_metrics_only_where_it_was_fitted(tmp_path):
     fitted.report = ImageJacobianFitReport(
         pairs=9, motion=20.0, error=1.0, held_out_error=2.0, noise=1.0
     )
-    with pytest.raises(ValueError, match="a loaded skill has no metrics"):  # it lacks the errors by cell
+    with pytest.raises(
+        ValueError, match="a loaded skill has no metrics"
+    ):  # it lacks the errors by cell
         VisualServoSkill(jacobian=fitted, target=None).metrics()

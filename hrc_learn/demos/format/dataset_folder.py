@@ -257,7 +257,7 @@ def _episodes_v3(root: Path, info: dict) -> Iterator[EpisodeEntry]:
     first_row: dict[tuple[int, int], int] = {}
     for row in rows:
         file = row[place[0]], row[place[1]]
-        start = row["dataset_from_index"]
+        start = int(row["dataset_from_index"] or 0)
         first_row[file] = min(first_row.get(file, start), start)
     # Resolved once per file: following links takes longer than all other work on an episode.
     template = info.get("data_path")
