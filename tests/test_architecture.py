@@ -116,7 +116,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
     "dmp": {"threadpoolctl"},
-    "cli": {"ray", "huggingface_hub", "httpx"},
+    "cli": {"huggingface_hub", "httpx"},
     "demos": {"av", "scipy", "huggingface_hub"},
     "vision": {"cv2"},
     "sim": {"franky_sim"},
