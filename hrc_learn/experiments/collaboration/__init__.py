@@ -1,1 +1,0 @@
-"""Experiment 3 of the paper: people in the whole job."""
