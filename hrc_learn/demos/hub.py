@@ -96,8 +96,9 @@ def push_dataset(
     report = check_dataset(path)
     if report.errors and not unsound:
         raise DatasetError(
-            f"has {len(report.errors)} errors, the first: {report.errors[0]}. Repair the "
-            f"dataset, or upload it with its errors (--unsound)",
+            # The advice comes first: long messages are cut at their end.
+            f"has {len(report.errors)} errors: repair the dataset, or upload it as it is "
+            f"(--unsound). The first: {report.errors[0]}",
             file=folder.root,
         )
     push = Push(
