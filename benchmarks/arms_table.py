@@ -1,8 +1,8 @@
 """A table of the registered arms: joints, reach, agreement with MuJoCo, servoing, demo, more.
 
 Written between the lines `<!-- arms:begin -->` and `<!-- arms:end -->` of the files given.
-Servoing is that of `hrc sweep --only near --robot NAME`: random starts, targets and cameras
-that nobody calibrated, against the kinematics. The last column is of earlier runs of
+The servoing column repeats the scenario `near` of `benchmarks/controller_sweep.py`: random
+starts, targets and uncalibrated cameras, simulated kinematically. The last column comes from
 `hrc demo --robot NAME --json FOLDER/NAME.json`; an arm without one keeps what its row says.
 Arms whose package is not installed are left out.
 """
