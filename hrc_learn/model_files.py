@@ -4,12 +4,11 @@ Models are written through `hrc_learn.store`: an interrupted save leaves the old
 but never an incomplete one.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 from torch import Tensor
 
 from hrc_learn import store
@@ -39,10 +38,9 @@ def write_model(
     header = {"format": FORMAT, "version": VERSION, "kind": kind}
     with store.replacing(folder, store.MODEL, overwrite=True) as new:
         new.mkdir()
-        (new / CONFIG).write_text(
-            json.dumps(header | config, indent=2) + "\n", encoding="utf-8"
-        )
-        save_file(tensors, new / MODEL)
+        (new / CONFIG).write_text(store.json_text(header | config), encoding="utf-8")
+        # Not by `save_file`, whose errors are no OSErrors.
+        (new / MODEL).write_bytes(save(tensors))
 
 
 class SavedModel:
@@ -57,6 +55,7 @@ class SavedModel:
                 raise ValueError(
                     f"{self.folder / CONFIG}: {field} is {found!r}, this reads {wanted!r}"
                 )
+        store.require_unchanged(self.folder)
         self.tensors = self._read_tensors()
 
     def get(self, field: str, *types: type) -> Any:
@@ -101,7 +100,7 @@ class SavedModel:
         if not path.is_file():
             raise FileNotFoundError(f"{path} does not exist")
         try:
-            return load_file(path)
+            return load(path.read_bytes())
         except SafetensorError as error:
             raise ValueError(f"{path}: not a safetensors file ({error})") from None
 
@@ -121,10 +120,4 @@ def _read_config(folder: Path) -> dict[str, Any]:
     store.settle(folder)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: no model was saved here")
-    try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: not valid JSON ({error})") from None
-    if not isinstance(config, dict):
-        raise ValueError(f"{path}: must hold one JSON object")
-    return config
+    return store.read_json(path, dict, "save the model again")

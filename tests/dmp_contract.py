@@ -274,6 +274,7 @@ class DMPContract:
             self.outputs(loaded.rollout(**arguments)), self.outputs(dmp.rollout(**arguments)), 0
         )
         assert sorted(p.name for p in (tmp_path / "saved").iterdir()) == [
+            ".manifest.json",
             "config.json",
             "model.safetensors",
         ]

@@ -85,7 +85,7 @@ LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
     # Of its modules for commands, each imported when its command runs.
     "cli": {"torch", "jaxtyping", "numpy", "tyro", "rich"},
-    "store": set(),
+    "store": {"msgspec"},
     "log": {"jaxtyping", "numpy"},
     "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
     "vision": {"jaxtyping", "numpy"},
@@ -103,7 +103,7 @@ LIBRARIES: dict[str, set[str]] = {
     "skills": {"torch", "jaxtyping", "numpy"},
     "learning": {"torch", "jaxtyping", "numpy"},
     "hardware": {"torch", "jaxtyping", "numpy"},
-    "teleoperation": {"torch", "jaxtyping", "numpy", "scipy"},
+    "teleoperation": {"torch", "jaxtyping", "numpy", "scipy", "msgspec"},
     "experiments": {"torch", "jaxtyping", "numpy", "matplotlib"},
     "lerobot": {
         *("torch", "jaxtyping", "numpy", "safetensors"),
@@ -127,7 +127,6 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
         "pygame",
         "forcedimension_core",
         "websockets",
-        "msgspec",
         "trimesh",
         "cv2",
     },
@@ -149,7 +148,6 @@ DISTRIBUTIONS = {
     "PIL": "matplotlib",
     # Requirements of viser's own.
     "websockets": "viser",
-    "msgspec": "viser",
     "trimesh": "viser",
     # Requirements of lerobot's own.
     "torchvision": "lerobot",

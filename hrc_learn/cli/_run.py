@@ -22,7 +22,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from hrc_learn.store import write_json
+from hrc_learn.store import DISK_ERRORS, write_json
 
 EXTRAS = {
     "tyro": "programs",
@@ -93,7 +93,7 @@ def status_of(work: Callable[[], int]) -> int:
             raise
         return 1
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno not in DISK_ERRORS:
             raise
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 2

@@ -27,6 +27,7 @@ from hrc_learn.store._claim import InTheWayError as InTheWayError
 from hrc_learn.store._claim import recover as recover
 from hrc_learn.store._claim import resolved as resolved
 from hrc_learn.store._claim import settle as settle
+from hrc_learn.store._disk import DISK_ERRORS as DISK_ERRORS
 from hrc_learn.store._disk import delete_files as delete_files
 from hrc_learn.store._disk import sync_file as sync_file
 from hrc_learn.store._ownership import DATASET as DATASET
@@ -36,7 +37,17 @@ from hrc_learn.store._ownership import MANIFEST as MANIFEST
 from hrc_learn.store._ownership import MODEL as MODEL
 from hrc_learn.store._ownership import RESULTS as RESULTS
 from hrc_learn.store._ownership import Kind as Kind
+from hrc_learn.store._ownership import changed_files as changed_files
+from hrc_learn.store._ownership import require_unchanged as require_unchanged
 from hrc_learn.store._ownership import source_of as source_of
+from hrc_learn.store._reading import Count as Count
+from hrc_learn.store._reading import Metres as Metres
+from hrc_learn.store._reading import Pixels as Pixels
+from hrc_learn.store._reading import Radians as Radians
+from hrc_learn.store._reading import json_text as json_text
+from hrc_learn.store._reading import parse_json as parse_json
+from hrc_learn.store._reading import read_json as read_json
+from hrc_learn.store._reading import read_toml as read_toml
 from hrc_learn.store._writing import new_file as new_file
 from hrc_learn.store._writing import new_folder as new_folder
 from hrc_learn.store._writing import read_made_by as read_made_by

@@ -13,11 +13,9 @@ from hrc_learn.store._disk import (
     carry_over,
     delete,
     delete_entries,
-    dump_json,
     entries,
     holder,
     is_at,
-    read_json,
     sign,
     sync_file,
     sync_folder,
@@ -25,6 +23,7 @@ from hrc_learn.store._disk import (
     try_lock,
 )
 from hrc_learn.store._ownership import Kind, owned_entries, write_manifest
+from hrc_learn.store._reading import json_text, read_json
 
 SUFFIX = ".writing"
 """Suffix of a workspace."""
@@ -164,15 +163,13 @@ class Claim:
         except InTheWayError as error:
             error.add_note(f"The new content is in {self.set_aside(self.new, 'new')}.")
             raise
-        replaces, owned = os.path.lexists(self.target), set()
-        if kind.manifest:
-            write_manifest(self.new, kind, source)
+        replaces = os.path.lexists(self.target)
+        write_manifest(self.new, kind, source)
         if replaces:
             owned = owned_entries(self.target, kind, adopt=keep) or set()
             if keep:  # after the manifest: carried files are foreign in the new folder too
                 owned |= carry_over(entries(self.target) - owned, self.target, self.new)
-        if replaces:
-            dump_json(self._owned, sorted(owned))
+            self._owned.write_text(json_text(sorted(owned)), encoding="utf-8")
         if self._sync:
             sync_tree(self.workspace)
         if replaces:
@@ -201,8 +198,8 @@ class Claim:
                 self.rename(self.new, self.target)
                 done.append(f"{name}: finished an interrupted replacement")
         if os.path.lexists(self._old):
-            listed = read_json(self._owned)
-            delete_entries(self._old, listed if isinstance(listed, list) else [])
+            with contextlib.suppress(OSError, ValueError):  # without a list nothing is ours
+                delete_entries(self._old, map(str, read_json(self._owned, list)))
             if os.path.lexists(self._old):
                 kept = self.set_aside(self._old, "kept")
                 warnings.warn(f"{kept} holds the foreign files of {name}", stacklevel=2)

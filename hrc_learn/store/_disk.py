@@ -3,14 +3,13 @@
 import contextlib
 import errno
 import filecmp
-import json
 import os
 import shutil
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 # Errors of file systems without locks, such as some network ones; not every OS has each.
 _NO_LOCKS = {
@@ -18,6 +17,14 @@ _NO_LOCKS = {
     for name in ("ENOTSUP", "EOPNOTSUPP", "ENOSYS", "ENOLCK", "EINVAL")
     if hasattr(errno, name)
 }
+
+
+DISK_ERRORS = {
+    getattr(errno, name)
+    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "EIO")
+    if hasattr(errno, name)
+}
+"""Errors of a full, read-only, protected or broken disk."""
 
 
 def try_lock(file: TextIO) -> bool:
@@ -45,10 +52,9 @@ def try_lock(file: TextIO) -> bool:
 
 def sign(file: TextIO) -> None:
     """Write the process and host into its locked file."""
-    file.seek(0)
-    file.truncate()
-    file.write(f"{os.getpid()} {socket.gethostname()}\n")
-    file.flush()
+    os.truncate(file.fileno(), 0)
+    # Unbuffered: on a full disk, closing the file shall not fail as well.
+    os.write(file.fileno(), f"{os.getpid()} {socket.gethostname()}\n".encode())
 
 
 def holder(path: Path) -> str:
@@ -93,17 +99,18 @@ def entries(folder: Path) -> set[str]:
     return found
 
 
-def dump_json(path: Path, content: object) -> None:
-    """Write a JSON file; values unknown to JSON become text."""
-    path.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
+@contextlib.contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Context that names a path in errors of the disk that name none.
 
-
-def read_json(path: Path) -> Any:
-    """Content of a JSON file; None if there is none."""
+    A full disk, for example, shows when a buffered file is closed, and that error has no name.
+    """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+        yield
+    except OSError as error:
+        if error.errno in DISK_ERRORS and error.filename is None:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
+        raise
 
 
 def sync_tree(folder: Path) -> None:

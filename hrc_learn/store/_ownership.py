@@ -1,18 +1,18 @@
 """Ownership of files: those written by this package may be deleted with their folder."""
 
+import hashlib
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-from hrc_learn.store._disk import dump_json, entries, matches, read_json
+from hrc_learn.store._disk import entries, matches
+from hrc_learn.store._reading import json_text, read_json
 
 MADE_BY = "made_by.json"
 """File in each folder of results that records its inputs."""
 MANIFEST = ".manifest.json"
-"""File that lists all other files of a folder."""
-_FORMAT, _VERSION = "hrc_learn manifest", 1
+"""File that lists all other files of a folder, with their checksums."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,8 +26,6 @@ class Kind:
     """Field and value that this JSON file must hold; None if its existence is enough."""
     files: tuple[str, ...]
     """Patterns of the files owned by a folder without a manifest; * matches / too."""
-    manifest: bool = True
-    """True if such a folder gets a manifest; not needed if it holds `files` only."""
 
 
 _MODEL_FILES = ("config.json", "model.safetensors")
@@ -38,14 +36,12 @@ MODEL = Kind(
     mark="config.json",
     says=("format", "hrc_learn"),
     files=_MODEL_FILES,
-    manifest=False,
 )
 EXPORT = Kind(
     name="export",
     mark="primitive/config.json",
     says=("format", "hrc_learn"),
     files=("step.pt2", *(f"primitive/{file}" for file in _MODEL_FILES)),
-    manifest=False,
 )
 DATASET = Kind(
     name="dataset",
@@ -104,7 +100,7 @@ def owned_entries(folder: Path, kind: Kind, *, adopt: bool = False) -> set[str] 
     if not present:
         return set()  # nothing could be lost
     manifest = _read_manifest(folder)
-    if manifest is not None and manifest.get("kind") != kind.name:
+    if manifest is not None and manifest.kind != kind.name:
         return None
     if manifest is None and not adopt and not _is_marked(folder, kind):
         return None
@@ -115,35 +111,85 @@ def owned_entries(folder: Path, kind: Kind, *, adopt: bool = False) -> set[str] 
     return present & owned
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Manifest:
+    format: Literal["hrc_learn manifest"] = "hrc_learn manifest"
+    version: Literal[1] = 1
+    kind: str
+    source: str = ""
+    entries: list[str]
+    """All files and folders of the folder, the latter with "/" at the end."""
+    sha256: dict[str, str] = field(default_factory=dict)
+    """Checksums of the files, by entry."""
+
+
 def write_manifest(folder: Path, kind: Kind, source: str) -> None:
     """Write the manifest of a folder, whose whole content was written here."""
-    content = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "kind": kind.name,
-        "source": source,
-        "entries": sorted(entries(folder) - {MANIFEST}),
-    }
-    dump_json(folder / MANIFEST, content)
+    names = sorted(entries(folder) - {MANIFEST})
+    checksums = {name: _checksum(folder / name) for name in names if (folder / name).is_file()}
+    manifest = _Manifest(kind=kind.name, source=source, entries=names, sha256=checksums)
+    (folder / MANIFEST).write_text(json_text(manifest), encoding="utf-8")
+
+
+def changed_files(folder: str | os.PathLike[str]) -> list[str]:
+    """Files of a folder that have changed, or are missing, since this package wrote it.
+
+    Returns:
+        Paths relative to the folder; none for a folder without a manifest.
+
+    Raises:
+        ValueError: The manifest is damaged.
+    """
+    folder = Path(folder)
+    if not (folder / MANIFEST).is_file():
+        return []
+    manifest = read_json(
+        folder / MANIFEST, _Manifest, "restore the folder, or delete this file"
+    )
+    return [
+        name
+        for name, checksum in manifest.sha256.items()
+        if not (folder / name).is_file() or _checksum(folder / name) != checksum
+    ]
+
+
+def require_unchanged(folder: str | os.PathLike[str]) -> None:
+    """Check that a folder is as this package wrote it.
+
+    Raises:
+        ValueError: A file has changed or is missing.
+    """
+    if changed := changed_files(folder):
+        raise ValueError(
+            f"{Path(folder) / changed[0]} has changed since it was written: restore it, or "
+            f"delete {MANIFEST} next to it if the change is intended"
+        )
 
 
 def source_of(folder: str | os.PathLike[str]) -> str:
     """Source given by the writer of a folder; "" if there is none."""
-    return str((_read_manifest(Path(folder)) or {}).get("source", ""))
+    manifest = _read_manifest(Path(folder))
+    return "" if manifest is None else manifest.source
 
 
-def _read_manifest(folder: Path) -> dict[str, Any] | None:
-    content = read_json(folder / MANIFEST)
-    known = isinstance(content, dict) and content.get("format") == _FORMAT
-    return content if known and isinstance(content.get("entries"), list) else None
+def _checksum(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _listed(folder: Path, manifest: Mapping[str, Any]) -> set[str]:
+def _read_manifest(folder: Path) -> _Manifest | None:
+    try:
+        return read_json(folder / MANIFEST, _Manifest)
+    except (OSError, ValueError):
+        return None
+
+
+def _listed(folder: Path, manifest: _Manifest) -> set[str]:
     """Entries of a manifest, and those of the manifests of the folders it lists.
 
     A foreign folder added later is not listed, whatever its own manifest says.
     """
-    listed = {str(entry) for entry in manifest["entries"]} | {MANIFEST}
+    listed = {*manifest.entries, MANIFEST}
     for entry in [entry for entry in listed if entry.endswith("/")]:
         inner = _read_manifest(folder / entry)
         if inner is not None:
@@ -154,6 +200,8 @@ def _listed(folder: Path, manifest: Mapping[str, Any]) -> set[str]:
 def _is_marked(folder: Path, kind: Kind) -> bool:
     if kind.says is None:
         return (folder / kind.mark).is_file()
-    field, value = kind.says
-    content = read_json(folder / kind.mark)
-    return isinstance(content, dict) and content.get(field) == value
+    name, value = kind.says
+    try:
+        return read_json(folder / kind.mark).get(name) == value
+    except (OSError, ValueError):
+        return False

@@ -1,16 +1,15 @@
 """Writing of files and folders that are complete or absent."""
 
-import json
-import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, SupportsFloat
+from typing import Any, Literal
 
 from hrc_learn.store._claim import Claim, InTheWayError, resolved, settle
-from hrc_learn.store._disk import dump_json
+from hrc_learn.store._disk import naming
 from hrc_learn.store._ownership import MADE_BY, RESULTS, Kind
+from hrc_learn.store._reading import json_text, read_json
 
 
 @contextmanager
@@ -29,7 +28,8 @@ def new_file(path: str | os.PathLike[str] | Claim) -> Iterator[Path]:
         InTheWayError: There is a folder of that name.
     """
     if not isinstance(path, Claim) and _is_device(path):
-        yield Path(path)  # such as /dev/stdout, which cannot be replaced
+        with naming(path):
+            yield Path(path)  # such as /dev/stdout, which cannot be replaced
         return
     with _claimed(path) as claim:
         if claim.target.is_dir():
@@ -97,7 +97,7 @@ def new_folder(
     with replacing(path, RESULTS, overwrite) as folder:
         folder.mkdir()
         yield folder
-        dump_json(folder / MADE_BY, made_by)
+        (folder / MADE_BY).write_text(json_text(made_by), encoding="utf-8")
 
 
 def read_made_by(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def read_made_by(folder: str | os.PathLike[str]) -> dict[str, Any]:
         FileNotFoundError: The folder does not record its inputs.
     """
     settle(folder)
-    return json.loads((Path(folder) / MADE_BY).read_text(encoding="utf-8"))
+    return read_json(Path(folder) / MADE_BY, dict, "repeat the command that made the folder")
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -118,32 +118,27 @@ def write_text(path: str | Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
-    """Write measured values as one flat JSON object.
+def write_json(path: str | Path, content: object) -> None:
+    """Write a JSON file; its folder is created if missing.
 
     Args:
-        path: File to write; its folder is created if missing.
-        values: Name -> number. Numbers that are not finite become null.
+        path: File to write.
+        content: Dataclass, mapping or list. Arrays and tensors become lists, numbers that are
+            not finite null, other objects text.
     """
-    content = {name: _plain(value) for name, value in values.items()}
-    write_text(path, json.dumps(content, indent=2) + "\n")
-
-
-def _plain(value: Any) -> float | int | bool | None:
-    # Scalars of numpy and torch become Python numbers.
-    plain = value.item() if hasattr(value, "item") else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
+    write_text(path, json_text(content))
 
 
 @contextmanager
 def _claimed(path: str | os.PathLike[str] | Claim) -> Iterator[Claim]:
     """A new claim for the duration of the context, or the given one, which stays held."""
     if not isinstance(path, Claim):
-        with Claim(path) as claim:
+        with naming(path), Claim(path) as claim:
             yield claim
         return
     try:
-        yield path
+        with naming(path.target):
+            yield path
     finally:
         path.clear()
 

@@ -183,6 +183,7 @@ def test_a_phase_of_the_callers_own_reproduces_but_is_not_saved(tmp_path):
 def test_files_without_a_type_of_phase_are_read(tmp_path):
     time, position = arm_motion()
     JointDMP.fit(time, position).save(tmp_path / "dmp")
+    (tmp_path / "dmp" / ".manifest.json").unlink()
     file = tmp_path / "dmp" / "config.json"
     file.write_text(file.read_text().replace('"type": "ExponentialPhase",', ""))
     assert JointDMP.load(tmp_path / "dmp").basis == GaussianBasis()

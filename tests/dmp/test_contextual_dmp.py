@@ -215,6 +215,7 @@ def test_a_feature_map_that_was_not_saved_is_asked_for(tmp_path):
 @pytest.mark.parametrize("fields", [{"degree": 0}, {"grade": 1}])
 def test_saved_features_that_cannot_be_are_named(fields, tmp_path):
     fitted().save(tmp_path / "placing")
+    (tmp_path / "placing" / ".manifest.json").unlink()
     path = tmp_path / "placing" / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"features": fields}))
     with pytest.raises(ValueError, match=r"config\.json: field 'features'"):

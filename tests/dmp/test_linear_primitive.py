@@ -47,7 +47,11 @@ def test_saving_replaces_whole_folders_and_leaves_nothing_else(saved):
     _, folder = saved
     JointDMP.fit(TIME, POSITION, n_basis=5).save(folder)
     assert JointDMP.load(folder).basis.count == 5
-    assert sorted(p.name for p in folder.iterdir()) == ["config.json", "model.safetensors"]
+    assert sorted(p.name for p in folder.iterdir()) == [
+        ".manifest.json",
+        "config.json",
+        "model.safetensors",
+    ]
     assert [p.name for p in folder.parent.iterdir()] == ["primitive"]
 
 
@@ -87,6 +91,16 @@ def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
     assert (tmp_path / "thesis" / "chapter.tex").read_text() == "years of work"
 
 
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_a_flipped_bit_is_noticed(saved, name):
+    _, folder = saved
+    content = bytearray((folder / name).read_bytes())
+    content[-8] ^= 1
+    (folder / name).write_bytes(content)
+    with pytest.raises(ValueError, match=name):
+        JointDMP.load(folder)
+
+
 @pytest.mark.parametrize(
     ("field", "value", "complaint"),
     [
@@ -104,6 +118,7 @@ def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
 )
 def test_a_wrong_config_names_file_and_field(saved, field, value, complaint):
     _, folder = saved
+    (folder / ".manifest.json").unlink()
     path = folder / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
     with pytest.raises(ValueError, match=complaint) as error:
@@ -113,6 +128,7 @@ def test_a_wrong_config_names_file_and_field(saved, field, value, complaint):
 
 def test_a_missing_field_or_file_is_named(saved):
     _, folder = saved
+    (folder / ".manifest.json").unlink()
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(
         json.dumps({k: config[k] for k in config if k != "basis"})
@@ -143,6 +159,7 @@ def test_a_missing_field_or_file_is_named(saved):
 )
 def test_wrong_tensors_are_named(saved, change, complaint):
     _, folder = saved
+    (folder / ".manifest.json").unlink()
     tensors = load_file(folder / "model.safetensors")
     change(tensors)
     save_file(tensors, folder / "model.safetensors")

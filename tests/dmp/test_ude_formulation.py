@@ -150,6 +150,7 @@ def test_angular_acceleration_is_that_of_the_error(dmp):
 def test_files_keep_the_formulation_and_older_ones_have_none(dmp, tmp_path):
     dmp.save(tmp_path)
     assert OrientationDMP.load(tmp_path).formulation == "ude"
+    (tmp_path / ".manifest.json").unlink()
     path = tmp_path / "config.json"
     config = json.loads(path.read_text())
     path.write_text(json.dumps(config | {"formulation": "euler"}))

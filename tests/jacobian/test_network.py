@@ -126,6 +126,7 @@ def test_save_replaces_an_older_save_and_leaves_nothing_else(tmp_path):
     assert_close(RBFImageJacobian.load(folder).weight, newer.weight)
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
     assert sorted(path.name for path in folder.iterdir()) == [
+        ".manifest.json",
         "config.json",
         "model.safetensors",
     ]
@@ -144,6 +145,7 @@ def test_load_names_what_is_wrong(tmp_path):
         RBFImageJacobian.load(tmp_path / "nowhere")
     folder = tmp_path / "model"
     random_network().save(folder)
+    (folder / ".manifest.json").unlink()
     config = json.loads((folder / "config.json").read_text())
 
     (folder / "config.json").write_text(json.dumps(config | {"version": 99}))

@@ -65,7 +65,7 @@ def test_what_older_versions_wrote_is_replaced(tmp_path):
     [('{"by": "us"}', True), ('{"by": "them"}', False), ("[]", False), ("no JSON", False)],
 )
 def test_a_mark_without_a_manifest_must_say_whose_it_is(tmp_path, text, ours):
-    kind = Kind(name="pie", mark="mark", says=("by", "us"), files=("mark",), manifest=False)
+    kind = Kind(name="pie", mark="mark", says=("by", "us"), files=("mark",))
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mark").write_text(text)
 
