@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
+from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
 N_BASIS = 60
 """Of a coordinate: as of `hrc fit --as-lerobot-policy`."""

@@ -145,7 +145,7 @@ def main(args: Args) -> None:
 def _fitted(args: Args, config: MujocoArmRobotConfig) -> Path:
     """The policy `dmp` in closed form, of ten demonstrations without imperfections."""
     from hrc_learn.lerobot.expert_recording import record_expert
-    from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
+    from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
     dataset = args.data / f"{args.task}_{args.fps}hz"
     policy = args.data / f"{args.task}_{args.fps}hz_policy"

@@ -62,10 +62,8 @@ class Args:
         "diffusion",
         "dmp",
         "motion_chunk",
-        "act_dmp",
-        "diffusion_dmp",
     )
-    """LeRobot's own and ours; the last two decode the first two by movement primitives."""
+    """LeRobot's own and ours."""
     demonstrations: int = 50
     """To learn from."""
     few: int = 3

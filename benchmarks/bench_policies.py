@@ -38,7 +38,7 @@ WARM_UP = 50
 """Steps of training in which the learning rate rises."""
 CONSTANT = 1e-6
 """Columns of the action that vary by less play no part."""
-POLICIES = ("act", "diffusion", "dmp", "motion_chunk", "act_dmp", "diffusion_dmp")
+POLICIES = ("act", "diffusion", "dmp", "motion_chunk")
 type Episode = dict[str, Tensor]
 
 
@@ -47,8 +47,7 @@ class Args:
     data: tuple[Path, ...]
     """Folders of LeRobot datasets."""
     policies: tuple[str, ...] = ("nearest", "act", "dmp", "motion_chunk")
-    """nearest: neighbour; act, diffusion: small ones; dmp, motion_chunk: from a closed form;
-    act_dmp, diffusion_dmp: the first two decoded by movement primitives."""
+    """nearest: neighbour; act, diffusion: small ones; dmp, motion_chunk: from a closed form."""
     minutes: float = 1.0
     """CPU time of building and training each."""
     chunk: int = 50
@@ -70,7 +69,7 @@ class Args:
 
 
 def main(args: Args) -> None:
-    from hrc_learn.lerobot.policy.closed_form import read_episodes
+    from hrc_learn.lerobot.policy.training_samples import read_episodes
 
     torch.set_num_threads(1)
     figures: dict[str, float] = {}
@@ -216,9 +215,7 @@ def learn(
         shown = [e | {ENVIRONMENT: e[STATE]} for e in shown]
     begun = time.process_time()
     policy: Any = get_policy_class(name)(config, dataset_stats=stats)
-    if name == "dmp":
-        policy.planner.fit(shown, ACTION)
-    elif name == "motion_chunk":
+    if name in ("dmp", "motion_chunk"):
         policy.fit(shown)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     until = begun + 60 * minutes
@@ -262,7 +259,7 @@ class Nearest:
     def __init__(
         self, shown: Sequence[Episode], stats: dict[str, dict[str, Tensor]], chunk: int
     ):
-        from hrc_learn.lerobot.policy.closed_form import SampleWindows
+        from hrc_learn.lerobot.policy.training_samples import SampleWindows
 
         windows = SampleWindows(shown, {STATE: None, ACTION: range(chunk)}, 1)
         everything = windows.batch(torch.arange(len(windows)))
@@ -294,12 +291,7 @@ def config_of(
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.policies import ACTConfig, DiffusionConfig
 
-    from hrc_learn.lerobot import (
-        ActDmpConfig,
-        DiffusionDmpConfig,
-        DMPConfig,
-        MotionChunkConfig,
-    )
+    from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 
     inputs = {STATE: PolicyFeature(FeatureType.STATE, (episode[STATE].shape[1],))}
     if ENVIRONMENT in episode or name not in ("dmp", "motion_chunk"):
@@ -342,12 +334,8 @@ def config_of(
             )
         case "act":
             return ACTConfig(**common, **act)
-        case "act_dmp":
-            return ActDmpConfig(**common, **act, fps=fps)
         case "diffusion":
             return DiffusionConfig(**common, **diffusion)
-        case "diffusion_dmp":
-            return DiffusionDmpConfig(**common, **diffusion, fps=fps)
     raise ValueError(f"--policies takes nearest, {', '.join(POLICIES)}, not {name!r}")
 
 
@@ -364,7 +352,7 @@ def train(
 
     The learning rate falls along a cosine over that time.
     """
-    from hrc_learn.lerobot.policy.closed_form import SampleWindows
+    from hrc_learn.lerobot.policy.training_samples import SampleWindows
 
     config = policy.config
     seen = config.observation_delta_indices

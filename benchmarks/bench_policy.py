@@ -98,7 +98,7 @@ class Done:
 
 def main(args: Args) -> None:
     from hrc_learn.lerobot.envs import ArmEnvConfig
-    from hrc_learn.lerobot.policy.closed_form import read_episodes
+    from hrc_learn.lerobot.policy.training_samples import read_episodes
 
     torch.set_num_threads(1)
     env = ArmEnvConfig(task=args.task, fps=args.fps, pixels=args.task == "grasping")
@@ -186,7 +186,7 @@ def _blind_to_constants(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     LeRobot divides by its spread of nothing, and the policy would be thrown anywhere.
     """
-    from hrc_learn.lerobot.policy.networks import SMALLEST_SPREAD
+    from hrc_learn.lerobot.policy.observation_encoder import SMALLEST_SPREAD
 
     return stats | {"std": np.where(stats["std"] > SMALLEST_SPREAD, stats["std"], np.inf)}
 
@@ -228,7 +228,7 @@ def _config(name: str, width: int) -> Any:
 
 def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> dict[str, float]:
     """As lerobot-train does it, with batches from memory; mean losses of some tenths of it."""
-    from hrc_learn.lerobot.policy.closed_form import SampleWindows, read_episodes
+    from hrc_learn.lerobot.policy.training_samples import SampleWindows, read_episodes
 
     config = policy.config
     episodes = [e | _observation(e[STATE]) for e in read_episodes(dataset, (STATE, ACTION))]

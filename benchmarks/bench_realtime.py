@@ -73,7 +73,7 @@ type Stepper = Callable[[dict[str, Any]], tuple[np.ndarray, bool]]
 
 def main(args: Args) -> None:
     from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
-    from hrc_learn.lerobot.policy.closed_form import read_episodes
+    from hrc_learn.lerobot.policy.training_samples import read_episodes
 
     torch.set_num_threads(1)
     columns = read_episodes(args.data, (STATE, ACTION))
@@ -121,7 +121,7 @@ def _learn(shown: Any, fps: float, args: Args) -> tuple[Any, int, float]:
     from lerobot.policies import make_pre_post_processors
 
     import hrc_learn.lerobot  # noqa: F401  registers ours
-    from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
+    from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
 
     torch.manual_seed(args.seed)
     stats: Any = statistics(shown)

@@ -11,9 +11,9 @@ from torch import Tensor
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import minimum_jerk
 from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
-from hrc_learn.lerobot.policy.closed_form import SampleWindows
-from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
-from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
+from hrc_learn.lerobot.policy.dmp_policy import DMPPolicy
+from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
+from hrc_learn.lerobot.policy.training_samples import SampleWindows
 
 FPS = 20.0
 NAMES = ["a.pos", "b.pos"]
@@ -133,14 +133,14 @@ def chunk_policy(episodes: list[Episode], **changes) -> MotionChunkPolicy:
 
 def fitted_policy(episodes: list[Episode], **changes) -> DMPPolicy:
     policy = DMPPolicy(config_for(episodes[0], **changes), dataset_stats=stats_of(episodes))
-    policy.planner.fit(episodes, "action")
+    policy.fit(episodes)
     return policy
 
 
 def shaken(policy: DMPPolicy, seed: int = 0) -> DMPPolicy:
     """The same after a training that went astray: what is seen changes the motion wildly."""
     rng = torch.Generator().manual_seed(seed)
-    last = policy.planner.motion.network[-1]
+    last = policy.motion.network[-1]
     with torch.no_grad():
         last.weight.copy_(0.3 * torch.randn(last.weight.shape, generator=rng))
     return policy

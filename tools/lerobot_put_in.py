@@ -11,8 +11,7 @@
 
 import pytest
 
-BACKBONES = ("act_dmp", "diffusion_dmp")
-POLICIES = ("dmp", "motion_chunk", *BACKBONES)
+POLICIES = ("dmp", "motion_chunk")
 FPS = 30.0
 """Of LeRobot's tests, whose policies are made without a dataset that would tell."""
 PAIRS = ("mock", "mujoco_arm", "smooth")
@@ -50,8 +49,6 @@ def _knowing_the_rate(make):
     def made(name, **settings):
         if name in POLICIES:
             settings["fps"] = FPS
-        if name in BACKBONES:  # no network for torchvision's weights
-            settings["pretrained_backbone_weights"] = None
         return make(name, **settings)
 
     return made

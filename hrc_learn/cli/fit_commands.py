@@ -174,7 +174,7 @@ def _fit_streamed(args: FitPrimitives, console: Console) -> None:
 
 def _fit_policy(args: FitPrimitives, console: Console) -> None:
     # LeRobot takes ten seconds to import.
-    from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
+    from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
     given = (args.channels, args.context, args.joint_names, args.units, args.mapping)
     if any(given) or (args.several, args.method, args.scaling) != (

@@ -10,11 +10,5 @@ from hrc_learn.lerobot import envs as envs
 from hrc_learn.lerobot import robots as robots
 from hrc_learn.lerobot import smoothing as smoothing
 from hrc_learn.lerobot import teleoperators as teleoperators
-from hrc_learn.lerobot.policy.configuration_backbones import ActDmpConfig as ActDmpConfig
-from hrc_learn.lerobot.policy.configuration_backbones import (
-    DiffusionDmpConfig as DiffusionDmpConfig,
-)
-from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig as DMPConfig
-from hrc_learn.lerobot.policy.configuration_motion_chunk import (
-    MotionChunkConfig as MotionChunkConfig,
-)
+from hrc_learn.lerobot.policy.dmp_policy import DMPConfig as DMPConfig
+from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkConfig as MotionChunkConfig

@@ -35,7 +35,7 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 from hrc_learn.lerobot.arm_robot import MARKER, PIXELS
-from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.training_samples import read_episodes
 from hrc_learn.lerobot.smoothing import PREPROCESSOR, read_pipeline
 from hrc_learn.lerobot.smoothing.action_limits import write_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE

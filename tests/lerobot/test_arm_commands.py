@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.training_samples import read_episodes
 
 pytestmark = pytest.mark.slow
 

@@ -22,8 +22,11 @@ from lerobot_samples import (
 )
 
 from hrc_learn.lerobot import DMPConfig
-from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy, write_closed_form_policy
-from hrc_learn.lerobot.policy.processor_dmp import make_dmp_pre_post_processors
+from hrc_learn.lerobot.policy.dmp_policy import (
+    DMPPolicy,
+    make_dmp_pre_post_processors,
+    write_closed_form_policy,
+)
 
 SHOWN = reaching(10)
 HELD_OUT = reaching(5, seed=1)
@@ -115,8 +118,8 @@ def test_what_explains_nothing_is_not_followed():
     policy, misled = fitted_policy(SHOWN), fitted_policy(others)
 
     def difference(policy):
-        ends = [policy.planner.initial_plan(seen).context for seen in (one, other)]
-        slopes = policy.planner.motion.slopes
+        ends = [policy.begin(seen).context for seen in (one, other)]
+        slopes = policy.motion.slopes
         return float(((ends[0] - ends[1]) @ slopes).norm())
 
     assert difference(misled) < 0.1 * difference(policy)
@@ -153,7 +156,7 @@ def test_training_takes_up_what_the_closed_form_leaves():
 def test_position_and_velocity_go_on_over_seams_whatever_is_predicted():
     """At a thousand actions a second velocity jumps show, were there any."""
     policy = shaken(fitted_policy(SHOWN, chunk_size=40, n_action_steps=20))
-    policy.planner.step = 1e-3
+    policy.config.fps = 1000.0
     noise = torch.Generator().manual_seed(0)
     episode = {
         key: x[:1] + torch.randn(400, x.shape[-1], generator=noise) if key != "action" else x
@@ -248,7 +251,7 @@ def test_a_dataset_on_disk_is_fitted_by_its_episodes(tmp_path, caplog):
     policy = DMPPolicy(config, dataset_stats=stats, dataset_meta=meta)
     assert config.fps == FPS
     like = DMPPolicy(config, dataset_stats=stats)
-    like.planner.fit([shown[0], shown[2]], "action")
+    like.fit([shown[0], shown[2]])
     torch.testing.assert_close(played(policy, shown[1]), played(like, shown[1]))
     # Of a dataset that is streamed nothing lies on disk.
     DMPPolicy(config, dataset_stats=stats, dataset_meta=SimpleNamespace(root=tmp_path, fps=FPS))
@@ -311,10 +314,10 @@ def test_a_closed_form_policy_is_a_checkpoint_of_numbers_alone(tmp_path, episode
     assert (config.fps, config.n_basis, config.push_to_hub) == (FPS, 12, False)
     shown = [e | {STATE: e["action"]} for e in (SHOWN[k] for k in chosen)]
     like = DMPPolicy(config_for(shown[0], state_names=["a.pos", "b.pos"]))
-    like.planner.encoder.load_state_dict(policy.planner.encoder.state_dict())
-    error = like.planner.fit(shown, "action")
-    assert figures["left_out_error"] == pytest.approx(error, rel=1e-5)
-    torch.testing.assert_close(policy.planner.motion.base, like.planner.motion.base)
+    like.encoder.load_state_dict(policy.encoder.state_dict())
+    like.fit(shown)
+    assert figures["left_out_error"] == pytest.approx(like.left_out_error, rel=1e-5)
+    torch.testing.assert_close(policy.motion.base, like.motion.base)
     for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
         assert (tmp_path / "policy" / name).is_file()
 

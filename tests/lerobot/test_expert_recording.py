@@ -6,7 +6,7 @@ import pytest
 from unchecked import shapes_unchecked
 
 from hrc_learn.lerobot import expert_recording
-from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.training_samples import read_episodes
 from hrc_learn.lerobot.robots import MujocoArmRobotConfig
 
 FPS = 10.0

@@ -15,9 +15,8 @@ from lerobot_samples import (
     train,
 )
 
-from hrc_learn.lerobot.policy.chunk_network import Plans
-from hrc_learn.lerobot.policy.continued_motion import MotionChunk
-from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
+from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
+from hrc_learn.lerobot.policy.motion_chunks import MotionChunk, Plans
 
 SHOWN = reaching(10)
 

@@ -29,8 +29,8 @@ from safetensors.torch import save_file
 from torchvision.models import resnet18
 
 from hrc_learn.lerobot import MotionChunkConfig
-from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder
-from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
+from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
+from hrc_learn.lerobot.policy.motion_chunks import ChunkDecoder
 
 SHOWN = reaching(10)
 

@@ -12,7 +12,7 @@ from hrc_learn.lerobot import person
 from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmValues
 from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
 from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
-from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.training_samples import read_episodes
 from hrc_learn.lerobot.robots import FrankaPandaConfig
 from hrc_learn.lerobot.teleoperators.arm_teleoperators import GuidedRobot
 from hrc_learn.teleoperation import ScriptedForce

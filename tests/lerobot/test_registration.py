@@ -7,7 +7,7 @@ from lerobot.processor import ProcessorStepRegistry
 from lerobot.robots import RobotConfig
 from lerobot.teleoperators import TeleoperatorConfig
 
-from hrc_learn.lerobot import ActDmpConfig, DiffusionDmpConfig, DMPConfig, MotionChunkConfig
+from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 from hrc_learn.lerobot.envs import ArmEnvConfig
 from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoArmRobotConfig
 from hrc_learn.lerobot.teleoperators import ArmExpertConfig, ArmPageConfig
@@ -34,5 +34,3 @@ def test_lerobot_knows_them_by_name():
         assert ProcessorStepRegistry.get(step)
     assert PreTrainedConfig.get_choice_class("dmp") is DMPConfig
     assert PreTrainedConfig.get_choice_class("motion_chunk") is MotionChunkConfig
-    assert PreTrainedConfig.get_choice_class("act_dmp") is ActDmpConfig
-    assert PreTrainedConfig.get_choice_class("diffusion_dmp") is DiffusionDmpConfig

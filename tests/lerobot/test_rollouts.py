@@ -10,8 +10,8 @@ from hrc_learn.lerobot import person
 from hrc_learn.lerobot.arm_robot import GRIPPER, ArmValues
 from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
 from hrc_learn.lerobot.person import PersonConfig
-from hrc_learn.lerobot.policy.closed_form import read_episodes
-from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
+from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
+from hrc_learn.lerobot.policy.training_samples import read_episodes
 from hrc_learn.lerobot.robots import MujocoArmRobotConfig
 from hrc_learn.lerobot.rollouts import CheckpointPolicy, record_rollouts
 from hrc_learn.teleoperation import ScriptedForce

@@ -10,9 +10,8 @@ from torch import nn
 from torchvision.models import ResNet18_Weights, resnet18, resnet34
 
 from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
-from hrc_learn.lerobot.policy.networks import (
-    HARMONICS,
-    ContextualMotion,
+from hrc_learn.lerobot.policy.contextual_motion import HARMONICS, ContextualMotion
+from hrc_learn.lerobot.policy.observation_encoder import (
     KeypointEncoder,
     ObservationEncoder,
     load_backbone,

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.lerobot.policy.motion_planner import (
+from hrc_learn.lerobot.policy.action_encoding import (
     ActionEncoding,
     matched_columns,
     rotation_triples,

@@ -1,44 +1,42 @@
-"""The policy `motion_chunk` as LeRobot calls it."""
+"""The policy `motion_chunk`: chunks of actions as motions that continue smoothly.
 
-import logging
+LeRobot finds policy and processors in the module of the configuration.
+"""
+
 from collections import deque
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
-from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from jaxtyping import Float
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import CosineDecayWithWarmupSchedulerConfig
+from lerobot.processor import (
+    make_default_pre_post_processors as make_motion_chunk_pre_post_processors,
+)
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from torch.nn import functional as F
 
-from hrc_learn.lerobot.policy.chunk_network import (
+from hrc_learn.lerobot.policy.action_encoding import (
+    ActionEncoding,
+    rotation_triples,
+    two_level_columns,
+)
+from hrc_learn.lerobot.policy.motion_chunks import (
     LEFT_OVER,
     ChunkDecoder,
     ChunkNetwork,
+    ContinuedMotion,
+    MotionChunk,
     Plans,
 )
-from hrc_learn.lerobot.policy.closed_form import SampleWindows, read_episodes
-from hrc_learn.lerobot.policy.common import (
-    frame_rate,
-    load_weights,
-    make_encoder,
-    require_any_statistics,
-    require_numbers,
-    require_statistics,
-    two_level_columns,
-)
-from hrc_learn.lerobot.policy.configuration_motion_chunk import MotionChunkConfig
-from hrc_learn.lerobot.policy.continued_motion import ContinuedMotion, MotionChunk
-from hrc_learn.lerobot.policy.motion_planner import (
-    ActionEncoding,
-    matched_columns,
-    rotation_triples,
-)
-from hrc_learn.lerobot.policy.networks import Observation, divisors
+from hrc_learn.lerobot.policy.observation_encoder import Observation, divisors
+from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig
+from hrc_learn.lerobot.policy.training_samples import SampleWindows
 
-logger = logging.getLogger(__name__)
+__all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 
 MEASURED = 0.5
 """Spreads by which actions may differ from the state of their name to be what it measures."""
@@ -72,7 +70,76 @@ MOST_CHUNKS = 50_000
 """That say enough of a linear function; more are spread evenly."""
 
 
-class MotionChunkPolicy(PreTrainedPolicy):
+@PreTrainedConfig.register_subclass("motion_chunk")
+@dataclass
+class MotionChunkConfig(MotionPolicyConfig):
+    """Chunks of actions, each a motion that goes on from what is being carried out."""
+
+    n_basis: int | None = None
+    """Basis functions a coordinate and chunk; None: 10, or two for five actions."""
+    hidden_dim: int = 256
+    """Width of the network."""
+    dropout: float = 0.1
+    """Dropout probability of hidden features in training."""
+    history: int = 2
+    """Frames over which the velocity of observation.state is seen, where every frame is shown
+    (`select_action`); 0: it is not. Training loads a second frame of everything for it."""
+    state_noise: float = 0.0
+    """Noise on observation.state in training, relative to its spread. With 0.15, plans return
+    to the demonstrations from nearby states. This helps where demonstrations hardly vary, such
+    as scripted ones; human variation has the same effect, and noise would blur the intent.
+    """
+    n_plans: int = 3
+    """Plans for each observation, of which one is carried out: as many ways to go as the
+    demonstrations may show from one place."""
+    two_level_actions: list[int] | None = None
+    """Components of the action that know two levels only, such as a gripper that is open or
+    shut, and jump between them; None: those that the dataset's statistics show to be such."""
+    blend_time: float | None = None
+    """About how long a chunk takes from what is carried out to what is planned [s]; None: 0.05
+    s or one action, or less where the basis functions of a chunk are so close to each other
+    that its acceleration is uneven within that time, with which the motion would go on."""
+    optimizer_lr: float = 1e-3
+    optimizer_weight_decay: float = 1e-2
+    scheduler_decay_steps: int = 20_000
+    """Steps along which the learning rate falls to nothing; no more than are trained."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("n_basis", "hidden_dim", "n_plans"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        if self.blend_time is not None and self.blend_time <= 0:
+            raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
+        if self.history < 0:
+            raise ValueError(f"history must be 0 frames or more, got {self.history}")
+        if self.state_noise < 0:
+            raise ValueError(f"state_noise must not be negative, got {self.state_noise}")
+        if self.chunk_size < 4:
+            raise ValueError(f"chunk_size must be at least 4, got {self.chunk_size}")
+
+    @property
+    def observation_delta_indices(self) -> list[int] | None:
+        """The current observation, and one before."""
+        return [-self.history, 0] if self.history else None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """The chunk, and the action after it."""
+        return list(range(self.chunk_size + 1))
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        """Cosine decay of the learning rate to zero."""
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=min(100, self.scheduler_decay_steps),
+            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=0.0,
+        )
+
+
+class MotionChunkPolicy(MotionPolicy):
     """Chunks that begin as what is being carried out goes on: C2, whatever is predicted.
 
     From each observation, and how fast the state in it changes, a network plans the next second
@@ -85,8 +152,6 @@ class MotionChunkPolicy(PreTrainedPolicy):
     name = "motion_chunk"  # pyright: ignore[reportAssignmentType]
     config: MotionChunkConfig
 
-    measured: Int[Tensor, "A"]
-    """Columns of the state that hold the action's components; -1: none does."""
     error: Float[Tensor, ""]
     """Root mean square distance of the nearest plan from what is shown, in spreads."""
     levels: Float[Tensor, "2 A"]
@@ -116,31 +181,17 @@ class MotionChunkPolicy(PreTrainedPolicy):
             ValueError: Features that the policy cannot work with, a frame rate that is unknown
                 or another one, or statistics with gaps.
         """
-        super().__init__(config)
-        config.validate_features()
-        config.fps = frame_rate(config, dataset_meta)
-        self.config = config
-        inputs = config.input_features or {}
-        widths = {k: inputs[k].shape[0] for k in (OBS_STATE, OBS_ENV_STATE) if k in inputs}
-        self.encoder = make_encoder(config, widths)
-        (width,) = (config.output_features or {})[ACTION].shape
-        names, states = config.action_feature_names, config.state_names
-        self.encoding = ActionEncoding(width, rotation_triples(names))
+        super().__init__(config, dataset_meta)
+        widths, width = self.encoder.widths, len(self.encoding.mean)
+        states = config.state_names if OBS_STATE in widths else None
         # States that turn are seen as orientations too, whose vectors do not jump.
-        self.turning = ActionEncoding(
-            widths.get(OBS_STATE, 0), rotation_triples(states) if OBS_STATE in widths else []
-        )
-        columns = matched_columns(
-            names, states if OBS_STATE in widths else None, (width, widths.get(OBS_STATE, 0))
-        )
+        self.turning = ActionEncoding(widths.get(OBS_STATE, 0), rotation_triples(states))
         self.register_buffer("error", torch.ones(()))
-        self.register_buffer("measured", torch.tensor(columns))
         self.register_buffer("levels", torch.tensor([[-1.0], [1.0]]).repeat(1, width))
         moving = widths.get(OBS_STATE, 0) if config.history else 0
         self.register_buffer("velocity_spread", torch.ones(moving))
         if config.pretrained_path is None:
-            require_any_statistics(dataset_stats, dataset_meta)
-            self._whiten(dataset_stats)
+            self._whiten(dataset_stats, dataset_meta)
         config.two_level_actions = config.two_level_actions or []
         self._stepped = sorted(config.two_level_actions)
         if not set(self._stepped) < set(range(width)):
@@ -150,7 +201,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
             )
         self._smooth = [k for k in range(width) if k not in self._stepped]
         self.decoder = ChunkDecoder(
-            config.chunk_size, 1 / config.fps, config.n_basis, config.blend_time
+            config.chunk_size, self._step, config.n_basis, config.blend_time
         )
         self.network = ChunkNetwork(
             numbers=sum(widths.values()),
@@ -165,12 +216,8 @@ class MotionChunkPolicy(PreTrainedPolicy):
         )
         self.motion = ContinuedMotion(self.decoder, self._compose, self._decompose)
         if config.pretrained_path is None:
-            self._fit(dataset_meta)
+            self._fit_dataset(dataset_meta)
         self.reset()
-
-    def get_optim_params(self) -> Any:
-        """All parameters alike."""
-        return self.parameters()
 
     def supports_rtc(self) -> bool:
         """Chunks go on from what is left of the one before: without guidance, exactly."""
@@ -257,7 +304,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         self.eval()
         if inference_delay < 0:
             raise ValueError(f"inference_delay must not be negative, got {inference_delay}")
-        require_numbers(self.config, self.encoder.widths, batch)
+        self._require_numbers(batch)
         self._states.clear()  # Callers that request chunks do not pass every frame.
         plans = self._plans(batch)
         if prev_chunk_left_over is not None:
@@ -277,16 +324,11 @@ class MotionChunkPolicy(PreTrainedPolicy):
             self._states.append(batch[OBS_STATE].clone())  # its memory may be used again
         if not self._action_queue:
             self.eval()
-            require_numbers(self.config, self.encoder.widths, batch)
+            self._require_numbers(batch)
             steps = self.config.n_action_steps
             chunk = self._go_on(batch, self._plans(batch), self.motion.after(steps), 0)
             self._action_queue.extend(chunk[:, :steps].unbind(1))
         return self._action_queue.popleft()
-
-    @property
-    def _step(self) -> float:
-        assert self.config.fps is not None
-        return 1 / self.config.fps
 
     def _turned(self, batch: Observation) -> Observation:
         """The observation with what turns in its state as an orientation."""
@@ -339,18 +381,13 @@ class MotionChunkPolicy(PreTrainedPolicy):
 
     def _chosen(self, plans: Plans, before: MotionChunk | None) -> Float[Tensor, "B D M"]:
         """One plan: likely, and the way that is being gone; the mean of those of one way."""
-        scores, same = (
-            plans.scores.log_softmax(-1),
-            SAME_WAY * self.error.clamp_min(LEAST_ERROR),
-        )
+        scores = plans.scores.log_softmax(-1)
+        same = SAME_WAY * self.error.clamp_min(LEAST_ERROR)
         positions = self.decoder.positions(plans.coefficients)
         if before is not None:
             off = positions - before.states[:, None, :, 0].to(positions)
             scores = scores - off.square().mean((-2, -1)) / (2 * same**2)
-        if before is None and self.config.sample_plans:
-            chosen = torch.multinomial(scores.exp(), 1)[:, 0]
-        else:
-            chosen = scores.argmax(-1)
+        chosen = scores.argmax(-1)
         row = torch.arange(len(chosen), device=chosen.device)
         apart = (positions - positions[row, chosen][:, None]).square().mean((-2, -1))
         weight = scores.masked_fill(apart >= same**2, -torch.inf).softmax(-1)
@@ -382,43 +419,20 @@ class MotionChunkPolicy(PreTrainedPolicy):
         upper = (coordinates[..., self._stepped] > (low + high) / 2).to(coordinates)
         return coordinates[..., self._smooth], upper
 
-    @classmethod
-    def _load_as_safetensor(
-        cls, model: Any, model_file: str, map_location: str, strict: bool
-    ) -> Any:
-        load = super()._load_as_safetensor
-        return load_weights(load, model, model_file, map_location, strict)
-
-    def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None) -> None:
-        """Take spreads, levels, and which columns know two levels only, from statistics."""
+    def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
+        """Take spreads, levels, and the columns with two levels only, from statistics."""
+        super()._whiten(stats, dataset_meta)
         if stats is None:
             return
-        width = len(self.encoding.mean)
-        for key, size in self.encoder.widths.items():
-            require_statistics(stats, key, size)
-        require_statistics(stats, ACTION, width, ("mean", "std", "min", "max"))
-        self.encoder.whiten(stats)
         mean, std, low, high = (
             torch.as_tensor(stats[ACTION][k]).to(self.encoding.mean)
             for k in ("mean", "std", "min", "max")
         )
-        self.encoding.whiten(std, mean)
         self.levels.copy_((torch.stack([low, high]) - mean) / self.encoding.std)
         if self.config.two_level_actions is None:
             turning = {i for triple in self.encoding.triples for i in triple}
             found = [i for i in two_level_columns(mean, std, low, high) if i not in turning]
-            self.config.two_level_actions = found if len(found) < width else []
-
-    def _fit(self, dataset_meta: Any) -> None:
-        """Start from the demonstrations, if they lie on disk."""
-        if dataset_meta is None:
-            return
-        root = Path(dataset_meta.root)
-        if not (root / "data").is_dir():
-            logger.warning("no demonstrations in %s: training starts from standing still", root)
-            return
-        keys = (ACTION, *self.encoder.widths)
-        self.fit(read_episodes(root, keys, self.config.fit_episodes))
+            self.config.two_level_actions = found if len(found) < len(mean) else []
 
     @torch.no_grad()
     def fit(self, demonstrations: list[dict[str, Tensor]]) -> None:

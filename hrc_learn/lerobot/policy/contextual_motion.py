@@ -1,0 +1,220 @@
+"""Movement primitives as a function of what is seen, and their fit in closed form."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
+
+from hrc_learn.dmp import JointDMP, Response, continue_motion, fit_ridge
+
+HARMONICS = 4
+"""Sines and cosines of the phase that the network sees."""
+DURATIONS = math.log(3)
+"""Largest deviation of a predicted duration from the fitted one, as a logarithm."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Primitives:
+    """One primitive of A coordinates for each element of a batch."""
+
+    weights: Float[Tensor, "*batch A N"]
+    start: Float[Tensor, "*batch A"]
+    start_velocity: Float[Tensor, "*batch A"]
+    """Per second."""
+    goal: Float[Tensor, "*batch A"]
+    duration: Float[Tensor, "*batch"]
+    """[s]"""
+
+
+class ContextualMotion(nn.Module):
+    """Primitives as a function of what is seen.
+
+    x = a + B c + r(features, phase),   x = (weights, y_0', y_0, g) of each coordinate, log tau
+
+    The context c is what was measured at the start of the episode. a and B come from a fit in
+    closed form (see `closed_form.py`), and the network r starts at zero: so the policy works
+    before the first gradient, and learns what is left. Weights count in units of the spring's
+    stiffness, where they are as large as the motion.
+    """
+
+    centre: Tensor
+    """Context of base."""
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self, response: Response, width: int, context: int, features: int, hidden: int
+    ):
+        """Make one that stands still.
+
+        Args:
+            response: Response of the primitives.
+            width: A, their coordinates.
+            context: C, length of the context.
+            features: Features of the first and the current observation together.
+            hidden: Width of the network.
+        """
+        super().__init__()
+        self.response = response
+        self.width = width
+        count = response.basis.count + 3
+        self.base = nn.Parameter(torch.zeros(width * count + 1))
+        self.slopes = nn.Parameter(torch.zeros(context, width * count + 1))
+        self.register_buffer("centre", torch.zeros(context))
+        self.register_buffer("low", torch.full((context,), -torch.inf))
+        self.register_buffer("high", torch.full((context,), torch.inf))
+        last = nn.Linear(hidden, width * count + 1)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.network = nn.Sequential(
+            nn.Linear(features + 2 * HARMONICS, hidden),
+            nn.LayerNorm(hidden),
+            nn.GELU(),
+            nn.Linear(hidden, hidden),
+            nn.GELU(),
+            last,
+        )
+
+    def forward(
+        self,
+        context: Float[Tensor, "B C"],
+        features: Float[Tensor, "B F"],
+        elapsed: Float[Tensor, "B"],
+    ) -> Primitives:
+        """Primitives for what is seen.
+
+        Args:
+            context: Numbers of the first observation.
+            features: Features of the first and the current observation.
+            elapsed: Since the start of the episode [s].
+        """
+        # Linear extrapolation outside the demonstrations is unbounded.
+        c = torch.minimum(torch.maximum(context, self.low), self.high) - self.centre
+        x = self.base + c @ self.slopes
+        phase = elapsed / self._duration(x)
+        angle = torch.pi * phase[:, None].clamp(0, 1) * torch.arange(1, HARMONICS + 1).to(x)
+        return self.primitives(
+            x + self.network(torch.cat([features, angle.sin(), angle.cos()], dim=-1))
+        )
+
+    def primitives(self, x: Float[Tensor, "*batch K"]) -> Primitives:
+        """Encoding of the coordinates."""
+        per_coordinate = x[..., :-1].unflatten(-1, (self.width, -1))
+        duration = self._duration(x)
+        return Primitives(
+            weights=per_coordinate[..., :-3] * self.response.spring.stiffness,
+            start_velocity=per_coordinate[..., -3] / duration[..., None],
+            start=per_coordinate[..., -2],
+            goal=per_coordinate[..., -1],
+            duration=duration,
+        )
+
+    def continued(
+        self,
+        primitives: Primitives,
+        position: Float[Tensor, "B A"],
+        velocity: Float[Tensor, "B A"],
+        *,
+        elapsed: Float[Tensor, "B"],
+        time: Float[Tensor, "B T"],
+    ) -> tuple[Float[Tensor, "B T A"], Float[Tensor, "B T A"]]:
+        """Motion of the primitives from here on; see `continue_motion`."""
+        return continue_motion(
+            self.response,
+            primitives.weights,
+            primitives.goal,
+            position,
+            velocity,
+            duration=primitives.duration,
+            elapsed=elapsed,
+            time=time,
+        )
+
+    def _duration(self, x: Tensor) -> Tensor:
+        fitted = self.base[-1].detach()
+        return (fitted + (x[..., -1] - fitted).clamp(-DURATIONS, DURATIONS)).exp()
+
+
+REGULARIZATIONS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
+"""Ridge strengths of the regression, chosen by cross-validation."""
+FEWEST = 4
+"""Fewest demonstrations for which a regression can be distinguished from chance."""
+SMALLEST_VARIATION = 0.05
+"""Fraction of its spread by which a context value must vary between demonstrations."""
+MARGIN = 0.5
+"""Fraction of the demonstrated range by which contexts may lie outside."""
+
+
+@torch.no_grad()
+def fit_closed_form(
+    motion: ContextualMotion,
+    demonstrations: Sequence[Float[Tensor, "_frames A"]],
+    contexts: Float[Tensor, "n C"],
+    fps: float,
+) -> float:
+    """Set base and slopes of `motion` from demonstrations.
+
+    One primitive is fitted to each demonstration. The motion is their mean or, if that predicts
+    demonstrations left out better, a ridge regression on the context.
+
+    Args:
+        motion: Changed in place.
+        demonstrations: Coordinates frame by frame.
+        contexts: Whitened context of each.
+        fps: Frames a second.
+
+    Returns:
+        Root mean square error of the motions of demonstrations left out, in the spread of the
+        coordinates; NaN for a single demonstration.
+    """
+    x, c, n = _fit_each(motion.response, demonstrations, fps), contexts.double(), len(contexts)
+    left_out = (x - x.mean(0)) * n / (n - 1) if n > 1 else x * torch.nan
+    best = _error(motion, left_out)
+    slopes = c.new_zeros(c.shape[1], x.shape[1])
+    varies = (c - c.mean(0)).square().mean(0).sqrt() > SMALLEST_VARIATION
+    for regularization in REGULARIZATIONS if n >= FEWEST and varies.any() else ():
+        fit = fit_ridge(c[:, varies], x, regularization)
+        error = _error(motion, fit.held_out)
+        if error < best:
+            best, slopes[varies] = error, fit.coefficients[1:] / fit.scale[:, None]
+    motion.base.copy_(x.mean(0))
+    motion.slopes.copy_(slopes)
+    motion.centre.copy_(c.mean(0))
+    low, high = torch.aminmax(c, dim=0)
+    motion.low.copy_(low - MARGIN * (high - low))
+    motion.high.copy_(high + MARGIN * (high - low))
+    return best
+
+
+def _fit_each(
+    response: Response, demonstrations: Sequence[Tensor], fps: float
+) -> Float[Tensor, "n K"]:
+    """Coordinates of one primitive for each demonstration, as in `ContextualMotion`."""
+    position = pad_sequence([d.double() for d in demonstrations], batch_first=True)
+    lengths = torch.tensor([len(d) for d in demonstrations])
+    frame = torch.arange(position.shape[1])
+    dmp = JointDMP.fit(
+        frame.double() / fps,
+        position,
+        mask=frame < lengths[:, None],
+        basis=response.basis,
+        spring=response.spring,
+    )
+    each = dmp.coordinates()
+    each[..., :-3] /= response.spring.stiffness
+    return torch.cat([each.flatten(1), dmp.duration.log()[:, None]], dim=-1)
+
+
+def _error(motion: ContextualMotion, difference: Float[Tensor, "n K"]) -> float:
+    """Motion error caused by a difference in coordinates, root mean square."""
+    # The map to motions is linear in all but the duration, which shifts them in time.
+    per_coordinate = difference[:, :-1].unflatten(-1, (motion.width, -1)).clone()
+    per_coordinate[..., :-3] *= motion.response.spring.stiffness
+    s = torch.linspace(0, 1, 100, dtype=torch.float64)
+    position, _, _ = motion.response.matrices(s, torch.float64)
+    square = (per_coordinate @ position).square().mean() + difference[:, -1].square().mean()
+    return float(square.sqrt())

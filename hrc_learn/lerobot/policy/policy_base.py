@@ -1,0 +1,299 @@
+"""Settings and construction common to all policies, and their demands on a dataset."""
+
+import logging
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, LRSchedulerConfig
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from safetensors import SafetensorError
+from torch import Tensor
+
+from hrc_learn.demos.format.metadata import flatten_names
+from hrc_learn.lerobot.policy.action_encoding import (
+    ActionEncoding,
+    matched_columns,
+    rotation_triples,
+)
+from hrc_learn.lerobot.policy.observation_encoder import Observation, ObservationEncoder
+from hrc_learn.lerobot.policy.training_samples import read_episodes
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class MotionPolicyConfig(PreTrainedConfig):
+    """Settings of any policy that plans motions, and its names from the dataset."""
+
+    chunk_size: int = 50
+    """Actions predicted at once."""
+    n_action_steps: int = 25
+    """Actions carried out before the next chunk is predicted."""
+    vision_backbone: str = "small"
+    """Image backbone: "small", four convolutions, or a ResNet of torchvision such as
+    "resnet18"; no weights are downloaded.
+    """
+    vision_weights: str | None = None
+    """File of weights for such a ResNet to begin with, safetensors by torchvision's names;
+    None: it begins with random ones, or has been given its weights."""
+    vision_pretrained: bool = False
+    """True if the ResNet started from torchvision's weights; set by `vision_weights`."""
+    n_keypoints: int = 32
+    """Places in each image that the network looks for."""
+    fit_episodes: list[int] | None = None
+    """Episodes to start from in closed form; None: all. Leave out here what is held out."""
+    fps: float | None = None
+    """Actions a second; that of the dataset, unless given."""
+    state_names: list[str] | None = None
+    """Components of observation.state, from the dataset."""
+    action_feature_names: list[str] | None = None
+    """Components of the action, from the dataset."""
+    optimizer_lr: float = 3e-4
+    optimizer_weight_decay: float = 1e-4
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(
+            ("VISUAL", "STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
+        )
+    )
+    """Identity: the policy normalises internally, where start and actions have one space."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps must be 1 to chunk_size ({self.chunk_size}), got "
+                f"{self.n_action_steps}"
+            )
+        if self.n_obs_steps != 1:
+            raise ValueError(
+                f"the policy {self.type!r} sees one step, got n_obs_steps={self.n_obs_steps}"
+            )
+        # LeRobot overwrites the field before it hands over the dataset.
+        self._trained_for = self.action_feature_names
+        self._trained_on = self.state_names
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Rewards play no part."""
+        return None
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """AdamW, as the network starts from what is already close."""
+        return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """Constant learning rate."""
+        return None
+
+    def validate_features(self) -> None:
+        """See whether the policy can work with its inputs and outputs.
+
+        Raises:
+            ValueError: There is no action, or nothing to see.
+        """
+        if self.action_feature is None:
+            raise ValueError(
+                f"the policy {self.type!r} needs the feature 'action' among its outputs"
+            )
+        if not self.input_features:
+            raise ValueError(
+                f"the policy {self.type!r} needs something to see: observation.state, "
+                "observation.environment_state or images"
+            )
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
+        """Take the names of components from a dataset; LeRobot calls this.
+
+        Raises:
+            ValueError: The policy was trained for other actions, or on other states or these
+                in another order.
+        """
+        self.action_feature_names = _names(features, "action")
+        self.state_names = _names(features, "observation.state")
+        if self._trained_for not in (None, self.action_feature_names):
+            raise ValueError(
+                f"the policy in {self.pretrained_path} was trained for the actions "
+                f"{', '.join(self._trained_for)}; the dataset has "
+                f"{', '.join(self.action_feature_names or ['no names'])}"
+            )
+        if self._trained_on not in (None, self.state_names):
+            raise ValueError(
+                f"the policy in {self.pretrained_path} was trained on observation.state with "
+                f"{', '.join(self._trained_on)}, in this order; the dataset has "
+                f"{', '.join(self.state_names or ['no names'])}"
+            )
+
+
+def _names(features: dict[str, dict[str, Any]], key: str) -> list[str] | None:
+    names = flatten_names(features.get(key, {}).get("names"))
+    return None if names is None else list(names)
+
+
+class MotionPolicy(PreTrainedPolicy):
+    """Base class of policies that plan motions and start from a fit in closed form."""
+
+    config_class = MotionPolicyConfig  # pyright: ignore[reportAssignmentType]
+    name = "motion"  # pyright: ignore[reportAssignmentType]
+
+    measured: Int[Tensor, "A"]
+    """Columns of the state that hold the action's components; -1: none does."""
+
+    def __init__(self, config: MotionPolicyConfig, dataset_meta: Any = None):
+        """Make the encoders of observations and actions.
+
+        Args:
+            config: Configuration with known features.
+            dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from.
+
+        Raises:
+            ValueError: The policy cannot work with the features, or the frame rate is unknown
+                or another one.
+        """
+        super().__init__(config)
+        config.validate_features()
+        config.fps = frame_rate(config, dataset_meta)
+        config.vision_pretrained |= config.vision_weights is not None
+        inputs = config.input_features or {}
+        widths = {k: inputs[k].shape[0] for k in (OBS_STATE, OBS_ENV_STATE) if k in inputs}
+        self.encoder = ObservationEncoder(
+            widths,
+            {key: feature.shape[0] for key, feature in config.image_features.items()},
+            backbone=config.vision_backbone,
+            n_keypoints=config.n_keypoints,
+            pretrained=config.vision_pretrained,
+        )
+        if config.vision_weights is not None:
+            self.encoder.load_vision(Path(config.vision_weights))
+            config.vision_weights = None  # a checkpoint brings its own
+        (width,) = (config.output_features or {})[ACTION].shape
+        names = config.action_feature_names
+        states = config.state_names if OBS_STATE in widths else None
+        self.encoding = ActionEncoding(width, rotation_triples(names))
+        columns = matched_columns(names, states, (width, widths.get(OBS_STATE, 0)))
+        self.register_buffer("measured", torch.tensor(columns))
+
+    def get_optim_params(self) -> Any:
+        """All parameters alike."""
+        return self.parameters()
+
+    @abstractmethod
+    def fit(self, demonstrations: list[dict[str, Tensor]]) -> None:
+        """Start from demonstrations in closed form, once their statistics are known.
+
+        Args:
+            demonstrations: Columns by key, (frames, components).
+        """
+
+    @property
+    def _step(self) -> float:
+        """Time between actions [s]."""
+        return 1 / self.config.fps
+
+    def _require_numbers(self, batch: Observation) -> None:
+        """Check that an observation holds the numbers that the policy was trained with.
+
+        Raises:
+            ValueError: Numbers are missing, of another width, or not finite.
+        """
+        kind = self.config.type
+        for key, width in self.encoder.widths.items():
+            if key not in batch:
+                raise ValueError(f"the policy {kind!r} needs {key} in the observation")
+            if batch[key].shape[-1] != width:
+                raise ValueError(
+                    f"the policy {kind!r} was trained with {width} values in {key}, but the "
+                    f"observation has {batch[key].shape[-1]}"
+                )
+            bad = (~batch[key].isfinite()).flatten(0, -2).any(0).nonzero().flatten().tolist()
+            if bad:
+                names = self.config.state_names if key == OBS_STATE else None
+                which = ", ".join(names[i] if names else str(i) for i in bad)
+                raise ValueError(f"{key} is not finite in {which}: check the sensor")
+
+    def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
+        """Take means and spreads from a dataset's statistics.
+
+        Raises:
+            ValueError: Statistics are missing or not finite.
+        """
+        if dataset_meta is not None and not stats:
+            raise ValueError(
+                f"the dataset in {dataset_meta.root} has no statistics (meta/stats.json), by "
+                "which the policy whitens observations and actions: compute them with "
+                "LeRobot's `lerobot-edit-dataset --operation.type recompute_stats`, or record "
+                "it again"
+            )
+        if stats is None:
+            return
+        for key, width in self.encoder.widths.items():
+            _require_statistics(stats, key, width, ("mean", "std"))
+        width = len(self.encoding.mean)
+        _require_statistics(stats, ACTION, width, ("mean", "std", "min", "max"))
+        self.encoder.whiten(stats)
+        mean, std = (torch.as_tensor(stats[ACTION][k]) for k in ("mean", "std"))
+        self.encoding.whiten(std, mean)
+
+    def _fit_dataset(self, dataset_meta: Any) -> None:
+        """Start from the demonstrations of a dataset that lies on disk."""
+        if dataset_meta is None:
+            return
+        root = Path(dataset_meta.root)
+        if not (root / "data").is_dir():
+            logger.warning("no demonstrations in %s: training starts from standing still", root)
+            return
+        keys = (ACTION, *self.encoder.widths)
+        self.fit(read_episodes(root, keys, self.config.fit_episodes))
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: Any, model_file: str, map_location: str, strict: bool
+    ) -> Any:
+        try:
+            return super()._load_as_safetensor(model, model_file, map_location, strict)
+        except SafetensorError as error:
+            raise ValueError(
+                f"{model_file} is damaged ({error}): copy or train the policy again"
+            ) from error
+
+
+def frame_rate(config: MotionPolicyConfig, dataset_meta: Any) -> float:
+    """Actions a second, of the settings or the dataset.
+
+    Raises:
+        ValueError: Neither is known, or they do not agree.
+    """
+    trained, shown = config.fps, None if dataset_meta is None else float(dataset_meta.fps)
+    if trained is None:
+        if shown is None:
+            raise ValueError(
+                f"the policy {config.type!r} must know how many actions a second there are: "
+                "train it on a dataset, or give fps (--policy.fps)"
+            )
+        return shown
+    if shown not in (None, trained):
+        raise ValueError(
+            f"the policy is for {trained:g} actions a second, the dataset has {shown:g}: "
+            "resample it, or train a policy of its own"
+        )
+    return trained
+
+
+def _require_statistics(
+    stats: Mapping[str, Mapping[str, Any]], key: str, width: int, names: tuple[str, ...]
+) -> None:
+    for name in names:
+        if name not in stats.get(key, {}):
+            raise ValueError(f"the dataset's statistics (meta/stats.json) lack {name} of {key}")
+        values = torch.as_tensor(stats[key][name])
+        if values.shape != (width,) or not values.isfinite().all():
+            raise ValueError(
+                f"the dataset's statistics (meta/stats.json) must have {width} finite numbers "
+                f"as {name} of {key}, got {values.tolist()}"
+            )
