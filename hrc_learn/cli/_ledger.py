@@ -1,11 +1,11 @@
 """Record of finished steps of a job, so that steps whose results are up to date are skipped."""
 
 import hashlib
-import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
-from hrc_learn.store import write_text
+from hrc_learn.store import json_text, read_json, write_json
 from hrc_learn.viz.report import software_versions
 
 
@@ -24,11 +24,9 @@ class Ledger:
                 repeated.
         """
         self._path = path
-        try:
-            entries = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            entries = {}
-        self._entries: dict[str, str] = entries if isinstance(entries, dict) else {}
+        self._entries: dict[str, str] = {}
+        with suppress(OSError, ValueError):
+            self._entries = read_json(path)
         code = contents(Path(__file__).parents[1], "*.py")
         self._software = [*software_versions().items(), code]
 
@@ -47,7 +45,7 @@ class Ledger:
     def enter(self, folder: Path, options: Mapping[str, object], *reads: Path) -> None:
         """Record that a step has just made a folder, with arguments as in `holds`."""
         self._entries[folder.name] = self._entry(folder, options, reads)
-        write_text(self._path, json.dumps(self._entries, indent=2) + "\n")
+        write_json(self._path, self._entries)
 
     def _entry(
         self, folder: Path, options: Mapping[str, object], reads: tuple[Path, ...]
@@ -58,7 +56,7 @@ class Ledger:
             *(contents(path) for path in reads),
             contents(folder),
         ]
-        text = json.dumps(made_of, default=str, sort_keys=True)
+        text = json_text(made_of)
         return hashlib.sha256(text.encode()).hexdigest()
 
 

@@ -6,7 +6,6 @@ line on stderr.
 
 import inspect
 import io
-import json
 import os
 import re
 import shlex
@@ -22,7 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from hrc_learn.store import DISK_ERRORS, write_json
+from hrc_learn.store import DISK_ERRORS, json_text, parse_json, write_json
 
 EXTRAS = {
     "tyro": "programs",
@@ -230,7 +229,7 @@ def has_screen() -> bool:
 
 def configuration(args: Any) -> dict[str, Any]:
     """Arguments of a command as plain JSON, to be stored with its results."""
-    return json.loads(json.dumps(asdict(args), default=str))
+    return parse_json(json_text(asdict(args)))
 
 
 def command_line() -> str:

@@ -13,6 +13,8 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
+from hrc_learn.store import read_toml
+
 
 def with_settings[Settings](texts: Sequence[str], default: Settings) -> Settings:
     """Settings with the given values in place of their defaults.
@@ -37,10 +39,7 @@ def with_settings[Settings](texts: Sequence[str], default: Settings) -> Settings
 def _parsed(text: str) -> dict[str, Any]:
     name, assigned, value = text.partition("=")
     if not assigned:
-        try:
-            return tomllib.loads(Path(text).read_text(encoding="utf-8"))
-        except tomllib.TOMLDecodeError as error:
-            raise ValueError(f"{text}: not valid TOML ({error})") from None
+        return read_toml(text)
     name = name.strip().replace("-", "_")
     try:
         return tomllib.loads(f"{name} = {value}")

@@ -1,6 +1,5 @@
 """`hrc check`, `repair`, `recover`, `curate`, `push`: quality of a dataset, and its upload."""
 
-import json
 import sys
 import webbrowser
 from collections.abc import Mapping
@@ -35,7 +34,7 @@ from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
 from hrc_learn.demos.read.contract import Contract, keep_contract
 from hrc_learn.jacobian import camera_placements
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
-from hrc_learn.store import new_folder, write_json, write_text
+from hrc_learn.store import new_folder, write_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 _RANKED_LINES = 20
@@ -91,12 +90,10 @@ def _store_contract(dataset: Path, contract: Contract | None) -> None:
 def _write_findings(args: Check, report: ValidationReport, counts: Mapping[str, int]) -> None:
     if args.out is not None:
         with new_folder(args.out, configuration(args), args.overwrite) as folder:
-            findings = json.dumps(report.records(), indent=2) + "\n"
-            write_text(folder / "findings.json", findings)
+            write_json(folder / "findings.json", report.records())
             write_json(folder / "metrics.json", counts)
             if report.contract is not None:
-                text = json.dumps(report.contract.content(), indent=2) + "\n"
-                write_text(folder / "contract.json", text)
+                write_json(folder / "contract.json", report.contract.content())
     write_values(args.json, counts)
 
 

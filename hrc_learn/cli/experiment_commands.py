@@ -3,7 +3,6 @@
 An experiment that is given no model uses the demo's, which is learned first if it is missing.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -38,7 +37,7 @@ from hrc_learn.sim import CameraChange, CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.store import write_text
+from hrc_learn.store import write_json
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz.report import show_command
 
@@ -269,7 +268,7 @@ def demo(args: Demo) -> int:
     """Carry out the whole job, command after command in one process."""
     console = Console()
     learn(args.out, console, steps=5, robot=args, again=args.overwrite)
-    write_text(args.out / "configuration.json", json.dumps(asdict(args), indent=2, default=str))
+    write_json(args.out / "configuration.json", asdict(args))
     _announce(console, 5, 5, "Grasping near a person, carrying, placing")
     return run(
         Run(

@@ -1,6 +1,5 @@
 """Experiment 3 of the paper: objects grasped near a person and placed on shelves."""
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,7 +31,7 @@ from hrc_learn.sim import Imperfections, RenderingUnavailableError
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.store import read_made_by
+from hrc_learn.store import read_json, read_made_by
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.viz.report import Section
 
@@ -42,6 +41,11 @@ object, at random moments of the whole job, or never."""
 
 # Time for the elbow to come to rest after the last drag [s], as after the two without a worker.
 _AFTER_DRAGS = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FitMetrics:
+    joint_nrmse_median: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,8 +103,8 @@ class CollaborationExperiment(CollaborationScenario):
 
     def metrics(self) -> Sequence[Metric[CollaborationRun]]:
         """Metrics of contacts, errors and the influence of the person."""
-        fit = json.loads((self.placing / "metrics.json").read_text(encoding="utf-8"))
-        return collaboration_metrics(len(self.shelves), fit["joint_nrmse_median"])
+        fit = read_json(self.placing / "metrics.json", _FitMetrics, "fit again")
+        return collaboration_metrics(len(self.shelves), fit.joint_nrmse_median)
 
     def recordings(self, run: CollaborationRun) -> Mapping[str, RunRecording]:
         """Recording of the whole job."""

@@ -5,7 +5,6 @@ that the robot itself measures. A simulated world of the assumed surroundings ch
 and follows the arm for the recording.
 """
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -39,7 +38,7 @@ from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, PickAndPlaceConf
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
-from hrc_learn.store import new_folder, write_text
+from hrc_learn.store import new_folder, write_json
 from hrc_learn.teleoperation import ScriptedDrawing, Touch
 from hrc_learn.viz.run_dashboard import record_run
 
@@ -182,7 +181,7 @@ class ArmRun:
                     {"text": said.text, "time": said.time} for said in self.cell.remarks
                 ],
             }
-            write_text(part / "result.json", json.dumps(result, indent=2))
+            write_json(part / "result.json", result)
 
 
 def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: float) -> Task:

@@ -1,7 +1,6 @@
 """Monte Carlo trials: one run repeated with other seeds, saved on disk and resumable."""
 
 import gc
-import json
 import math
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -13,7 +12,7 @@ from typing import Any
 
 import torch
 
-from hrc_learn.store import Claim, new_file, sync_file
+from hrc_learn.store import Claim, json_text, naming, new_file, parse_json, sync_file
 
 # Keys of a line of the file: one JSON object per trial. The first line of the file holds the
 # settings under the last key, so that results of different settings never mix.
@@ -45,16 +44,12 @@ class Trial:
     def line(self) -> str:
         """Trial as one line of JSON; NaN and infinity become null."""
         row = {_SEED: self.seed, _FAILURE: self.failure, **self.values}
-        finite = {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in row.items()
-        }
-        return json.dumps(finite) + "\n"
+        return json_text(row, indent=False)
 
     @classmethod
     def from_line(cls, line: str) -> "Trial":
         """Trial from a line; null becomes NaN."""
-        row = json.loads(line)
+        row = parse_json(line)
         seed, failure = row.pop(_SEED), row.pop(_FAILURE)
         values = {name: math.nan if value is None else value for name, value in row.items()}
         return cls(seed=seed, failure=failure, values=values)
@@ -82,14 +77,14 @@ class TrialFile:
         """
         self._path = path
         self.trials: dict[int, Trial] = {}
-        made_by = json.loads(json.dumps(made_by, default=str))
+        made_by = parse_json(json_text(made_by))
         path.parent.mkdir(parents=True, exist_ok=True)
         self._claim = Claim(path)
         try:
             if path.exists():
                 self._resume(made_by)
             else:
-                self._write(json.dumps({_MADE_BY: made_by}) + "\n")
+                self._write(json_text({_MADE_BY: made_by}, indent=False))
         except BaseException:
             self.close()
             raise
@@ -106,7 +101,7 @@ class TrialFile:
 
     def append(self, trial: Trial) -> None:
         """Add a trial; it is on disk when this method returns."""
-        with self._path.open("a", encoding="utf-8") as file:
+        with naming(self._path), self._path.open("a", encoding="utf-8") as file:
             file.write(trial.line())
         sync_file(self._path)
         self.trials[trial.seed] = trial
@@ -116,7 +111,7 @@ class TrialFile:
         whole = text[: text.rfind("\n") + 1]
         lines = whole.splitlines()
         try:
-            before = json.loads(lines[0])[_MADE_BY]
+            before = parse_json(lines[0])[_MADE_BY]
             found = [Trial.from_line(line) for line in lines[1:]]
         except (IndexError, KeyError, TypeError, ValueError) as error:
             raise ValueError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,8 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from hrc_learn.store import read_toml
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,13 +197,10 @@ def read_limits(path: Path) -> dict[str, dict[str, float]]:
     Raises:
         ValueError: The file is not valid TOML, or a table holds values other than numbers.
     """
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: {error}") from None
+    tables = read_toml(path)
     for name, row in tables.items():
         if not isinstance(row, dict) or not all(
-            isinstance(value, int | float) for value in row.values()
+            type(value) in (int, float) for value in row.values()
         ):
             raise ValueError(f"{path}: [{name}] must be a table of numbers")
     return tables

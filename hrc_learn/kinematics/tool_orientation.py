@@ -7,18 +7,18 @@ orientation for grasping is along the tangent of each demonstration near the obj
 end effector was going.
 """
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.store import write_text
+from hrc_learn.store import Radians, read_json, write_json
 
 NEAR = 0.05
 """Length of the last stretch of a path, whose direction is its tangent there [m]."""
@@ -76,6 +76,18 @@ def turn_about_vertical(
 
 
 @dataclass(frozen=True, kw_only=True)
+class _ApproachFile:
+    version: Literal[1] = 1
+    orientation_wxyz: tuple[float, float, float, float]
+    spread_rad: Radians
+    turned_rad: Radians
+
+    def __post_init__(self) -> None:
+        if not math.isclose(math.hypot(*self.orientation_wxyz), 1.0, abs_tol=1e-3):
+            raise ValueError("orientation_wxyz is no unit quaternion")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Approach:
     """Orientation of the end effector in front of an object, from demonstrated approaches.
 
@@ -126,13 +138,11 @@ class Approach:
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
-        content = {
-            "version": 1,
-            "orientation_wxyz": self.orientation.tolist(),
-            "spread_rad": self.spread,
-            "turned_rad": self.turned,
-        }
-        write_text(path, json.dumps(content, indent=2))
+        w, x, y, z = self.orientation.tolist()
+        content = _ApproachFile(
+            orientation_wxyz=(w, x, y, z), spread_rad=self.spread, turned_rad=self.turned
+        )
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: Path) -> "Approach":
@@ -142,13 +152,11 @@ class Approach:
             FileNotFoundError: If there is no such file.
             ValueError: If it is not one of ours.
         """
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content.get("version") != 1 or "orientation_wxyz" not in content:
-            raise ValueError(f"{path} is not an approach of a known version: fit it again.")
+        content = read_json(path, _ApproachFile, "fit it again")
         return cls(
-            orientation=torch.tensor(content["orientation_wxyz"], dtype=torch.float64),
-            spread=content["spread_rad"],
-            turned=content["turned_rad"],
+            orientation=torch.tensor(content.orientation_wxyz, dtype=torch.float64),
+            spread=content.spread_rad,
+            turned=content.turned_rad,
         )
 
 

@@ -3,11 +3,10 @@
 Candidates are the mean, a function of start and goal, and the nearest demonstration.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast
 
 import torch
 from jaxtyping import Float
@@ -28,7 +27,7 @@ from hrc_learn.learning.primitive_fitting import (
     contexts,
     fit_contextual,
 )
-from hrc_learn.store import write_text
+from hrc_learn.store import read_json, write_json
 
 CHOICE = "prediction.json"
 """File in a model's folder that names the model of each channel."""
@@ -42,6 +41,16 @@ _WORTH = 0.9
 """Largest error, relative to a simpler model, that justifies a less simple one."""
 _REGULARIZATIONS = (1e-6, 1e-3, 1e-1, 1.0)
 """Candidates for the regularisation of the contextual model; the largest is nearly the mean."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Choice:
+    """Content of the file `CHOICE`."""
+
+    models: dict[str, Literal["mean", "contextual", "nearest"]]
+    """Best model by channel."""
+    context: tuple[str, ...]
+    """Columns whose first row is the context."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,8 +165,7 @@ def keep_best(
         elif errors.best == "nearest":
             fitted.each[channel].save(folder / EACH / channel)
     if chosen:
-        content = json.dumps({"models": chosen, "context": list(columns)}, indent=2)
-        write_text(folder / CHOICE, f"{content}\n")
+        write_json(folder / CHOICE, {"models": chosen, "context": columns})
     return metrics
 
 
@@ -167,22 +175,16 @@ def best_models(folder: Path) -> dict[str, str]:
     Raises:
         ValueError: The file is damaged.
     """
-    return {k: v for k, v in _choice(folder)[0].items() if v != "mean"}
+    return {k: v for k, v in _choice(folder).models.items() if v != "mean"}
 
 
-def _choice(folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
+def _choice(folder: Path) -> _Choice:
     path = folder / CHOICE
-    if not path.is_file():
-        return {}, ()
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        models, columns = dict(content["models"]), tuple(content["context"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: damaged ({error!r}); fit again") from error
-    unknown = sorted({*models.values()} - {*MODELS})
-    if unknown:
-        raise ValueError(f"{path}: unknown model {unknown[0]!r}; there are {', '.join(MODELS)}")
-    return models, columns
+    return (
+        read_json(path, _Choice, "fit again")
+        if path.is_file()
+        else _Choice(models={}, context=())
+    )
 
 
 def predict(
@@ -200,11 +202,11 @@ def predict(
         FileNotFoundError: The folder holds no model.
         ValueError: The model is damaged, or a demonstration lacks a column of the context.
     """
-    models, columns = _choice(folder)
-    model = models.get(channel, "mean")
+    choice = _choice(folder)
+    model = choice.models.get(channel, "mean")
     if model == "mean":
         return motions.adapted(channel, load_primitive(folder / channel, channel))
-    context = contexts(demos, columns, motions, channel)
+    context = contexts(demos, choice.context, motions, channel)
     if model == "contextual":
         primitives = ContextualDMP.load(folder / CONTEXTUAL / channel).at(context)
         return motions.adapted(channel, primitives)

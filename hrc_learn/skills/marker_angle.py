@@ -10,11 +10,11 @@ demonstrated, without calibration.
 from __future__ import annotations
 
 import copy
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import KalmanConfig, KalmanEstimator, Measurement, RBFImageJacobian
 from hrc_learn.jacobian.learning_estimators import RecursiveState
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
-from hrc_learn.store import write_text
+from hrc_learn.store import Radians, read_json, write_json
 
 HALF_TURN = math.pi
 """Period of the turn of a parallel grasp [rad]."""
@@ -56,6 +56,13 @@ class AngleDemonstration:
     """Direction of the object's marker [rad]."""
     final: float
     """Direction of the tool's marker at the end, above the object [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _AngleFile:
+    version: Literal[1] = 1
+    offset_rad: Radians
+    spread_rad: Radians
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,8 +105,8 @@ class MarkerAngle:
     def save(self, folder: Path) -> None:
         """Write `folder/angle` and `folder/angle.json`."""
         self.jacobian.save(folder / "angle")
-        content = {"version": 1, "offset_rad": self.offset, "spread_rad": self.spread}
-        write_text(folder / "angle.json", json.dumps(content, indent=2))
+        content = _AngleFile(offset_rad=self.offset, spread_rad=self.spread)
+        write_json(folder / "angle.json", content)
 
     @classmethod
     def load(cls, folder: Path) -> MarkerAngle:
@@ -107,16 +114,13 @@ class MarkerAngle:
 
         Raises:
             FileNotFoundError: There is no such folder or file.
-            ValueError: A file has an unknown version or kind.
+            ValueError: A file is damaged, or has an unknown version or kind.
         """
-        path = folder / "angle.json"
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content.get("version") != 1 or "offset_rad" not in content:
-            raise ValueError(f"{path} has an unknown version: fit it again.")
+        content = read_json(folder / "angle.json", _AngleFile, "fit it again")
         return cls(
             jacobian=RBFImageJacobian.load(folder / "angle"),
-            offset=content["offset_rad"],
-            spread=content["spread_rad"],
+            offset=content.offset_rad,
+            spread=content.spread_rad,
         )
 
 

@@ -12,10 +12,10 @@ few percent too long or too short once the camera has been turned by 10 degrees.
 """
 
 import copy
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.marker_angle import MarkerAngle
-from hrc_learn.store import write_text
+from hrc_learn.store import Metres, Pixels, read_json, write_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 OBJECT_FEATURE = "observation.object_feature"
@@ -59,6 +59,18 @@ for the estimator of the image Jacobian [m]."""
 PIXEL_NOISE = 0.15
 """Standard deviation of a marker's centre [px]: 0.08 px for the detector, more in noisy and
 blurred images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TargetFile:
+    version: Literal[2] = 2
+    offset_m: tuple[Metres, Metres, Metres]
+    error_px: Pixels | None
+    focal_px: Pixels | None = None
+
+    def __post_init__(self) -> None:
+        if self.focal_px is not None and self.focal_px <= 0:
+            raise ValueError(f"focal_px must be positive, got {self.focal_px}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,14 +173,9 @@ class VisualTarget:
 
     def save(self, path: Path) -> None:
         """Write a JSON file, atomically."""
-        error = None if np.isnan(self.error) else self.error
-        content = {
-            "version": 2,
-            "offset_m": self.offset.tolist(),
-            "error_px": error,
-            "focal_px": self.focal,
-        }
-        write_text(path, json.dumps(content, indent=2))
+        x, y, z = self.offset.tolist()
+        content = _TargetFile(offset_m=(x, y, z), error_px=self.error, focal_px=self.focal)
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: Path) -> "VisualTarget":
@@ -176,17 +183,11 @@ class VisualTarget:
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: The file has an unknown version.
+            ValueError: The file is damaged or has an unknown version.
         """
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content.get("version") != 2 or "offset_m" not in content:
-            raise ValueError(f"{path} has an unknown version: fit the visual target again.")
-        error = content["error_px"]
-        return cls(
-            offset=np.array(content["offset_m"]),
-            error=float("nan") if error is None else float(error),
-            focal=content.get("focal_px"),
-        )
+        content = read_json(path, _TargetFile, "fit the visual target again")
+        error = math.nan if content.error_px is None else content.error_px
+        return cls(offset=np.array(content.offset_m), error=error, focal=content.focal_px)
 
 
 def _gradient(

@@ -29,6 +29,7 @@ from hrc_learn.store._claim import resolved as resolved
 from hrc_learn.store._claim import settle as settle
 from hrc_learn.store._disk import DISK_ERRORS as DISK_ERRORS
 from hrc_learn.store._disk import delete_files as delete_files
+from hrc_learn.store._disk import naming as naming
 from hrc_learn.store._disk import sync_file as sync_file
 from hrc_learn.store._ownership import DATASET as DATASET
 from hrc_learn.store._ownership import EXPORT as EXPORT

@@ -79,13 +79,13 @@ def parse_json[T](
         raise ValueError(f"{source}: {_complaint(error)}{end}") from None
 
 
-def json_text(content: object) -> str:
-    """JSON text of any content, indented.
+def json_text(content: object, *, indent: bool = True) -> str:
+    """JSON text of any content, on many indented lines or on one.
 
     Arrays and tensors become lists, numbers that are not finite null, other objects text.
     """
     data = msgspec.json.encode(content, enc_hook=_plain)
-    return msgspec.json.format(data, indent=2).decode() + "\n"
+    return (msgspec.json.format(data, indent=2) if indent else data).decode() + "\n"
 
 
 def _plain(value: Any) -> object:

@@ -430,9 +430,10 @@ def test_folders_that_are_no_runs_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"has no report\.json: .* not the folder of a run"):
         read_report(tmp_path)
     for text, complaint in (
-        ("{", r"report\.json is damaged"),
-        ('{"title": "x"}', "is not a report of hrc_learn"),
-        ('{"format": "hrc_learn report", "version": 99}', "has version 99"),
+        ("{", r"report\.json: not valid JSON"),
+        ('{"title": "x"}', "lacks the field"),
+        ('{"format": "cake"}', "format: unknown value 'cake'"),
+        ('{"format": "hrc_learn report", "version": 99}', "version: unknown value 99"),
     ):
         (tmp_path / "report.json").write_text(text)
         with pytest.raises(ValueError, match=complaint):

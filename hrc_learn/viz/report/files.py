@@ -5,19 +5,18 @@ The folder is read again to compare runs.
 """
 
 import base64
-import json
 import math
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Literal
 from urllib.parse import quote
 
-from hrc_learn.store import new_file
+from hrc_learn.store import new_file, read_json, write_json
 from hrc_learn.viz.report.content import (
     Film,
     Measurement,
@@ -240,8 +239,40 @@ FIGURES = "figures"
 FILM = "film.mp4"
 LINKED = (".rrd", ".mp4", ".npz")
 """Suffixes of recordings, films and logs in the folder, to which the page links."""
-FORMAT = "hrc_learn report"
-VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PictureFile:
+    name: str
+    caption: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class _SectionFile:
+    heading: str
+    text: str
+    figures: list[_PictureFile]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row(Measurement):
+    value: float | int | None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """Value; None if it is not finite, which JSON cannot represent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ReportFile:
+    format: Literal["hrc_learn report"] = "hrc_learn report"
+    version: Literal[1] = 1
+    title: str
+    summary: str
+    command: str
+    film: str | None = None
+    """Caption of the film; None without one."""
+    table: list[_Row]
+    sections: list[_SectionFile]
+    configuration: dict[str, bool | int | float | str | None]
+    versions: dict[str, str]
 
 
 def write_report(folder: str | os.PathLike[str], report: Report) -> None:
@@ -271,9 +302,7 @@ def write_report(folder: str | os.PathLike[str], report: Report) -> None:
     with new_file(folder / PAGE) as part:
         linked = sorted(file.name for file in folder.iterdir() if file.suffix in LINKED)
         part.write_text(reports_page(report.title, [report], linked), encoding="utf-8")
-    with new_file(folder / REPORT) as part:
-        text = json.dumps(_to_json(report), indent=2, ensure_ascii=False, allow_nan=False)
-        part.write_text(text + "\n", encoding="utf-8")
+    write_json(folder / REPORT, _as_file(report))
 
 
 def read_report(folder: str | os.PathLike[str]) -> Report:
@@ -292,18 +321,9 @@ def read_report(folder: str | os.PathLike[str]) -> Report:
             f"{folder} has no {REPORT}: it is not the folder of a run, or the run failed "
             "before its report."
         )
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f"{path} is not a report of hrc_learn.")
-    if content["version"] != VERSION:
-        raise ValueError(
-            f"{path} has version {content['version']}, but this package reads {VERSION}: "
-            "read it with the package that wrote it, or repeat the run."
-        )
-    return _from_json(content, folder)
+    advice = "read it with the package that wrote it, or repeat the run"
+    content = read_json(path, _ReportFile, advice)
+    return _from_file(content, folder)
 
 
 def _drawn(report: Report) -> Report:
@@ -315,56 +335,60 @@ def _drawn(report: Report) -> Report:
     return replace(report, sections=sections)
 
 
-def _to_json(report: Report) -> dict[str, Any]:
+def _as_file(report: Report) -> _ReportFile:
     configuration = flatten(report.configuration)
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "title": report.title,
-        "summary": report.summary,
-        "command": report.command,
-        "film": None if report.film is None else report.film.caption,
-        "table": [asdict(m) | {"value": _finite(m.value)} for m in report.table],
-        "sections": [
-            {
-                "heading": section.heading,
-                "text": section.text,
-                "figures": [{"name": p.name, "caption": p.caption} for p in section.figures],
-            }
+    return _ReportFile(
+        title=report.title,
+        summary=report.summary,
+        command=report.command,
+        film=None if report.film is None else report.film.caption,
+        table=[_Row(**vars(row)) for row in report.table],
+        sections=[
+            _SectionFile(
+                heading=section.heading,
+                text=section.text,
+                figures=[_PictureFile(name=p.name, caption=p.caption) for p in section.figures],
+            )
             for section in report.sections
         ],
-        "configuration": {key: _plain(value) for key, value in configuration.items()},
-        "versions": dict(report.versions),
-    }
+        configuration={key: _plain(value) for key, value in configuration.items()},
+        versions=dict(report.versions),
+    )
 
 
-def _from_json(content: Mapping[str, Any], folder: Path) -> Report:
+def _from_file(content: _ReportFile, folder: Path) -> Report:
     sections = [
         Section(
-            heading=section["heading"],
-            text=section["text"],
+            heading=section.heading,
+            text=section.text,
             figures=[
                 Picture(
-                    figure["name"],
-                    (folder / FIGURES / f"{figure['name']}.png").read_bytes(),
-                    figure["caption"],
-                    _bytes_if_there(folder / FIGURES / f"{figure['name']}.svg"),
+                    figure.name,
+                    (folder / FIGURES / f"{figure.name}.png").read_bytes(),
+                    figure.caption,
+                    _bytes_if_there(folder / FIGURES / f"{figure.name}.svg"),
                 )
-                for figure in section["figures"]
+                for figure in section.figures
             ],
         )
-        for section in content["sections"]
+        for section in content.sections
     ]
     table = [
-        Measurement(**row | {"value": math.nan if row["value"] is None else row["value"]})
-        for row in content["table"]
+        Measurement(**{**vars(row), "value": math.nan if row.value is None else row.value})
+        for row in content.table
     ]
-    # Reports of earlier versions of this package have no film.
-    caption = content.get("film")
-    film = None if caption is None else Film((folder / FILM).read_bytes(), caption)
-    same = ("title", "summary", "command", "configuration", "versions")
+    film = None
+    if content.film is not None:
+        film = Film((folder / FILM).read_bytes(), content.film)
     return Report(
-        table=table, sections=sections, film=film, **{name: content[name] for name in same}
+        title=content.title,
+        summary=content.summary,
+        command=content.command,
+        table=table,
+        sections=sections,
+        film=film,
+        configuration=content.configuration,
+        versions=content.versions,
     )
 
 
@@ -372,12 +396,8 @@ def _bytes_if_there(path: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def _finite(value: float | int) -> float | int | None:
-    """The value, or None if it is not finite, which JSON cannot represent."""
-    return value if math.isfinite(value) else None
-
-
-def _plain(value: object) -> object:
+def _plain(value: object) -> bool | int | float | str | None:
     """JSON value, with all other types converted to text."""
-    known = isinstance(value, (bool, int, str, type(None)))
-    return value if known or (isinstance(value, float) and math.isfinite(value)) else str(value)
+    if isinstance(value, (bool, int, str, type(None))):
+        return value
+    return value if isinstance(value, float) and math.isfinite(value) else str(value)
