@@ -31,13 +31,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.arm_access import through_franka, through_franky
 from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
 from hrc_learn.experiments.collaboration_trial import (
     NULL_SPACE_FORCES,
     CollaborationScenario,
     simulate_collaboration,
 )
+from hrc_learn.experiments.simulated_cell import through_franka, through_franky
 from hrc_learn.hardware import DriverError
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, World

@@ -21,13 +21,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
+from elbow_margin import elbow_margin
 from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.elbow_pulls import elbow_margin, path_distance
+from hrc_learn.experiments.run_measures import path_distance
 from hrc_learn.kinematics import panda
 
 # LeRobot takes ten seconds to import: only once there is something to do.

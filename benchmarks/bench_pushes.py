@@ -18,13 +18,13 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from elbow_margin import elbow_margin
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import track
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.elbow_pulls import elbow_margin
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import Imperfections, World

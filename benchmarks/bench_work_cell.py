@@ -24,7 +24,7 @@ from rich.table import Table
 from timing import time_calls
 
 from hrc_learn import cli
-from hrc_learn.experiments.worker_in_run import draw_visit, move_worker
+from hrc_learn.experiments.people_in_run import draw_visit
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, MotionLog, WorkerSensor, World, whole_arm
 from hrc_learn.sim.workplace import Workplace
@@ -114,7 +114,8 @@ def work_cell_step(seed: int, *parts: str) -> Callable[[], None]:
     def advance(duration: float) -> None:
         motion.advance(duration)
         if visit is not None:
-            move_worker(world, visit)
+            ends = visit.ends_at(world.time)
+            world.move_worker(ends, visit.item_at(world.time, ends))
 
     cell = WorkCell(
         chain=panda,

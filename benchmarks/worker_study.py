@@ -35,8 +35,14 @@ from worker_tables import WorkerTables
 from hrc_learn import cli
 from hrc_learn.controller import WayMakingConfig
 from hrc_learn.controller.arm_loop_state import ArmLoopConfig
-from hrc_learn.experiments.worker_in_run import draw_visit
-from hrc_learn.sim import Imperfections, WorkerVisit, whole_arm
+from hrc_learn.sim import (
+    Imperfections,
+    Worker,
+    WorkerConfig,
+    WorkerVisit,
+    random_visit,
+    whole_arm,
+)
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -221,7 +227,9 @@ def draw_job(
     offset, noise = [], []
     for run in runs:
         rng = np.random.default_rng([config.seed, run])
-        visits.append(draw_visit(workplace, rng))
+        worker = Worker(WorkerConfig.draw(rng))
+        table, centre = workplace.scene.table, workplace.table_centre
+        visits.append(random_visit(worker, rng, bench=table, under=centre))
         drawn = sizes.draw(rng)
         offset.append(drawn.encoder_offset)
         noise.append(sizes.encoder_noise * rng.standard_normal((_READINGS, 7)))

@@ -54,8 +54,6 @@ _APPLIES = {
     "handover": ("collaboration",),
 }
 """Experiments that an option belongs to."""
-_COMPARED = ("learned", "kalman", "composite", "paper", "fixed")
-"""Variants of the grasping experiment that are compared by default."""
 _SIMULATED_ONLY = ("trials", "serve", "page", "camera_moved", "worker", "handover")
 
 
@@ -135,7 +133,6 @@ def _grasping(args: Run) -> tuple[GraspingExperiment, Callable[..., tuple[Workpl
     folder = _model(args.aiming)
     experiment = GraspingExperiment(
         aiming=folder,
-        variants=_COMPARED,
         imperfections=_imperfections(args),
         camera=_simulated_camera(args),
         page=PageConfig() if args.page else None,
@@ -174,7 +171,7 @@ def _collaboration(
     def task(experiment: CollaborationExperiment) -> tuple[Workplace, Task]:
         servoing, skill = VisualServoSkill.load(aiming), PlacingSkill.load(placing, panda)
         shelves = experiment.shelves
-        workplace = workplace_for(shelves, panda, experiment.shelf_x, experiment.shelf_depth)
+        workplace = workplace_for(shelves, panda)
         workplace = workplace.approached(servoing.approach)
         return workplace, collaboration_task(
             servoing, skill, workplace, shelves, experiment.config

@@ -19,8 +19,8 @@ from hrc_learn.cli.arm_arguments import ServePage
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
-from hrc_learn.experiments.arm_access import access_by
 from hrc_learn.experiments.real_arm import ArmSite, opened_site
+from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm

@@ -29,8 +29,8 @@ from hrc_learn.controller import (
     SafetyConfig,
 )
 from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
-from hrc_learn.experiments.arm_access import access_by
 from hrc_learn.experiments.real_arm import ArmSite, opened_arm
+from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid

@@ -1,15 +1,13 @@
 """Experiment 3 of the paper: objects grasped near a person and placed on shelves."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
 from hrc_learn.demos import Demonstration, load_demos
-from hrc_learn.experiments.arm_access import ArmDriver, access_by
 from hrc_learn.experiments.collaboration_metrics import TRIAL_METRICS, collaboration_metrics
-from hrc_learn.experiments.collaboration_report import SUMMARY, collaboration_sections
+from hrc_learn.experiments.collaboration_report import collaboration_sections
 from hrc_learn.experiments.collaboration_trial import (
     DRAGS_NEAR_WORKER,
     NULL_SPACE_FORCES,
@@ -21,13 +19,12 @@ from hrc_learn.experiments.experiment import RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_measures import worker_distance
 from hrc_learn.experiments.run_recorder import record
-from hrc_learn.experiments.simulated_cell import UNOBSERVED, Observer
-from hrc_learn.experiments.snapshots import collaboration_snapshots
+from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.experiments.table_objects import workplace_for
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.log import LoggedSteps, RunRecording
-from hrc_learn.sim import Imperfections, RenderingUnavailableError
+from hrc_learn.sim import Imperfections
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -53,7 +50,12 @@ class CollaborationExperiment(CollaborationScenario):
     """Grasp each object near a person, carry it to the cabinet, place it on its shelf."""
 
     title: ClassVar[str] = "Collaboration: grasping and placing near a person"
-    summary: ClassVar[str] = SUMMARY
+    summary: ClassVar[str] = (
+        "An arm grasps objects with an uncalibrated camera while a person pushes its elbow "
+        "aside to reach under it. It then carries each object to a cabinet along a motion "
+        "learned from demonstrations of the end effector and the null-space posture, and "
+        "places it on a shelf. Simulated in MuJoCo, which also decides on success by contacts."
+    )
 
     aiming: Path
     """Folder of the visual-servoing skill."""
@@ -61,10 +63,6 @@ class CollaborationExperiment(CollaborationScenario):
     """Folder of the placing skill."""
     shelves: tuple[str, ...] = ("middle",)
     """Shelf of each of up to three objects."""
-    shelf_x: float | None = None
-    """Position along the boards at which objects are placed [m]; None: the cell's layout."""
-    shelf_depth: float | None = None
-    """Distance behind the front edge of the boards [m]; None: the cell's layout."""
     pulls: Pulls = "scripted"
     """Times at which the scripted person pulls the elbow; overrides `forces`."""
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
@@ -91,7 +89,7 @@ class CollaborationExperiment(CollaborationScenario):
             PlacingSkill.load(self.placing, robot),
             self.shelves,
             scenario,
-            workplace=workplace_for(self.shelves, robot, self.shelf_x, self.shelf_depth),
+            workplace=workplace_for(self.shelves, robot),
             access=access_by(self.arm, robot),
             seed=seed,
             observer=observer,
@@ -134,13 +132,7 @@ class CollaborationExperiment(CollaborationScenario):
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]
     ) -> Sequence[Section]:
         """Report sections: timeline, grasping, person, worker, placing."""
-        snapshots = []
-        if run.visit is not None and len(run.visit.markers) and len(run.cell.log):
-            try:
-                snapshots = collaboration_snapshots(run)
-            except RenderingUnavailableError as error:
-                print(f"note: no pictures of the worker: {error}", file=sys.stderr)
-        return collaboration_sections(run, recordings["run"], snapshots)
+        return collaboration_sections(run, recordings["run"])
 
     def study(self) -> Study:
         """Trials with other object poses, imperfections and noise."""

@@ -3,7 +3,6 @@
 Success is read from contacts and poses of the simulator, not from the report of the task.
 """
 
-from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from typing import get_args
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from hrc_learn.experiments.collaboration_trial import CollaborationRun
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
+from hrc_learn.experiments.people_in_run import worker_contacts
 from hrc_learn.experiments.run_measures import (
     Deviation,
     Hold,
@@ -23,7 +23,6 @@ from hrc_learn.experiments.run_measures import (
     worker_distance,
 )
 from hrc_learn.experiments.trials import Trial
-from hrc_learn.experiments.worker_in_run import worker_contacts
 from hrc_learn.sim import Touch
 from hrc_learn.sim.hand_over import HandOver, Reach
 from hrc_learn.skills.pick_and_place import HOME, RELEASE, Mishap, PickPlaceJob
@@ -35,6 +34,111 @@ _CONTACTS = {
     "arm itself": "contacts of the arm with itself",
 }
 """Names of metrics, by the object that was hit."""
+_SAME_TASK = "main task not affected (Experiment 3)"
+
+
+def collaboration_metrics(
+    objects: int, reproduction_nrmse: float
+) -> list[Metric[CollaborationRun]]:
+    """Metrics of a run, in the order of the table.
+
+    Args:
+        objects: Number of objects to be placed.
+        reproduction_nrmse: Normalised RMS error of the primitives, from their fit.
+    """
+    return [
+        Metric(
+            "reproduction of the demonstrations, NRMSE",
+            lambda run: reproduction_nrmse,
+            at_most=1e-3,
+        ),
+        *_GRASPING,
+        Metric(
+            "objects held flat between both pads",
+            lambda run: len(run.held_flat),
+            at_least=objects,
+            essential=True,
+            detail=lambda run: _all_but(run, run.held_flat),
+        ),
+        *_SAFETY,
+        *_HAND_OVER,
+        *_COURSE,
+        Metric(
+            "objects that stand on their shelf",
+            lambda run: len(_standing(run)),
+            at_least=objects,
+            claim="three objects, one after the other (Experiment 3)",
+            essential=True,
+            detail=lambda run: _all_but(run, _standing(run)),
+        ),
+        *_PULLS,
+    ]
+
+
+_GRASPING: Sequence[Metric[CollaborationRun]] = (
+    Metric("servoing time", lambda run: _worst(run, lambda e: e.servo_time), "s"),
+    Metric(
+        "pixel error at descent",
+        lambda run: _worst(run, lambda e: e.pixel_error),
+        "px",
+        at_most=5.0,
+    ),
+    Metric("grasp offset", lambda run: max(_grasp_offsets(run), default=None), "mm"),
+    Metric(
+        "object tilt in the hand",
+        lambda run: max((np.rad2deg(h.tilt) for h in _holds(run)), default=None),
+        "deg",
+        at_most=3.0,
+    ),
+    Metric(
+        "slip in the hand",
+        lambda run: max((1e3 * h.slip for h in _holds(run)), default=None),
+        "mm",
+        at_most=3.0,
+    ),
+)
+
+_SAFETY: Sequence[Metric[CollaborationRun]] = (
+    Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
+    Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
+    Metric(
+        "joint limit violations",
+        lambda run: limit_violations(run.cell),
+        at_most=0,
+        essential=True,
+    ),
+    *(
+        Metric[CollaborationRun](
+            name,
+            lambda run, hit=hit: len(_contacts(run)[hit]),
+            at_most=0,
+            essential=True,
+            detail=lambda run, hit=hit: f"first {_contacts(run)[hit][0]}",
+        )
+        for hit, name in _CONTACTS.items()
+    ),
+    # Not listed, as the rows above name what was hit.
+    Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
+    Metric("contacts with the worker", lambda run: _worker_contacts(run)),
+    Metric("min distance", lambda run: _min_distance(run), "mm"),
+    Metric(
+        "separation violations",
+        lambda run: (
+            None if run.separation_margin is None else int((run.separation_margin < 0).sum())
+        ),
+        at_most=0,
+        essential=True,
+    ),
+    Metric(
+        "waited for the worker",
+        lambda run: (
+            None
+            if run.visit is None
+            else float((1.0 - run.cell.log["pace"]).sum() * run.cell.config.dt)
+        ),
+        "s",
+    ),
+)
 
 
 def _handed(
@@ -57,7 +161,7 @@ def _distance(place: np.ndarray | None, other: np.ndarray) -> float:
     return float("nan") if place is None else 1e3 * float(np.linalg.norm(place - other))
 
 
-HAND_OVER_METRICS: Sequence[Metric[CollaborationRun]] = (
+_HAND_OVER: Sequence[Metric[CollaborationRun]] = (
     Metric(
         "hand-over recognised before it began",
         _handed(lambda receipt, reach, _: float(receipt.seen < reach.begin)),
@@ -68,20 +172,10 @@ HAND_OVER_METRICS: Sequence[Metric[CollaborationRun]] = (
         _handed(lambda receipt, _, __: receipt.passed_over),
     ),
     Metric(
-        "hand-over recognised, true share of the movement then",
+        "hand-over recognised at this fraction of the movement",
         _handed(
             lambda receipt, reach, _: (
                 100 * (receipt.recognised - reach.begin) / (reach.end - reach.begin)
-            )
-        ),
-        "%",
-    ),
-    Metric(
-        "phase error when recognised",
-        _handed(
-            lambda receipt, reach, _: (
-                100
-                * abs(receipt.phase - (receipt.seen - reach.begin) / (reach.end - reach.begin))
             )
         ),
         "%",
@@ -97,217 +191,56 @@ HAND_OVER_METRICS: Sequence[Metric[CollaborationRun]] = (
         "mm",
     ),
     Metric(
-        "from where it was held out to where it was taken",
-        _handed(lambda receipt, _, plan: _distance(receipt.place, plan.place)),
-        "mm",
-    ),
-    Metric(
-        "from the hand setting off until the object was held",
+        "time until the object was held",
         _handed(lambda receipt, reach, _: receipt.taken - reach.begin),
         "s",
     ),
 )
-"""Metrics of the object that a person hands over."""
 
-_FAR = 0.15
-"""Displacement of the elbow by a pull that counts as followed [m]."""
-
-
-def collaboration_metrics(
-    objects: int, reproduction_nrmse: float
-) -> list[Metric[CollaborationRun]]:
-    """Metrics of a run, in the order of the table.
-
-    Args:
-        objects: Number of objects to be placed.
-        reproduction_nrmse: Normalised RMS error of the primitives, from their fit.
-    """
-    return [
-        Metric(
-            "reproduction of the demonstrations, NRMSE",
-            lambda run: reproduction_nrmse,
-            at_most=1e-3,
-        ),
-        Metric("servoing time", lambda run: _worst(run, lambda e: e.servo_time), "s"),
-        Metric(
-            "pixel error at descent",
-            lambda run: _worst(run, lambda e: e.pixel_error),
-            "px",
-            at_most=5.0,
-        ),
-        Metric("grasp offset", lambda run: max(_grasp_offsets(run), default=None), "mm"),
-        Metric(
-            "object tilt in the hand",
-            lambda run: max((np.rad2deg(h.tilt) for h in _holds(run)), default=None),
-            "deg",
-            at_most=3.0,
-        ),
-        Metric(
-            "slip in the hand",
-            lambda run: max((1e3 * h.slip for h in _holds(run)), default=None),
-            "mm",
-            at_most=3.0,
-        ),
-        Metric(
-            "objects held flat between both pads",
-            lambda run: len(run.held_flat),
-            at_least=objects,
-            essential=True,
-            detail=lambda run: _all_but(run, run.held_flat),
-        ),
-        Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
-        Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
-        Metric(
-            "joint limit violations",
-            lambda run: limit_violations(run.cell),
-            at_most=0,
-            essential=True,
-        ),
-        *(
-            Metric(
-                name,
-                lambda run, hit=hit: len(_contacts(run)[hit]),
-                at_most=0,
-                essential=True,
-                detail=lambda run, hit=hit: f"first {_contacts(run)[hit][0]}",
-            )
-            for hit, name in _CONTACTS.items()
-        ),
-        # Not listed, as the rows above name what was hit.
-        Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
-        Metric("contacts with the worker", _met_worker),
-        Metric("min distance", _min_distance, "mm"),
-        Metric(
-            "separation violations",
-            lambda run: (
-                None
-                if run.separation_margin is None
-                else int((run.separation_margin < 0).sum())
+_COURSE: Sequence[Metric[CollaborationRun]] = (
+    Metric(
+        "cycle time",
+        lambda run: run.cell.time,
+        "s",
+        claim="the first object on its shelf after 68 s (snapshots)",
+    ),
+    *(
+        Metric[CollaborationRun](
+            f"recovered from: {mishap}",
+            lambda run, mishap=mishap: (
+                sum(note.mishap == mishap for pick in run.picks for note in pick.recoveries)
+                or None
             ),
-            at_most=0,
-            essential=True,
-        ),
-        Metric("waited for the worker", _waited, "s"),
-        *HAND_OVER_METRICS,
-        Metric("free for his hands while he reaches", _free_volume, "l", resolution=0.1),
-        Metric("bench he reaches comfortably", _comfortable, "%"),
-        Metric(
-            "cycle time",
-            lambda run: run.cell.time,
-            "s",
-            claim="the first object on its shelf after 68 s (snapshots)",
-        ),
-        *(
-            Metric(
-                f"recovered from: {mishap}",
-                lambda run, mishap=mishap: _recoveries(run)[mishap] or None,
-            )
-            for mishap in get_args(Mishap)
-        ),
-        Metric(
-            "objects that stand on their shelf",
-            lambda run: len(_standing(run)),
-            at_least=objects,
-            claim="three objects, one after the other (Experiment 3)",
-            essential=True,
-            detail=lambda run: _all_but(run, _standing(run)),
-        ),
-        Metric(
-            "end effector deviation",
-            lambda run: (
-                _off_path(run) if run.pulls else _pushed(run, lambda d: 1e3 * d.position)
-            ),
-            "mm",
-            at_most=2.0,
-            claim="main task not affected (Experiment 3)",
-        ),
-        Metric(
-            "end effector rotation",
-            lambda run: None if run.pulls else _pushed(run, lambda d: np.rad2deg(d.rotation)),
-            "deg",
-            at_most=0.5,
-            claim="main task not affected (Experiment 3)",
-        ),
-        Metric(
-            "elbow moved",
-            lambda run: (
-                _elbow_pulled(run) if run.pulls else _pushed(run, lambda d: 1e3 * d.elbow)
-            ),
-            "mm",
-            # Enough to reach under the arm; without it the deviation above proves nothing.
-            at_least=100.0,
-            claim="joint 4 dragged forward for 7 s, backward for 4 s",
-        ),
-        Metric("pulls", lambda run: len(_pulled(run)) or None),
-        Metric(
-            "pulls with room for 150 mm",
-            lambda run: (
-                sum(margin >= _FAR for _, margin in _pulled(run)) if run.pulls else None
-            ),
-        ),
-        Metric(
-            "pulls with room for 150 mm that moved the elbow so far",
-            lambda run: (
-                sum(moved >= _FAR for moved, margin in _pulled(run) if margin >= _FAR)
-                if run.pulls
-                else None
-            ),
-        ),
-    ]
+        )
+        for mishap in get_args(Mishap)
+    ),
+)
 
-
-def _met_worker(run: CollaborationRun) -> int | None:
-    """Number of contacts with the worker; None without a worker."""
-    if run.world.config.worker is None:
-        return None
-    return len(worker_contacts(run.world, run.cell.log, run.motion))
-
-
-def _min_distance(run: CollaborationRun) -> float | None:
-    """True smallest distance of the worker from robot and load [mm]; None without a worker."""
-    distance = worker_distance(run.motion, len(run.cell.log))
-    return 1e3 * float(distance.min()) if len(distance) else None
-
-
-def _waited(run: CollaborationRun) -> float | None:
-    """Time that the task waited for the worker [s]; None without a worker."""
-    if run.visit is None:
-        return None
-    return float((1.0 - run.cell.log["pace"]).sum() * run.cell.config.dt)
-
-
-def _free_volume(run: CollaborationRun) -> float | None:
-    """Mean free volume over the reaches [l]; None without a worker."""
-    spaces = run.reach_spaces
-    return 1e3 * float(np.mean([space.free_volume for space in spaces])) if spaces else None
-
-
-def _comfortable(run: CollaborationRun) -> float | None:
-    """Mean comfortable fraction of the bench over the reaches [%]; None without a worker."""
-    spaces = run.reach_spaces
-    return 100.0 * float(np.mean([space.comfortable for space in spaces])) if spaces else None
-
-
-def _off_path(run: CollaborationRun) -> float | None:
-    """Largest distance of the end effector from its path in phases with pulls [mm]."""
-    off = [1e3 * effect.tool for effect in run.pull_effects if np.isfinite(effect.tool)]
-    return max(off, default=None)
-
-
-def _elbow_pulled(run: CollaborationRun) -> float | None:
-    """Median displacement of the elbow over the pulls at random moments [mm]."""
-    moved = [moved for moved, _ in _pulled(run)]
-    return 1e3 * float(np.median(moved)) if moved else None
-
-
-def _pulled(run: CollaborationRun) -> list[tuple[float, float]]:
-    """Displacement of the elbow by each pull at a random moment, and its margin [m]."""
-    pulled: dict[float, tuple[float, float]] = {}
-    for effect in run.pull_effects:
-        moved, margin = pulled.get(effect.pull.start, (0.0, effect.margin))
-        pulled[effect.pull.start] = max(moved, effect.elbow), margin
-    return list(pulled.values())
-
+_PULLS: Sequence[Metric[CollaborationRun]] = (
+    Metric(
+        "end effector deviation",
+        lambda run: _off_path(run) if run.pulls else _pushed(run, lambda d: 1e3 * d.position),
+        "mm",
+        at_most=2.0,
+        claim=_SAME_TASK,
+    ),
+    Metric(
+        "end effector rotation",
+        lambda run: None if run.pulls else _pushed(run, lambda d: np.rad2deg(d.rotation)),
+        "deg",
+        at_most=0.5,
+        claim=_SAME_TASK,
+    ),
+    Metric(
+        "elbow moved",
+        lambda run: _elbow_pulled(run) if run.pulls else _pushed(run, lambda d: 1e3 * d.elbow),
+        "mm",
+        # Enough to reach under the arm; without it the deviation above proves nothing.
+        at_least=100.0,
+        claim="joint 4 dragged forward for 7 s, backward for 4 s",
+    ),
+    Metric("pulls", lambda run: len(run.pull_effects) or None),
+)
 
 TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("trials, success rate", success_rate),
@@ -321,6 +254,31 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("trials, min distance (median)", median("min_distance_mm"), "mm"),
 )
 """Metrics of repeated runs."""
+
+
+def _worker_contacts(run: CollaborationRun) -> int | None:
+    """Number of contacts with the worker; None without a worker."""
+    if run.world.config.worker is None:
+        return None
+    return len(worker_contacts(run.world, run.cell.log, run.motion))
+
+
+def _min_distance(run: CollaborationRun) -> float | None:
+    """True smallest distance of the worker from robot and load [mm]; None without a worker."""
+    distance = worker_distance(run.motion, len(run.cell.log))
+    return 1e3 * float(distance.min()) if len(distance) else None
+
+
+def _off_path(run: CollaborationRun) -> float | None:
+    """Largest distance of the end effector from its path in phases with pulls [mm]."""
+    off = [1e3 * effect.tool for effect in run.pull_effects if np.isfinite(effect.tool)]
+    return max(off, default=None)
+
+
+def _elbow_pulled(run: CollaborationRun) -> float | None:
+    """Median displacement of the elbow over the pulls at random moments [mm]."""
+    moved = [effect.elbow for effect in run.pull_effects]
+    return 1e3 * float(np.median(moved)) if moved else None
 
 
 def _worst(run: CollaborationRun, measured: Callable[[PickPlaceJob], float]) -> float | None:
@@ -395,8 +353,3 @@ def _contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
     names = [pick.item.name for pick in run.picks if pick.release is not None]
     begun = [start for start, _ in spans(run.cell.log, RELEASE)]
     return unwanted_contacts(run.world, run.cell.log, dict(zip(names, begun, strict=True)))
-
-
-def _recoveries(run: CollaborationRun) -> Counter[str]:
-    """Number of recoveries from each kind of mishap."""
-    return Counter(note.mishap for pick in run.picks for note in pick.recoveries)

@@ -3,7 +3,7 @@
 Each figure takes the recording of the run and the time interval of each object, by its name.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import matplotlib
 import numpy as np
@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from hrc_learn.experiments.collaboration_trial import CollaborationRun
-from hrc_learn.experiments.snapshots import Image, snapshots_figure
 from hrc_learn.log import Event, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import (
@@ -23,7 +22,6 @@ from hrc_learn.viz.figure_parts import (
     frame_space,
     near,
     needed,
-    shade,
     space,
 )
 from hrc_learn.viz.figures import image_jacobian_figure, joints_figure, person_figure
@@ -37,33 +35,33 @@ CARRYING = ("transfer", "release")
 
 _HIDDEN = "#8D8F94"
 
-SUMMARY = (
-    "An arm grasps objects with an uncalibrated camera while a person pushes its elbow aside "
-    "to reach under it. It then carries each object to a cabinet along a motion learned from "
-    "demonstrations of the end effector and the null-space posture, and places it on a shelf. "
-    "Simulated in MuJoCo, which also decides on success by contacts."
-)
 
-
-def collaboration_sections(
-    run: CollaborationRun,
-    recording: RunRecording,
-    snapshots: Sequence[tuple[str, Image]] = (),
-) -> list[Section]:
-    """Report sections: timeline, grasping, person, worker if one came, placing.
-
-    Args:
-        run: The run.
-        recording: Recording of the run.
-        snapshots: Pictures of the job near the worker, with their titles; empty without a
-            worker, or if this machine cannot render.
-    """
+def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> list[Section]:
+    """Report sections: timeline, grasping, person, worker if one came, placing."""
     objects: Spans = {pick.item.name: pick.span for pick in run.picks}
     notes = [
         f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
         for pick in run.picks
         for note in pick.recoveries
     ]
+    timeline = Picture("timeline", timeline_figure(recording, objects), "Phases over time.")
+    marker = Picture(
+        "marker",
+        marker_figure(recording, objects),
+        "Paths of the marker over the camera's first image, and its distance from the target.",
+    )
+    jacobian = Picture(
+        "image_jacobian",
+        image_jacobian_figure(recording),
+        "Image Jacobian: estimate of the controller, and truth in the simulator.",
+    )
+    person = Picture(
+        "person", person_figure(recording), "Effort of the person, elbow and end effector."
+    )
+    trajectories = Picture(
+        "trajectories", trajectories_figure(recording, objects), "Paths of the end effector."
+    )
+    joints = Picture("joints", joints_figure(recording), "Joint positions and limits.")
     return [
         Section(
             heading="The job",
@@ -71,9 +69,7 @@ def collaboration_sections(
                 "A state machine: detect, servo, wait for the person, grasp, carry home, "
                 f"transfer, release, retreat. {' '.join(notes) or 'No recovery was needed.'}"
             ),
-            figures=(
-                Picture("timeline", timeline_figure(recording, objects), "Phases over time."),
-            ),
+            figures=(timeline,),
         ),
         Section(
             heading="Grasping with an uncalibrated camera",
@@ -82,19 +78,7 @@ def collaboration_sections(
                 "above the object. The image Jacobian was learned from the demonstrations and "
                 "adapts online, also to a moved camera."
             ),
-            figures=(
-                Picture(
-                    "marker",
-                    marker_figure(recording, objects),
-                    "Paths of the marker over the camera's first image, and its distance from "
-                    "the target.",
-                ),
-                Picture(
-                    "image_jacobian",
-                    image_jacobian_figure(recording),
-                    "Image Jacobian: estimate of the controller, and truth in the simulator.",
-                ),
-            ),
+            figures=(marker, jacobian),
         ),
         Section(
             heading="The person",
@@ -102,60 +86,33 @@ def collaboration_sections(
                 "The force of the person acts in the null space of the task: the elbow yields, "
                 "the end effector stays."
             ),
-            figures=(
-                Picture(
-                    "end_effector",
-                    end_effector_figure(recording),
-                    "Position and orientation of the end effector, and effort of the person.",
-                ),
-                Picture(
-                    "person",
-                    person_figure(recording),
-                    "Effort, elbow and end effector, enlarged.",
-                ),
-            ),
+            figures=(person,),
         ),
-        *_worker_sections(recording, snapshots),
+        *([_worker_section(recording)] if recording.worker_distance else []),
         Section(
             heading="Carrying and placing",
             text="The demonstration, and the motion of the arm with every object.",
-            figures=(
-                Picture(
-                    "trajectories",
-                    trajectories_figure(recording, objects),
-                    "Paths of the end effector.",
-                ),
-                Picture("joints", joints_figure(recording), "Joint positions and limits."),
-            ),
+            figures=(trajectories, joints),
         ),
     ]
 
 
-def _worker_sections(
-    recording: RunRecording, snapshots: Sequence[tuple[str, Image]]
-) -> list[Section]:
-    """Section about the worker; none without a worker."""
-    if not recording.worker_distance:
-        return []
-    text = (
-        "A worker comes to the table, puts something down, reaches for markers under the arm "
-        "and leaves, without regard to the robot. The robot sees the worker late and with "
-        "noise, keeps the protective distance of ISO/TS 15066 from every part of the body, and "
-        "waits if necessary. The expert drags joint 4 forward and back twice to make space."
-    )
-    figures = []
-    if snapshots:
-        caption = (
-            "The job, after the paper's snapshots of Experiment 3. Violet: smallest distance. "
-            "Orange: direction in which the expert drags the elbow."
-        )
-        figures.append(Picture("worker_snapshots", snapshots_figure(snapshots), caption))
+def _worker_section(recording: RunRecording) -> Section:
     caption = (
         "Smallest distance from the robot and its load: true, seen by the robot, and the "
         "protective distance of the part with the smallest margin."
     )
-    figures.append(Picture("worker", worker_figure(recording), caption))
-    return [Section(heading="The worker", text=text, figures=tuple(figures))]
+    return Section(
+        heading="The worker",
+        text=(
+            "A worker comes to the table, puts something down, reaches for markers under the "
+            "arm and leaves, without regard to the robot. The robot sees the worker late and "
+            "with noise, keeps the protective distance of ISO/TS 15066 from every part of the "
+            "body, and waits if necessary. The expert drags joint 4 forward and back twice to "
+            "make space."
+        ),
+        figures=(Picture("worker", worker_figure(recording), caption),),
+    )
 
 
 def worker_figure(run: RunRecording) -> Figure:
@@ -247,37 +204,6 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
     return figure
 
 
-def end_effector_figure(run: RunRecording) -> Figure:
-    """Position and orientation of the end effector, and effort of the person, over time."""
-    effort = needed(run.nullspace_input, "nullspace_input")
-    hand = next((body for body in run.bodies if body.name == "hand"), None)
-    acting = np.linalg.norm(effort, axis=1) > 0
-    rows = [
-        ("position [m]", "Position of the end effector", run.position, "xyz"),
-        ("effort d [N m]", "Null-space effort of the person, by joint", effort, None),
-    ]
-    if hand is not None:
-        turn = _euler_angles(hand.orientation)
-        rows.insert(1, ("angle [deg]", "Orientation of the end effector", turn, _ANGLES))
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.9 * len(rows)))
-        column = figure.subplots(len(rows), 1, sharex=True)
-        for axes, (label, title, values, names) in zip(column, rows, strict=True):
-            shade(axes, run.time, acting)
-            axes.plot(run.time, values)
-            axes.set(ylabel=label, title=title)
-            axes.margins(x=0)
-            axes.legend(
-                axes.get_lines(),
-                names or run.joint_names,
-                loc="center left",
-                bbox_to_anchor=(1.0, 0.5),
-            )
-        column[-1].set_xlabel("time [s] (shaded: a person pushes the elbow)")
-        figure.align_ylabels()
-    return figure
-
-
 def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
     """Phases of the task by object, with pushes and occlusions below."""
     events = [(event, end) for event, end in _lasting(run) if end > event.time]
@@ -310,21 +236,6 @@ def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
         handles = [axes.plot([], [], lw=6, color=c)[0] for c in colours.values()]
         figure.legend(handles, colours, loc="outside upper right", ncols=len(colours))
     return figure
-
-
-_ANGLES = ("about x", "about y", "about z")
-
-
-def _euler_angles(q: Float[np.ndarray, "time 4"]) -> Float[np.ndarray, "time 3"]:
-    """Rotations about the base's x, then y, then z from gripper down, unwrapped [deg]."""
-    w, x, y, z = q.T
-    # q = turn * down, where down = (0, s, s, 0) with s^2 = 1/2: turn = q * conj(down).
-    s = np.sqrt(0.5)
-    w, x, y, z = s * (x + y), s * (z - w), -s * (w + z), s * (y - x)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.rad2deg(np.unwrap(np.stack([roll, pitch, yaw], axis=1), axis=0))
 
 
 def _lasting(run: RunRecording) -> list[tuple[Event, float]]:

@@ -8,21 +8,18 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
-from hrc_learn.experiments.elbow_pulls import PullEffect, pull_effects
-from hrc_learn.experiments.hand_over_person import (
+from hrc_learn.experiments.people_in_run import (
     GivingPerson,
-    giver,
+    draw_visit,
+    separation_margin,
     shown_hand_overs,
     waiting_pose,
 )
-from hrc_learn.experiments.reach_space import (
-    ReachSpace,
-    reach_spaces,
-    space_over_bench,
-)
+from hrc_learn.experiments.run_measures import PullEffect, pull_effects
 from hrc_learn.experiments.simulated_cell import (
+    SIMULATED,
     UNOBSERVED,
+    ArmAccess,
     Observer,
     grasping_allows_for,
     plan_checker,
@@ -33,11 +30,6 @@ from hrc_learn.experiments.table_objects import (
     draw_object_poses,
     points_to_see,
 )
-from hrc_learn.experiments.worker_in_run import (
-    draw_visit,
-    move_worker,
-    separation_margin,
-)
 from hrc_learn.protocols import Human
 from hrc_learn.sim import (
     CameraChange,
@@ -47,6 +39,7 @@ from hrc_learn.sim import (
     MotionLog,
     OcclusionInterval,
     ScriptedOcclusion,
+    WorkerConfig,
     WorkerSensor,
     WorkerVisit,
     World,
@@ -166,16 +159,11 @@ class CollaborationRun:
 
     @cached_property
     def pull_effects(self) -> list[PullEffect]:
-        """Effect of each pull at a random moment, for each phase that it reached into."""
+        """Effect of each pull at a random moment."""
         if not self.pulls:
             return []
-        return pull_effects(
-            self.cell.log,
-            self.pulls,
-            self.workplace.robot.chain,
-            encoder_offset=self.world.arm.encoder_offset,
-            clearance=self.workplace.arm_clearance,
-        )
+        offset = self.world.arm.encoder_offset
+        return pull_effects(self.cell.log, self.pulls, self.workplace.robot.chain, offset)
 
     @cached_property
     def separation_margin(self) -> Float[np.ndarray, " steps"] | None:
@@ -193,20 +181,6 @@ class CollaborationRun:
                 item.name: (as_load(item), self.motion.held(item.name)[: len(log)])
                 for item in self.workplace.scene.objects
             },
-        )
-
-    @cached_property
-    def reach_spaces(self) -> list[ReachSpace]:
-        """Free space of the worker at each marker; empty without a worker."""
-        if self.visit is None or not len(self.visit.markers):
-            return []
-        x, y, _ = self.visit.markers.mean(axis=0).tolist()
-        return reach_spaces(
-            self.cell.log,
-            self.visit,
-            whole_arm(self.world.config.arm),
-            space_over_bench((x, y), self.world.table_top),
-            self.world.arm.encoder_offset,
         )
 
     @property
@@ -263,7 +237,12 @@ def simulate_collaboration(
         # A generator of its own keeps runs with and without pulls alike otherwise.
         pulls = random_pulls(np.random.default_rng([seed, 1]))
         config = replace(config, interactions=0)
-    person = _scripted_person(workplace, scenario, pulls)
+    person = ScriptedPerturbation(
+        workplace.robot.chain,
+        pulls if scenario.forces == "random" else scenario.forces,
+        0.0 if scenario.forces == "random" else None,
+        InteractionForceConfig(mapping=scenario.mapping),
+    )
     stage = _Stage(workplace, scenario, plant, seed, rng)
     world, items = stage.world, workplace.scene.objects
     eyes = ChangingCamera(
@@ -333,18 +312,6 @@ def simulate_collaboration(
     )
 
 
-def _scripted_person(
-    workplace: Workplace, scenario: CollaborationScenario, pulls: Sequence[ScriptedForce]
-) -> ScriptedPerturbation:
-    chain, interaction = (
-        workplace.robot.chain,
-        InteractionForceConfig(mapping=scenario.mapping),
-    )
-    if scenario.forces == "random":
-        return ScriptedPerturbation(chain, pulls, 0.0, interaction)
-    return ScriptedPerturbation(chain, scenario.forces, None, interaction)
-
-
 class _Stage:
     """World of a collaboration, with its objects and people.
 
@@ -369,10 +336,11 @@ class _Stage:
         self.visit: WorkerVisit | None = None
         scene = workplace.scene
         if scenario.worker:
-            self.visit = draw_visit(workplace, person_rng, beside_elbow=True)
+            self.visit = draw_visit(workplace, person_rng)
             scene = replace(scene, worker=self.visit.worker.config)
         if scenario.handover:
-            scene = replace(scene, worker=giver(seed).config)
+            giver = WorkerConfig.draw(np.random.default_rng([seed, 4]))
+            scene = replace(scene, worker=giver)
         self.world = World(scene, self._sizes.draw(rng, workplace.robot.joints))
         poses = draw_object_poses(workplace, self.world, self._sizes.object_yaw, rng)
         self.world.reset(workplace.home_joints().numpy(), poses)
@@ -393,16 +361,19 @@ class _Stage:
             separation = plant.plant(scenario.cell.safety).separation
             self.watch = PersonWatch(self._tracker, whole_arm(scene.arm), separation, expected)
         self._occluder = ScriptedOcclusion(self.world, scenario.disturbances.occlusions)
-        if self.visit is not None:
-            move_worker(self.world, self.visit)
+        self._move_worker()
 
     def update(self) -> None:
         """Move occluder and person to where they are now."""
         self._occluder.update()
-        if self.visit is not None:
-            move_worker(self.world, self.visit)
+        self._move_worker()
         if self.giving is not None:
             self.giving.update()
+
+    def _move_worker(self) -> None:
+        if self.visit is not None:
+            ends = self.visit.ends_at(self.world.time)
+            self.world.move_worker(ends, self.visit.item_at(self.world.time, ends))
 
     def receiving(self, cell: WorkCell) -> dict[str, Receiving]:
         """Skill that receives the last object, by its name; empty without a hand-over."""

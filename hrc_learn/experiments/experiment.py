@@ -7,7 +7,7 @@ An experiment is a frozen dataclass of its settings with the methods of `Experim
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
@@ -26,7 +26,6 @@ from hrc_learn.viz.report import (
     PAGE,
     Film,
     Measurement,
-    Picture,
     Report,
     Section,
     show_command,
@@ -58,11 +57,9 @@ class Study:
     """Rows of the table that the trials add."""
     text: str = ""
     """Description of the differences between trials."""
-    pictures: Callable[[Sequence[Trial]], Sequence[Picture]] = lambda trials: ()
-    """Makes figures of the trials."""
 
     def section(self, trials: Sequence[Trial]) -> Section:
-        """Section of the report: success rate, failures, figures."""
+        """Section of the report: success rate and failures."""
         summary = Summary.of(trials)
         lines = [
             self.text,
@@ -70,7 +67,7 @@ class Study:
             *(f"Seed {seed}: {reason}." for seed, reason in summary.failed.items()),
         ]
         text = "\n\n".join(filter(None, lines))
-        return Section(heading=self.title, text=text, figures=self.pictures(trials))
+        return Section(heading=self.title, text=text)
 
 
 @runtime_checkable

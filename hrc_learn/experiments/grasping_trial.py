@@ -1,92 +1,133 @@
-"""One grasp in simulation, with a choice of image-Jacobian estimators."""
+"""One grasp in simulation, from a random scene: camera, start of the arm, object."""
 
-import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
-from hrc_learn.experiments.grasping_scene import GraspingScene
 from hrc_learn.experiments.simulated_cell import (
+    SIMULATED,
     UNOBSERVED,
+    ArmAccess,
     Observer,
     grasping_allows_for,
     plan_checker,
     simulated_cell,
 )
-from hrc_learn.geometry import Pose
-from hrc_learn.jacobian import (
-    CompositeEstimator,
-    FixedEstimator,
-    ImageJacobianEstimator,
-    PaperEstimator,
-    RBFImageJacobian,
+from hrc_learn.geometry import quaternion
+from hrc_learn.sim import (
+    CameraKind,
+    Imperfections,
+    MotionLog,
+    ObjectConfig,
+    World,
+    open_camera,
 )
-from hrc_learn.sim import CameraKind, MotionLog, ObjectConfig, World, open_camera
+from hrc_learn.sim.imperfections import DrawnImperfections
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
 from hrc_learn.skills.marker_sensor import MarkerSensor
-from hrc_learn.skills.visual_skill import VisualServoSkill, from_learned, guessed_network
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
 from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.vision import CameraModel
 
-REACHED = 5.0
-"""Distance of the marker from its true target that counts as reached [px]."""
-
-
-@dataclass(frozen=True)
-class Variant:
-    """An initial image Jacobian, and a law that adapts it."""
-
-    label: str
-    estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator]
-    """Makes the estimator from the learned image Jacobian."""
-    claim: str = ""
-    """Claim of the paper."""
-
-
-def _from_guess(
-    law: type[ImageJacobianEstimator],
-) -> Callable[[RBFImageJacobian], ImageJacobianEstimator]:
-    """The law, started from the paper's initial image Jacobian."""
-    return lambda _: law(guessed_network())
-
-
-DEFAULT = "learned"
-
-VARIANTS: Mapping[str, Variant] = {
-    DEFAULT: Variant("Kalman filter from the learned Jacobian", from_learned),
-    "kalman": Variant(
-        "Kalman filter from the paper's guess", lambda _: from_learned(guessed_network())
-    ),
-    "composite": Variant(
-        "composite law from the paper's guess", _from_guess(CompositeEstimator)
-    ),
-    "paper": Variant(
-        "the paper's law from its guess",
-        _from_guess(PaperEstimator),
-        claim="reaches the target, faster than without adaptation (Experiment 2)",
-    ),
-    "fixed": Variant(
-        "the paper's guess, not adapted",
-        _from_guess(FixedEstimator),
-        claim="reaches the target, slower (Experiment 2)",
-    ),
-    "unadapted": Variant(
-        "the learned Jacobian, not adapted",
-        # Estimators work in double precision; the copy leaves the network of the skill as is.
-        lambda learned: FixedEstimator(copy.deepcopy(learned).double()),
-    ),
-}
-"""Estimators to compare, the default first."""
+# Joint speed [rad/s] and time between samples [s] of the approach checked for contacts.
+_APPROACH_SPEED, _PATH_STEP = 0.6, 0.05
+# Largest yaw of objects in a scene without imperfections, either way [rad]: as laid by hand.
+_ALONG_EDGES = 0.06
+CAMERA_SHIFT = 0.10
+"""Largest shift of a random camera along each axis [m]."""
+# Largest distance along each axis between the middle of the workplace and the point that a
+# random camera looks at [m].
+_CAMERA_MISS = 0.04
+# Largest distance of the object from the middle of the table along each axis [m].
+_OBJECT_REACH = (0.10, 0.08, 0.0)
+# Distance of the start from the joint limits [rad], and smallest height of the end effector
+# there [m].
+_LIMIT_MARGIN, _START_HEIGHT = 0.02, 0.15
+START_DISTANCE = 0.35
+"""Smallest distance of the end effector at the start from its goal [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulatedGrasp:
+class GraspingSceneConfig:
+    """Distribution of random scenes."""
+
+    camera_roll: float = 0.0
+    """Rotation of the camera about its axis since the demonstrations [rad]."""
+    random_camera: bool = False
+    """Shift and tilt the camera, and rotate it by any angle in place of `camera_roll`."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GraspingScene:
+    """Initial conditions of a grasp: camera, arm and object."""
+
+    workplace: Workplace
+    """Workplace with the camera of the run, which the controller does not know."""
+    start: Float[np.ndarray, " joints"]
+    """Joint positions at the start [rad]."""
+    object_pose: Float[np.ndarray, "4 4"]
+    imperfections: DrawnImperfections | None = None
+    """Imperfections of arm, calibration, camera and object; None: none."""
+
+    def world(self) -> World:
+        """World with this scene, at rest."""
+        world = World(self.workplace.scene, self.imperfections)
+        world.reset(self.start, {self.workplace.scene.objects[0].name: self.object_pose})
+        return world
+
+    @classmethod
+    def draw(
+        cls,
+        workplace: Workplace,
+        config: GraspingSceneConfig,
+        rng: np.random.Generator,
+        camera: CameraKind = "synthetic",
+        imperfections: Imperfections | None = None,
+    ) -> "GraspingScene":
+        """Draw a scene.
+
+        The arm starts anywhere within its joint limits where it touches nothing, does not hide
+        the object from the camera, and can move home on straight lines in joint space.
+
+        Args:
+            workplace: Workplace with the camera of the demonstrations.
+            config: Distribution of the scenes.
+            rng: Random generator.
+            camera: Kind of camera that checks if the object is hidden.
+            imperfections: Imperfections of arm, calibration, camera and object; None: none.
+        """
+        scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
+        # A generator of its own: the scenes are the same with any imperfections.
+        drawn = sizes.draw(rng.spawn(1)[0], workplace.robot.joints)
+        yaw = max(_ALONG_EDGES, sizes.object_yaw)
+        pose = workplace.random_object_pose(_OBJECT_REACH, rng, yaw)
+        camera_model = _draw_camera(workplace, config, rng)
+        workplace = replace(workplace, scene=replace(scene, camera=camera_model))
+        item = scene.objects[0]
+        world = World(workplace.scene, drawn)
+        pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
+        eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
+        sensor = MarkerSensor(eye, workplace.scene.marker_ids)
+        for start in _starts(workplace, rng):
+            world.reset(start, {item.name: pose})
+            if item.marker.id in sensor.detect() and _has_free_path(world, workplace, start):
+                return cls(
+                    workplace=workplace, start=start, object_pose=pose, imperfections=drawn
+                )
+        raise AssertionError("the sequence of starts is endless")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspingRun:
     """One grasp, successful or not."""
 
     scene: GraspingScene
@@ -105,8 +146,6 @@ def simulate_grasp(
     aiming: VisualServoSkill,
     scene: GraspingScene,
     *,
-    estimator: ImageJacobianEstimator | None = None,
-    known_target: bool = False,
     camera: CameraKind = "auto",
     config: GraspingConfig | None = None,
     rng: np.random.Generator,
@@ -114,15 +153,12 @@ def simulate_grasp(
     drawings: Sequence[DrawnInterval] = (),
     page: PageConfig | None = None,
     observer: Observer = UNOBSERVED,
-) -> SimulatedGrasp:
+) -> GraspingRun:
     """Grasp an object and carry it home, in MuJoCo.
 
     Args:
         aiming: Learned image Jacobian and visual target.
         scene: Initial conditions.
-        estimator: Estimator of the image Jacobian; by default that of `Grasping`.
-        known_target: Give the controller the true target pixel, which no real one can know.
-            Estimators then differ only in the path to it.
         camera: Kind of camera that watches.
         config: Configuration of the grasp.
         rng: Source of image noise and of lost images.
@@ -138,14 +174,6 @@ def simulate_grasp(
     item, sizes = workplace.scene.objects[0], world.imperfections.sizes
     eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
     config = grasping_allows_for(config or GraspingConfig(), access.declared(sizes))
-    above = scene.above()
-
-    def true_target(
-        pixel, jacobian, orientation: Float[Tensor, "4"], further: Float[np.ndarray, "3"]
-    ) -> Float[np.ndarray, "2"]:
-        target = scene.true_target(world, Pose(above.position, orientation))
-        return target + jacobian[:, :3] @ further
-
     result, failure = None, ""
     with simulated_cell(
         world,
@@ -157,21 +185,13 @@ def simulate_grasp(
         observer=observer,
         rng=rng,
     ) as simulated:
-        task = Grasping(
-            simulated.cell,
-            workplace,
-            aiming,
-            config,
-            estimator=estimator,
-            target=true_target if known_target else None,
-            check=plan_checker(world),
-        )
+        task = Grasping(simulated.cell, workplace, aiming, config, check=plan_checker(world))
         try:
             result = task.grasp(item)
             task.go_home()
         except TaskFailedError as error:
             failure = str(error)
-    return SimulatedGrasp(
+    return GraspingRun(
         scene=scene,
         world=world,
         cell=simulated.cell,
@@ -182,11 +202,55 @@ def simulate_grasp(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class GraspingRun:
-    """Grasps of the same object from the same start, seen by the same camera."""
+def _draw_camera(
+    workplace: Workplace, config: GraspingSceneConfig, rng: np.random.Generator
+) -> CameraModel:
+    """Camera of the demonstrations, moved and rotated.
 
-    grasp: SimulatedGrasp
-    """Grasp by the default variant without knowledge of the target: this one must succeed."""
-    compared: Mapping[str, SimulatedGrasp]
-    """Grasps by variant, each with the known target pixel."""
+    It looks at a point near the middle of the workplace and is then rotated about its axis.
+    """
+    camera = workplace.scene.camera
+    rotation, position = camera.pose[:3, :3], camera.pose[:3, 3]
+    roll = config.camera_roll
+    if config.random_camera:
+        position = position + CAMERA_SHIFT * rng.uniform(-1, 1, 3)
+        middle = workplace.hover().position.numpy()
+        sight = middle + _CAMERA_MISS * rng.uniform(-1, 1, 3) - position
+        # Sine of the angle times its axis: close to the rotation vector for these small tilts.
+        tilt = np.cross(rotation[:, 2], sight / np.linalg.norm(sight))
+        rotation = _rotation(tilt) @ rotation
+        roll = rng.uniform(-np.pi, np.pi)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation @ _rotation(np.array([0.0, 0.0, roll]))
+    pose[:3, 3] = position
+    return replace(camera, pose=pose)
+
+
+def _rotation(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    return quaternion.to_matrix(quaternion.exp(torch.from_numpy(vector))).numpy()
+
+
+def _starts(
+    workplace: Workplace, rng: np.random.Generator
+) -> Iterator[Float[np.ndarray, " joints"]]:
+    """Joint positions within the limits, with the end effector high and far enough [rad]."""
+    limits, hover = workplace.robot.chain.limits, workplace.hover().position
+    lower, upper = limits.lower + _LIMIT_MARGIN, limits.upper - _LIMIT_MARGIN
+    while True:
+        q = rng.uniform(lower, upper)
+        tool = workplace.robot.chain.forward(torch.from_numpy(q)).position
+        if tool[2] > _START_HEIGHT and (tool - hover).norm() > START_DISTANCE:
+            yield q
+
+
+def _has_free_path(
+    world: World, workplace: Workplace, start: Float[np.ndarray, " joints"]
+) -> bool:
+    """True if straight lines in joint space lead home, directly or by way of the table."""
+
+    def free(a: Float[Tensor, " joints"], b: Float[Tensor, " joints"]) -> bool:
+        return not world.collisions_along(joint_line(a, b, _APPROACH_SPEED, _PATH_STEP).numpy())
+
+    here, home = torch.from_numpy(start), workplace.home_joints()
+    postures = workplace.hover_postures()
+    return free(here, home) or any(free(here, q) and free(q, home) for q in postures)

@@ -1,11 +1,10 @@
-"""One object placed on a shelf in MuJoCo from any start, and its outcome.
+"""One object placed on a shelf in MuJoCo from any start.
 
     transfer -> release -> retreat
 
 The plan is carried out even if it collides: contacts are counted, not prevented.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,17 +13,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.demos import Demonstration
-from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
-from hrc_learn.experiments.run_measures import (
-    limit_violations,
-    place_angle,
-    true_tool,
-    unwanted_contacts,
+from hrc_learn.experiments.run_measures import true_tool, unwanted_contacts
+from hrc_learn.experiments.simulated_cell import (
+    SIMULATED,
+    UNOBSERVED,
+    ArmAccess,
+    Observer,
+    simulated_cell,
 )
-from hrc_learn.experiments.simulated_cell import UNOBSERVED, Observer, simulated_cell
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.failures import TaskFailedError
@@ -36,12 +34,11 @@ from hrc_learn.teleoperation import ScriptedPerturbation
 SPACES: dict[PlanningSpace, str] = {"pose": "task space", "joint": "joint space"}
 """Spaces in which motions to other shelves are planned: ours, and the paper's."""
 
-DEVIATION_MM, PLACE_ERROR_MM, PLACE_TILT_DEG = 12.0, 3.0, 3.0
-"""Bounds of a good placing. Approach paths planned in task space deviate by 2 mm, those planned
-in joint space with a shifted goal by 100 mm. Errors are those of the object on its board."""
-
 # Iterations of the taught correction: each reduces errors of milliradians a thousandfold.
 _TEACHING_ITERATIONS = 4
+# Largest distance of the end of a demonstration from a shelf [m]. Shelves are 24 cm apart: 5 cm
+# is a careless demonstration, more is another place.
+_SHELF_DISTANCE = 0.05
 # Starts drawn before the search for a collision-free one fails.
 _DRAWS = 100
 
@@ -212,80 +209,6 @@ def random_start(
     raise TaskFailedError(f"no free start in {_DRAWS} draws with noise of {noise:g} rad")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ApproachPath:
-    """Last part of a path of the end effector, from the front edge of the boards on.
-
-    It runs against y, as boards that open towards +y require.
-    """
-
-    offset: Float[np.ndarray, "samples 3"]
-    """Offset of the end effector from the goal [m]."""
-
-    @classmethod
-    def of(
-        cls, path: Float[np.ndarray, "steps 3"], goal: Float[np.ndarray, "3"], edge: float
-    ) -> "ApproachPath":
-        """Cut the approach off a path.
-
-        Args:
-            path: Path of the end effector [m].
-            goal: Intended end of the path [m].
-            edge: y at which the approach begins, when it is crossed for the last time [m]. A
-                path that ends in front of it has no samples.
-        """
-        outside = np.flatnonzero(path[:, 1] > edge)
-        first = int(outside[-1]) + 1 if len(outside) else 0
-        return cls(offset=path[first:] - goal)
-
-    @property
-    def remaining(self) -> Float[np.ndarray, " samples"]:
-        """Remaining distance to the goal along y [m]."""
-        return self.offset[:, 1]
-
-    def distance(self, other: "ApproachPath") -> Float[np.ndarray, " samples"]:
-        """Distance from another approach, sideways and in height, at the same depth [m].
-
-        Both are relative to their goals, so that different shelves can be compared.
-        """
-        # Tremor moves a demonstration back a little: use the first time at each depth.
-        progress = np.maximum.accumulate(-other.remaining)
-        there = [np.interp(-self.remaining, progress, other.offset[:, k]) for k in (0, 2)]
-        return np.hypot(self.offset[:, 0] - there[0], self.offset[:, 2] - there[1])
-
-    def deviation(self, other: "ApproachPath") -> float:
-        """Largest distance from another approach [m]; infinite without samples."""
-        return float(self.distance(other).max()) if len(self.offset) else np.inf
-
-
-def approach_path(
-    path: Float[np.ndarray, "steps 3"], goal: Pose, workplace: Workplace
-) -> ApproachPath:
-    """Part of a path of the end effector behind the front edge of the boards."""
-    return ApproachPath.of(path, goal.position.numpy(), _edge(workplace))
-
-
-def demonstrated_approach(demonstration: Demonstration, workplace: Workplace) -> ApproachPath:
-    """Demonstrated approach relative to its end.
-
-    Raises:
-        ValueError: If the demonstration ends in front of the cabinet.
-    """
-    path = demonstrated_path(demonstration, workplace.robot.chain)
-    approach = ApproachPath.of(path, path[-1], _edge(workplace))
-    if not len(approach.offset):
-        raise ValueError(
-            f"demonstration {demonstration.episode} ends at y = {path[-1, 1]:.3f} m, in front "
-            f"of the cabinet at {_edge(workplace):.3f} m: give demonstrations of placing."
-        )
-    return approach
-
-
-def _edge(workplace: Workplace) -> float:
-    """Y of the end effector when its load crosses the front edge of the boards [m]."""
-    return workplace.scene.cabinet.front + workplace.scene.objects[0].half_size[2]
-
-
 def demonstrated_path(
     demonstration: Demonstration, chain: SerialChain
 ) -> Float[np.ndarray, "frames 3"]:
@@ -303,69 +226,22 @@ def demonstrated_path(
     return chain.forward(torch.from_numpy(joints)).position.numpy()
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlacingOutcome:
-    """Measured outcome of one placing."""
+def demonstrated_shelf(end: Float[np.ndarray, "3"], workplace: Workplace) -> str:
+    """Shelf at which a path of the end effector ends.
 
-    deviation: float
-    """Deviation of the approach path from the demonstrated one, moved to the goal [m]."""
-    place_error: float
-    """Horizontal distance of the object on its board from its intended place [m]."""
-    place_tilt: float
-    """Angle of the object from its intended orientation [rad]."""
-    violations: int
-    """Steps in which a joint was outside its range of position or velocity."""
-    contacts: tuple[Touch, ...]
-    """Unwanted contacts."""
-    peak_speed: float
-    """Largest joint velocity as a fraction of the limit of that joint."""
-    jerk: float
-    """Dimensionless jerk of the end effector's path over that of the demonstration."""
-    placed: bool
-    """True if the object stands on its board afterwards."""
-
-    @classmethod
-    def of(
-        cls, run: SimulatedPlacing, workplace: Workplace, demonstration: Demonstration
-    ) -> "PlacingOutcome":
-        """Measure a placing on any shelf against a demonstration."""
-        approach = approach_path(run.path, run.goal, workplace)
-        error = run.object_pose[:3, 3] - run.goal.position.numpy()
-        speed = np.abs(run.cell.log["joint_velocity"]) / run.cell.chain.limits.velocity.numpy()
-        done, demonstrated = (
-            dimensionless_jerk(torch.from_numpy(time), torch.from_numpy(path))
-            for time, path in (
-                (run.time, run.path),
-                (demonstration.time, demonstrated_path(demonstration, run.cell.chain)),
-            )
+    Raises:
+        ValueError: If it ends more than 5 cm from the place on any shelf.
+    """
+    distance = {
+        shelf: float(np.linalg.norm(workplace.shelf(shelf).position.numpy() - end))
+        for shelf in workplace.shelf_names()
+    }
+    nearest = min(distance, key=distance.__getitem__)
+    if distance[nearest] > _SHELF_DISTANCE:
+        x, y, z = end.tolist()
+        raise ValueError(
+            f"the demonstration ends at ({x:.2f}, {y:.2f}, {z:.2f}) m, "
+            f"{100 * distance[nearest]:.0f} cm from the nearest shelf ({nearest}): give "
+            "demonstrations of placing (hrc record expert)."
         )
-        return cls(
-            deviation=approach.deviation(demonstrated_approach(demonstration, workplace)),
-            place_error=float(np.linalg.norm(error[:2])),
-            place_tilt=place_angle(run.object_pose, run.goal.orientation),
-            violations=limit_violations(run.cell),
-            contacts=run.contacts,
-            peak_speed=float(speed.max()),
-            jerk=float(done / demonstrated),
-            placed=run.placed,
-        )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlacingRun:
-    """Placings on every shelf, planned in both spaces."""
-
-    workplace: Workplace
-    demonstration: Demonstration
-    demonstrated_shelf: str
-    placings: Mapping[tuple[PlanningSpace, str], SimulatedPlacing]
-    """Placings from the start of the demonstration, by space and shelf."""
-    outcomes: Mapping[PlanningSpace, Mapping[str, PlacingOutcome]]
-    """Outcomes by space, then by shelf."""
-    same_joint7: tuple[str, ...]
-    """Shelves within reach with joint 7 as at the end of the demonstration."""
-
-    @property
-    def reproduction(self) -> SimulatedPlacing:
-        """Demonstrated motion, reproduced in joint space as in the paper."""
-        return self.placings["joint", self.demonstrated_shelf]
+    return nearest

@@ -13,18 +13,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.experiments.elbow_pulls import path_distance
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import LoggedSteps
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.skills.pick_and_place import INTERACT
 from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.vision import CameraModel
 
 ELBOW, TOOL = 3, -1
 """Indices of the elbow and the tool among the frames of the links."""
 
+# Time after its end during which a pull still counts, while the arm moves back [s].
+_AFTER = 1.0
+# Largest lag of the end effector behind its goal [s]: servos lag, and a motion that waits for
+# a limit lags further.
+_LAG = 0.5
+# Distance the goal must move within that lag to have a direction [m].
+_LEAST_MOTION = 0.002
 # Orientation of a held object in the hand: its x axis along the closing direction of the
 # fingers, which is the y axis of the hand, its top towards the palm.
 _IN_HAND = quaternion.from_matrix(
@@ -271,3 +278,144 @@ def box_angle(
     half_turn = q.new_tensor([0.0, 0.0, 0.0, 1.0])
     other = quaternion.multiply(q, half_turn)
     return torch.minimum(quaternion.angle(q, goal), quaternion.angle(other, goal))
+
+
+class PullEffect(NamedTuple):
+    """Effect of one pull at the elbow at any moment of a job."""
+
+    elbow: float
+    """Largest displacement of the elbow [m]."""
+    tool: float
+    """Largest distance of the end effector from its path [m]; NaN if it had no path."""
+
+
+def pull_effects(
+    log: LoggedSteps,
+    pulls: Sequence[ScriptedForce],
+    chain: SerialChain,
+    encoder_offset: Float[np.ndarray, " joints"] | None = None,
+) -> list[PullEffect]:
+    """Effects of the pulls of a run that acted during it.
+
+    While the arm follows a motion or holds its end effector, its path is known, and so is its
+    distance from that path. Visual servoing has no path: there the grasp offset is the measure.
+
+    Args:
+        log: Log of a work cell.
+        pulls: Pulls in the time of the log [s].
+        chain: Kinematics of the arm.
+        encoder_offset: Constant errors of the encoders [rad]. With them distances are true
+            ones, also where a displaced elbow changes the joints for the same pose. None:
+            distances are those of the encoders.
+    """
+    time, joints = log["time"], torch.from_numpy(log["joint_position"])
+    tool = chain.forward(joints).position.numpy()
+    if encoder_offset is not None:
+        tool = tool + _hidden_displacement(chain, log, torch.from_numpy(encoder_offset))
+    off_path = path_distance(tool, log["goal_position"], time)
+    starts = [event.time for event in log.events]
+    phases = list(zip(starts, [*starts[1:], math.inf], strict=True))
+    effects = []
+    for pull in pulls:
+        elbow, known = [], [math.nan]
+        # Each phase has a path of its own, from which the elbow was displaced.
+        for begin, end in phases:
+            rows = (time >= max(pull.start, begin)) & (time < min(pull.end + _AFTER, end))
+            if not (rows & (time < pull.end)).any():
+                continue
+            during = torch.from_numpy(rows)
+            planned = torch.from_numpy(log["path_joints"])[during]
+            elbow.append(float(_elbow_displacement(chain, joints[during], planned).max()))
+            known += off_path[rows].tolist()
+        if elbow:
+            effects.append(PullEffect(max(elbow), float(np.fmax.reduce(known))))
+    return effects
+
+
+def _hidden_displacement(
+    chain: SerialChain, log: LoggedSteps, offset: Float[Tensor, " joints"]
+) -> Float[np.ndarray, "time 3"]:
+    """Displacement of the end effector by a push that the encoders do not show [m].
+
+    It is the change of the encoders' error at the end effector against that without the push:
+    on the path, or else when no input last moved the null space.
+    """
+    joints = torch.from_numpy(log["joint_position"])
+    path = torch.from_numpy(log["path_joints"])
+    pushed = (log["nullspace_input"] != 0).any(axis=1)
+    rows = np.arange(len(joints))
+    last = np.maximum.accumulate(np.where(pushed, 0, rows))
+    undisturbed = torch.where(path.isfinite().all(-1, keepdim=True), path, joints[last])
+
+    def error(q: Float[Tensor, "time joints"]) -> Float[Tensor, "time 3"]:
+        return chain.forward(q - offset).position - chain.forward(q).position
+
+    return (error(joints) - error(undisturbed)).numpy()
+
+
+def _elbow_displacement(
+    chain: SerialChain,
+    joints: Float[Tensor, "time joints"],
+    planned: Float[Tensor, "time joints"],
+) -> Float[Tensor, " time"]:
+    """Distance of the elbow from its undisturbed position [m].
+
+    The undisturbed position is that of the path, or else that at the start of the pull, moved
+    along with the end effector.
+    """
+    on_path = planned.isfinite().all(-1, keepdim=True)
+    elbow, tool = chain.joint_origins(joints)[:, ELBOW], chain.forward(joints).position
+    path = chain.joint_origins(torch.where(on_path, planned, joints))[:, ELBOW]
+    undisturbed = torch.where(on_path, path, elbow[0] + tool - tool[0])
+    return (elbow - undisturbed).norm(dim=-1)
+
+
+def path_distance(
+    position: Float[np.ndarray, "time 3"],
+    goal: Float[np.ndarray, "time 3"],
+    time: Float[np.ndarray, " time"],
+) -> Float[np.ndarray, " time"]:
+    """Distance of each position from the path of the goals [m]; NaN without a path.
+
+    The end effector may be anywhere along the path: behind its goal, as servos lag, or ahead of
+    it when it stops. The distance is therefore measured from the nearest of the recent goals,
+    and from the line along which the goal moved last.
+
+    Args:
+        position: Position of the end effector [m].
+        goal: Goal of the end effector [m]; NaN without a path.
+        time: Time of both [s].
+    """
+    nearest = _distance_across(position - goal, goal, time)
+    start, step = goal[:-1], np.diff(goal, axis=0)
+    length = (step**2).sum(axis=1)
+    for lag in range(_lag_samples(time)):
+        here = position[lag + 1 :]
+        a, d, square = start[: len(here)], step[: len(here)], length[: len(here)]
+        fraction = ((here - a) * d).sum(axis=1) / np.maximum(square, 1e-12)
+        away = np.linalg.norm(here - a - np.clip(fraction, 0, 1)[:, None] * d, axis=1)
+        # A segment with an unknown end is none: fmin leaves NaN out.
+        nearest[lag + 1 :] = np.fmin(nearest[lag + 1 :], away)
+    return np.where(np.isfinite(goal).all(axis=1), nearest, np.nan)
+
+
+def _distance_across(
+    error: Float[np.ndarray, "time 3"],
+    goal: Float[np.ndarray, "time 3"],
+    time: Float[np.ndarray, " time"],
+) -> Float[np.ndarray, " time"]:
+    """Size of the part of an error across the recent direction of the goal [m]."""
+    lag = min(_lag_samples(time), len(time))
+    motion = np.full_like(goal, np.nan)
+    motion[lag:] = goal[lag:] - goal[: len(goal) - lag]
+    length = np.linalg.norm(motion, axis=1, keepdims=True)
+    # A goal that hardly moved has no direction.
+    moved = length > _LEAST_MOTION
+    direction = np.where(moved, motion / np.maximum(length, _LEAST_MOTION), 0.0)
+    along = (error * direction).sum(axis=1, keepdims=True) * direction
+    return np.linalg.norm(error - along, axis=1)
+
+
+def _lag_samples(time: Float[np.ndarray, " time"]) -> int:
+    """Number of samples within the largest lag."""
+    return round(_LAG / float(np.median(np.diff(time)))) if len(time) > 1 else 0

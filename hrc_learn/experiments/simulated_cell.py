@@ -1,21 +1,24 @@
-"""The simulated work cell in which the trials of all three experiments run.
+"""The simulated work cell of all three experiments, and the access to its arm.
 
-with simulated_cell(world, human=person, sensor=sensor) as simulated:
-PickAndPlace(simulated.cell, ...).run(jobs)
+with simulated_cell(world, human=person, sensor=sensor, access=through_franky()) as simulated:
+    PickAndPlace(simulated.cell, ...).run(jobs)
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
-from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
-from hrc_learn.experiments.elbow_pulls import Clearance
-from hrc_learn.protocols import Human
+from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
+from hrc_learn.kinematics import Arm, SerialChain
+from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import Imperfections, MotionLog, World
+from hrc_learn.sim.protocol_server import ArmServer, ServedArm, serve_world
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.person_watch import PersonWatch
@@ -23,6 +26,106 @@ from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
+
+type Serve = Callable[[World], AbstractContextManager[ArmServer]]
+"""Function that serves the arm of a world over its network protocol, such as `serve_world`."""
+ArmDriver = Literal["sim", "franky", "franka"]
+"""Driver of a simulated arm: the simulator itself, or a driver of the real arm."""
+
+PROTOCOL_DELAY = 0.003
+"""Delay from a command to a driver until the servos have it [s]: two cycles of the protocol,
+and one because the state read before it is one cycle old. Measured with commands every 10 ms.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmAccess:
+    """Connection to the arm of a world, with the delay and dynamics of its driver.
+
+    A driver takes the same task through everything in front of a real arm: the driver package,
+    its sockets, and the 1 ms cycles of the protocol, which the world answers.
+    """
+
+    open: Callable[[World], AbstractContextManager[OpenedArm]]
+    """Connects to the arm of a world at rest, until the run ends."""
+    delay: float = 0.0
+    """Delay from a command until the servos of the arm have it [s]."""
+    dynamics: float = 1.0
+    """Fraction of the acceleration of the arm that the driver uses."""
+
+    def declared(self, sizes: Imperfections) -> Imperfections:
+        """Imperfections that a controller must allow for: those of arm and driver."""
+        return replace(
+            sizes,
+            command_delay=sizes.command_delay + self.delay,
+            slowness=max(sizes.slowness, 1 - self.dynamics),
+        )
+
+
+SIMULATED = ArmAccess(open=lambda world: nullcontext(world.opened_arm))
+"""Direct access to the simulated arm."""
+
+
+def access_by(driver: ArmDriver, robot: Arm) -> ArmAccess:
+    """Access to the arm of a world through a named driver.
+
+    Args:
+        driver: Name of the driver.
+        robot: Arm of the world.
+
+    Raises:
+        ValueError: If the driver does not support the arm.
+    """
+    if driver == "sim":
+        return SIMULATED
+    if not robot.is_franka:
+        raise ValueError(
+            f"--arm {driver} drives Franka arms only, not the {robot.name}: leave it out to "
+            "simulate without a driver."
+        )
+    return through_franky() if driver == "franky" else through_franka(robot)
+
+
+def through_franky(config: FrankyConfig | None = None, serve: Serve = serve_world) -> ArmAccess:
+    """Access over the network protocol through the driver package franky.
+
+    Args:
+        config: Configuration of the driver. By default that of a real arm without the real-time
+            check, which a server that waits for each answer does not need, and with the grip
+            force of the simulated gripper.
+        serve: Serves the arm over its protocol.
+    """
+    config = config or FrankyConfig(realtime="ignore", grip_force=40.0)
+    return _through_protocol(partial(FrankyArm, config=config), config.dynamics, serve)
+
+
+def through_franka(chain: SerialChain, serve: Serve = serve_world) -> ArmAccess:
+    """Access over the network protocol through our own loop at 1 kHz, in lockstep with it.
+
+    Args:
+        chain: Kinematics of the arm.
+        serve: Serves the arm over its protocol.
+    """
+    config = FrankaConfig(realtime=False, lockstep=True)
+    driver = partial(FrankaArm, chain=chain, config=config)
+    return _through_protocol(driver, config.acceleration, serve)
+
+
+def _through_protocol(
+    open_driver: Callable[[str], Any], dynamics: float, serve: Serve
+) -> ArmAccess:
+    """Access through a driver that connects to an address, with a method `close`."""
+
+    @contextmanager
+    def open_arm(world: World) -> Iterator[OpenedArm]:
+        with serve(world) as server:
+            with server.running():
+                driver = open_driver(server.address)
+            with closing(ServedArm(driver, server)) as arm:
+                yield OpenedArm(arm=arm, gripper=arm, advance=server.advance)
+
+    return ArmAccess(open=open_arm, delay=PROTOCOL_DELAY, dynamics=dynamics)
+
 
 type LiveView = Callable[[WorkCell, World, MotionLog], AbstractContextManager[None]]
 """Context entered when a cell is ready to start and left when the run is over."""
@@ -73,7 +176,8 @@ def simulated_cell(
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
     on_step: Callable[[], None] = lambda: None,
     rng: np.random.Generator | None = None,
-    clearance: Clearance | None = None,
+    clearance: Callable[[Float[torch.Tensor, "*batch joints"]], Float[torch.Tensor, "*batch"]]
+    | None = None,
     watch: PersonWatch | None = None,
 ) -> Iterator[SimulatedCell]:
     """Connect a work cell to a world, without gradients, until the block ends.
@@ -82,8 +186,8 @@ def simulated_cell(
         world: World with arm, camera and objects, at rest.
         human: Scripted person.
         sensor: Camera with its marker detector; None for tasks without a camera.
-        config: Configuration of the loop; the imperfections of the world and of the driver are
-            added to it (`allow_for`).
+        config: Configuration of the loop; the delays, losses and braking of the world and of
+            the driver are allowed for in it.
         access: Access to the arm.
         page: Serves a page on which people push and draw too, in real time; None: no page.
         title: Title of that page.
@@ -94,7 +198,17 @@ def simulated_cell(
         clearance: Distance between the arm and its surroundings, kept when it is pushed.
         watch: Watches for people near the arm.
     """
-    config = allow_for(config or WorkCellConfig(), access.declared(world.imperfections.sizes))
+    config, plant = config or WorkCellConfig(), access.declared(world.imperfections.sizes)
+    latency = LatencyConfig(
+        delay=max(config.latency.delay, plant.image_delay),
+        frame_loss=max(config.latency.frame_loss, plant.image_loss),
+    )
+    config = replace(
+        config,
+        latency=latency,
+        safety=plant.plant(config.safety),
+        command_delay=plant.following_delay,
+    )
     with torch.inference_mode(), ExitStack() as stack:
         opened = stack.enter_context(access.open(world))
         motion = MotionLog(world, opened.advance)
@@ -105,8 +219,15 @@ def simulated_cell(
 
         people, advance_all, task = human, advance, None
         if page is not None:
-            announce = partial(_tell_address, observer)
-            task = stack.enter_context(task_page(world, config.dt, page, announce, title))
+            task = stack.enter_context(
+                task_page(
+                    world,
+                    config.dt,
+                    page,
+                    lambda address: observer.tell(f"Page at {address}"),
+                    title,
+                )
+            )
             people, advance_all = task.joined(human, advance)
         cell = WorkCell(
             chain=world.arm.robot.chain,
@@ -125,24 +246,6 @@ def simulated_cell(
             task.follow(cell)
         stack.enter_context(observer.view(cell, world, motion))
         yield SimulatedCell(cell=cell, motion=motion)
-
-
-def _tell_address(observer: Observer, address: str) -> None:
-    observer.tell(f"Page at {address}")
-
-
-def allow_for(config: WorkCellConfig, sizes: Imperfections) -> WorkCellConfig:
-    """Configuration of a loop that allows for the delays, losses and braking of its plant."""
-    latency = LatencyConfig(
-        delay=max(config.latency.delay, sizes.image_delay),
-        frame_loss=max(config.latency.frame_loss, sizes.image_loss),
-    )
-    return replace(
-        config,
-        latency=latency,
-        safety=sizes.plant(config.safety),
-        command_delay=sizes.following_delay,
-    )
 
 
 def grasping_allows_for(config: GraspingConfig, sizes: Imperfections) -> GraspingConfig:

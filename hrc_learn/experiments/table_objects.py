@@ -47,21 +47,8 @@ def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workpla
     return replace(workplace, scene=replace(workplace.scene, objects=tuple(items)))
 
 
-def workplace_for(
-    shelves: Sequence[str],
-    robot: Arm,
-    shelf_x: float | None = None,
-    shelf_depth: float | None = None,
-) -> Workplace:
-    """Workplace with one object for each shelf.
-
-    Args:
-        shelves: Names of the shelves.
-        robot: Arm of the workplace.
-        shelf_x: Position along the boards at which objects are placed [m]; by default that of
-            the cell's layout.
-        shelf_depth: Distance behind the front edge of the boards [m]; by default that of the
-            layout.
+def workplace_for(shelves: Sequence[str], robot: Arm) -> Workplace:
+    """Workplace of an arm with one object for each shelf.
 
     Raises:
         ValueError: If no shelf is named, or more than there are objects.
@@ -71,10 +58,7 @@ def workplace_for(
             f"{len(shelves)} shelves are named, but there are 1 to {len(THREE_OBJECTS)} "
             "objects, each with a shelf of its own."
         )
-    given = {"shelf_x": shelf_x, "shelf_depth": shelf_depth}
-    options = {name: value for name, value in given.items() if value is not None}
-    workplace = Workplace.of(robot, **options)
-    return with_objects(workplace, THREE_OBJECTS[: len(shelves)])
+    return with_objects(Workplace.of(robot), THREE_OBJECTS[: len(shelves)])
 
 
 def check_shelves(workplace: Workplace, shelves: Sequence[str]) -> None:

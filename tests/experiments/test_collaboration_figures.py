@@ -3,19 +3,15 @@ from io import BytesIO
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from sample_runs import sample_run
 
 from hrc_learn.experiments import collaboration_report as collaboration_figures
 from hrc_learn.experiments.collaboration_report import (
-    end_effector_figure,
     marker_figure,
     timeline_figure,
     trajectories_figure,
 )
-from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import gripper_down
 from hrc_learn.log import Event
 
 OBJECTS = {"box": (0.0, 2.0), "tin": (2.0, 4.0)}
@@ -29,15 +25,7 @@ def run():
     return sample_run(phases=events)
 
 
-@pytest.mark.parametrize(
-    "draw",
-    [
-        trajectories_figure,
-        marker_figure,
-        timeline_figure,
-        lambda run, _: end_effector_figure(run),
-    ],
-)
+@pytest.mark.parametrize("draw", [trajectories_figure, marker_figure, timeline_figure])
 def test_figures_are_drawn(run, draw):
     buffer = BytesIO()
     draw(run, OBJECTS).savefig(buffer, format="png", dpi=60)
@@ -66,17 +54,6 @@ def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
     assert labels == [*PHASES, "person pushes", "marker occluded"]
 
 
-def test_angles_count_from_the_gripper_pointing_down(run):
-    turns = np.deg2rad([[0.0, 0.0, 0.0], [-90.0, 0.0, 0.0], [0.0, 0.0, 20.0], [0.0, 15.0, 0.0]])
-    down = gripper_down()
-    q = quaternion.multiply(quaternion.exp(torch.from_numpy(turns)), down).numpy()
-    steps = len(run.time) // len(turns)
-    hand = replace(run.bodies[0], orientation=np.repeat(q, steps, axis=0), name="hand")
-    axes = end_effector_figure(replace(run, bodies=(hand,))).axes[1]
-    drawn = np.stack([line.get_ydata() for line in axes.get_lines()], axis=-1)[::steps]
-    np.testing.assert_allclose(drawn, np.rad2deg(turns), atol=1e-9)
-
-
 def test_runs_without_a_camera_are_refused_where_it_is_needed(run):
     with pytest.raises(ValueError, match="needs camera"):
         collaboration_figures.marker_figure(replace(run, camera=None), OBJECTS)
@@ -94,4 +71,3 @@ def test_figures_of_a_job_that_never_saw_its_marker_are_drawn_all_the_same(run):
     )
     for draw in (trajectories_figure, marker_figure, timeline_figure):
         draw(blind, {"box": (0.0, 4.0)})
-    end_effector_figure(blind)

@@ -8,16 +8,17 @@ import pytest
 from taught_models import teach
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments.arm_access import through_franka, through_franky
 from hrc_learn.experiments.collaboration_trial import (
     CollaborationScenario,
     simulate_collaboration,
 )
-from hrc_learn.experiments.grasping_scene import GraspingScene, GraspingSceneConfig
 from hrc_learn.experiments.grasping_trial import (
+    GraspingScene,
+    GraspingSceneConfig,
     simulate_grasp,
 )
 from hrc_learn.experiments.placing_trial import place
+from hrc_learn.experiments.simulated_cell import through_franka, through_franky
 from hrc_learn.hardware import FrankyConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections

@@ -7,21 +7,33 @@ import pytest
 import torch
 
 from hrc_learn.controller import SeparationConfig
-from hrc_learn.experiments.worker_in_run import (
+from hrc_learn.experiments.people_in_run import (
     draw_visit,
-    move_worker,
     separation_margin,
     worker_contacts,
 )
 from hrc_learn.kinematics import panda, separation
 from hrc_learn.log import StepLog
-from hrc_learn.sim import MotionLog, WorkerDistance, World, whole_arm
+from hrc_learn.sim import (
+    MotionLog,
+    Worker,
+    WorkerConfig,
+    WorkerDistance,
+    World,
+    random_visit,
+    whole_arm,
+)
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
 
 WORKPLACE = Workplace()
-VISIT = draw_visit(WORKPLACE, np.random.default_rng(5))
+VISIT = random_visit(
+    Worker(WorkerConfig()),
+    np.random.default_rng(5),
+    bench=WORKPLACE.scene.table,
+    under=WORKPLACE.table_centre,
+)
 SCENE = replace(WORKPLACE.scene, worker=VISIT.worker.config)
 HAND = PARTS.index("hand_right")
 
@@ -100,18 +112,6 @@ def test_what_the_robot_holds_can_meet_the_worker_what_lies_about_cannot(held):
     assert len(motion.nearest(2)) == 2
 
 
-def test_he_is_where_his_visit_says():
-    world = World(SCENE)
-    world.reset(WORKPLACE.home_joints().numpy())
-    world.data.time = VISIT.released
-    move_worker(world, VISIT)
-    capsule = world.data.geom("worker_head").xpos
-    ends = VISIT.capsules_at(VISIT.released).ends
-    np.testing.assert_allclose(capsule, ends[PARTS.index("head")].mean(axis=0), atol=1e-9)
-    item = world.data.body("worker_item").xpos
-    np.testing.assert_allclose(item, VISIT.item_at(VISIT.released))
-
-
 def test_a_world_without_a_worker_keeps_no_distances():
     world = World(WORKPLACE.scene)
     world.reset(WORKPLACE.home_joints().numpy())
@@ -120,9 +120,8 @@ def test_a_world_without_a_worker_keeps_no_distances():
     assert motion.nearest() == ()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_beside_the_elbow_nobody_leans_into_the_arm_that_waits(seed):
-    visit = draw_visit(WORKPLACE, np.random.default_rng(seed), beside_elbow=True)
+def test_beside_the_elbow_nobody_leans_into_the_arm_that_waits():
+    visit = draw_visit(WORKPLACE, np.random.default_rng(0))
     waiting, world = WORKPLACE.hover_joints().numpy(), World(SCENE)
     world.reset(waiting)
     distance = WorkerDistance(world)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from franky_servers import READY, served_world
 
-from hrc_learn.experiments.arm_access import FRANKY_DELAY, SIMULATED, through_franky
+from hrc_learn.experiments.simulated_cell import PROTOCOL_DELAY, SIMULATED, through_franky
 from hrc_learn.hardware import FrankyConfig
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import CYCLE, loopback_addresses, serve_world
@@ -69,7 +69,7 @@ def test_a_velocity_is_followed_within_the_delay_told():
 
         shifts = np.arange(0, 0.03, 0.001)
         misfit = [np.sqrt(np.mean((held(times - s) - actual)[10:] ** 2)) for s in shifts]
-        assert shifts[np.argmin(misfit)] <= FRANKY_DELAY
+        assert shifts[np.argmin(misfit)] <= PROTOCOL_DELAY
         assert min(misfit) < 0.01
         # All cycles but the first of the motion are answered, unless the machine is too busy.
         assert served.server.missed <= 0.05 * served.server.cycles
@@ -162,7 +162,7 @@ def test_without_answers_the_arm_goes_on_with_its_acceleration():
     went_on = 2 * velocities[silent - 1] - velocities[silent - 2]
     np.testing.assert_allclose(velocities[silent], went_on, atol=1e-9)
     assert np.abs(velocities[silent, 0]).max() > 0.1
-    late = round(FRANKY_DELAY / DT) + 1
+    late = round(PROTOCOL_DELAY / DT) + 1
     np.testing.assert_allclose(actual[late:], commands[:-late], atol=0.05)
 
 
@@ -225,7 +225,7 @@ def test_a_controller_is_told_of_the_drivers_delay_and_acceleration():
     access = through_franky(FrankyConfig(dynamics=0.4, realtime="ignore"))
     sizes = Imperfections(command_delay=0.02, slowness=0.3)
     told = access.declared(sizes)
-    assert told.command_delay == pytest.approx(0.02 + FRANKY_DELAY)
+    assert told.command_delay == pytest.approx(0.02 + PROTOCOL_DELAY)
     assert told.slowness == pytest.approx(0.6)
     assert access.declared(Imperfections(slowness=0.8)).slowness == 0.8
     assert SIMULATED.declared(sizes) == sizes

@@ -10,17 +10,30 @@ import sampling
 import torch
 
 from hrc_learn.controller import SafetyConfig, SeparationConfig
-from hrc_learn.experiments.worker_in_run import draw_visit
 from hrc_learn.kinematics import GraspedBox, panda, separation
 from hrc_learn.protocols import PersonObservation
-from hrc_learn.sim import Imperfections, WorkerDistance, WorkerSensor, World, whole_arm
+from hrc_learn.sim import (
+    Imperfections,
+    Worker,
+    WorkerConfig,
+    WorkerDistance,
+    WorkerSensor,
+    World,
+    random_visit,
+    whole_arm,
+)
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
 from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
 
 WORKPLACE = Workplace()
-VISIT = draw_visit(WORKPLACE, np.random.default_rng(5))
+VISIT = random_visit(
+    Worker(WorkerConfig()),
+    np.random.default_rng(5),
+    bench=WORKPLACE.scene.table,
+    under=WORKPLACE.table_centre,
+)
 SCENE = replace(WORKPLACE.scene, worker=VISIT.worker.config)
 ARM = whole_arm(SCENE.arm)
 HAND = PARTS.index("hand_right")

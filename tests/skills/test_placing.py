@@ -11,8 +11,8 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.experiments.metric_table import evaluate
-from hrc_learn.experiments.placing_experiment import placing_metrics
-from hrc_learn.experiments.placing_trial import PlacingOutcome, place
+from hrc_learn.experiments.placing_metrics import PlacingOutcome, placing_metrics
+from hrc_learn.experiments.placing_trial import place
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.learning.primitive_fitting import fit_primitives

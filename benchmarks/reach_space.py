@@ -2,21 +2,26 @@
 
 Both depend on the arm alone, at the moments at which the worker has a hand at a marker. The
 worker's stance and lean are searched for, so that arms compare whatever the worker did there.
+
+python benchmarks/reach_space.py --placing outputs/demo/placing --aiming outputs/demo/aiming
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from hrc_learn import cli
+from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, separation
 from hrc_learn.log import LoggedSteps
-from hrc_learn.sim import WorkerVisit
+from hrc_learn.sim import WorkerVisit, whole_arm
 from hrc_learn.sim.worker import Posture
 from hrc_learn.sim.worker_visit import HAND_OVER_BENCH
 
@@ -42,6 +47,44 @@ _COMFORTABLE = np.deg2rad(20.0)
 _PLACES = 5
 # Postures that are measured together: some 100 MB.
 _BLOCK = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    placing: Path
+    """Folder of the placing skill."""
+    aiming: Path
+    """Folder of the visual-servoing skill."""
+    jobs: int = 6
+    """Jobs near a worker."""
+    seed: int = 100
+    """First seed."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+def main(args: Args) -> None:
+    """Measure the space of each worker, and print the medians over the jobs."""
+    experiment = CollaborationExperiment(placing=args.placing, aiming=args.aiming, worker=True)
+    rows = []
+    for seed in range(args.seed, args.seed + args.jobs):
+        run = experiment.run(seed)
+        if run.visit is None or not len(run.visit.markers):
+            continue
+        x, y, _ = run.visit.markers.mean(axis=0).tolist()
+        spaces = reach_spaces(
+            run.cell.log,
+            run.visit,
+            whole_arm(run.world.config.arm),
+            space_over_bench((x, y), run.world.table_top),
+            run.world.arm.encoder_offset,
+        )
+        rows.append(np.mean([(s.free_volume, s.comfortable) for s in spaces], axis=0))
+    volume, comfortable = np.median(rows, axis=0).tolist()
+    print(f"free volume {1e3 * volume:.1f} l, comfortable reach {100 * comfortable:.0f} %")
+    if args.json is not None:
+        figures = {"free_volume_l": 1e3 * volume, "comfortable_%": 100 * comfortable}
+        cli.write_json(args.json, figures)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,3 +244,7 @@ def _reaching(
         swing=zero,
         hands=hands,
     )
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

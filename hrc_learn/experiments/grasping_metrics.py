@@ -1,0 +1,209 @@
+"""Metrics of a grasp, read from the simulator, and statistics of grasps in random scenes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hrc_learn.experiments.grasping_trial import GraspingRun
+from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
+from hrc_learn.experiments.run_measures import (
+    Hold,
+    grasp_offset,
+    hold,
+    limit_violations,
+    span,
+    spans,
+    true_tool,
+    unwanted_contacts,
+)
+from hrc_learn.experiments.trials import Trial
+from hrc_learn.geometry import quaternion
+from hrc_learn.sim import Touch
+
+LIFTED = 0.10
+"""Height above the table at which an object counts as lifted [m]: half of the lift."""
+GRASP_OFFSET = 15.0
+"""Horizontal distance of the end effector from the object at which the open fingers still take
+it [mm]; they leave 18 mm on either side."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Descent:
+    """State at the start of the last descent onto the object. NaN if it never descended."""
+
+    vision_time: float = math.nan
+    """Time since the vision region first contributed to the command [s]."""
+    offset: float = math.nan
+    """Horizontal distance of the end effector from the object [m]."""
+    angle: float = math.nan
+    """Angle between the actual and the demonstrated direction of the end effector [rad]."""
+
+    @classmethod
+    def of(cls, run: GraspingRun) -> "Descent":
+        """Measure the last descent of a grasp."""
+        log = run.cell.log
+        descents = [event.time for event in log.events if event.text == "grasp"]
+        if not descents:
+            return cls()
+        servoing, time = span(log, "servo"), log["time"]
+        last = int(np.searchsorted(time, descents[-1])) - 1
+        tool = true_tool(run.motion, run.world, len(log))[last]
+        actual, demonstrated = (
+            quaternion.rotate(q, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+            for q in (tool.orientation, run.scene.workplace.hover().orientation)
+        )
+        guided = (time >= servoing[0]) & (log["vision_activation"] > 0)
+        taken_over = time[guided][0] if guided.any() else math.nan
+        normal = torch.linalg.cross(actual, demonstrated)
+        return cls(
+            vision_time=float(min(servoing[1], descents[-1]) - taken_over),
+            offset=grasp_offset(log, run.motion, run.world, run.item.name, descents[-1]),
+            angle=float(torch.atan2(normal.norm(), actual @ demonstrated)),
+        )
+
+
+def _contacts(run: GraspingRun) -> tuple[Touch, ...]:
+    return sum(unwanted_contacts(run.world, run.cell.log).values(), ())
+
+
+def lift(run: GraspingRun) -> float:
+    """Height of the object above its start [m]; 0 unless it is between both fingers."""
+    if not run.world.holds(run.item.name):
+        return 0.0
+    return float(run.world.object_pose(run.item.name)[2, 3] - run.scene.object_pose[2, 3])
+
+
+def _hold(run: GraspingRun) -> Hold | None:
+    """Stability of the object in the hand after the lift; None if it was never lifted."""
+    homes = [t for t, _ in spans(run.cell.log, "home")]
+    if run.result is None or not homes:
+        return None
+    log, item = run.cell.log, run.item.name
+    return hold(log, run.motion, run.world, item, homes[-1], math.inf)
+
+
+def jacobian_errors(run: GraspingRun) -> tuple[float, float]:
+    """Relative errors of the linear image Jacobian as vision starts, and at descent.
+
+    NaN if vision never started.
+    """
+    log = run.cell.log
+    guided = np.flatnonzero(log["vision_activation"] > 0)
+    if not len(guided):
+        return math.nan, math.nan
+    ends = guided[[0, -1]]
+    tool = true_tool(run.motion, run.world, len(log))[torch.from_numpy(ends)]
+    marker = tool.apply(torch.from_numpy(run.world.hand_marker_offset())).numpy()
+    true = run.world.config.camera.image_jacobian(marker)[..., :3]
+    error = np.linalg.norm(log["image_jacobian"][ends, :, :3] - true, axis=(1, 2))
+    first, last = error / np.linalg.norm(true, axis=(1, 2))
+    return float(first), float(last)
+
+
+def grasping_metrics() -> list[Metric[GraspingRun]]:
+    """Metrics of one grasp."""
+    return [
+        Metric(
+            "object held, lifted and carried home",
+            lambda run: int(not run.failure and lift(run) > LIFTED),
+            at_least=1,
+            claim="the robot grasped the object (Experiment 2)",
+            essential=True,
+        ),
+        Metric(
+            "object held flat between both pads",
+            lambda run: int(run.world.holds_flat(run.item.name)),
+            at_least=1,
+            essential=True,
+        ),
+        Metric("attempts", lambda run: run.result.attempts if run.result else 0),
+        Metric(
+            "servoing time, from the remote start",
+            lambda run: run.result and run.result.servo_time,
+            "s",
+            at_most=20.0,
+            claim="9.2 s (Experiment 2)",
+        ),
+        Metric("time in vision", lambda run: Descent.of(run).vision_time, "s", listed=False),
+        Metric("cycle time", lambda run: run.cell.time, "s", claim="15 s (Experiment 2)"),
+        Metric(
+            "pixel error at descent",
+            lambda run: run.result and run.result.pixel_error,
+            "px",
+            at_most=5.0,
+            claim="the desired position is reached (Experiment 2)",
+        ),
+        Metric(
+            "grasp offset", lambda run: 1e3 * Descent.of(run).offset, "mm", at_most=GRASP_OFFSET
+        ),
+        Metric(
+            "object tilt in the hand",
+            lambda run: None if (held := _hold(run)) is None else math.degrees(held.tilt),
+            "deg",
+            at_most=3.0,
+        ),
+        Metric(
+            "slip in the hand",
+            lambda run: None if (held := _hold(run)) is None else 1e3 * held.slip,
+            "mm",
+            at_most=3.0,
+        ),
+        Metric(
+            "angle to the demonstrated approach at descent",
+            lambda run: math.degrees(Descent.of(run).angle),
+            "deg",
+            at_most=1.0,
+        ),
+        Metric(
+            "joint limit violations",
+            lambda run: limit_violations(run.cell),
+            at_most=0,
+            claim="the joint-space region prevents them",
+            essential=True,
+        ),
+        Metric(
+            "contacts",
+            lambda run: len(_contacts(run)),
+            at_most=0,
+            essential=True,
+            detail=lambda run: str(_contacts(run)[0]),
+        ),
+        Metric(
+            "image Jacobian, error as vision takes over",
+            lambda run: 100 * jacobian_errors(run)[0],
+            "%",
+            claim="set at random",
+        ),
+        Metric(
+            "image Jacobian, error at descent",
+            lambda run: 100 * jacobian_errors(run)[1],
+            "%",
+            at_most=20.0,
+            claim="estimated online",
+        ),
+    ]
+
+
+_TIME, _PIXELS = "servoing_time_from_the_remote_start_s", "pixel_error_at_descent_px"
+
+TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
+    # Of 50 grasps one may fail.
+    Metric("grasps that succeed", success_rate, at_least=0.98),
+    Metric("grasps, servoing time (median)", median(_TIME), "s"),
+    Metric("grasps, servoing time (95 %)", p95(_TIME), "s"),
+    Metric("grasps, pixel error (median)", median(_PIXELS), "px"),
+    Metric("grasps, pixel error (95 %)", p95(_PIXELS), "px"),
+    Metric("grasps, grasp offset (median)", median("grasp_offset_mm"), "mm"),
+    Metric("grasps, grasp offset (95 %)", p95("grasp_offset_mm"), "mm", at_most=6.0),
+    Metric(
+        "grasps, object tilt in the hand (95 %)",
+        p95("object_tilt_in_the_hand_deg"),
+        "deg",
+        at_most=3.0,
+    ),
+    Metric("grasps, slip in the hand (95 %)", p95("slip_in_the_hand_mm"), "mm", at_most=3.0),
+)
+"""Metrics of grasps in random scenes."""

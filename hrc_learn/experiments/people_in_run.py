@@ -1,0 +1,351 @@
+"""People near the robot in a run: a worker at the table, a person who hands an object over."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.controller import SeparationConfig
+from hrc_learn.dmp import InteractionPrimitive
+from hrc_learn.geometry import Pose, minimum_jerk
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, panda, separation
+from hrc_learn.log import LoggedSteps
+from hrc_learn.protocols import PersonObservation
+from hrc_learn.sim import (
+    Imperfections,
+    MotionLog,
+    ObjectConfig,
+    Touch,
+    Worker,
+    WorkerConfig,
+    WorkerSensor,
+    WorkerVisit,
+    World,
+    random_visit,
+    whole_arm,
+)
+from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over
+from hrc_learn.sim.worker import PARTS
+from hrc_learn.sim.worker_tracking import IMAGE_RATE
+from hrc_learn.sim.worker_visit import turned_about_base
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig
+
+# Arrival at the elbow [s] and number of reaches: a robot waits above its first object 11 s
+# after the start, and the worker is to reach under it then.
+_ARRIVES, _REACHES = (4.0, 9.0), (3, 5)
+# Distance that people keep from a resting arm in their view, the thickness of a sleeve [m];
+# time between checks of it [s]; and workers drawn until one can reach like that.
+_KEPT_CLEAR, _CHECKED_EVERY, _DRAWS = 0.03, 0.05, 200
+# Joints at the ends of the forearm, from 0.
+_FOREARM = slice(3, 5)
+# Speed up to which a part of the arm counts as at rest [m/s]: servos that hold a pose against a
+# push creep.
+_AT_REST = 0.01
+# Steps that are computed together: some 100 MB.
+_BLOCK = 250
+# Demonstrated visits by different people: 30 hand-overs among 120 other movements.
+_VISITS = 30
+# Basis functions for a movement of about a second: on twelve other visits four functions
+# recognised every kind from its first half; six and eight fit the noise of the tracker.
+_BASIS_FUNCTIONS = 4
+# Waiting position of the end effector relative to its hover position over the table [m].
+_WAITING_OFFSET = (0.05, -0.16, 0.25)
+# Body and hand of a tracked person in which movements are watched.
+_WATCHED = PARTS.index("pelvis"), PARTS.index("hand_right")
+# Fewest images of a movement to learn from.
+_FEWEST_IMAGES = 8
+# The person brings the object to the robot's hand after it has moved this far [m] and rested
+# this long [s], perceives its position with this standard deviation [m], and releases the
+# object after the robot has held it this long [s].
+_APPROACHED, _RESTED, _PERCEPTION_NOISE, _RELEASE_AFTER = 0.05, 0.5, 0.004, 0.3
+# Speed below which a hand rests [m/s], and longest time for which the object is held out [s].
+_RESTING_SPEED, _GIVE_UP_AFTER = 0.02, 25.0
+
+
+def draw_visit(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
+    """Draw a visit of a worker to the table.
+
+    The worker comes to the side of the table where the elbow is, while the robot waits above
+    its first object, and reaches under the forearm, as in the paper's Experiment 3.
+
+    Args:
+        workplace: Table and arm.
+        rng: Source of the worker's body, times and motions.
+
+    Raises:
+        ValueError: No worker can reach under the arm that waits.
+    """
+    # Visits are drawn to the side of +y, as if the side of -x were there, and turned.
+    table = workplace.scene.table
+    arm, waiting = whole_arm(workplace.scene.arm), workplace.hover_joints()
+    elbow, wrist = panda.joint_origins(waiting)[_FOREARM].tolist()
+    x, y = (elbow[0] + wrist[0]) / 2, (elbow[1] + wrist[1]) / 2
+    (a, b, c), (half_a, half_b, half_c) = table.centre, table.half_size
+    bench = replace(table, centre=(b, -a, c), half_size=(half_b, half_a, half_c))
+    for _ in range(_DRAWS):
+        worker = Worker(WorkerConfig.draw(rng))
+        radius = torch.from_numpy(worker.radius)
+
+        def is_clear(ends: Float[np.ndarray, "time parts 2 3"], radius=radius) -> bool:
+            """True if the body stays clear of the arm that waits, as people do."""
+            there = torch.from_numpy(turned_about_base(ends, np.pi / 2))
+            found = separation(arm, waiting, there, radius)
+            return bool((found.distance >= _KEPT_CLEAR).all())
+
+        try:
+            visit = random_visit(
+                worker,
+                rng,
+                bench=bench,
+                under=(y, -x),
+                begin=_ARRIVES,
+                reaches=_REACHES,
+                is_clear=is_clear,
+            )
+        except ValueError:
+            continue  # a small person who stands where the arm hinders them
+        on_the_way = np.arange(visit.begin, visit.end, _CHECKED_EVERY)
+        if is_clear(visit.capsules_at(on_the_way).ends):
+            return visit.turned(np.pi / 2)
+    raise ValueError(
+        f"none of {_DRAWS} workers can reach under the arm that waits over "
+        f"({workplace.table_centre[0]:g}, {workplace.table_centre[1]:g}) m: move the table's "
+        "centre away from the arm's base."
+    )
+
+
+def worker_contacts(world: World, log: LoggedSteps, motion: MotionLog) -> tuple[Touch, ...]:
+    """Contacts of the worker with the robot, or with the object in its gripper.
+
+    Args:
+        world: Simulation at the end of the run.
+        log: Log of the run.
+        motion: Motion of everything in it.
+    """
+    objects = {item.name for item in world.config.objects}
+    time = log["time"] if len(log) else np.empty(0)
+
+    def counts(touch: Touch) -> bool:
+        if touch.first not in objects:
+            return True
+        during = (time >= touch.start) & (time <= touch.end)
+        # A contact may be shorter than a step: the step in which it began counts as well.
+        during[max(int(np.searchsorted(time, touch.start, side="right")) - 1, 0)] = True
+        return bool((during & motion.held(touch.first)[: len(time)]).any())
+
+    return tuple(touch for touch in world.worker_contacts.touches if counts(touch))
+
+
+def margin_to_stop(
+    found: Separation,
+    joint_velocity: Float[Tensor, "*batch joints"],
+    person_velocity: Float[Tensor, "*batch H 2 3"],
+    config: SeparationConfig,
+) -> tuple[Float[Tensor, "*batch C H"], Bool[Tensor, "*batch C H"]]:
+    """Margin of each distance over the one within which the arm can stop before a person [m].
+
+    Args:
+        found: True distances.
+        joint_velocity: Joint velocity of the arm [rad/s].
+        person_velocity: Velocity of both ends of the person's capsules [m/s].
+        config: Protective distance, with the deceleration of the arm.
+
+    Returns:
+        d - v_h v/a - v^2/(2 a), infinite where the arm does not approach; and True where it
+        does.
+    """
+    stop = replace(config, reaction_time=0.0, clearance=0.0)
+    closing = -found.rate(joint_velocity, torch.zeros_like(person_velocity))
+    coming = -found.person_rate(person_velocity)
+    spare = found.distance - stop.protective_distance(closing, coming)
+    moves = closing > _AT_REST
+    return torch.where(moves, spare, torch.inf), moves
+
+
+def separation_margin(
+    log: LoggedSteps,
+    visit: WorkerVisit,
+    arm: CapsuleArm,
+    config: SeparationConfig,
+    *,
+    encoder_offset: Float[np.ndarray, " joints"],
+    loads: Mapping[str, tuple[GraspedBox, Bool[np.ndarray, " steps"]]],
+) -> Float[np.ndarray, " steps"]:
+    """Margin of the true distance from the worker over the stopping distance, at each step [m].
+
+    The stopping distance is v_h v/a + v^2/(2 a), for a part of the arm that approaches a part
+    of the worker at speed v while that comes at v_h: the protective distance without reaction
+    time and uncertainty. The result is the smallest margin over all parts, infinite while the
+    arm approaches none.
+
+    Args:
+        log: Log of the run.
+        visit: Motion of the worker.
+        arm: Capsules of arm and tool.
+        config: Protective distance, with the deceleration of the arm.
+        encoder_offset: Offset of the logged joint positions: measured minus true [rad].
+        loads: Objects in the gripper, and the steps in which they were.
+    """
+    time = log["time"]
+    q = torch.from_numpy(log["joint_position"] - encoder_offset)
+    v = torch.from_numpy(log["joint_velocity"])
+    margin = np.full(len(time), np.inf)
+
+    def measure(steps: np.ndarray, load: GraspedBox | None) -> None:
+        there = visit.capsules_at(time[steps])
+        ends, speed = torch.from_numpy(there.ends), torch.from_numpy(there.velocity)
+        radius = torch.from_numpy(there.radius).expand(len(steps), -1)
+        found = separation(arm, q[steps], ends, radius, load)
+        spare, _ = margin_to_stop(found, v[steps], speed, config)
+        margin[steps] = spare.amin((-2, -1)).numpy()
+
+    rest = np.ones(len(time), dtype=bool)
+    for load, held in [*loads.values(), (None, rest)]:
+        steps = np.flatnonzero(held & rest)
+        rest[steps] = False
+        for k in range(0, len(steps), _BLOCK):
+            measure(steps[k : k + _BLOCK], load)
+    return margin
+
+
+class GivingPerson:
+    """Moves a person with an object in their hand, reacting to the robot's hand.
+
+    Attributes:
+        hand_over: Actions of the person, as far as decided.
+    """
+
+    def __init__(self, world: World, item: ObjectConfig, rng: np.random.Generator):
+        """Place the person at some distance, waiting.
+
+        Args:
+            world: World with the person and the object.
+            item: Object in the hand of the person.
+            rng: Random generator.
+        """
+        assert world.config.worker is not None
+        self._world, self._item, self._rng = world, item, rng
+        self.worker = Worker(world.config.worker)
+        later = random_hand_over(
+            self.worker, rng, bench=world.config.table, thickness=item.half_size[2]
+        )
+        # The person waits until the robot is free.
+        self.hand_over = later.starting(1e6)
+        self._begun, self._brought, self._gone = False, False, False
+        self._start, self._at_rest, self._held = np.zeros(3), 0.0, 0.0
+        self._before, self._time = self._tool(), world.time
+        self.update()
+
+    def begin(self, time: float) -> None:
+        """Let the person come from this time on [s]."""
+        if not self._begun:
+            self.hand_over = self.hand_over.starting(time - 1e6)
+            self._begun, self._start = True, self._tool()
+
+    def ends_at(self, time: float) -> Float[np.ndarray, "parts 2 3"]:
+        """Ends of the capsules of the person at a time [m], for a tracker."""
+        return self.hand_over.visit.ends_at(time)
+
+    def update(self) -> None:
+        """Move the person and the object in their hand to where they are now."""
+        world, now = self._world, self._world.time
+        passed, self._time = now - self._time, now
+        tool = self._tool()
+        rests = np.linalg.norm(tool - self._before) < _RESTING_SPEED * max(passed, 1e-9)
+        self._before, self._at_rest = tool, self._at_rest + passed if rests else 0.0
+        if self._begun and not self._gone:
+            self._go_on(tool, now, passed)
+        world.move_worker(self.ends_at(now))
+        if not self._gone:
+            pose = np.eye(4)
+            pose[:3, 3] = self.hand_over.thing_at(now)
+            world.carry(self._item.name, pose)
+
+    def _go_on(self, tool: np.ndarray, now: float, passed: float) -> None:
+        plan = self.hand_over
+        waiting = now - plan.visit.end
+        if waiting < 0:
+            return
+        if not self._brought:
+            come = np.linalg.norm(tool - self._start) > _APPROACHED
+            if come and self._at_rest > _RESTED:
+                there = tool + _PERCEPTION_NOISE * self._rng.standard_normal(3)
+                self.hand_over, self._brought = plan.brought_to(there, now), True
+        else:
+            held = self._world.holds(self._item.name)
+            self._held = self._held + passed if held else 0.0
+        if self._held > _RELEASE_AFTER or waiting > _GIVE_UP_AFTER:
+            self.hand_over, self._gone = self.hand_over.left(now), True
+
+    def _tool(self) -> Float[np.ndarray, "3"]:
+        """True position of the robot's hand [m]."""
+        return self._world.arm.tcp_pose()[:3, 3].copy()
+
+
+def waiting_pose(workplace: Workplace) -> Pose:
+    """Waiting pose of the end effector: above the table, nearer to the robot."""
+    home, over = workplace.home(), workplace.hover().position
+    return Pose(over + over.new_tensor(_WAITING_OFFSET), home.orientation)
+
+
+def shown_hand_overs(
+    workplace: Workplace, sizes: Imperfections, item: ObjectConfig
+) -> InteractionPrimitive:
+    """Model of hand-overs, learned from thirty people seen by the same tracker.
+
+    In the demonstrations the robot's hand moves from its waiting pose to where the object is
+    held out.
+
+    Args:
+        workplace: Workplace of the hand-overs.
+        sizes: Noise, delay and loss of the tracker.
+        item: Object that is handed over.
+    """
+    rng = np.random.default_rng(0)
+    home, table = waiting_pose(workplace).position.numpy(), workplace.scene.table
+    shown: list[tuple[np.ndarray, np.ndarray, np.ndarray, str]] = []
+    for _ in range(_VISITS):
+        worker = Worker(WorkerConfig.draw(rng))
+        plan = random_hand_over(worker, rng, bench=table, thickness=item.half_size[2])
+        shown += _movements(plan, home, sizes, rng)
+    time, person, robot, kinds = zip(*shown, strict=True)
+    return InteractionPrimitive.fit(
+        [torch.from_numpy(t) for t in time],
+        [torch.from_numpy(p) for p in person],
+        [torch.from_numpy(r) for r in robot],
+        kinds,
+        n_basis=_BASIS_FUNCTIONS,
+    )
+
+
+def _movements(
+    plan: HandOver, home: np.ndarray, sizes: Imperfections, rng: np.random.Generator
+) -> Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]]:
+    """Times, hand of the person, hand of the robot, and kind of each movement of one visit."""
+    now = plan.visit.begin
+    sensor = WorkerSensor(plan.visit, lambda: now, sizes, rng)
+    watch, found = MovementWatch(ReceivingConfig(), *_WATCHED), []
+    newest: PersonObservation | None = None
+    for reach in plan.reaches:
+        times: list[float] = []
+        hand: list[np.ndarray] = []
+        while newest is None or newest.time < reach.end:
+            now += 1 / IMAGE_RATE
+            seen = sensor.read()
+            if seen is None or seen is newest:
+                continue
+            newest = seen
+            # Until the hand arrives: the watch adds samples of a resting hand after that.
+            if watch.see(seen) and seen.time < reach.end:
+                times, hand = watch.times.copy(), watch.hand.copy()
+        if len(times) >= _FEWEST_IMAGES and times[-1] > reach.begin:
+            u = (np.array(times) - times[0]) / (times[-1] - times[0])
+            met = plan.place if reach.kind == HAND_OVER else home
+            progress = minimum_jerk(torch.from_numpy(u))[0].numpy()
+            robot = home + progress[:, None] * (met - home)
+            found.append((np.array(times) - times[0], np.stack(hand), robot, reach.kind))
+    return found

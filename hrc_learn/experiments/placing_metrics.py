@@ -1,0 +1,290 @@
+"""Metrics of placings: outcome of each, values of a run, statistics over random starts."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.demos import Demonstration
+from hrc_learn.experiments.metric_table import Metric, column, largest, total
+from hrc_learn.experiments.placing_trial import SPACES, SimulatedPlacing, demonstrated_path
+from hrc_learn.experiments.run_measures import limit_violations, place_angle
+from hrc_learn.experiments.run_recorder import demonstrated_joints
+from hrc_learn.experiments.trials import Trial
+from hrc_learn.learning.channels import dimensionless_jerk
+from hrc_learn.sim import Touch
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.placing import PlanningSpace
+
+DEVIATION_MM, PLACE_ERROR_MM, PLACE_TILT_DEG = 12.0, 3.0, 3.0
+"""Bounds of a good placing. Approach paths planned in task space deviate by 2 mm, those planned
+in joint space with a shifted goal by 100 mm. Errors are those of the object on its board."""
+
+# Of 50 placings from random starts one may fail.
+_FRACTION = 0.98
+# Largest dimensionless jerk of a reproduction relative to the demonstration.
+_JERK = 1e-2
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlacingOutcome:
+    """Measured outcome of one placing."""
+
+    deviation: float
+    """Deviation of the approach path from the demonstrated one, moved to the goal [m]."""
+    place_error: float
+    """Horizontal distance of the object on its board from its intended place [m]."""
+    place_tilt: float
+    """Angle of the object from its intended orientation [rad]."""
+    violations: int
+    """Steps in which a joint was outside its range of position or velocity."""
+    contacts: tuple[Touch, ...]
+    """Unwanted contacts."""
+    peak_speed: float
+    """Largest joint velocity as a fraction of the limit of that joint."""
+    jerk: float
+    """Dimensionless jerk of the end effector's path over that of the demonstration."""
+    placed: bool
+    """True if the object stands on its board afterwards."""
+
+    @classmethod
+    def of(
+        cls, run: SimulatedPlacing, workplace: Workplace, demonstration: Demonstration
+    ) -> "PlacingOutcome":
+        """Measure a placing on any shelf against a demonstration."""
+        shown = demonstrated_path(demonstration, run.cell.chain)
+        # The load crosses the front edge of the boards before the end effector does.
+        edge = workplace.scene.cabinet.front + workplace.scene.objects[0].half_size[2]
+        error = run.object_pose[:3, 3] - run.goal.position.numpy()
+        speed = np.abs(run.cell.log["joint_velocity"]) / run.cell.chain.limits.velocity.numpy()
+        done, demonstrated = (
+            dimensionless_jerk(torch.from_numpy(time), torch.from_numpy(path))
+            for time, path in (
+                (run.time, run.path),
+                (demonstration.time, shown),
+            )
+        )
+        return cls(
+            deviation=approach_deviation(run.path, run.goal.position.numpy(), shown, edge),
+            place_error=float(np.linalg.norm(error[:2])),
+            place_tilt=place_angle(run.object_pose, run.goal.orientation),
+            violations=limit_violations(run.cell),
+            contacts=run.contacts,
+            peak_speed=float(speed.max()),
+            jerk=float(done / demonstrated),
+            placed=run.placed,
+        )
+
+
+def approach_deviation(
+    path: Float[np.ndarray, "steps 3"],
+    goal: Float[np.ndarray, "3"],
+    demonstrated: Float[np.ndarray, "frames 3"],
+    edge: float,
+) -> float:
+    """Largest distance of an approach from the demonstrated one, moved to the goal [m].
+
+    Approaches run against y, as boards that open towards +y require. They are compared
+    sideways and in height at the same depth, so that different shelves can be compared.
+
+    Args:
+        path: Path of the end effector [m].
+        goal: Intended end of the path [m].
+        demonstrated: Demonstrated path of the end effector, which ends behind the edge [m].
+        edge: y at which the approach begins, when it is crossed for the last time [m].
+
+    Returns:
+        Distance [m]; infinite if the path ends in front of the edge.
+    """
+    done, shown = _approach(path, goal, edge), _approach(demonstrated, demonstrated[-1], edge)
+    if not len(done):
+        return np.inf
+    # Tremor moves a demonstration back a little: use the first time at each depth.
+    progress = np.maximum.accumulate(-shown[:, 1])
+    x, z = (np.interp(-done[:, 1], progress, shown[:, k]) for k in (0, 2))
+    return float(np.hypot(done[:, 0] - x, done[:, 2] - z).max())
+
+
+def _approach(
+    path: Float[np.ndarray, "steps 3"], goal: Float[np.ndarray, "3"], edge: float
+) -> Float[np.ndarray, "samples 3"]:
+    """Offset from the goal in the last part of a path, behind the edge [m]."""
+    outside = np.flatnonzero(path[:, 1] > edge)
+    return path[int(outside[-1]) + 1 if len(outside) else 0 :] - goal
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlacingRun:
+    """Placings on every shelf, planned in both spaces."""
+
+    workplace: Workplace
+    demonstration: Demonstration
+    demonstrated_shelf: str
+    placings: Mapping[tuple[PlanningSpace, str], SimulatedPlacing]
+    """Placings from the start of the demonstration, by space and shelf."""
+    outcomes: Mapping[PlanningSpace, Mapping[str, PlacingOutcome]]
+    """Outcomes by space, then by shelf."""
+
+    @property
+    def reproduction(self) -> SimulatedPlacing:
+        """Demonstrated motion, reproduced in joint space as in the paper."""
+        return self.placings["joint", self.demonstrated_shelf]
+
+
+type ByShelf = Mapping[str, PlacingOutcome]
+
+
+def _millimetres(outcome: PlacingOutcome) -> float:
+    return 1e3 * outcome.place_error
+
+
+def _degrees(outcome: PlacingOutcome) -> float:
+    return float(np.rad2deg(outcome.place_tilt))
+
+
+def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
+    """Metrics of one placing on each of the shelves."""
+
+    def worst(of: Callable[[PlacingOutcome], float]) -> Callable[[ByShelf], float]:
+        return lambda outcomes: max(map(of, outcomes.values()))
+
+    def count(of: Callable[[PlacingOutcome], int]) -> Callable[[ByShelf], int]:
+        return lambda outcomes: sum(map(of, outcomes.values()))
+
+    def first_contacts(outcomes: ByShelf) -> str:
+        first = {shelf: o.contacts[0] for shelf, o in outcomes.items() if o.contacts}
+        return "; ".join(f"{shelf} shelf: {touch}" for shelf, touch in first.items())
+
+    return [
+        *(metric for shelf in shelves for metric in _shelf_metrics(shelf)),
+        Metric(
+            "place error", worst(_millimetres), "mm", at_most=PLACE_ERROR_MM, essential=True
+        ),
+        Metric("place tilt", worst(_degrees), "deg", at_most=PLACE_TILT_DEG, essential=True),
+        Metric(
+            "joint limit violations", count(lambda o: o.violations), at_most=0, essential=True
+        ),
+        Metric(
+            "contacts",
+            count(lambda o: len(o.contacts)),
+            at_most=0,
+            claim="no collision with the cabinet",
+            essential=True,
+            detail=first_contacts,
+        ),
+        Metric(
+            "peak joint speed, fraction of its limit",
+            worst(lambda o: o.peak_speed),
+            at_most=1.0,
+        ),
+        Metric(
+            "dimensionless jerk, fraction of the demonstration's",
+            worst(lambda o: o.jerk),
+            at_most=_JERK,
+            claim="several unnecessary jerks removed",
+        ),
+        Metric(
+            "objects that stand on their shelf",
+            count(lambda o: o.placed),
+            at_least=len(shelves),
+            essential=True,
+        ),
+    ]
+
+
+def _shelf_metrics(shelf: str) -> list[Metric[ByShelf]]:
+    metrics = (
+        Metric[PlacingOutcome](
+            "approach-path deviation",
+            lambda outcome: 1e3 * outcome.deviation,
+            "mm",
+            at_most=DEVIATION_MM,
+            claim="similar paths towards the goals",
+            essential=True,
+        ),
+        Metric[PlacingOutcome]("contacts", lambda outcome: len(outcome.contacts)),
+        Metric("place error", _millimetres, "mm", listed=False),
+        Metric("place tilt", _degrees, "deg", listed=False),
+        Metric[PlacingOutcome]("placed", lambda outcome: int(outcome.placed), listed=False),
+    )
+    return [metric.of_part(lambda run: run[shelf], f"{shelf} shelf, ") for metric in metrics]
+
+
+def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
+    """Metrics of the experiment: reproduction, task space, joint space."""
+    table, joint_space = placing_metrics(shelves), f"{SPACES['joint']}, "
+    return [
+        Metric(
+            "demonstration, duration",
+            lambda run: float(run.demonstration.duration),
+            "s",
+            claim="30 s",
+        ),
+        Metric(
+            "reproduction, duration",
+            lambda run: run.reproduction.plan.duration,
+            "s",
+            claim="20 s, tau = 1.5",
+        ),
+        Metric("reproduction, joint RMSE", _joint_rmse, "deg", at_most=2.0),
+        *(m.of_part(lambda run: run.outcomes["pose"]) for m in table),
+        *(
+            m.of_part(lambda run: run.outcomes["joint"], joint_space, bounded=False)
+            for m in table
+        ),
+    ]
+
+
+def _joint_rmse(run: PlacingRun) -> float:
+    """RMSE of the reproduced joints at equal fractions of the motion [deg]."""
+    done = run.reproduction
+    demonstrated = demonstrated_joints(run.demonstration, done.time / done.time[-1])
+    return float(np.rad2deg(np.sqrt(np.square(done.joint_position - demonstrated).mean())))
+
+
+def random_start_metrics(shelves: Sequence[str]) -> list[Metric[Sequence[Trial]]]:
+    """Metrics of placings from random starts."""
+
+    def by_shelf(trials: Sequence[Trial], key: str) -> np.ndarray:
+        return np.array([column(trials, f"{shelf}_shelf_{key}") for shelf in shelves])
+
+    metrics: Sequence[Metric[Sequence[Trial]]] = (
+        Metric("placings", lambda trials: len(trials) * len(shelves)),
+        Metric(
+            "fraction without contact",
+            lambda trials: float((by_shelf(trials, "contacts") == 0).mean()),
+            at_least=_FRACTION,
+        ),
+        Metric(
+            "fraction that stands on its shelf",
+            lambda trials: float((by_shelf(trials, "placed") == 1).mean()),
+            at_least=_FRACTION,
+        ),
+        Metric("joint limit violations", total("joint_limit_violations"), at_most=0),
+        Metric(
+            f"fraction within {PLACE_ERROR_MM:g} mm and {PLACE_TILT_DEG:g} deg of its place",
+            lambda trials: float(
+                (
+                    (by_shelf(trials, "place_error_mm") <= PLACE_ERROR_MM)
+                    & (by_shelf(trials, "place_tilt_deg") <= PLACE_TILT_DEG)
+                ).mean()
+            ),
+            at_least=_FRACTION,
+        ),
+        Metric(
+            "place error (median)",
+            lambda trials: float(np.nanmedian(by_shelf(trials, "place_error_mm"))),
+            "mm",
+        ),
+        Metric("largest place error", largest("place_error_mm"), "mm"),
+        Metric("largest place tilt", largest("place_tilt_deg"), "deg"),
+        Metric(
+            "largest approach-path deviation",
+            lambda trials: float(by_shelf(trials, "approach_path_deviation_mm").max()),
+            "mm",
+            at_most=DEVIATION_MM,
+        ),
+    )
+    return [metric.of_part(lambda trials: trials, "random starts, ") for metric in metrics]
