@@ -93,7 +93,7 @@ def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[
     from hrc_learn.demos.format.dataset_folder import read_info
     from hrc_learn.lerobot.camera_watch import add_camera_watch
     from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
-    from hrc_learn.lerobot.robots.mujoco_arm import MovedCameraConfig
+    from hrc_learn.lerobot.mujoco_arm import MovedCameraConfig
 
     if correct:
         add_camera_watch(checkpoint, args.data, correct=True)

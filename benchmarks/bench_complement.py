@@ -33,8 +33,8 @@ from hrc_learn.kinematics import panda
 
 # LeRobot takes ten seconds to import: only once there is something to do.
 if TYPE_CHECKING:
-    from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
-    from hrc_learn.lerobot.rollouts import CheckpointPolicy
+    from hrc_learn.lerobot.episode_recording import CheckpointPolicy
+    from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot, MujocoArmRobotConfig
     from hrc_learn.teleoperation import ScriptedForce
 
 _ELBOW = 3
@@ -101,9 +101,9 @@ class Pulled:
 
 
 def main(args: Args) -> None:
+    from hrc_learn.lerobot.episode_recording import CheckpointPolicy
+    from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot, MujocoArmRobotConfig
     from hrc_learn.lerobot.person import PersonConfig, scripted_pulls
-    from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
-    from hrc_learn.lerobot.rollouts import CheckpointPolicy
 
     torch.set_num_threads(1)
     config = MujocoArmRobotConfig(
@@ -145,7 +145,7 @@ def main(args: Args) -> None:
 
 def _fitted(args: Args, config: MujocoArmRobotConfig) -> Path:
     """The policy `dmp` in closed form, of ten demonstrations without imperfections."""
-    from hrc_learn.lerobot.expert_recording import record_expert
+    from hrc_learn.lerobot.episode_recording import record_expert
     from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
     dataset = args.data / f"{args.task}_{args.fps}hz"
@@ -161,7 +161,7 @@ def _fitted(args: Args, config: MujocoArmRobotConfig) -> Path:
 
 
 def _do(robot: MujocoArmRobot, leader: CheckpointPolicy, seed: int) -> Done:
-    from hrc_learn.lerobot.rollouts import roll_out
+    from hrc_learn.lerobot.episode_recording import roll_out
 
     rows: list[tuple[Any, ...]] = []
     waited, complement = 0.0, robot.complement

@@ -122,7 +122,7 @@ def main(args: Args) -> None:
 def _recorded(args: Args, env: ArmEnvConfig, first: int, count: int) -> Path:
     folder = args.data / f"{args.task}_{args.fps}hz_from_{first}_{count}"
     if not folder.exists():
-        from hrc_learn.lerobot.expert_recording import record_expert
+        from hrc_learn.lerobot.episode_recording import record_expert
 
         robot = replace(env.robot_config(), seed=first)
         shown = record_expert(folder, robot, count)

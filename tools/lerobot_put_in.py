@@ -65,15 +65,15 @@ def put_in_pair(request, monkeypatch, tmp_path):
     """A robot and a teleoperator in the place of LeRobot's mocks."""
     if request.param == "mock":
         return
-    from hrc_learn.lerobot.robots import MujocoArmRobotConfig
+    from hrc_learn.lerobot.arm_teleoperators import ArmExpertConfig
+    from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
     from hrc_learn.lerobot.smoothing import ActionLimits, SmoothRobotConfig
-    from hrc_learn.lerobot.teleoperators import ArmExpertConfig
 
     def panda():
         return MujocoArmRobotConfig(scenario="grasping", fps=FPS, calibration_dir=tmp_path)
 
     def smooth():
-        from hrc_learn.lerobot.robots import MujocoArmRobot
+        from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot
 
         names = list(MujocoArmRobot(panda()).action_features)
         ones, unlimited = [1.0] * len(names), [None] * len(names)

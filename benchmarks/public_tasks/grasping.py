@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from public_tasks.protocol import ACTION, AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
 
+from hrc_learn.lerobot.arm_teleoperators import ArmExpert, ArmExpertConfig
 from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
-from hrc_learn.lerobot.teleoperators import ArmExpert, ArmExpertConfig
 
 OBJECT = 2
 """Last numbers of what a `mujoco_arm` observes: the object's pixel."""

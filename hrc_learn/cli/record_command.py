@@ -142,8 +142,8 @@ def _details(args: Record) -> dict[str, object]:
 
 def _record_expert(args: Record, episodes: int, seed: int) -> None:
     """The columns of lerobot-record with mujoco_arm and arm_expert, in simulated time."""
-    from hrc_learn.lerobot.expert_recording import record_expert
-    from hrc_learn.lerobot.robots import MujocoArmRobotConfig
+    from hrc_learn.lerobot.episode_recording import record_expert
+    from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 
     if args.out.exists():
         raise FileExistsError(f"{args.out} exists: give another --out")

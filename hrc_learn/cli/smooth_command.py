@@ -18,7 +18,7 @@ def smooth(args: Smooth) -> None:
     if args.checkpoint is None and (args.remove or args.limits is None):
         raise ValueError("give --checkpoint, or --limits to write only a file.")
     # LeRobot takes seconds to import.
-    from hrc_learn.lerobot.arm_robot import ArmValues
+    from hrc_learn.lerobot.arm_values import ArmValues
     from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
 
     if args.remove and args.checkpoint is not None:

@@ -7,8 +7,12 @@ imported on demand.
 
 from hrc_learn.lerobot import camera_watch as camera_watch
 from hrc_learn.lerobot import envs as envs
-from hrc_learn.lerobot import robots as robots
 from hrc_learn.lerobot import smoothing as smoothing
-from hrc_learn.lerobot import teleoperators as teleoperators
+
+# LeRobot looks here for the class of a device, which is named like its configuration.
+from hrc_learn.lerobot.arm_teleoperators import ArmExpert as ArmExpert
+from hrc_learn.lerobot.arm_teleoperators import ArmPage as ArmPage
+from hrc_learn.lerobot.franka_panda import FrankaPanda as FrankaPanda
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot as MujocoArmRobot
 from hrc_learn.lerobot.policy.dmp_policy import DMPConfig as DMPConfig
 from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkConfig as MotionChunkConfig

@@ -1,16 +1,14 @@
-"""Arms as LeRobot robots: names and units of their values, and the base class of all robots.
-
-Units are radians, metres and pixels; poses are in the base frame, as position and rotation
-vector. Names end in `.pos` or `.vel` because lerobot-rollout passes on no others.
-"""
+"""Arms as LeRobot robots: their base class, and the warnings about recordings of them."""
 
 from __future__ import annotations
 
+import logging
+import time
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -19,129 +17,33 @@ from lerobot.robots import Robot, RobotConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from torch import Tensor
 
-from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import Arm as ArmModel
-from hrc_learn.kinematics import SerialChain, gripper_down
-from hrc_learn.lerobot.loop_watch import LoopWatch
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.lerobot.arm_values import DOWN, GRIPPER, HAND, ActionSpace, ArmValues
 from hrc_learn.lerobot.person import Person, PersonConfig
 from hrc_learn.protocols import Arm, ArmState
-from hrc_learn.teleoperation.recording_quality import pressed
+from hrc_learn.teleoperation.recording_quality import RecordingQuality, pressed
 
 if TYPE_CHECKING:
     from hrc_learn.sim import World
     from hrc_learn.skills.arm_motion import PositionServo
     from hrc_learn.skills.complementary_motion import ComplementaryMotion
 
-HAND = tuple(f"ee.{axis}.pos" for axis in ("x", "y", "z", "wx", "wy", "wz"))
-GRIPPER = "gripper.pos"
-PIXELS = ("object.u.pos", "object.v.pos")
-MARKER = ("marker.u.pos", "marker.v.pos", "marker.seen.pos")
+logger = logging.getLogger(__name__)
 
-ActionSpace = Literal["joint", "ee"]
-"""Positions of the joints, or of the end effector; the gripper's opening in either case."""
-
-DOWN = quaternion.log(gripper_down()).numpy()
-"""Rotation vector of a gripper that points down, the reference for choosing the signs of others
-[rad].
-"""
-
-
-class ArmValues:
-    """The values of an arm by their names: those of its joints are called as the joints are.
-
-    Attributes:
-        chain: Kinematics of the arm.
-        joints: Names of the joints' positions [rad].
-        velocities: Names of their velocities [rad/s].
-    """
-
-    def __init__(self, chain: SerialChain):
-        """Name them."""
-        self.chain = chain
-        self.joints = tuple(f"{name}.pos" for name in chain.joint_names)
-        self.velocities = tuple(f"{name}.vel" for name in chain.joint_names)
-
-    def action_names(self, space: ActionSpace) -> tuple[str, ...]:
-        """Names of an action's values, in order."""
-        return (*(self.joints if space == "joint" else HAND), GRIPPER)
-
-    def action_of(
-        self,
-        space: ActionSpace,
-        joints: Float[np.ndarray, " joints"],
-        width: float,
-        near: Float[np.ndarray, "3"] = DOWN,
-    ) -> dict[str, float]:
-        """The action that sends the joints somewhere, and the gripper to an opening.
-
-        Args:
-            space: Action space.
-            joints: Positions [rad].
-            width: Opening [m].
-            near: Rotation vector before, which this one goes on from [rad].
-        """
-        values = joints if space == "joint" else self.hand_vector(joints, near)
-        names = self.action_names(space)
-        return dict(zip(names, (*map(float, values), float(width)), strict=True))
-
-    def hand_vector(
-        self, joints: Float[np.ndarray, " joints"], near: Float[np.ndarray, "3"] = DOWN
-    ) -> Float[np.ndarray, "6"]:
-        """Position [m] and rotation vector [rad] of the end effector.
-
-        A gripper that points down is half a turn from the base, where the shortest rotation
-        vector jumps from one side to the other; `near` picks the side.
-        """
-        pose = self.chain.forward(torch.from_numpy(np.asarray(joints, dtype=float)))
-        vector = pose.vector()
-        pair = torch.stack([torch.from_numpy(np.array(near, dtype=float)), vector[3:]])
-        return torch.cat([vector[:3], quaternion.unwrap_log(pair)[1]]).numpy()
-
-    def target_of(
-        self, action: Mapping[str, Any]
-    ) -> tuple[Float[np.ndarray, " joints"] | Pose, float]:
-        """Read an action of either space; names it does not know are passed over.
-
-        Returns:
-            Positions of the joints [rad] or pose of the end effector, and opening of the
-            gripper [m], NaN where none is given.
-
-        Raises:
-            ValueError: Names are missing.
-        """
-        width = float(action.get(GRIPPER, np.nan))
-        if all(name in action for name in HAND):
-            vector = torch.tensor([float(action[name]) for name in HAND], dtype=torch.float64)
-            return Pose.from_vector(vector), width
-        missing = [name for name in self.joints if name not in action]
-        if missing:
-            raise ValueError(
-                f"an action for this arm needs {', '.join(self.joints)} or {', '.join(HAND)}, "
-                f"but lacks {', '.join(missing)}."
-            )
-        return np.array([float(action[name]) for name in self.joints]), width
-
-    def observed(
-        self, state: ArmState, names: Sequence[str], near: Float[np.ndarray, "3"] = DOWN
-    ) -> dict[str, float]:
-        """Values of the arm's state by name.
-
-        Args:
-            state: State of the arm.
-            names: Wanted, of those of this class, `HAND` and `GRIPPER`.
-            near: Rotation vector of the end effector before [rad].
-        """
-        q = state.joint_position
-        values = dict(zip(self.joints, q.tolist(), strict=True))
-        values |= zip(self.velocities, state.joint_velocity.tolist(), strict=True)
-        values[GRIPPER] = state.gripper_width
-        if not {*HAND}.isdisjoint(names):
-            values |= zip(HAND, self.hand_vector(q, near).tolist(), strict=True)
-        return {name: float(values[name]) for name in names}
+LATE = 1.5
+"""Periods after which an action is late: from here on the nearest frame is the next one."""
+PAUSE = 2.0
+"""Longer without an action is no late one but a pause [s], as between two episodes."""
+TOLERATED = 0.02
+"""Fraction of late actions that raises no warning."""
+EPISODE = 1.0
+"""Shorter stretches are no episodes [s], and need not show anything."""
 
 
 class Device:
-    """A device that has nothing to calibrate; to derive from before LeRobot's own class."""
+    """Mix-in for devices without calibration; precedes LeRobot's own class among the bases."""
 
     _connected = False
 
@@ -160,10 +62,10 @@ class Device:
         """Nothing to do."""
 
     def connect(self, calibrate: bool = True) -> None:
-        """Take hold of the device.
+        """Open the device.
 
         Raises:
-            DeviceAlreadyConnectedError: It is held already.
+            DeviceAlreadyConnectedError: It is open already.
         """
         if self._connected:
             raise DeviceAlreadyConnectedError(f"{self} is connected already.")
@@ -171,10 +73,10 @@ class Device:
         self._connected = True
 
     def disconnect(self) -> None:
-        """Let it go.
+        """Close the device.
 
         Raises:
-            DeviceNotConnectedError: It is not held.
+            DeviceNotConnectedError: It is not open.
         """
         self._need_connection()
         self._connected = False
@@ -186,70 +88,126 @@ class Device:
 
     @abstractmethod
     def _open(self) -> None:
-        """Take hold of it."""
+        """Open the device."""
 
     @abstractmethod
     def _close(self) -> None:
-        """Let it go."""
+        """Close the device."""
 
 
-class RobotRegistry:
-    """The connected robots among which a teleoperator finds the one that it guides.
+class LoopWatch:
+    """Judges recordings of an arm, and warns at the end of each stretch of actions.
 
-    LeRobot gives a teleoperator no reference to the robot. One that guides the end effector,
-    rather than copying joints of its own, needs to know where the arm is.
+    LeRobot stamps frames with their number over the rate, whenever they were recorded: where
+    actions came late, the arm seems to have moved faster than it did. LeRobot reports neither
+    that it records nor the end of an episode, so a stretch ends with a pause, with the robot's
+    next episode, or when it is disconnected.
     """
 
-    def __init__(self) -> None:
-        self._robots: list[ArmRobot] = []
+    def __init__(
+        self,
+        name: str,
+        fps: float,
+        clock: Callable[[], float] = time.perf_counter,
+        chain: SerialChain | None = None,
+        *,
+        in_real_time: bool = True,
+    ):
+        """Start without actions.
 
-    def __iter__(self) -> Iterator[ArmRobot]:
-        """In the order in which they were connected."""
-        return iter(tuple(self._robots))
-
-    def add(self, robot: ArmRobot) -> None:
-        """Note a robot that has been connected."""
-        self._robots.append(robot)
-
-    def remove(self, robot: ArmRobot) -> None:
-        """Forget a robot that has been disconnected."""
-        self._robots.remove(robot)
-
-    def find(self, id: str | None) -> ArmRobot:
-        """The robot with a name, or the only one.
-
-        Raises:
-            DeviceNotConnectedError: There is none, or several and no name is given.
+        Args:
+            name: Name of the robot, for the warning.
+            fps: Actions a second that there should be.
+            clock: Seconds.
+            chain: Kinematics of the arm, for checking joint limits; None skips this check.
+            in_real_time: True if the arm keeps moving while the loop is late.
         """
-        found = [robot for robot in self._robots if id in (None, robot.id)]
-        if len(found) == 1:
-            return found[0]
-        names = ", ".join(repr(robot.id) for robot in self._robots) or "none"
-        wanted = "a robot of hrc_learn" if id is None else f"one robot with id {id!r}"
-        raise DeviceNotConnectedError(
-            f"this teleoperator guides {wanted} (mujoco_arm or franka_panda); connected: "
-            f"{names}. Give --teleop.robot_id where there are several."
-        )
+        self._name, self._clock, self._in_real_time = name, clock, in_real_time
+        self._fps, self._quality = fps, RecordingQuality(fps, chain, LATE)
+
+    def tick(self, state: ArmState | None = None, touching: Collection[str] = ()) -> None:
+        """Count an action.
+
+        Args:
+            state: Last reading of the arm; None: it was not read.
+            touching: Unexpected contacts of the arm, as text.
+        """
+        now = self._clock()
+        if self._in_real_time and self._quality.ticks.gap(now) > PAUSE:
+            self.end()
+        if state is None:
+            self._quality.ticks.tick(now)
+        else:
+            q, width = state.joint_position, state.gripper_width
+            self._quality.add(now, state.time, q, width, touching)
+
+    def end(self) -> None:
+        """Report doubts about the actions since the last end."""
+        ticks = self._quality.ticks
+        if self._in_real_time and ticks.late_ticks > TOLERATED * ticks.ticks:
+            logger.warning(
+                "%s: %d of %d actions came late, by %.0f ms at most: what was recorded lacks "
+                "about %d frames, and moves faster there than the arm did. Record again with "
+                "fewer or smaller images, a lower --dataset.fps, or nothing else to compute",
+                self._name,
+                ticks.late_ticks,
+                ticks.ticks,
+                1e3 * ticks.latest,
+                ticks.lost,
+            )
+        doubts = self._quality.met()
+        if len(self._quality.states) >= EPISODE * self._fps:
+            doubts.insert(0, self._quality.worthless())
+        for doubt in filter(None, doubts):
+            logger.warning("%s: in what was recorded, %s", self._name, doubt)
+        self._quality.clear()
 
 
 @cache
-def robot_registry() -> RobotRegistry:
-    """Registry of connected robots in this process, used by robots and teleoperators."""
-    return RobotRegistry()
+def connected_robots() -> list[ArmRobot]:
+    """Connected robots of this process, in the order in which they were connected."""
+    return []
+
+
+def find_robot(id: str | None) -> ArmRobot:
+    """The connected robot with a name, or the only one, for its teleoperator.
+
+    LeRobot gives a teleoperator no reference to the robot. One that guides the end effector
+    needs the state of the arm.
+
+    Raises:
+        DeviceNotConnectedError: There is none, or several and no name is given.
+    """
+    robots = connected_robots()
+    found = [robot for robot in robots if id in (None, robot.id)]
+    if len(found) == 1:
+        return found[0]
+    names = ", ".join(repr(robot.id) for robot in robots) or "none"
+    wanted = "a robot of hrc_learn" if id is None else f"one robot with id {id!r}"
+    raise DeviceNotConnectedError(
+        f"this teleoperator guides {wanted} (mujoco_arm or franka_panda); connected: "
+        f"{names}. Give --teleop.robot_id where there are several."
+    )
 
 
 @dataclass(kw_only=True)
-class ArmRobotConfig(RobotConfig):
-    """Settings common to simulated and real arms."""
+class ValuesConfig:
+    """Commanded and observed values of an arm."""
 
-    fps: float = 50.0
-    """Actions a second: the rate of the dataset, or of the rollout."""
     action_space: ActionSpace = "joint"
     """Space of actions: joint positions ("joint"), or the pose of the end effector ("ee")."""
     velocity: bool = False
     """Observe joint velocities."""
     hand: bool = False
     """Observe the pose of the end effector; always observed if actions command it."""
+
+
+@dataclass(kw_only=True)
+class ArmRobotConfig(ValuesConfig, RobotConfig):
+    """Settings common to simulated and real arms."""
+
+    fps: float = 50.0
+    """Actions a second: the rate of the dataset, or of the rollout."""
     person: PersonConfig = field(default_factory=PersonConfig)
     """Person that guides the body while actions command the end effector."""
 
@@ -313,19 +271,19 @@ class ArmRobot(Device, Robot):
 
     @property
     def person_names(self) -> tuple[str, ...]:
-        """Names of what is observed of the person."""
+        """Names of the values observed of the person."""
         return self._person_config.names(self.work_arm.chain)
 
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
         if self._person_config.kind != "none":
             self._invite(self._person_config)
-        robot_registry().add(self)
+        connected_robots().append(self)
 
     def disconnect(self) -> None:
         self._need_connection()
         self._loop.end()
-        robot_registry().remove(self)
+        connected_robots().remove(self)
         if self.complement is not None:
             self.complement = None
             self._person.close()
@@ -358,7 +316,7 @@ class ArmRobot(Device, Robot):
         return self.values.action_of(self.space, sent, width, self._rotation)
 
     def _judge(self) -> None:
-        """Tell the watch what is recorded with this action."""
+        """Pass the reading that is recorded with this action to the watch."""
         if not self.judged:
             return
         state, self._state = self._state, None
@@ -384,7 +342,7 @@ class ArmRobot(Device, Robot):
     def _command(
         self, joints: Float[np.ndarray, " joints"], width: float
     ) -> Float[np.ndarray, " joints"]:
-        """Send joints [rad] and gripper [m]; where the joints are really sent [rad]."""
+        """Send joints [rad] and gripper [m]; returns the joints that were sent [rad]."""
 
     @property
     @abstractmethod
@@ -409,10 +367,7 @@ class ArmRobot(Device, Robot):
     def clearance(
         self, joint_position: Float[Tensor, "*batch joints"]
     ) -> Float[Tensor, "*batch"]:
-        """Distance of the arm from what it must not meet, as far as that is known [m].
-
-        A real arm knows of itself only.
-        """
+        """Distance of the arm from known obstacles [m]: from itself alone for a real arm."""
         return self.work_arm.whole.self_distance(joint_position)
 
     def _invite(self, config: PersonConfig) -> None:
@@ -437,7 +392,7 @@ class ArmRobot(Device, Robot):
         joints: Float[np.ndarray, " joints"],
         width: float,
     ) -> tuple[Float[np.ndarray, " joints"], float]:
-        """Joints and gripper, with the body where the person wants it."""
+        """Joints and gripper with the person's motion of the body."""
         from hrc_learn.skills.arm_motion import joints_near
 
         with torch.inference_mode():

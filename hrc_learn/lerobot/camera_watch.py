@@ -9,8 +9,7 @@ the pixels that the policy sees to what they were if the camera still stood ther
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -22,7 +21,6 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from hrc_learn.demos import load_demos
 from hrc_learn.demos.format.dataset_folder import read_info
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
@@ -33,20 +31,13 @@ from hrc_learn.jacobian import (
     ImageDemonstration,
     ObjectPlane,
 )
-from hrc_learn.learning.visual_servo_fitting import feature_trajectories
-from hrc_learn.lerobot.arm_robot import MARKER, PIXELS
+from hrc_learn.lerobot.arm_values import HAND, MARKER, PIXELS
 from hrc_learn.lerobot.policy.training_samples import read_episodes
 from hrc_learn.lerobot.smoothing import PREPROCESSOR, read_pipeline
 from hrc_learn.lerobot.smoothing.action_limits import write_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CAMERA_WATCH = "hrc_learn_camera_watch"
-POSE_NAMES = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
-"""Names of the state values of the tool's pose: position [m], rotation vector [rad]. On a robot
-they end in `.pos`.
-"""
-FEATURE = "observation.image_feature"
-"""Pixel u, v of the tool's marker, and whether it is seen, where the state has no `MARKER`."""
 
 
 @ProcessorStepRegistry.register(CAMERA_WATCH)
@@ -62,11 +53,9 @@ class CameraWatchStep(ProcessorStep):
     fps: float
     """Calls a second [1/s]."""
     pose_columns: list[int]
-    """Indices of `POSE_NAMES` in the state, in that order."""
-    feature: str = FEATURE
-    """Observation with the pixel and whether it is seen."""
-    marker_columns: list[int] | None = None
-    """Indices of `MARKER` in the state, in that order; None: `feature` has them."""
+    """Indices of `HAND` in the state, in that order."""
+    marker_columns: list[int]
+    """Indices of `MARKER` in the state, in that order."""
     correct: bool = False
     """Correct pixels to those that the camera would see at its original pose."""
     object_columns: list[int] | None = None
@@ -81,7 +70,7 @@ class CameraWatchStep(ProcessorStep):
         if not self.fps > 0:
             raise ValueError(f"fps must be positive, got {self.fps}.")
         for name, wanted in (
-            ("pose_columns", POSE_NAMES),
+            ("pose_columns", HAND),
             ("marker_columns", MARKER),
             ("object_columns", PIXELS),
         ):
@@ -97,9 +86,9 @@ class CameraWatchStep(ProcessorStep):
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
-        state, feature = observation.get(OBS_STATE), observation.get(self.feature)
+        state = observation.get(OBS_STATE)
         self._calls += 1
-        if state is None or (self.marker_columns is None and feature is None):
+        if state is None:
             return transition
         if state.ndim > 1 and len(state) > 1:
             raise ValueError(
@@ -107,8 +96,7 @@ class CameraWatchStep(ProcessorStep):
                 f"{len(state)}: set eval.batch_size to 1."
             )
         values = state.reshape(-1).double().cpu()
-        marker = values[self.marker_columns] if feature is None else feature.reshape(-1)
-        marker = marker.double().cpu()
+        marker = values[self.marker_columns]
         pose = self._look(values, marker)
         if not (isinstance(self._watch, CameraCorrection) and self._watch.motion):
             return transition
@@ -118,12 +106,8 @@ class CameraWatchStep(ProcessorStep):
             values[self.object_columns] = torch.from_numpy(pixel)
         if pose is not None:
             marker[:2] = torch.from_numpy(self._watch.marker(pose, marker[:2].numpy()))
-        corrected = dict(observation)
-        if feature is None:
             values[self.marker_columns] = marker
-        else:
-            corrected[self.feature] = marker.to(feature).reshape(feature.shape)
-        corrected[OBS_STATE] = values.to(state).reshape(state.shape)
+        corrected = {**observation, OBS_STATE: values.to(state).reshape(state.shape)}
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
     def _look(self, state: Float[Tensor, " values"], marker: Float[Tensor, "3"]) -> Pose | None:
@@ -150,16 +134,7 @@ class CameraWatchStep(ProcessorStep):
             self.motion = None
 
     def get_config(self) -> dict[str, Any]:
-        return {
-            "reference": self.reference,
-            "fps": self.fps,
-            "pose_columns": self.pose_columns,
-            "feature": self.feature,
-            "marker_columns": self.marker_columns,
-            "correct": self.correct,
-            "object_columns": self.object_columns,
-            "object_height": self.object_height,
-        }
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.init}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -174,19 +149,19 @@ def add_camera_watch(
     *,
     correct: bool = False,
 ) -> CameraReference:
-    """Let a trained policy's camera be watched wherever its checkpoint is used.
+    """Add a watch of the camera to a trained policy's checkpoint.
 
     A step from an earlier call is replaced. Weights and all other steps stay as they are.
 
     Args:
         checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
-        dataset: It was trained on, with the tool's pose and its marker's pixel in every frame.
+        dataset: Training data, with the tool's pose and its marker's pixel in every frame.
         image_size: Width and height of the camera's images [px].
         correct: True if pixels of the marker, and of an object that was seen before the tool
             came and is taken where the tool is lowest, are corrected as well.
 
     Returns:
-        Where the camera stood.
+        Reference of the camera in the demonstrations.
 
     Raises:
         FileNotFoundError: The folder holds no preprocessor.
@@ -197,20 +172,19 @@ def add_camera_watch(
     content = read_pipeline(path, without=(CAMERA_WATCH,))
     info = read_info(dataset)
     names = [name.removesuffix(".pos") for name in info["features"][OBS_STATE]["names"]]
-    if missing := [name for name in POSE_NAMES if name not in names]:
-        raise ValueError(
-            f"{dataset}: {OBS_STATE} has no {', '.join(missing)}: the tool's pose is needed to "
-            "know where its marker must be seen."
-        )
-    pose_columns, marker_columns, object_columns = (
-        _columns(names, wanted) for wanted in (POSE_NAMES, MARKER, PIXELS)
+    index = {name: i for i, name in enumerate(names)}
+    pose_names, marker_names, object_names = (
+        [name.removesuffix(".pos") for name in wanted] for wanted in (HAND, MARKER, PIXELS)
     )
-    assert pose_columns is not None
+    if missing := [name for name in pose_names + marker_names if name not in index]:
+        raise ValueError(
+            f"{dataset}: {OBS_STATE} has no {', '.join(missing)}: record the tool's pose and "
+            "its marker's pixel (robot.hand=true, robot.marker=true)."
+        )
+    pose_columns, marker_columns = ([index[n] for n in x] for x in (pose_names, marker_names))
+    object_columns = [index[name] for name in object_names if name in index] or None
     states = [episode[OBS_STATE].double() for episode in read_episodes(dataset, [OBS_STATE])]
-    if marker_columns is None:
-        watched = list(feature_trajectories(load_demos(dataset)))
-    else:
-        watched = [_watched(x[:, pose_columns], x[:, marker_columns]) for x in states]
+    watched = [_watched(x[:, pose_columns], x[:, marker_columns]) for x in states]
     fps = float(info["fps"])
     reference = CameraReference.fit(watched, fps, image_size)
     height = 0.0
@@ -230,12 +204,6 @@ def add_camera_watch(
     content["steps"].insert(0, {"registry_name": CAMERA_WATCH, "config": step.get_config()})
     write_json(path, content)
     return reference
-
-
-def _columns(names: Sequence[str], wanted: Sequence[str]) -> list[int] | None:
-    """Indices of names; None if one is missing."""
-    wanted = [name.removesuffix(".pos") for name in wanted]
-    return [names.index(name) for name in wanted] if {*wanted} <= {*names} else None
 
 
 def _watched(

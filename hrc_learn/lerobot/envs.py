@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
 
@@ -14,9 +14,13 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from hrc_learn.lerobot.arm_robot import ActionSpace
-from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
-from hrc_learn.lerobot.robots.mujoco_arm import CAMERA, ImagesConfig, MovedCameraConfig
+from hrc_learn.lerobot.arm_robot import ValuesConfig
+from hrc_learn.lerobot.mujoco_arm import (
+    CAMERA,
+    MujocoArmRobot,
+    MujocoArmRobotConfig,
+    WorkplaceConfig,
+)
 from hrc_learn.teleoperation.scenarios import ScenarioView, make_scenario
 
 _MORE_TIME = 1.25
@@ -25,7 +29,7 @@ _MORE_TIME = 1.25
 
 @EnvConfig.register_subclass("mujoco_arm")
 @dataclass
-class ArmEnvConfig(EnvConfig):
+class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
     """Scenarios of a `mujoco_arm`, judged by MuJoCo's contacts; `--env.type=mujoco_arm`.
 
     Observations and actions are those of the robot with the same settings, in the same order,
@@ -34,30 +38,8 @@ class ArmEnvConfig(EnvConfig):
 
     task: str | None = "placing"
     """Task: "placing" or "grasping"."""
-    arm: str = "panda"
-    """Same as the robot's."""
-    base: str = ""
-    """Same as the robot's."""
-    tip: str = ""
-    """Same as the robot's."""
     fps: int = 50
     """Frame rate of the training dataset [Hz]."""
-    shelf: str = "middle"
-    """Target shelf: "lower", "middle" or "upper"."""
-    action_space: ActionSpace = "joint"
-    """Same as the robot's."""
-    velocity: bool = False
-    """Same as the robot's."""
-    hand: bool = False
-    """Same as the robot's."""
-    pixels: bool = False
-    """Same as the robot's."""
-    marker: bool = False
-    """Same as the robot's."""
-    moved_camera: MovedCameraConfig = field(default_factory=MovedCameraConfig)
-    """Same as the robot's."""
-    images: ImagesConfig = field(default_factory=ImagesConfig)
-    """Same as the robot's."""
     episode_length: int | None = None
     """Actions after which an episode has failed; None: a quarter more than a demonstration."""
 
@@ -78,20 +60,11 @@ class ArmEnvConfig(EnvConfig):
 
     def robot_config(self) -> MujocoArmRobotConfig:
         """Settings of the robot in it."""
+        shared = [f.name for f in (*fields(WorkplaceConfig), *fields(ValuesConfig))]
         return MujocoArmRobotConfig(
-            arm=self.arm,
-            base=self.base,
-            tip=self.tip,
             scenario=self.task or "placing",
-            shelf=self.shelf,
             fps=float(self.fps),
-            action_space=self.action_space,
-            velocity=self.velocity,
-            hand=self.hand,
-            pixels=self.pixels,
-            marker=self.marker,
-            moved_camera=self.moved_camera,
-            images=self.images,
+            **{name: getattr(self, name) for name in shared},
         )
 
     @property
@@ -118,13 +91,6 @@ class ArmEnvConfig(EnvConfig):
         else:
             vector = gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
         return {self.type: {0: vector}}
-
-
-# A class of its own: LeRobot takes an environment's type for the name that it was asked for by.
-@EnvConfig.register_subclass("panda")
-@dataclass
-class PandaEnvConfig(ArmEnvConfig):
-    """The same by its former name, `--env.type=panda`."""
 
 
 _PICTURE = (240, 180)

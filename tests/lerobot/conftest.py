@@ -2,14 +2,14 @@
 
 import pytest
 
-from hrc_learn.lerobot.arm_robot import robot_registry
-from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
+from hrc_learn.lerobot.arm_robot import connected_robots
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot, MujocoArmRobotConfig
 
 
 @pytest.fixture(autouse=True)
 def nothing_left_connected():
     yield
-    for robot in robot_registry():
+    for robot in list(connected_robots()):
         robot.disconnect()
 
 

@@ -13,7 +13,7 @@ import pytest
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import smoothing
-from hrc_learn.lerobot.arm_robot import ArmValues
+from hrc_learn.lerobot.arm_values import ArmValues
 from hrc_learn.lerobot.smoothing import (
     ActionLimits,
     calibrated_ranges,

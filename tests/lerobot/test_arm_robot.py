@@ -8,10 +8,12 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmRobot, ArmValues, robot_registry
-from hrc_learn.lerobot.expert_recording import observation_features
+from hrc_learn.lerobot.arm_robot import ArmRobot, connected_robots, find_robot
+from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
+from hrc_learn.lerobot.episode_recording import observation_features
+from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
-from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoArmRobotConfig
 
 READY = panda.ready.numpy()
 VALUES = ArmValues(panda)
@@ -125,20 +127,19 @@ def test_the_hand_is_observed_on_the_side_where_it_was(simulated):
 
 
 def test_a_robot_is_found_by_its_name_or_where_it_is_the_only_one(simulated):
-    registry = robot_registry()
     with pytest.raises(DeviceNotConnectedError, match=r"a robot of hrc.*: none"):
-        registry.find(None)
+        find_robot(None)
     left = simulated(scenario="grasping", id="left")
-    assert registry.find(None) is registry.find("left") is left
+    assert find_robot(None) is find_robot("left") is left
     with pytest.raises(DeviceNotConnectedError, match=r"one robot with id 'right' .* 'left'"):
-        registry.find("right")
+        find_robot("right")
     right = simulated(scenario="grasping", id="right")
-    assert registry.find("right") is right
+    assert find_robot("right") is right
     with pytest.raises(DeviceNotConnectedError, match="'left', 'right'"):
-        registry.find(None)
-    assert list(registry) == [left, right]
+        find_robot(None)
+    assert connected_robots() == [left, right]
     left.disconnect()
-    assert registry.find(None) is right
+    assert find_robot(None) is right
 
 
 def test_an_action_of_the_hand_in_part_is_none_of_it():

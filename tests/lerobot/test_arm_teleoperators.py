@@ -10,9 +10,8 @@ from served_franka import served_franka
 from unchecked import shapes_unchecked
 
 from hrc_learn.kinematics import fr3, panda
-from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmValues
-from hrc_learn.lerobot.teleoperators import ArmExpertConfig, ArmPageConfig
-from hrc_learn.lerobot.teleoperators.arm_teleoperators import GuidedRobot
+from hrc_learn.lerobot.arm_teleoperators import ArmExpertConfig, ArmPageConfig, GuidedRobot
+from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.teleoperation import hand_guiding, page
 

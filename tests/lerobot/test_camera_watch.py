@@ -12,13 +12,8 @@ from lerobot.processor import ProcessorStepRegistry
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import MarkerCamera
-from hrc_learn.lerobot.camera_watch import (
-    CAMERA_WATCH,
-    FEATURE,
-    POSE_NAMES,
-    CameraWatchStep,
-    add_camera_watch,
-)
+from hrc_learn.lerobot.arm_values import HAND, MARKER
+from hrc_learn.lerobot.camera_watch import CAMERA_WATCH, CameraWatchStep, add_camera_watch
 from hrc_learn.lerobot.smoothing import PREPROCESSOR
 
 FPS = 25
@@ -48,18 +43,14 @@ def episode(rng, camera=CAMERA, frames=100):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     root, rng = tmp_path_factory.mktemp("sets") / "set", np.random.default_rng(0)
-    with DatasetWriter(root, FPS, "any", ["a"]) as writer:
+    names = [name.removesuffix(".pos") for name in ("a.pos", *HAND, *MARKER)]
+    with DatasetWriter(root, FPS, "any", names) as writer:
         for _ in range(6):
             writer.start_episode("look")
             pose, pixels = episode(rng)
             for k, pixel in enumerate(pixels):
-                writer.add_frame(
-                    joint_position=[0.01 * k],
-                    position=pose.position[k].numpy(),
-                    orientation=pose.orientation[k].numpy(),
-                    feature=pixel,
-                    feature_visible=True,
-                )
+                state = [0.01 * k, *pose[k].vector().tolist(), *pixel, 1.0]
+                writer.add_frame(joint_position=state)
             writer.save_episode()
     return root
 
@@ -84,39 +75,33 @@ def step(config):
     return ProcessorStepRegistry.get(CAMERA_WATCH)(**config)
 
 
-def rollout(step, dataset, pose, pixels):
+def rollout(step, pose, pixels):
     """Show the step an episode as a robot would."""
-    names = json.loads((dataset / "meta/info.json").read_text())["features"][
-        "observation.state"
-    ]
-    columns = [names["names"].index(name) for name in POSE_NAMES]
     for k, pixel in enumerate(pixels):
-        state = torch.zeros(1, len(names["names"]))
-        state[0, columns] = pose[k].vector().float()
-        feature = torch.tensor([[*pixel, 1.0]], dtype=torch.float32)
-        transition = {TransitionKey.OBSERVATION: {"observation.state": state, FEATURE: feature}}
+        state = torch.tensor([[0.0, *pose[k].vector(), *pixel, 1.0]], dtype=torch.float32)
+        transition = {TransitionKey.OBSERVATION: {"observation.state": state}}
         assert step(transition) is transition
 
 
-def test_a_camera_that_stands_still_is_left_in_peace(step, dataset, caplog):
+def test_a_camera_that_stands_still_is_left_in_peace(step, caplog):
     rng = np.random.default_rng(1)
-    for _ in range(3):
-        rollout(step, dataset, *episode(rng))
+    for _ in range(2):
+        rollout(step, *episode(rng))
         step.reset()
     assert not caplog.records
 
 
-def test_a_moved_camera_is_warned_about_once_an_episode(step, dataset, caplog):
+def test_a_moved_camera_is_warned_about_once_an_episode(step, caplog):
     caplog.set_level(logging.WARNING)
     rng = np.random.default_rng(2)
     moved = CAMERA.moved(np.array([0.0, np.deg2rad(0.5), 0.0, 0.004, 0.0, 0.0]))
-    rollout(step, dataset, *episode(rng, moved))
+    rollout(step, *episode(rng, moved))
     (record,) = caplog.records
     assert "camera moved by" in record.getMessage()
     assert step.motion.displacement > 5
     step.reset()
     assert step.motion is None
-    rollout(step, dataset, *episode(rng, moved))
+    rollout(step, *episode(rng, moved))
     assert len(caplog.records) == 2
 
 
@@ -168,16 +153,16 @@ def test_a_policy_sees_what_there_is_while_the_camera_stands_still(correcting):
     np.testing.assert_allclose(state[9:], CAMERA.project(CAMERA.from_base(OBJECT)), rtol=1e-6)
 
 
-def test_an_unseen_marker_and_missing_observations_are_passed_over(step, dataset):
+def test_an_unseen_marker_and_missing_observations_are_passed_over(step):
     pose, pixels = episode(np.random.default_rng(3))
-    rollout(step, dataset, pose, np.full_like(pixels, np.nan))
+    rollout(step, pose, np.full_like(pixels, np.nan))
     assert step.motion is None
     step({TransitionKey.OBSERVATION: None})
-    step({TransitionKey.OBSERVATION: {FEATURE: torch.zeros(1, 3)}})
+    step({TransitionKey.OBSERVATION: {"observation.environment_state": torch.zeros(1, 3)}})
 
 
 def test_several_environments_at_once_are_refused(step):
-    observation = {"observation.state": torch.zeros(2, 7), FEATURE: torch.zeros(2, 3)}
+    observation = {"observation.state": torch.zeros(2, 10)}
     with pytest.raises(ValueError, match="batch_size"):
         step({TransitionKey.OBSERVATION: observation})
 

@@ -7,9 +7,9 @@ from lerobot.teleoperators import make_teleoperator_from_config
 from unchecked import shapes_unchecked
 
 from hrc_learn.kinematics import panda
+from hrc_learn.lerobot.arm_teleoperators import ArmExpertConfig
 from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
-from hrc_learn.lerobot.robots.mujoco_arm import ImagesConfig
-from hrc_learn.lerobot.teleoperators import ArmExpertConfig
+from hrc_learn.lerobot.mujoco_arm import ImagesConfig
 from hrc_learn.teleoperation.scenarios import make_scenario
 
 FPS = 20

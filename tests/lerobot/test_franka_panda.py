@@ -12,8 +12,8 @@ from served_franka import served_franka
 
 from hrc_learn.hardware import CollisionConfig, DriverError, Load
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.arm_robot import GRIPPER, ArmValues
-from hrc_learn.lerobot.robots import FrankaPandaConfig
+from hrc_learn.lerobot.arm_values import GRIPPER, ArmValues
+from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.protocol_server import serve_world
 

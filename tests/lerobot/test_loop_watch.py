@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.loop_watch import LoopWatch
+from hrc_learn.lerobot.arm_robot import LoopWatch
 from hrc_learn.protocols import ArmState
 
 FPS = 20.0

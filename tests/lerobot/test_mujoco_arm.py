@@ -9,11 +9,10 @@ from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, MARKER, PIXELS, ArmValues
-from hrc_learn.lerobot.loop_watch import LoopWatch
-from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
-from hrc_learn.lerobot.robots.mujoco_arm import MovedCameraConfig
-from hrc_learn.lerobot.teleoperators import ArmExpertConfig
+from hrc_learn.lerobot.arm_robot import LoopWatch
+from hrc_learn.lerobot.arm_teleoperators import ArmExpertConfig
+from hrc_learn.lerobot.arm_values import GRIPPER, HAND, MARKER, PIXELS, ArmValues
+from hrc_learn.lerobot.mujoco_arm import MovedCameraConfig, MujocoArmRobot, MujocoArmRobotConfig
 
 JOINTS = ArmValues(panda).joints
 FPS = 20.0

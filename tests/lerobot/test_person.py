@@ -9,12 +9,12 @@ from unchecked import shapes_unchecked
 from hrc_learn.demos import load_demos
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import person
-from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmValues
-from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
+from hrc_learn.lerobot.arm_teleoperators import GuidedRobot
+from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
+from hrc_learn.lerobot.episode_recording import add_frame, new_dataset
+from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
 from hrc_learn.lerobot.policy.training_samples import read_episodes
-from hrc_learn.lerobot.robots import FrankaPandaConfig
-from hrc_learn.lerobot.teleoperators.arm_teleoperators import GuidedRobot
 from hrc_learn.teleoperation import ScriptedForce
 
 JOINTS, VELOCITIES = ArmValues(panda).joints, ArmValues(panda).velocities

@@ -7,13 +7,17 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import person
-from hrc_learn.lerobot.arm_robot import GRIPPER, ArmValues
-from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
+from hrc_learn.lerobot.arm_values import GRIPPER, ArmValues
+from hrc_learn.lerobot.episode_recording import (
+    CheckpointPolicy,
+    add_frame,
+    new_dataset,
+    record_rollouts,
+)
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 from hrc_learn.lerobot.policy.training_samples import read_episodes
-from hrc_learn.lerobot.robots import MujocoArmRobotConfig
-from hrc_learn.lerobot.rollouts import CheckpointPolicy, record_rollouts
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.teleoperation.scenarios import Grasping
 
@@ -26,7 +30,7 @@ FAR = np.array([0.3, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0])
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     """Fitted to two motions along a line."""
-    from hrc_learn.lerobot.robots import MujocoArmRobot
+    from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot
 
     home = tmp_path_factory.mktemp("home")
     robot = MujocoArmRobot(

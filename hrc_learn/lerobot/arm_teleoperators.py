@@ -14,15 +14,10 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.kinematics import Arm, panda
-from hrc_learn.lerobot.arm_robot import (
-    DOWN,
-    ArmRobot,
-    ArmValues,
-    Device,
-    robot_registry,
-)
+from hrc_learn.lerobot.arm_robot import ArmRobot, Device, find_robot
+from hrc_learn.lerobot.arm_values import DOWN, ArmValues
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot
 from hrc_learn.lerobot.person import RobotPage
-from hrc_learn.lerobot.robots import MujocoArmRobot
 from hrc_learn.protocols import ArmState, Human, HumanInput
 
 if TYPE_CHECKING:
@@ -131,16 +126,13 @@ class ArmTeleoperator(Device, Teleoperator):
 
     def _find(self) -> ArmRobot:
         """The robot that is guided, which is connected after its teleoperator."""
-        return robot_registry().find(self._robot_id)
+        return find_robot(self._robot_id)
 
 
-@TeleoperatorConfig.register_subclass("panda_expert")
 @TeleoperatorConfig.register_subclass("arm_expert")
 @dataclass(kw_only=True)
 class ArmExpertConfig(ArmTeleoperatorConfig):
-    """The script that shows a `mujoco_arm` its scenario; `--teleop.type=arm_expert`, as
-    before `panda_expert`.
-    """
+    """Scripted demonstrator of a `mujoco_arm`; `--teleop.type=arm_expert`."""
 
 
 class ArmExpert(ArmTeleoperator):
@@ -163,13 +155,10 @@ class ArmExpert(ArmTeleoperator):
         return self._guided_robot(robot, lambda: robot.run.expert).next()[0]
 
 
-@TeleoperatorConfig.register_subclass("panda_page")
 @TeleoperatorConfig.register_subclass("arm_page")
 @dataclass(kw_only=True)
 class ArmPageConfig(ArmTeleoperatorConfig):
-    """Person that guides an arm in a browser: `--teleop.type=arm_page`, also registered as
-    `panda_page`.
-    """
+    """Person that guides an arm in a browser; `--teleop.type=arm_page`."""
 
     host: str = "127.0.0.1"
     """Address of the page. Anyone that can reach it can move the arm."""

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import pytest
 from unchecked import shapes_unchecked
 
-from hrc_learn.lerobot import expert_recording
+from hrc_learn.lerobot import episode_recording
+from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 from hrc_learn.lerobot.policy.training_samples import read_episodes
-from hrc_learn.lerobot.robots import MujocoArmRobotConfig
 
 FPS = 10.0
 
@@ -26,7 +26,7 @@ class Short:
 @pytest.fixture
 def outcomes(monkeypatch):
     """Makes demonstrations short, and their outcomes those of a list; keeps their seeds."""
-    seeds, show = [], expert_recording._show
+    seeds, show = [], episode_recording._show
 
     def scripted(results):
         results = iter(results)
@@ -38,7 +38,7 @@ def outcomes(monkeypatch):
             robot.run.scenario = scenario
             return next(results)
 
-        monkeypatch.setattr(expert_recording, "_show", shown)
+        monkeypatch.setattr(episode_recording, "_show", shown)
         return seeds
 
     with shapes_unchecked():
@@ -52,7 +52,7 @@ def config(folder):
 def test_what_fails_is_shown_again_from_the_next_seed(tmp_path, outcomes):
     seeds = outcomes([True, False, True])
     folder = tmp_path / "set"
-    told = list(expert_recording.record_expert(folder, config(tmp_path), episodes=2))
+    told = list(episode_recording.record_expert(folder, config(tmp_path), episodes=2))
     assert told == [(1, True), (1, False), (2, True)]
     assert seeds == [5, 6, 7]
     episodes = read_episodes(folder, ["action", "observation.state"])
@@ -62,7 +62,7 @@ def test_what_fails_is_shown_again_from_the_next_seed(tmp_path, outcomes):
 
 def test_more_failures_than_successes_are_too_many(tmp_path, outcomes):
     outcomes([False] * 9)
-    recording = expert_recording.record_expert(tmp_path / "set", config(tmp_path), episodes=2)
+    recording = episode_recording.record_expert(tmp_path / "set", config(tmp_path), episodes=2)
     assert [next(recording) for _ in range(4)] == [(0, False)] * 4
     with pytest.raises(RuntimeError, match="4 of 4 demonstrations failed"):
         next(recording)

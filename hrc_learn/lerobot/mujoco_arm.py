@@ -16,7 +16,8 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import ArmChoice
-from hrc_learn.lerobot.arm_robot import DOWN, MARKER, PIXELS, ArmRobot, ArmRobotConfig
+from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
+from hrc_learn.lerobot.arm_values import DOWN, MARKER, PIXELS
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.protocols import Arm
 from hrc_learn.teleoperation.scenarios import check_scenario, make_scenario
@@ -45,7 +46,7 @@ class ImagesConfig:
 
 @dataclass
 class MovedCameraConfig:
-    """The fixed camera stands elsewhere than in demonstrations, and still sees the table."""
+    """Displacement of the fixed camera; it still sees the table."""
 
     distance: float = 0.0
     """Distance by which it is moved [m]."""
@@ -55,14 +56,9 @@ class MovedCameraConfig:
     """Random seed of both directions."""
 
 
-@RobotConfig.register_subclass("mujoco_panda")
-@RobotConfig.register_subclass("mujoco_arm")
 @dataclass(kw_only=True)
-class MujocoArmRobotConfig(ArmRobotConfig):
-    """An arm in our MuJoCo workplace; `--robot.type=mujoco_arm`, as before `mujoco_panda`.
-
-    `fps` counts commands a second of simulated time.
-    """
+class WorkplaceConfig:
+    """Settings of the simulated workplace, the same for robot and environment."""
 
     arm: str = "panda"
     """Registered name of the arm, or its URDF or MJCF file."""
@@ -70,12 +66,8 @@ class MujocoArmRobotConfig(ArmRobotConfig):
     """Link of such a file that is the arm's base; empty: its root."""
     tip: str = ""
     """Link of such a file that is the arm's flange; empty: its only end."""
-    scenario: str = "placing"
-    """Task: "placing" or "grasping"."""
     shelf: str = "middle"
     """Target shelf: "lower", "middle" or "upper"."""
-    seed: int = 0
-    """Seed of the first initial configuration; each reset increments it."""
     pixels: bool = False
     """Observe the pixel of the object in the fixed camera at the start of the episode, which a
     policy needs to grasp without images.
@@ -88,12 +80,26 @@ class MujocoArmRobotConfig(ArmRobotConfig):
     """Displacement of the fixed camera from its pose in the demonstrations."""
     images: ImagesConfig = field(default_factory=ImagesConfig)
     """Images to be observed."""
+
+
+@RobotConfig.register_subclass("mujoco_arm")
+@dataclass(kw_only=True)
+class MujocoArmRobotConfig(WorkplaceConfig, ArmRobotConfig):
+    """An arm in our MuJoCo workplace; `--robot.type=mujoco_arm`.
+
+    `fps` counts commands a second of simulated time.
+    """
+
+    scenario: str = "placing"
+    """Task: "placing" or "grasping"."""
+    seed: int = 0
+    """Seed of the first initial configuration; each reset increments it."""
     imperfections: float = 0.0
     """Size of the errors of arm, calibration and workplace, in multiples of the nominal ones;
-    each seed draws its own. 0: there are none."""
+    each seed draws its own."""
     episode_time: float = 0.0
-    """Begin anew when this much time [s] has passed, as `--dataset.episode_time_s` says when
-    lerobot-record ends an episode, of which it tells a robot nothing; 0: never."""
+    """Time [s] after which the scenario starts again, equal to `--dataset.episode_time_s`:
+    lerobot-record does not report the end of an episode. 0: never."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -213,14 +219,14 @@ class MujocoArmRobot(ArmRobot):
         return values
 
     def _look_at_marker(self) -> tuple[float, float, float]:
-        """Its pixel, or the last one, and whether it is seen."""
+        """Pixel of the marker, or the last one, and 1 while it is visible, else 0."""
         pixel = self.run.tool_pixel()
         u, v = self._marker[:2] if pixel is None else pixel.tolist()
         self._marker = (u, v, float(pixel is not None))
         return self._marker
 
     def _begin_anew_in_time(self) -> None:
-        """True if the recorder starts its next episode.
+        """Start the scenario again when the recorder starts its next episode.
 
         The recorder ends an episode at the first frame that would be late, and saving takes
         longer than a frame. The threshold allows this much for a last frame, however busy the
@@ -241,7 +247,7 @@ class MujocoArmRobot(ArmRobot):
         super().disconnect()
 
     def _warn_of_half_an_episode(self) -> None:
-        """True if the time limit or a late loop ended the episode before the task was done."""
+        """Warn if the time limit or a late loop ended the episode before the task was done."""
         shown, whole = self.dt * self.run.commands, self.run.scenario.duration
         if not self.run.succeeded():
             logger.warning(
@@ -255,7 +261,7 @@ class MujocoArmRobot(ArmRobot):
             )
 
     def begin(self, seed: int) -> None:
-        """Put everything in place as a seed has it."""
+        """Start the scenario of a seed."""
         self._loop.end()
         self.run.begin(seed)
         self._looked = 0.0
