@@ -1,11 +1,11 @@
-"""Filters and derivatives of recorded signals, at even or uneven stamps."""
+"""Filters, derivatives and rests of recorded signals, at even or uneven stamps."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.geometry import quaternion
@@ -43,7 +43,10 @@ def local_polynomial(
         raise ValueError(
             f"{len(time)} samples do not determine a polynomial of degree {degree}"
         )
-    neighbours = _neighbours(time, window, degree)
+    count = round(window / float(np.median(np.diff(time))))
+    count = min(max(count, degree + 2) | 1, len(time))  # an odd number around each sample
+    first = np.clip(np.arange(len(time)) - count // 2, 0, len(time) - count)
+    neighbours = first[:, None] + np.arange(count)
     offset = time[neighbours] - time[:, None]
     # Scaled to -1..1 for a well-conditioned fit.
     scale = np.abs(offset).max(1, keepdims=True)
@@ -51,16 +54,6 @@ def local_polynomial(
     Q, R = np.linalg.qr(powers)
     coefficients = np.linalg.solve(R, Q.mT @ values[neighbours])
     return coefficients[:, 0], coefficients[:, 1] / scale
-
-
-def _neighbours(
-    time: Float64[np.ndarray, " frames"], window: float | int, degree: int
-) -> np.ndarray:
-    """Indices (frames, neighbours) of an odd number of samples around each sample."""
-    count = round(window / float(np.median(np.diff(time))))
-    count = min(max(count, degree + 2) | 1, len(time))
-    first = np.clip(np.arange(len(time)) - count // 2, 0, len(time) - count)
-    return first[:, None] + np.arange(count)
 
 
 MOVING_FIELDS = (
@@ -135,19 +128,14 @@ def butterworth(
             "with savitzky_golay, which accepts uneven ones"
         )
     rate = 1 / steps.mean()
-    if not 0 < cutoff < rate / 2:
-        raise ValueError(f"cutoff must be between 0 and {rate / 2:.4g} Hz, got {cutoff:.4g}")
     correction = (np.sqrt(2) - 1) ** (1 / (2 * order))
     # Bilinear transform: the correction applies to the frequencies of the analogue filter.
     raised = np.arctan(np.tan(np.pi * cutoff / rate) / correction) * rate / np.pi
     sections = np.asarray(butter(order, raised, fs=rate, output="sos"))
-    reflected = 3 * (order + 1)
-    if len(demo) <= reflected:
-        raise ValueError(
-            f"{len(demo)} frames are too few for this filter: it needs at least {reflected + 1}"
-        )
     return _filtered(
-        demo, fields, lambda values: sosfiltfilt(sections, values, axis=0, padlen=reflected)
+        demo,
+        fields,
+        lambda values: sosfiltfilt(sections, values, axis=0, padlen=3 * (order + 1)),
     )
 
 
@@ -162,24 +150,20 @@ def _filtered(
     for name in fields:
         if name not in demo.recorded:
             continue
-        values = _filterable(demo, name)
+        if name in ("time", "feature_visible"):
+            raise ValueError(f"{name} cannot be smoothed")
+        seen = demo.feature_visible
+        if name == "feature" and seen is not None and not seen.all():
+            raise ValueError(
+                f"the feature is not visible at frame {int(np.argmin(seen))}: cut the "
+                f"demonstration to the visible part, or do not smooth the feature"
+            )
+        values = getattr(demo, name)
         result = smooth(values.reshape(len(demo), -1)).reshape(values.shape)
         if name == "orientation":
             result /= np.linalg.norm(result, axis=1, keepdims=True)
         smoothed[name] = result
     return replace(demo, **smoothed)
-
-
-def _filterable(demo: Demonstration, name: str) -> np.ndarray:
-    if name in ("time", "feature_visible"):
-        raise ValueError(f"{name} cannot be smoothed")
-    seen = demo.feature_visible
-    if name == "feature" and seen is not None and not seen.all():
-        raise ValueError(
-            f"the feature is not visible at frame {int(np.argmin(seen))}: cut the "
-            f"demonstration to the visible part, or do not smooth the feature"
-        )
-    return getattr(demo, name)
 
 
 def estimate_joint_velocity(
@@ -233,3 +217,108 @@ def estimate_twist(
     product = quaternion.multiply(q_dot, quaternion.conjugate(q))
     angular = 2 * product[:, 1:] / q.square().sum(1, keepdim=True)
     return np.hstack([linear, angular.numpy()])
+
+
+_JOINT_REST, _LINEAR_REST = (0.01, 0.04), (0.003, 0.01)
+"""Speeds below which a rest begins and above which it ends, of the fastest joint [rad/s], and
+of the end effector [m/s]. Between them, the last state persists: a speed close to one bound
+does not split a recording."""
+_SHORTEST_REST = 0.3
+"""Shortest rest [s]; shorter ones, as at a turning point, belong to the motion."""
+_REST_WINDOW = 0.15
+"""Width of the neighbourhood for speeds [s]."""
+
+
+def resting(demo: Demonstration) -> Bool[np.ndarray, " _frames"]:
+    """Mask of frames in which the joints, or else the end effector, rest.
+
+    Raises:
+        ValueError: The demonstration holds neither joint nor Cartesian positions, or too few
+            frames to estimate a speed.
+    """
+    joints = demo.joint_position
+    values = demo.position if joints is None else joints
+    if values is None:
+        raise ValueError("rest is found in joint positions or positions; neither is recorded")
+    _, rates = local_polynomial(demo.time, values, window=_REST_WINDOW, degree=2)
+    speed = np.linalg.norm(rates, axis=1) if joints is None else np.abs(rates).max(1)
+    low, high = _LINEAR_REST if joints is None else _JOINT_REST
+    state = np.where(speed > high, 1, np.where(speed < low, -1, 0))
+    # The arm moves before the first clear state.
+    last = np.maximum.accumulate(np.where(state != 0, np.arange(len(demo)), -1))
+    still = np.where(last >= 0, state[last], 1) < 0
+    for start, stop in _runs(still):
+        if demo.time[stop - 1] - demo.time[start] < _SHORTEST_REST:
+            still[start:stop] = False
+    return still
+
+
+def cut(demo: Demonstration, start: int, stop: int) -> Demonstration:
+    """Frames `start` to `stop` (exclusive) of a demonstration; time begins at zero again.
+
+    Raises:
+        ValueError: The range is empty or exceeds the demonstration.
+    """
+    if not 0 <= start < stop <= len(demo):
+        raise ValueError(
+            f"frames {start} to {stop} are no part of a demonstration of {len(demo)} frames"
+        )
+    rows = {name: getattr(demo, name)[start:stop] for name in demo.recorded}
+    rows["time"] = demo.time[start:stop] - demo.time[start]
+    return replace(
+        demo,
+        **rows,
+        start_time=demo.start_time + float(demo.time[start]),
+        extra={key: values[start:stop] for key, values in demo.extra.items()},
+    )
+
+
+def trim_rest(demo: Demonstration, keep: float | int = 0.1) -> Demonstration:
+    """Trim the rest before and after the motion.
+
+    Args:
+        demo: The demonstration.
+        keep: Rest left at either end [s], so that the motion begins and ends at rest.
+
+    Raises:
+        ValueError: As in `resting`, or the arm never moves.
+    """
+    moving = np.flatnonzero(~resting(demo))
+    if not len(moving):
+        raise ValueError(f"episode {demo.episode}: the arm rests all the time")
+    return _with_margin(demo, int(moving[0]), int(moving[-1]) + 1, keep)
+
+
+def split_at_rest(
+    demo: Demonstration, *, shortest: float | int = 0.5, keep: float | int = 0.1
+) -> list[Demonstration]:
+    """Split a demonstration into the motions between rests.
+
+    Args:
+        demo: Demonstration of several motions, such as the parts of a task.
+        shortest: Duration below which motions are left out [s].
+        keep: Rest left at either end of each motion [s].
+
+    Raises:
+        ValueError: As in `resting`.
+    """
+    return [
+        _with_margin(demo, start, stop, keep)
+        for start, stop in _runs(~resting(demo))
+        if demo.time[stop - 1] - demo.time[start] >= shortest
+    ]
+
+
+def _runs(flags: Bool[np.ndarray, " frames"]) -> list[tuple[int, int]]:
+    """First frame and exclusive end of every run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
+def _with_margin(
+    demo: Demonstration, start: int, stop: int, keep: float | int
+) -> Demonstration:
+    time = demo.time
+    first = int(np.searchsorted(time, time[start] - keep))
+    behind = int(np.searchsorted(time, time[stop - 1] + keep, side="right"))
+    return cut(demo, first, behind)

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, freqz, savgol_filter
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.demos.preprocessing import (
-    RestCriterion,
     align,
     at_times,
     butterworth,
@@ -97,23 +96,6 @@ def test_a_regular_demonstration_resampled_to_its_own_rate_is_itself():
     assert len(again) == 120
     for name in demo.recorded:
         np.testing.assert_allclose(getattr(again, name), getattr(demo, name), atol=1e-12)
-
-
-def test_straight_lines_and_turns_at_constant_rate_are_scipys():
-    demo = swing(jittered(40))
-    times = np.sort(np.random.default_rng(1).uniform(0, demo.duration, 90))
-    moved = at_times(demo, times, "linear")
-    for k in range(2):
-        expected = np.interp(times, demo.time, demo.joint_position[:, k])
-        np.testing.assert_allclose(moved.joint_position[:, k], expected, atol=1e-12)
-    slerp = Slerp(demo.time, Rotation.from_quat(demo.orientation, scalar_first=True))(times)
-    assert angle(moved.orientation, slerp.as_quat(scalar_first=True)).max() < 1e-7
-
-
-def test_orientations_at_rest_stay_finite():
-    time = np.arange(10) / 50
-    demo = swing(time, orientation=np.tile([1.0, 0, 0, 0], (10, 1)))
-    np.testing.assert_allclose(at_times(demo, time[:-1] + 0.01, "linear").orientation[:, 0], 1)
 
 
 def test_what_is_counted_or_seen_is_not_averaged():
@@ -210,9 +192,9 @@ def test_filters_say_what_they_need():
     with pytest.raises(ValueError, match="needs even stamps"):
         butterworth(swing(jittered()), cutoff=5)
     even = swing(np.arange(100) / 50)
-    with pytest.raises(ValueError, match="between 0 and 25 Hz"):
-        butterworth(even, cutoff=30)
-    with pytest.raises(ValueError, match="8 frames are too few"):
+    with pytest.raises(ValueError, match="fs/2"):
+        butterworth(even, cutoff=25)
+    with pytest.raises(ValueError, match="padlen"):
         butterworth(cut(even, 0, 8), cutoff=5)
     lost = replace(even, feature=np.zeros((100, 2)), feature_visible=np.arange(100) != 7)
     with pytest.raises(ValueError, match="not visible at frame 7"):
@@ -256,9 +238,6 @@ def test_a_speed_between_the_bounds_changes_nothing():
     q = np.cumsum(speed)[:, None] * 0.01
     demo = swing(time, joint_position=np.hstack([q, q]), joint_velocity=None)
     assert not resting(demo).any()
-    assert resting(demo, RestCriterion(joint_speed=(0.03, 0.04))).sum() == pytest.approx(
-        100, abs=20
-    )
 
 
 def test_an_arm_moves_until_it_clearly_rests_and_rests_until_it_clearly_moves():
@@ -346,14 +325,13 @@ def warped(time, strength):
     return time[-1] * (s + strength * np.sin(np.pi * s) ** 2)
 
 
-def test_a_rest_as_long_as_the_shortest_is_one():
-    demo = with_rests()
-    still = resting(demo, RestCriterion(shortest=0.0))
-    inner = np.flatnonzero(still & (demo.time > 2) & (demo.time < 4.5))
-    lasts = demo.time[inner[-1]] - demo.time[inner[0]]
-    assert lasts > 0.5
-    assert resting(demo, RestCriterion(shortest=lasts - 1e-9))[inner].all()
-    assert not resting(demo, RestCriterion(shortest=lasts + 1e-9))[inner].any()
+@pytest.mark.parametrize(("rest", "counts"), [(0.5, True), (0.2, False)])
+def test_a_rest_shorter_than_0_3_s_belongs_to_the_motion(rest, counts):
+    time = np.arange(400) / 100
+    speed = np.where(np.abs(time - 2) < rest / 2, 0.0, 0.5)
+    q = np.cumsum(speed)[:, None] * 0.01
+    still = resting(swing(time, joint_position=np.hstack([q, q]), joint_velocity=None))
+    assert still.any() == counts
 
 
 def test_demonstrations_are_brought_to_the_timing_of_one():
@@ -396,7 +374,7 @@ def test_poses_are_aligned_too_and_the_median_leads():
             for strength, stretch in ((0.1, 1.4), (0.0, 1.0), (-0.1, 0.7))
         ]
     )
-    aligned = align(demos, band=None)
+    aligned = align(demos)
     for demo in aligned:
         np.testing.assert_array_equal(demo.time, demos[1].time)
         assert angle(demo.orientation, demos[1].orientation).mean() < 0.03
