@@ -280,7 +280,7 @@ def align(demos: DemonstrationSet, reference: int | None = None) -> Demonstratio
 def _scale(name: str, motions: list[np.ndarray]) -> np.ndarray:
     """Range of each component over all motions, of orientations the largest rotation."""
     if name == "orientation":
-        ranges = np.array(max(_angles(q, q[:1]).max() for q in motions))
+        ranges = np.array([max(_angles(q, q[:1]).max() for q in motions)])
     else:
         ranges = np.ptp(np.concatenate(motions), axis=0)
     return np.maximum(ranges, 1e-9)  # a component at rest has no range to divide by

@@ -22,11 +22,7 @@ from hrc_learn.demos.quality.decisions import (
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.quality.ranking import (
-    density_clusters,
-    log_dimensionless_jerk,
-    rank_episodes,
-)
+from hrc_learn.demos.quality.ranking import log_dimensionless_jerk, rank_episodes
 from hrc_learn.teleoperation.curation_page import CurationPage
 
 NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]
@@ -145,25 +141,6 @@ def test_jerk_knows_neither_units_nor_pace():
     assert log_dimensionless_jerk(s, path) == pytest.approx(exact, abs=0.05)
     assert log_dimensionless_jerk(3 * s, 57.3 * path) == pytest.approx(exact, abs=0.05)
     assert np.isnan(log_dimensionless_jerk(s, np.zeros((400, 2))))
-
-
-def test_density_clusters_are_those_of_the_definition():
-    rng = np.random.default_rng(1)
-    points = np.concatenate(
-        [rng.normal(0, 0.1, (30, 2)), rng.normal(3, 0.1, (12, 2)), [[1.5, 1.5]]]
-    )
-    labels = density_clusters(points, 0.3, 3)
-    near = np.linalg.norm(points[:, None] - points, axis=-1) <= 0.3
-    core = near.sum(1) - 1 >= 3
-    for i, label in enumerate(labels):
-        of_cores = {int(labels[j]) for j in np.flatnonzero(near[i] & core)}
-        assert (label in of_cores) if of_cores else label == -1
-        assert not core[i] or of_cores == {label}
-    assert (labels[:30] == 0).sum() > 25
-    assert labels[-1] == -1
-    # A group that is many steps long.
-    chain = 0.2 * np.arange(200.0)[:, None]
-    assert not density_clusters(np.concatenate([chain, chain + 50]), 0.3, 1)[:200].any()
 
 
 # What is decided.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
@@ -42,11 +42,9 @@ _DIMENSIONS = 16
 """Principal components for distances: a neighbour search in more is far slower."""
 _NEIGHBOURS = 3
 _REACH = 2.0
-"""Radius of a cluster, in usual distances to the third neighbour."""
+"""Distance of neighbours in a cluster, in usual distances to the third neighbour."""
 _SAME = 0.05
 """Fraction of the usual distance to the nearest episode below which an episode is a repeat."""
-_BATCH = 32
-"""Points whose neighbours are found at once."""
 
 
 @dataclass(kw_only=True)
@@ -293,10 +291,11 @@ def _compare(
     shapes: Mapping[int, Float64[np.ndarray, " numbers"]],
 ) -> None:
     """Find clusters, repeats, and the distance of each episode from its neighbours."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    widths = {len(shape) for shape in shapes.values()}
-    if len(shapes) <= _NEIGHBOURS or len(widths) != 1:
+    if len(shapes) <= _NEIGHBOURS or len({len(shape) for shape in shapes.values()}) != 1:
         return
     indices = [*shapes]
     points = _principal_components(np.stack([*shapes.values()]))
@@ -306,10 +305,15 @@ def _compare(
     reach = float(np.median(distances[:, -1]))
     if reach <= 0:
         return
-    labels = density_clusters(points, _REACH * reach, _NEIGHBOURS)
+    one, other = np.nonzero(distances <= _REACH * reach)
+    edges = (np.ones(len(one)), (one, neighbours[one, other]))
+    labels = connected_components(coo_array(edges, shape=(len(points), len(points))))[1]
+    # The largest cluster is number 0; a few odd episodes are none.
+    clusters = [c for c, size in Counter(labels.tolist()).most_common() if size > _NEIGHBOURS]
     for number, index in enumerate(indices):
         quality = qualities[index]
-        quality.cluster = int(labels[number])
+        if labels[number] in clusters:
+            quality.cluster = clusters.index(labels[number])
         quality.place = float(points[number, 0]), float(points[number, 1])
         quality.measures["distance"] = float(distances[number, 1:].mean() / reach)
         # The later one of two similar episodes is the repeat.
@@ -329,56 +333,9 @@ def _principal_components(
     # A component that rests in most episodes must not dominate.
     scale = np.maximum(scale, 0.05 * scale.max())
     centred = ((columns - np.median(columns, axis=0)) / scale).reshape(len(shapes), -1)
-    # Outliers would determine all components.
-    # Twenty ranges: far beyond any motion of the same task.
-    centred = np.clip(centred, -20, 20)
-    # The smaller of both products, whose principal axes span the same space.
-    if centred.shape[1] <= len(centred):
-        axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1][:, :_DIMENSIONS]
-        return centred @ axes / np.sqrt(_PHASES)
-    values, vectors = np.linalg.eigh(centred @ centred.T)
-    main = np.sqrt(np.maximum(values[::-1][:_DIMENSIONS], 0.0))
-    return vectors[:, ::-1][:, :_DIMENSIONS] * main / np.sqrt(_PHASES)
-
-
-def density_clusters(
-    points: Float64[np.ndarray, "points dimensions"], radius: float, neighbours: int
-) -> Int64[np.ndarray, " points"]:
-    """Clusters of close points by density (DBSCAN).
-
-    Points with enough neighbours are cores, cores within the radius form a cluster, and other
-    points belong to the cluster of a core within the radius (Ester et al. 1996, "A
-    density-based algorithm for discovering clusters").
-
-    Args:
-        points: Points to cluster.
-        radius: Largest distance of neighbours.
-        neighbours: Number of neighbours that make a point a core.
-
-    Returns:
-        Cluster of each point, the largest cluster 0; -1 for none.
-    """
-    from scipy.spatial import KDTree
-
-    tree = KDTree(points)
-    # Each point is its own neighbour.
-    core = tree.query_ball_point(points, radius, return_length=True) > neighbours
-    labels = np.full(len(points), -1)
-    for group, seed in enumerate(np.flatnonzero(core)):
-        if labels[seed] >= 0:
-            continue
-        labels[seed] = group
-        front = np.array([seed])
-        while len(front):
-            # In batches: all pairs of a dense cluster are too many to hold.
-            near = tree.query_ball_point(points[front[:_BATCH]], radius)
-            reached = np.unique(np.concatenate([*near]).astype(int))
-            new = reached[labels[reached] < 0]
-            labels[new] = group
-            front = np.concatenate([front[_BATCH:], new[core[new]]])
-    known, sizes = np.unique(labels[labels >= 0], return_counts=True)
-    order = {int(label): rank for rank, label in enumerate(known[np.argsort(-sizes)])}
-    return np.array([order.get(int(label), -1) for label in labels])
+    # Outliers would determine all components: twenty ranges are beyond any such motion.
+    left, sizes, _ = np.linalg.svd(np.clip(centred, -20, 20), full_matrices=False)
+    return (left * sizes)[:, :_DIMENSIONS] / np.sqrt(_PHASES)
 
 
 @dataclass(frozen=True)
