@@ -16,7 +16,7 @@ from hrc_learn.cli._settings import with_settings
 from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
 from hrc_learn.cli.arguments import FitImageJacobian, FitPrimitives
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos, thumbnails
-from hrc_learn.demos.read.opened_dataset import open_dataset
+from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.jacobian import (
     CellErrors,
     EvidenceConfig,

@@ -21,7 +21,7 @@ from hrc_learn.demos import (
 )
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.contract import keep_contract
-from hrc_learn.demos.read.opened_dataset import open_dataset
+from hrc_learn.demos.read.source import open_dataset
 
 STATE = "observation.state"
 NAMES = ["shoulder.pos", "elbow.pos", "gripper.pos"]
@@ -301,7 +301,7 @@ def test_what_cannot_be_understood_or_written_is_said(root, tmp_path, monkeypatc
     def refuse(*_):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("hrc_learn.demos.read.opened_dataset.keep_contract", refuse)
+    monkeypatch.setattr("hrc_learn.demos.read.source.keep_contract", refuse)
     assert "Permission denied" in keep_first_contract(root)
 
 

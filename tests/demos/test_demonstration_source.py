@@ -17,7 +17,7 @@ from hrc_learn.demos import (
     open_demos,
 )
 from hrc_learn.demos.read import frames
-from hrc_learn.demos.read.opened_dataset import open_dataset
+from hrc_learn.demos.read.source import open_dataset
 
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
@@ -109,10 +109,10 @@ def test_nothing_is_read_where_no_unit_must_be_guessed(tmp_path, monkeypatch):
     entries = dataset.folder.episodes
     rows = count_rows(monkeypatch)
     assert (
-        dataset.survey_units(entries, {"joint_position": "rad"})["joint_position"].unit == "rad"
+        dataset.decide_units(entries, {"joint_position": "rad"})["joint_position"].unit == "rad"
     )
     assert not rows
-    dataset.survey_units(entries, {})
+    dataset.decide_units(entries, {})
     assert sum(rows) == sum(LENGTHS)
 
 

@@ -27,7 +27,7 @@ from hrc_learn.demos import (
     load_demos,
     repair_dataset,
 )
-from hrc_learn.demos.read.opened_dataset import open_dataset
+from hrc_learn.demos.read.source import open_dataset
 
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]

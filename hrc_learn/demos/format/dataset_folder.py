@@ -1,7 +1,8 @@
 """Folder of a LeRobot dataset: its metadata in one form for the versions 2.0, 2.1 and 3.0."""
 
 import shlex
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
@@ -345,3 +346,86 @@ def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
         index: {key: s for key, s in statistics.items() if s.keys() >= _REQUIRED}
         for index, statistics in found.items()
     }
+
+
+EpisodeFilter = Callable[[EpisodeEntry], bool]
+"""True for an episode that is wanted, by its `index`, `length` and `tasks`."""
+
+
+def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
+    """Contradictions between the counts of episodes and frames in the metadata."""
+    entries, info = folder.episodes, folder.info
+    if not entries:
+        yield DatasetError("the dataset holds no episodes", file=folder.root)
+    for name, counted in (
+        ("total_episodes", len(entries)),
+        ("total_frames", sum(entry.length for entry in entries)),
+    ):
+        if info.get(name, counted) != counted:
+            yield DatasetError(
+                f"says {info[name]}, but the list of episodes counts {counted}: episodes were "
+                f"lost, or the file belongs to another copy; hrc repair counts anew",
+                file=INFO_PATH,
+                key=name,
+            )
+    repeated = [index for index, n in Counter(e.index for e in entries).items() if n > 1]
+    for index in repeated:
+        yield DatasetError("is listed more than once", file="meta/episodes", episode=index)
+    missing = sorted(set(range(len(entries))) - {entry.index for entry in entries})
+    if missing and not repeated:
+        yield DatasetError(
+            "is missing from the list of episodes: indices must count from 0 without a gap",
+            file="meta/episodes",
+            episode=missing[0],
+        )
+    for entry in entries:
+        if entry.length <= 0:
+            yield entry.error("has no frames")
+
+
+def select_episodes(
+    folder: DatasetFolder,
+    episodes: Sequence[int] | None = None,
+    tasks: str | Sequence[str] | None = None,
+    where: EpisodeFilter | None = None,
+) -> tuple[EpisodeEntry, ...]:
+    """Episodes wanted, in the order wanted.
+
+    Args:
+        folder: The dataset.
+        episodes: Indices of the episodes; None for all, in their order.
+        tasks: Select episodes of one of these tasks.
+        where: Select episodes for which this is true.
+
+    Raises:
+        DatasetError: An episode or task does not exist, or no episode is left.
+    """
+    by_index = {entry.index: entry for entry in folder.episodes}
+    if not by_index:
+        raise DatasetError("the dataset holds no episodes", file=folder.root)
+    indices = [*by_index] if episodes is None else episodes
+    if not len(indices):
+        raise DatasetError("no episode was asked for; None reads all", file=folder.root)
+    for index in indices:
+        if index not in by_index:
+            raise DatasetError(
+                f"there is no such episode; the dataset has {min(by_index)} to {max(by_index)}",
+                file=folder.root,
+                episode=index,
+            )
+    chosen = [by_index[index] for index in indices]
+    if tasks is not None:
+        wanted = {tasks} if isinstance(tasks, str) else {*tasks}
+        known = {task for entry in folder.episodes for task in entry.tasks}
+        if unknown := sorted(wanted - known):
+            raise DatasetError(
+                f"no episode shows the task {unknown[0]!r}; the list of episodes has "
+                f"{', '.join(map(repr, sorted(known))) or 'none'}",
+                file=folder.root,
+            )
+        chosen = [entry for entry in chosen if wanted & {*entry.tasks}]
+    if where is not None:
+        chosen = [entry for entry in chosen if where(entry)]
+    if not chosen:
+        raise DatasetError("no episode is left by the filters given", file=folder.root)
+    return tuple(chosen)

@@ -24,8 +24,8 @@ from hrc_learn.demos.read.columns import (
 )
 from hrc_learn.demos.read.contract import Contract, infer_contract
 from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quantities
-from hrc_learn.demos.read.opened_dataset import OpenedDataset
 from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
+from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import (
     Quantities,
     UnitDecision,

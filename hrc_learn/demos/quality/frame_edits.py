@@ -13,8 +13,8 @@ from hrc_learn.demos.preprocessing import trim_rest
 from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.frames import RawFrames, select_quantities
-from hrc_learn.demos.read.opened_dataset import OpenedDataset
 from hrc_learn.demos.read.quantities import is_hand
+from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities, UnitDecision
 
 _PAUSE = 0.1

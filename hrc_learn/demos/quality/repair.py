@@ -25,8 +25,8 @@ from hrc_learn.demos.quality.value_edits import fix_signs, resample_to_grid, unw
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.contract import fingerprint
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
-from hrc_learn.demos.read.opened_dataset import OpenedDataset
 from hrc_learn.demos.read.quantities import INDEX_KEYS
+from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities, units_from_episodes
 from hrc_learn.demos.write.assembly import assemble
 from hrc_learn.demos.write.episode import episode_path

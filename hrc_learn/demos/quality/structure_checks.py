@@ -15,6 +15,7 @@ from hrc_learn.demos.format.dataset_files import INFO_PATH, open_parquet, read_j
 from hrc_learn.demos.format.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
+    count_faults,
     dataset_folder,
     read_episodes,
     read_info,
@@ -30,7 +31,6 @@ from hrc_learn.demos.read.frames import (
     to_numpy,
     width_fault,
 )
-from hrc_learn.demos.read.opened_dataset import count_faults
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 _BATCH_ROWS = 2**14

@@ -9,8 +9,7 @@ from jaxtyping import Float64
 from numpy.lib.stride_tricks import sliding_window_view
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.preprocessing import resample
-from hrc_learn.demos.preprocessing import nearest_frames
+from hrc_learn.demos.preprocessing import nearest_frames, resample
 from hrc_learn.demos.quality.frame_edits import ColumnSemantics, EpisodeEdit
 from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.profiles import is_discrete, profile_columns

@@ -1,6 +1,7 @@
 """Frames of episodes as raw arrays, in the types and units they have on disk."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby, pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float64, Shaped
 from hrc_learn.demos.format.dataset_files import open_parquet, read_table, row_group_starts
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.units import Quantities
 
 RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]
@@ -202,6 +203,66 @@ def disk_runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
         cuts.append(cuts[-1] + (here <= before))
     for _, run in groupby(zip(cuts, entries, strict=True), key=lambda pair: pair[0]):
         yield [entry for _, entry in run]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawEpisode:
+    """One episode in the units on disk."""
+
+    entry: EpisodeEntry
+    frames: RawFrames
+    quantities: Quantities
+
+
+def read_quantities(
+    folder: DatasetFolder,
+    columns: ColumnMapping,
+    entries: Sequence[EpisodeEntry],
+    roles: Iterable[str] | None = None,
+) -> Iterator[RawEpisode]:
+    """Read the quantities of episodes one after another, in the order they lie on disk.
+
+    Args:
+        folder: The dataset.
+        columns: Meaning of its columns.
+        entries: Episodes wanted, in any order, once each.
+        roles: Quantities wanted; None for all, and all extra columns.
+
+    Raises:
+        DatasetError: An episode cannot be read, or holds values that are not finite.
+    """
+    selections, extra = columns.selections, columns.extra
+    if roles is not None:
+        selections, extra = {role: selections[role] for role in roles}, ()
+    keys = {key for s in selections.values() for key, _ in s.columns} | {*extra}
+    on_disk = sorted(entries, key=lambda entry: (entry.file, entry.start))
+    for entry, frames in read_frames(folder, on_disk, sorted(keys)):
+        quantities = select_quantities(frames, selections)
+        _require_finite(entry, quantities, selections)
+        yield RawEpisode(entry=entry, frames=frames, quantities=quantities)
+
+
+def _require_finite(
+    entry: EpisodeEntry, quantities: Quantities, selections: Mapping[str, ColumnSelection]
+) -> None:
+    """Check all values; those of a feature that was not seen become 0."""
+    seen = quantities.get("feature_visible")
+    for role, values in quantities.items():
+        # The sum is finite unless a value is not: far cheaper than a mask.
+        if np.isfinite(values.sum()):
+            continue
+        bad = ~np.isfinite(values)
+        if role == "feature" and seen is not None:
+            values[bad & (seen == 0)] = 0.0
+            bad &= seen != 0
+        if bad.any():
+            frame, component = (int(i) for i in np.argwhere(bad)[0])
+            raise entry.error(
+                f"{role} is {values[frame, component]} there; leave the episode out "
+                f"(episodes=[...]) or repair the recording",
+                frame=frame,
+                key=selections[role].column_name(component),
+            )
 
 
 def select_quantities(

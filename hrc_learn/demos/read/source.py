@@ -1,6 +1,10 @@
 """Demonstrations read from a LeRobot dataset, at once or one after another."""
 
+import contextlib
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol, overload, runtime_checkable
 
@@ -12,20 +16,221 @@ from hrc_learn.demos.demonstration import (
     DemonstrationSet,
     joint_columns,
 )
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.image_features import missing_note, only_feature, with_feature
-from hrc_learn.demos.read.columns import MappingSpec
-from hrc_learn.demos.read.frames import disk_runs, frame_timestamps
-from hrc_learn.demos.read.opened_dataset import (
+from hrc_learn.demos.format.dataset_folder import (
+    DatasetFolder,
+    EpisodeEntry,
     EpisodeFilter,
-    OpenedDataset,
-    RawEpisode,
-    open_dataset,
+    count_faults,
+    open_folder,
     select_episodes,
-    warn_of_conversions,
 )
+from hrc_learn.demos.format.metadata import SIDECAR_PATH, Sidecar, read_sidecar
+from hrc_learn.demos.image_features import missing_note, only_feature, with_feature
+from hrc_learn.demos.issues import DatasetError, UnitsWarning
+from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
+from hrc_learn.demos.read.contract import (
+    Contract,
+    contract_in,
+    fingerprint,
+    infer_contract,
+    keep_contract,
+)
+from hrc_learn.demos.read.frames import (
+    RawEpisode,
+    disk_runs,
+    frame_timestamps,
+    read_quantities,
+)
+from hrc_learn.demos.read.profiles import profile_episode
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
-from hrc_learn.demos.read.units import UnitDecision
+from hrc_learn.demos.read.units import (
+    Quantities,
+    UnitDecision,
+    guessed_from_values,
+    unit_factor,
+    units_from_episodes,
+)
+
+_SAMPLED_EPISODES = 32
+"""Episodes that decide on units."""
+_CONTRACT_EPISODES = 200
+"""Episodes that a contract is inferred from; more change nothing and take longer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenedDataset:
+    """Metadata of a dataset and the meaning of its columns; no file stays open."""
+
+    folder: DatasetFolder
+    sidecar: Sidecar
+    contract: Contract | None
+    """Contract kept with the dataset."""
+    columns: ColumnMapping
+    own_feature: bool = False
+    """True if the image feature is a column of the dataset, or left out by the caller."""
+
+    @classmethod
+    def of(cls, folder: DatasetFolder, mapping: MappingSpec | None = None) -> "OpenedDataset":
+        """Find the quantities of a dataset.
+
+        Args:
+            folder: Metadata of the dataset.
+            mapping: Role -> columns, as in `load_demos`; takes precedence over the contract,
+                which takes precedence over names.
+
+        Raises:
+            DatasetError: Mapping or contract name columns that do not exist, or the sidecar is
+                damaged.
+        """
+        sidecar = read_sidecar(folder.root)
+        contract = contract_in(sidecar)
+        kept = None if contract is None else contract.selections(folder.features)
+        columns = map_columns(folder.features, sidecar, mapping, kept)
+        return cls(
+            folder=folder,
+            sidecar=sidecar,
+            contract=contract,
+            columns=columns,
+            own_feature="feature" in columns.selections or "feature" in (mapping or {}),
+        )
+
+    @cached_property
+    def contract_note(self) -> str | None:
+        """Warning that the data changed since the contract was kept, or None."""
+        if self.contract is None or self.contract.fingerprint == fingerprint(self.folder):
+            return None
+        return (
+            f"the data changed since the contract in {SIDECAR_PATH} was kept: "
+            f"hrc check --keep-contract renews it"
+        )
+
+    @cached_property
+    def declared_units(self) -> Mapping[str, str | Sequence[str]]:
+        """Units by role from the sidecar, or of each component from the contract."""
+        known = {} if self.contract is None else self.contract.units(self.columns.selections)
+        return {**self.sidecar.units, **known}
+
+    def sample(self, most: int) -> Sequence[EpisodeEntry]:
+        """Subset of `most` episodes, spread evenly over the dataset."""
+        every = self.folder.episodes
+        places = np.linspace(0, len(every) - 1, min(len(every), most))
+        return [every[int(place)] for place in places]
+
+    def decide_units(
+        self, entries: Sequence[EpisodeEntry], given: Mapping[str, str]
+    ) -> dict[str, UnitDecision]:
+        """Unit of every quantity, by a pass over the columns whose unit must be guessed.
+
+        Undeclared units are guessed from a sample of the dataset, so that the guess does not
+        depend on the episodes that are loaded.
+
+        Args:
+            entries: Episodes that must not contradict the decision.
+            given: Units from the caller.
+
+        Raises:
+            DatasetError: A unit is unknown or does not fit its quantity, or one of the episodes
+                cannot be read, or is in another unit than the rest.
+        """
+        for role, unit in given.items():  # before any long read
+            unit_factor(role, unit)
+        selections, stated = self.columns.selections, {*self.declared_units, *given}
+        guessed = guessed_from_values(selections, stated)
+        sample = self.sample(_SAMPLED_EPISODES)
+        wanted = {entry.index: entry for entry in entries}
+        roles, first = [*guessed], [*wanted.values()]
+        if "time" in selections and "time" not in stated:
+            roles.append("time")
+            first = first if guessed else first[:1]
+
+        def episodes() -> Iterator[tuple[EpisodeEntry, Quantities]]:
+            for episode in self.read(first, roles) if roles else ():
+                yield episode.entry, episode.quantities
+            for entry in sample if guessed else ():
+                if entry.index not in wanted:
+                    # Its faults are raised when the episode itself is read.
+                    with contextlib.suppress(DatasetError):
+                        for episode in self.read([entry], guessed):
+                            yield entry, episode.quantities
+
+        decisions, faults = units_from_episodes(
+            selections,
+            episodes(),
+            self.folder.fps,
+            self.declared_units,
+            given,
+            {entry.index for entry in sample},
+        )
+        for fault in faults:
+            if fault.episode in wanted:
+                raise fault
+        return decisions
+
+    def read(
+        self, entries: Sequence[EpisodeEntry], roles: Iterable[str] | None = None
+    ) -> Iterator[RawEpisode]:
+        """Episodes one after another; arguments and errors as in `read_quantities`."""
+        return read_quantities(self.folder, self.columns, entries, roles)
+
+    def keep_first_contract(
+        self, units: Mapping[str, str] | None = None
+    ) -> tuple["OpenedDataset", str]:
+        """Keep the inferred contract with a dataset that declares nothing itself.
+
+        Later readers then interpret the dataset in the same way, whatever is added, and report
+        changes. A dataset with a contract, or one of `DatasetWriter`, needs none. The contract
+        never changes what is read: otherwise it is not kept.
+
+        Args:
+            units: Units on disk by role, as in `load_demos`.
+
+        Returns:
+            The dataset with its contract, and a note for the user, empty if nothing was kept.
+        """
+        if self.contract is not None or self.sidecar.columns:
+            return self, ""
+        folder = self.folder
+        try:
+            decisions = self.decide_units(folder.episodes, units or {})
+            profiles = [
+                profile_episode(
+                    episode.entry.index, episode.frames, episode.quantities, folder.fps
+                )
+                for episode in self.read(self.sample(_CONTRACT_EPISODES))
+            ]
+        except DatasetError as error:
+            return self, f"no contract of the columns is kept: {error}"
+        contract = infer_contract(folder, self.columns, decisions, profiles)
+        columns = map_columns(
+            folder.features, self.sidecar, kept=contract.selections(folder.features)
+        )
+        if not columns.reads_like(self.columns):
+            return self, ""  # such as an order of components that a contract cannot express
+        try:
+            keep_contract(folder.root, contract)
+        except OSError as error:
+            return self, f"no contract of the columns is kept: {error.strerror or error}"
+        note = (
+            f"the meaning of the columns is kept in {folder.root / SIDECAR_PATH}: edit it there"
+        )
+        sidecar = replace(self.sidecar, contract=contract.content())
+        return replace(self, sidecar=sidecar, contract=contract, columns=columns), note
+
+
+def open_dataset(path: str | Path, mapping: MappingSpec | None = None) -> OpenedDataset:
+    """Read the metadata of a dataset and find its quantities.
+
+    Args:
+        path: Folder of the dataset.
+        mapping: Role -> columns, as in `load_demos`.
+
+    Raises:
+        DatasetError: The metadata are missing, damaged or contradictory.
+    """
+    folder = open_folder(path)
+    for fault in count_faults(folder):
+        raise fault
+    return OpenedDataset.of(folder, mapping)
 
 
 @runtime_checkable
@@ -69,13 +274,8 @@ def load_demos(
         DatasetError: The dataset cannot be read; names file, episode, frame and key where
             known, and the remedy.
     """
-    dataset, entries = _open(path, episodes, mapping, tasks, where)
-    raw = {e.entry.index: e for e in dataset.read(tuple(dict.fromkeys(entries)))}
-    decisions = dataset.decide_units(raw.values(), units or {}, entries)
-    source = DemonstrationSource(dataset, entries, decisions, joint_names)
-    demos = [source.convert(raw[entry.index]) for entry in entries]
-    warn_of_conversions(dataset.folder.root, decisions)
-    return DemonstrationSet(demos, notes=source.notes, source=source.source)
+    source = open_demos(path, episodes, mapping, units, joint_names, tasks=tasks, where=where)
+    return source.load()
 
 
 def open_demos(
@@ -109,31 +309,22 @@ def open_demos(
     Raises:
         DatasetError: The metadata are damaged, or an argument names what does not exist.
     """
-    dataset, entries = _open(path, episodes, mapping, tasks, where)
-    if joint_names is not None:  # before any long read
-        joint_columns(dataset.columns.joint_names, joint_names)
-    notes: tuple[str, ...] = ()
-    if keep_contract and not mapping:
-        dataset, note = dataset.keep_first_contract(units)
-        notes = (note,) if note else ()
-    decisions = dataset.survey_units(entries, units or {})
-    warn_of_conversions(dataset.folder.root, decisions)
-    return DemonstrationSource(dataset, entries, decisions, joint_names, notes)
-
-
-def _open(
-    path: str | Path | OpenLeRobotDataset,
-    episodes: Sequence[int] | None,
-    mapping: MappingSpec | None,
-    tasks: str | Sequence[str] | None,
-    where: EpisodeFilter | None,
-) -> tuple[OpenedDataset, tuple[EpisodeEntry, ...]]:
     if isinstance(path, str | Path):
         root = path
     else:
         root, episodes = path.root, path.episodes if episodes is None else episodes
-    dataset = open_dataset(root, mapping)
-    return dataset, select_episodes(dataset.folder, episodes, tasks, where)
+    dataset, note = open_dataset(root, mapping), ""
+    entries = select_episodes(dataset.folder, episodes, tasks, where)
+    if joint_names is not None:  # before any long read
+        joint_columns(dataset.columns.joint_names, joint_names)
+    if keep_contract and not mapping:
+        dataset, note = dataset.keep_first_contract(units)
+    decisions = dataset.decide_units(entries, units or {})
+    for decision in decisions.values():
+        if decision.converts:
+            warnings.warn(f"{dataset.folder.root}: {decision.note}", UnitsWarning, stacklevel=2)
+    notes = (note,) if note else ()
+    return DemonstrationSource(dataset, entries, decisions, joint_names, notes)
 
 
 class DemonstrationSource(Sequence[Demonstration]):
@@ -200,8 +391,8 @@ class DemonstrationSource(Sequence[Demonstration]):
     def __getitem__(self, index):
         if isinstance(index, slice):
             return self._part(self._entries[index])
-        (episode,) = self._dataset.read([self._entries[index]])
-        return self.convert(episode)
+        (demo,) = self._read([self._entries[index]])
+        return demo
 
     def spread(self, most: int) -> "DemonstrationSource":
         """Subset of `most` demonstrations, spread evenly over the sequence and still unread."""
@@ -218,7 +409,10 @@ class DemonstrationSource(Sequence[Demonstration]):
 
     def __iter__(self) -> Iterator[Demonstration]:
         for run in disk_runs(self._entries):
-            yield from map(self.convert, self._dataset.read(run))
+            yield from self._read(run)
+
+    def _read(self, entries: Sequence[EpisodeEntry]) -> Iterator[Demonstration]:
+        return map(self._convert, self._dataset.read(entries))
 
     def __repr__(self) -> str:
         return (
@@ -254,7 +448,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         """
         return DemonstrationSet([*self], notes=self.notes, source=self.source)
 
-    def convert(self, episode: RawEpisode) -> Demonstration:
+    def _convert(self, episode: RawEpisode) -> Demonstration:
         """Demonstration of a raw episode of this dataset.
 
         Raises:

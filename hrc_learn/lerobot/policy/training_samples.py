@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from hrc_learn.demos.format.dataset_folder import open_folder
+from hrc_learn.demos.format.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
-from hrc_learn.demos.read.opened_dataset import select_episodes
 
 MOST = 256
 """Demonstrations that say enough of a motion to start from; more are spread evenly."""
