@@ -10,7 +10,6 @@ import pytest
 from clean_sets import SETS, write_set
 from commands import done
 from lerobot_folders import joint_path, write_folder
-from unchecked import shapes_unchecked
 
 from hrc_learn.demos import (
     DatasetError,
@@ -116,31 +115,17 @@ def test_a_contract_is_renewed_and_says_what_was_edited_or_is_told_now(root, tmp
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"role": "tentacle"}, "unknown role 'tentacle'; known are"),
-        ({"key": "nowhere"}, "nowhere/shoulder.pos is no component"),
-    ],
-)
-def test_a_contract_that_makes_no_sense_is_refused(root, change, message):
-    contract = kept(root)
-    first, *others = contract.components
-    broken = replace(contract, components=(replace(first, **change), *others))
-    keep_contract(root, broken)
-    with pytest.raises(DatasetError, match=message):
-        load_demos(root)
-
-
-@pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        ("index", "0", r"contract.components\[0\]: index must be a whole number"),
-        ("index", -1, r"contract.components\[0\]: index must be .* at least 0, got -1"),
-        ("index", 1, r"contract.components\[1\]: repeats component 1 of action"),
-        ("name", None, r"contract.components\[0\]: name must be text, got None"),
-        ("unit", 5, r"contract.components\[0\]: unit must be text, got 5"),
-        ("sign", 2, r"contract.components\[0\]: sign must be -1, 0 or 1, got 2"),
-        ("colour", "red", r"contract.components\[0\]: has the unknown field 'colour'"),
+        ("index", "0", r"contract.components\[0\].index: expected int, got str"),
+        ("index", -1, r"contract.components\[0\].index: expected int >= 0"),
+        ("index", 1, r"contract: component 1 of action is listed 2 times"),
+        ("name", None, r"contract.components\[0\].name: expected str, got null"),
+        ("low", None, r"contract.components\[0\].low: expected float, got null"),
+        ("sign", 2, r"contract.components\[0\].sign: unknown value 2"),
+        ("sign", True, r"contract.components\[0\].sign: expected int, got bool"),
+        ("role", "tentacle", r"contract.components\[0\]: .*unknown role 'tentacle'; known are"),
+        ("key", "nowhere", "contract: nowhere/.* is no component of the dataset"),
     ],
 )
 def test_an_entry_that_was_edited_wrongly_is_named(root, place, value, message):
@@ -148,30 +133,26 @@ def test_an_entry_that_was_edited_wrongly_is_named(root, place, value, message):
     content["components"].sort(key=lambda entry: (entry["key"], entry["index"]))
     content["components"][0][place] = value
     edit_sidecar(root, contract=content)
-    with pytest.raises(DatasetError, match=f"{SIDECAR_PATH}, {message}"):
+    with pytest.raises(DatasetError, match=f"{SIDECAR_PATH}[:,] {message}"):
         load_demos(root)
 
 
 @pytest.mark.parametrize(
     ("said", "message"),
     [
-        ({"units": []}, "units: must be an object"),
-        ({"units": {"position": 5}}, "units.position: must be text, got 5"),
-        ({"columns": ["joint_position"]}, "columns: must be an object"),
-        ({"columns": {"joint_position": {"key": STATE}}}, "columns.joint_position: must hold"),
-        ({"columns": {"joint_position": STATE}}, "columns.joint_position: must hold"),
-        ({"contract": [1]}, "contract: must be an object"),
-        ({"contract": {"components": {}}}, "contract.components: must be a list"),
-        ({"contract": {"components": [1]}}, "contract.fingerprint: must be text"),
+        ({"format": 2}, "format: "),
+        ({"units": {"position": 5}}, r"units\[...\]: expected str, got int"),
+        ({"columns": {"joint_position": {"key": STATE}}}, "columns.*lacks the field names"),
+        ({"contract": [1]}, "contract: expected object, got array"),
         (
-            {"contract": {"components": [{"key": STATE}], "fingerprint": ""}},
-            r"contract.components\[0\]: lacks index",
+            {"contract": {"components": [{"key": STATE}]}},
+            r"contract.components\[0\]: lacks the field index",
         ),
     ],
 )
 def test_a_sidecar_that_was_edited_wrongly_is_refused(root, said, message):
     edit_sidecar(root, **said)
-    with shapes_unchecked(), pytest.raises(DatasetError, match=f"{SIDECAR_PATH}, {message}"):
+    with pytest.raises(DatasetError, match=f"{SIDECAR_PATH}: {message}"):
         load_demos(root)
 
 

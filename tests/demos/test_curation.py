@@ -159,7 +159,17 @@ def test_decisions_are_kept_beside_the_dataset(odd, tmp_path):
     with pytest.raises(DatasetError, match="belongs to another dataset"):
         read_decisions(root)
     decisions_path(root).write_text("[1]")
-    with pytest.raises(DatasetError, match="holds no decisions"):
+    with pytest.raises(DatasetError, match=r"curation.json: expected object, got array"):
+        read_decisions(root)
+
+
+def test_the_name_of_an_episode_is_its_number_whatever_the_caller_gives(tmp_path):
+    root = write_set(tmp_path / "set", "v3.0")
+    keep_decisions(root, {True: Decision(verdict="reject")})  # True is equal to 1
+    assert [*read_decisions(root)] == [1]
+    text = decisions_path(root).read_text()
+    decisions_path(root).write_text(text.replace('"1"', '"True"'))
+    with pytest.raises(DatasetError, match="delete it to begin anew"):
         read_decisions(root)
 
 

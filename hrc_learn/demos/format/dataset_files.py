@@ -177,7 +177,7 @@ def open_parquet(root: Path, file: str, episode: int | None = None) -> pq.Parque
     if not is_inside(root, file):
         raise DatasetError(_OUTSIDE, file=file, episode=episode)
     try:
-        return pq.ParquetFile(root / file)
+        return pq.ParquetFile(root / file, page_checksum_verification=True)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise DatasetError(
             "unreadable: the file is truncated, because the recording was not finalized or "
@@ -242,3 +242,8 @@ def row_group_starts(metadata: pq.FileMetaData) -> list[int]:
     """First row of each row group."""
     sizes = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
     return [0, *accumulate(sizes)][:-1]
+
+
+def write_parquet(table: pa.Table, path: Path) -> None:
+    """Write a table with a checksum of each page, which readers verify."""
+    pq.write_table(table, path, write_page_checksum=True)

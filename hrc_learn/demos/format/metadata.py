@@ -13,24 +13,24 @@ files; the sidecar holds them.
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from math import prod
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from jaxtyping import Shaped, UInt8
 
-from hrc_learn.demos.format.dataset_files import INFO_PATH
+from hrc_learn.demos.format.dataset_files import INFO_PATH, write_parquet
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.store import read_json
 
 NUMERIC = ("float", "int", "uint", "bool")
 """Prefixes of the dtypes of numbers."""
 # Bounds of one numeric column; the force field of a wrist sensor has some hundred components.
 _WIDEST, _MOST_AXES = 100_000, 8
 SIDECAR_PATH = "meta/hrc_learn.json"
-SIDECAR_FORMAT = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,13 +110,24 @@ def flatten_names(names: object) -> tuple[str, ...] | None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SidecarColumn:
+    """Columns that hold one quantity."""
+
+    key: str
+    """Feature."""
+    names: tuple[str, ...]
+    """Its components."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Sidecar:
     """Units and meaning of a dataset's columns, as declared by its writer."""
 
+    format: Literal[1] = 1
     units: dict[str, str] = field(default_factory=dict)
     """Unit on disk of each role."""
-    columns: dict[str, dict] = field(default_factory=dict)
-    """Role -> {"key": feature, "names": components}."""
+    columns: dict[str, SidecarColumn] = field(default_factory=dict)
+    """Columns of each role."""
     joint_names: tuple[str, ...] = ()
     frames: dict[str, str] = field(default_factory=dict)
     """Reference frames of the poses: "base" and "ee"."""
@@ -126,45 +137,24 @@ class Sidecar:
     """Meaning of each component, as in `read.contract`; {} if none is kept."""
 
 
-def sidecar_copy(sidecar: Sidecar, units: Mapping[str, str]) -> dict:
-    """Content of the sidecar file of a copy in these units; {} if there is nothing to say."""
-    if not units and sidecar == Sidecar():
-        return {}
-    return {"format": SIDECAR_FORMAT, **vars(sidecar), "units": dict(units)}
-
-
-def read_sidecar(root: Path) -> Sidecar:
+def read_sidecar[T](root: Path, schema: type[T] = Sidecar) -> T:
     """The dataset's sidecar, empty if there is no file.
 
+    Args:
+        root: Folder of the dataset.
+        schema: Dataclass of the wanted part of its content, with a default for each field.
+
     Raises:
-        DatasetError: The file is damaged or of a later format.
+        DatasetError: The file is damaged, or was edited wrongly; names the field.
     """
     path = root / SIDECAR_PATH
     if not path.exists():
-        return Sidecar()
+        return schema()
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != SIDECAR_FORMAT:
-            raise DatasetError(
-                f"format {content['format']} is unknown (only {SIDECAR_FORMAT} can be read): "
-                f"a newer hrc_learn wrote the file",
-                file=SIDECAR_PATH,
-            )
-        return Sidecar(
-            units=content["units"],
-            columns=content["columns"],
-            joint_names=tuple(content["joint_names"]),
-            frames=content["frames"],
-            details=content["details"],
-            contract=content.get("contract") or {},
-        )
-    except DatasetError:
-        raise
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DatasetError(
-            f"damaged ({error!r}): delete it to have units guessed, or restore it",
-            file=SIDECAR_PATH,
-        ) from error
+        return read_json(path, schema, "edit it, or delete it to have units guessed")
+    except ValueError as error:
+        message = str(error).removeprefix(f"{path}: ")
+        raise DatasetError(message, file=SIDECAR_PATH) from error
 
 
 VERSION = "v3.0"
@@ -232,7 +222,7 @@ def data_schema(schema: pa.Schema, features: Mapping[str, dict]) -> pa.Schema:
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Write the list of task texts."""
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
-    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(_PANDAS_INDEX)}), path)
+    write_parquet(table.replace_schema_metadata({"pandas": json.dumps(_PANDAS_INDEX)}), path)
 
 
 def info_content(
@@ -263,9 +253,9 @@ def info_content(
     }
 
 
-def write_json(path: Path, content: Mapping) -> None:
+def dump_json(path: Path, content: object) -> None:
     """Write a JSON object the way LeRobot does."""
-    text = json.dumps(content, indent=4, ensure_ascii=False) + "\n"
+    text = json.dumps(content, indent=4, ensure_ascii=False, default=asdict) + "\n"
     path.write_text(text, encoding="utf-8")
 
 

@@ -12,10 +12,11 @@ from hrc_learn.demos.format.dataset_folder import recorded_statistics
 from hrc_learn.demos.format.metadata import (
     INDEX_FEATURES,
     NUMERIC,
+    Sidecar,
+    SidecarColumn,
     Statistics,
     episode_statistics,
     image_statistics,
-    sidecar_copy,
 )
 from hrc_learn.demos.format.videos import (
     Segments,
@@ -124,13 +125,13 @@ class ColumnRewriter:
             features[TIME_KEY] = {"dtype": "float64", "shape": [1], "names": ["time"]}
         return {**features, **INDEX_FEATURES}
 
-    def _sidecar(self, semantics: ColumnSemantics, given: Mapping[str, str]) -> dict:
+    def _sidecar(self, semantics: ColumnSemantics, given: Mapping[str, str]) -> Sidecar:
         sidecar = semantics.dataset.sidecar
         columns, units = dict(sidecar.columns), {**sidecar.units, **given}
         if self._add_time and columns:
-            columns["time"] = {"key": TIME_KEY, "names": ["time"]}
+            columns["time"] = SidecarColumn(key=TIME_KEY, names=("time",))
             units["time"] = "s"
-        return sidecar_copy(replace(sidecar, columns=columns), units)
+        return replace(sidecar, columns=columns, units=units)
 
     def videos_of(self, edit: EpisodeEdit) -> Segments:
         """Parts of the old videos that show the remaining frames.

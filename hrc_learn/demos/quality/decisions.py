@@ -1,8 +1,7 @@
 """Decisions on the episodes of a dataset, kept next to it, and the curated copy."""
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -10,10 +9,9 @@ from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.repair import Progress, RepairOptions, RepairReport, repair_dataset
 from hrc_learn.demos.read.columns import MappingSpec
-from hrc_learn.store import new_file
+from hrc_learn.store import Count, read_json, write_json
 
 Verdict = Literal["accept", "cut", "reject"]
-_FORMAT = 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,10 +19,22 @@ class Decision:
     """Decision on one episode."""
 
     verdict: Verdict
-    start: int = 0
+    start: Count = 0
     """First frame kept by a cut."""
-    stop: int = 0
+    stop: Count = 0
     """End of the frames kept by a cut (exclusive)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _KeptDecision(Decision):
+    length: Count
+    """Number of frames of the episode."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _DecisionFile:
+    decisions: dict[Count, _KeptDecision]
+    format: Literal[1] = 1
 
 
 Decisions = dict[int, Decision]
@@ -61,46 +71,41 @@ def read_decisions(root: Path) -> Decisions:
     Raises:
         DatasetError: The file is damaged, or belongs to another dataset.
     """
-    path, entries = decisions_path(root), {e.index: e for e in open_folder(root).episodes}
+    path = decisions_path(root)
     if not path.is_file():
         return {}
+    lengths = {entry.index: entry.length for entry in open_folder(root).episodes}
+    advice = "delete it to begin anew"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        decisions: Decisions = {}
-        for name, said in content["decisions"].items():
-            entry = entries[int(name)]
-            if said["length"] != entry.length:
-                raise DatasetError(
-                    f"decides on {said['length']} frames of the episode, which has "
-                    f"{entry.length}: it belongs to another dataset; delete it to begin anew",
-                    file=path,
-                    episode=entry.index,
-                )
-            decisions[entry.index] = decide(
-                said["verdict"], entry.length, said["start"], said["stop"]
+        kept = read_json(path, _DecisionFile, advice).decisions
+    except ValueError as error:
+        raise DatasetError(str(error).removeprefix(f"{path}: "), file=path) from error
+    decisions: Decisions = {}
+    for index, known in kept.items():
+        if known.length != lengths.get(index):
+            raise DatasetError(
+                f"decides on an episode of {known.length} frames, the dataset has "
+                f"{lengths.get(index, 'no such episode')}: it belongs to another dataset; "
+                f"{advice}",
+                file=path,
+                episode=index,
             )
-    except DatasetError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise DatasetError(
-            f"holds no decisions on this dataset ({error!r}); delete it to begin anew",
-            file=path,
-        ) from error
+        try:
+            decisions[index] = decide(known.verdict, known.length, known.start, known.stop)
+        except ValueError as error:
+            raise DatasetError(f"{error}; {advice}", file=path, episode=index) from error
     return decisions
 
 
 def keep_decisions(root: Path, decisions: Mapping[int, Decision]) -> None:
     """Write the decisions next to the dataset, which is not changed."""
-    lengths = {entry.index: entry.length for entry in open_folder(root).episodes}
-    content = {
-        "format": _FORMAT,
-        "decisions": {
-            str(index): asdict(decision) | {"length": lengths[index]}
-            for index, decision in sorted(decisions.items())
-        },
+    kept = {
+        # The index of the dataset: True is equal to 1, but no name of an episode.
+        entry.index: _KeptDecision(**vars(decisions[entry.index]), length=entry.length)
+        for entry in open_folder(root).episodes
+        if entry.index in decisions
     }
-    with new_file(decisions_path(root)) as part:
-        part.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_json(decisions_path(root), _DecisionFile(decisions=kept))
 
 
 def write_curated(

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
-from hrc_learn.demos.format.metadata import SIDECAR_PATH, read_sidecar, sidecar_copy, write_json
 from hrc_learn.demos.format.videos import Segments, read_segments
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
@@ -23,7 +22,7 @@ from hrc_learn.demos.quality.frame_edits import (
 )
 from hrc_learn.demos.quality.value_edits import fix_signs, resample_to_grid, unwrap
 from hrc_learn.demos.read.columns import MappingSpec
-from hrc_learn.demos.read.contract import fingerprint
+from hrc_learn.demos.read.contract import fingerprint, keep_contract
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
@@ -312,11 +311,8 @@ class _Repair:
             replace(part, unit=given.get((part.key, part.index), part.unit))
             for part in contract.components
         )
-        carried = replace(
-            contract, components=parts, fingerprint=fingerprint(open_folder(target))
-        )
-        sidecar = replace(read_sidecar(target), contract=carried.content())
-        write_json(target / SIDECAR_PATH, sidecar_copy(sidecar, sidecar.units))
+        renewed = fingerprint(open_folder(target))
+        keep_contract(target, replace(contract, components=parts, fingerprint=renewed))
 
 
 def _copy_notes(source: Path, target: Path) -> None:

@@ -7,11 +7,10 @@ the contract or sidecar kept with the dataset, then the naming conventions of `q
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.format.dataset_files import INFO_PATH
-from hrc_learn.demos.format.metadata import SIDECAR_PATH, Feature, Sidecar
+from hrc_learn.demos.format.metadata import Feature, Sidecar
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.quantities import (
     INDEX_KEYS,
@@ -105,10 +104,8 @@ def map_columns(
         kept: Columns of a contract kept with the dataset; replaces all guesses.
 
     Raises:
-        DatasetError: The mapping names a role or column that does not exist, or the sidecar's
-            units or columns are malformed.
+        DatasetError: The mapping or the sidecar names a role or column that does not exist.
     """
-    _require_well_formed(sidecar)
     usable = {
         key: feature
         for key, feature in features.items()
@@ -119,7 +116,7 @@ def map_columns(
         found = dict(kept)
     elif sidecar.columns:
         declared = {
-            role: [f"{column['key']}/{name}" for name in column["names"]]
+            role: [f"{column.key}/{name}" for name in column.names]
             for role, column in sidecar.columns.items()
         }
         found = parse_mapping(declared, usable)
@@ -152,29 +149,6 @@ def map_columns(
 def replaced_roles(mapping: MappingSpec) -> set[str]:
     """Roles that a caller's mapping replaces: one encoding of an orientation replaces all."""
     return {*mapping} | ({*ORIENTATION_ROLES} if {*mapping} & {*ORIENTATION_ROLES} else set())
-
-
-def _require_well_formed(sidecar: Sidecar) -> None:
-    """Check the form of the sidecar's units and columns, which may have been edited."""
-    for name in ("units", "columns"):
-        if not isinstance(content := getattr(sidecar, name), dict):
-            raise _malformed(f"must be an object, got {content!r}", name)
-    for role, unit in sidecar.units.items():
-        if not isinstance(unit, str):
-            raise _malformed(f"must be text, got {unit!r}", f"units.{role}")
-    for role, column in sidecar.columns.items():
-        content: dict[str, Any] = column if isinstance(column, dict) else {}
-        names = content.get("names")
-        texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
-        if not isinstance(content.get("key"), str) or not texts:
-            raise _malformed(
-                'must hold a "key", a feature, and "names", a list of its components',
-                f"columns.{role}",
-            )
-
-
-def _malformed(message: str, key: str) -> DatasetError:
-    return DatasetError(f"{message}; edit it", file=SIDECAR_PATH, key=key)
 
 
 def parse_mapping(

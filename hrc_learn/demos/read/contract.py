@@ -7,28 +7,27 @@ be edited there, and every reader of the dataset obeys it.
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder
 from hrc_learn.demos.format.metadata import (
-    SIDECAR_FORMAT,
     SIDECAR_PATH,
     Feature,
-    Sidecar,
+    dump_json,
     read_sidecar,
-    write_json,
 )
 from hrc_learn.demos.issues import DatasetError, plain_text
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, is_discrete
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES, is_hand, joint_of
 from hrc_learn.demos.read.units import UnitDecision, comes_in
-from hrc_learn.store import new_file
+from hrc_learn.store import Count, new_file
 
 _QUANTITIES = {
     "arm": "joint_position",
@@ -57,7 +56,7 @@ class ComponentContract:
     """Meaning of one component of one feature."""
 
     key: str
-    index: int
+    index: Count
     name: str
     role: str
     """Role, one of `CONTRACT_ROLES`."""
@@ -67,7 +66,7 @@ class ComponentContract:
     """0.5 % quantile of all values."""
     high: float
     """99.5 % quantile of all values."""
-    sign: int = 0
+    sign: Literal[-1, 0, 1] = 0
     """Direction of the state as this command grows, +1 or -1; 0 if unknown."""
     delay: float | None = None
     """Delay of the state behind this command [s]; None if unknown."""
@@ -75,6 +74,13 @@ class ComponentContract:
     """Confidence, 0 to 1."""
     evidence: str = ""
     """Evidence in words."""
+
+    def __post_init__(self) -> None:
+        if self.role not in CONTRACT_ROLES:
+            raise ValueError(
+                f"{self.name} has the unknown role {self.role!r}; known are "
+                f"{', '.join(CONTRACT_ROLES)}"
+            )
 
     @property
     def quantity(self) -> str | None:
@@ -92,9 +98,15 @@ class ComponentContract:
 class Contract:
     """Meaning of the components of a dataset."""
 
-    components: tuple[ComponentContract, ...]
-    fingerprint: str
+    components: tuple[ComponentContract, ...] = ()
+    fingerprint: str = ""
     """Fingerprint of the data it was inferred from."""
+
+    def __post_init__(self) -> None:
+        places = Counter((part.key, part.index) for part in self.components)
+        for (key, index), count in places.items():
+            if count > 1:
+                raise ValueError(f"component {index} of {key} is listed {count} times")
 
     def rows(self) -> list[tuple[str, ...]]:
         """The contract as a table with its header; similar neighbours are one row."""
@@ -191,86 +203,32 @@ class Contract:
         }
 
 
-def _faulty(message: str, place: str = "contract") -> DatasetError:
-    return DatasetError(f"{message}; edit it", file=SIDECAR_PATH, key=place)
+def _faulty(message: str) -> DatasetError:
+    return DatasetError(f"{message}; edit it", file=SIDECAR_PATH, key="contract")
 
 
-def contract_in(sidecar: Sidecar) -> Contract | None:
-    """Contract kept in a sidecar, or None.
+@dataclass(frozen=True, kw_only=True)
+class _ContractPart:
+    """The part of the sidecar that holds the contract."""
+
+    contract: Contract = Contract()
+
+
+def read_contract(root: Path) -> Contract | None:
+    """Contract kept with a dataset, or None.
 
     Raises:
         DatasetError: The contract is damaged, or names a role that does not exist.
     """
-    if not sidecar.contract:
-        return None
-    content: object = sidecar.contract
-    if not isinstance(content, dict):
-        raise _faulty(f"must be an object, got {content!r}")
-    components, origin = content.get("components"), content.get("fingerprint")
-    if not isinstance(components, list):
-        raise _faulty(f"must be a list, got {components!r}", "contract.components")
-    if not isinstance(origin, str):
-        raise _faulty(f"must be text, got {origin!r}", "contract.fingerprint")
-    parts: dict[tuple[str, int], ComponentContract] = {}
-    for number, entry in enumerate(components):
-        place = f"contract.components[{number}]"
-        part = _component(entry, place)
-        if (part.key, part.index) in parts:
-            raise _faulty(f"repeats component {part.index} of {part.key}", place)
-        parts[part.key, part.index] = part
-    return Contract(components=tuple(parts.values()), fingerprint=origin)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-_TEXT = ("text", lambda value: isinstance(value, str))
-_NUMBER = ("a number", _is_number)
-_FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "key": _TEXT,
-    "index": ("a whole number of at least 0", lambda value: type(value) is int and value >= 0),
-    "name": _TEXT,
-    "role": _TEXT,
-    "unit": _TEXT,
-    "low": _NUMBER,
-    "high": _NUMBER,
-    "sign": ("-1, 0 or 1", lambda value: _is_number(value) and value in (-1, 0, 1)),
-    "delay": ("a number or null", lambda value: value is None or _is_number(value)),
-    "confidence": _NUMBER,
-    "evidence": _TEXT,
-}
-"""Field of a `ComponentContract` -> requirement, in words and as a test."""
-
-
-def _component(entry: object, place: str) -> ComponentContract:
-    """One component from its JSON object, which may have been edited."""
-    if not isinstance(entry, dict):
-        raise _faulty(f"must be an object, got {entry!r}", place)
-    required = [f.name for f in fields(ComponentContract) if f.default is MISSING]
-    missing = [name for name in required if name not in entry]
-    unknown = [name for name in entry if name not in _FIELDS]
-    if missing or unknown:
-        fault = f"lacks {missing[0]}" if missing else f"has the unknown field {unknown[0]!r}"
-        raise _faulty(fault, place)
-    for name, value in entry.items():
-        wanted, fits = _FIELDS[name]
-        if not fits(value):
-            raise _faulty(f"{name} must be {wanted}, got {value!r}", place)
-    part = ComponentContract(**entry)
-    if part.role not in CONTRACT_ROLES:
-        known = ", ".join(CONTRACT_ROLES)
-        raise _faulty(
-            f"{part.name} has the unknown role {part.role!r}; known are {known}", place
-        )
-    return part
+    contract = read_sidecar(root, _ContractPart).contract
+    return contract if contract.components else None
 
 
 def keep_contract(root: Path, contract: Contract) -> None:
     """Write the contract into the sidecar, keeping the rest of its content."""
     sidecar = replace(read_sidecar(root), contract=contract.content())
     with new_file(root / SIDECAR_PATH) as part:
-        write_json(part, {"format": SIDECAR_FORMAT, **vars(sidecar)})
+        dump_json(part, sidecar)
 
 
 def fingerprint(folder: DatasetFolder) -> str:
@@ -326,7 +284,7 @@ def infer_contract(
                 key=feature.key,
                 index=index,
                 name=feature.names[index] if feature.names else f"joint_{index + 1}",
-                role=role or "other",
+                role="other",
                 unit="",
                 low=float(low[index]),
                 high=float(high[index]),

@@ -30,10 +30,10 @@ from hrc_learn.demos.issues import DatasetError, UnitsWarning
 from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
 from hrc_learn.demos.read.contract import (
     Contract,
-    contract_in,
     fingerprint,
     infer_contract,
     keep_contract,
+    read_contract,
 )
 from hrc_learn.demos.read.frames import (
     RawEpisode,
@@ -83,7 +83,7 @@ class OpenedDataset:
                 damaged.
         """
         sidecar = read_sidecar(folder.root)
-        contract = contract_in(sidecar)
+        contract = read_contract(folder.root)
         kept = None if contract is None else contract.selections(folder.features)
         columns = map_columns(folder.features, sidecar, mapping, kept)
         return cls(

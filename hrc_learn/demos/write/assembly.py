@@ -2,15 +2,14 @@
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrc_learn.demos.format.dataset_files import open_parquet, read_table
+from hrc_learn.demos.format.dataset_files import open_parquet, read_table, write_parquet
 from hrc_learn.demos.format.dataset_folder import episode_lists, open_folder
 from hrc_learn.demos.format.metadata import (
     CHUNK_SIZE,
@@ -19,13 +18,14 @@ from hrc_learn.demos.format.metadata import (
     FILE_SIZE_MB,
     SIDECAR_PATH,
     VIDEO_PATH,
+    Sidecar,
     Statistics,
     combined_statistics,
     data_schema,
+    dump_json,
     info_content,
     place,
     read_sidecar,
-    write_json,
     write_tasks,
 )
 from hrc_learn.demos.format.videos import Segments, VideoSegment, video_path
@@ -78,12 +78,11 @@ def assemble(
                 columns |= placement.columns(key, segment)
             listed.add(staged, file, columns)
     sidecar = header.sidecar
-    if earlier is not None and sidecar:
+    if earlier is not None:
         # Details and contract kept with the earlier dataset also hold for the longer one.
         before = read_sidecar(earlier)
-        sidecar = sidecar | {"details": before.details | sidecar["details"]}
-        if before.contract:
-            sidecar["contract"] = before.contract
+        details = before.details | sidecar.details
+        sidecar = replace(sidecar, details=details, contract=before.contract)
     _write_metadata(target, header, listed, sidecar)
 
 
@@ -186,7 +185,7 @@ def _write_frames(
     """Write a data file, one row group per episode."""
     path.parent.mkdir(exist_ok=True)
     schema = data_schema(read_episode(group[0]).table.schema, header.features)
-    with pq.ParquetWriter(path, schema) as writer:
+    with pq.ParquetWriter(path, schema, write_page_checksum=True) as writer:
         for staged in map(read_episode, group):
             writer.write_table(staged.table.cast(schema))
             yield staged
@@ -205,11 +204,11 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _write_metadata(
-    target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: dict[str, Any]
+    target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: Sidecar
 ) -> None:
     tasks = list(listed.tasks)
     write_tasks(target / "meta/tasks.parquet", tasks)
-    pq.write_table(listed.table(), target / EPISODES_PATH)
+    write_parquet(listed.table(), target / EPISODES_PATH)
     content = info_content(
         header.features,
         header.fps,
@@ -218,10 +217,10 @@ def _write_metadata(
         frames=listed.frames,
         tasks=len(tasks),
     )
-    write_json(target / "meta/info.json", content)
-    write_json(target / "meta/stats.json", listed.statistics())
-    if sidecar:
-        write_json(target / SIDECAR_PATH, sidecar)
+    dump_json(target / "meta/info.json", content)
+    dump_json(target / "meta/stats.json", listed.statistics())
+    if sidecar != Sidecar():
+        dump_json(target / SIDECAR_PATH, sidecar)
 
 
 def _carry_over(earlier: Path, target: Path) -> _EpisodeList:

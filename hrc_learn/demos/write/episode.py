@@ -2,21 +2,21 @@
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from jaxtyping import Float64, Int64, Shaped
 
 from hrc_learn.demos.demonstration import float_array
-from hrc_learn.demos.format.metadata import SIDECAR_FORMAT, Statistics
+from hrc_learn.demos.format.dataset_files import open_parquet, read_table, write_parquet
+from hrc_learn.demos.format.metadata import Sidecar, SidecarColumn, Statistics
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.geometry import quaternion
-from hrc_learn.store import new_file
+from hrc_learn.store import new_file, parse_json
 
 STATE_KEY = "observation.state"
 TIME_KEY = "observation.time"
@@ -115,25 +115,24 @@ def lerobot_features(columns: Sequence[RecordedColumn], dtype: str) -> dict[str,
     }
 
 
-def sidecar_content(
+def sidecar_of(
     columns: Sequence[RecordedColumn],
     joint_names: Sequence[str],
     frames: Mapping[str, str],
     details: Mapping[str, object],
-) -> dict:
-    """Content of the sidecar file for these columns."""
+) -> Sidecar:
+    """Declaration of these columns."""
     known = {column.role: column for column in columns if column.role is not None}
-    return {
-        "format": SIDECAR_FORMAT,
-        "units": {role: ROLES[role].unit for role in known},
-        "columns": {
-            role: {"key": column.key, "names": list(column.names)}
+    return Sidecar(
+        units={role: ROLES[role].unit for role in known},
+        columns={
+            role: SidecarColumn(key=column.key, names=column.names)
             for role, column in known.items()
         },
-        "joint_names": list(joint_names),
-        "frames": dict(frames),
-        "details": dict(details),
-    }
+        joint_names=tuple(joint_names),
+        frames=dict(frames),
+        details=dict(details),
+    )
 
 
 def encode(
@@ -267,18 +266,23 @@ class RecordingHeader:
     robot_type: str
     features: dict[str, dict]
     """Features as in `meta/info.json`, with LeRobot's index columns."""
-    sidecar: dict
-    """Content of `meta/hrc_learn.json`."""
+    sidecar: Sidecar
 
 
 @dataclass(frozen=True, kw_only=True)
-class StagedEpisode:
-    """One saved episode of a recording."""
+class EpisodeDescription:
+    """Properties of one saved episode, kept in the metadata of its file."""
 
     header: RecordingHeader
     tasks: list[str]
     """Texts of its tasks, at least one."""
     statistics: Statistics
+
+
+@dataclass(frozen=True, kw_only=True)
+class StagedEpisode(EpisodeDescription):
+    """One saved episode of a recording."""
+
     table: pa.Table
 
 
@@ -294,26 +298,25 @@ def episode_number(path: Path) -> int:
 
 def write_episode(path: Path, episode: StagedEpisode) -> None:
     """Write one episode; `path` exists only once it is complete and on disk."""
-    metadata = {
-        "header": vars(episode.header),
-        "tasks": episode.tasks,
-        "statistics": episode.statistics,
-    }
-    table = episode.table.replace_schema_metadata({_METADATA_KEY: json.dumps(metadata)})
+    described = {name: getattr(episode, name) for name in ("header", "tasks", "statistics")}
+    metadata = {_METADATA_KEY: json.dumps(described, default=asdict)}
     with new_file(path) as part:
-        pq.write_table(table, part)
+        write_parquet(episode.table.replace_schema_metadata(metadata), part)
 
 
 def read_episode(path: Path) -> StagedEpisode:
-    """Read an episode written by `write_episode`."""
-    table = pq.read_table(path)
-    metadata = json.loads(table.schema.metadata[_METADATA_KEY])
-    return StagedEpisode(
-        header=RecordingHeader(**metadata["header"]),
-        tasks=metadata["tasks"],
-        statistics=metadata["statistics"],
-        table=table,
-    )
+    """Read an episode written by `write_episode`.
+
+    Raises:
+        DatasetError: The file is damaged.
+    """
+    table = read_table(open_parquet(path.parent, path.name), path.name)
+    described = (table.schema.metadata or {}).get(_METADATA_KEY, b"")
+    try:
+        description = parse_json(described, EpisodeDescription)
+    except ValueError as error:
+        raise DatasetError(f"no episode of a recording ({error})", file=path) from error
+    return StagedEpisode(**vars(description), table=table)
 
 
 def staged_paths(folder: Path, first: int = 0) -> list[Path]:

@@ -31,7 +31,7 @@ from hrc_learn.demos.write.episode import (
     index_columns,
     lerobot_features,
     require_valid,
-    sidecar_content,
+    sidecar_of,
     to_table,
     write_episode,
 )
@@ -371,9 +371,7 @@ class DatasetWriter:
                 **self._video_features,
                 **INDEX_FEATURES,
             },
-            sidecar=sidecar_content(
-                columns, self.joint_names, self._frames_of_poses, self._details
-            ),
+            sidecar=sidecar_of(columns, self.joint_names, self._frames_of_poses, self._details),
         )
 
 
