@@ -1,6 +1,5 @@
 """Every kind of broken dataset gives its finding, with file, episode, frame and key."""
 
-import json
 import re
 import shutil
 from pathlib import Path
@@ -11,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot_folders import FPS, joint_path, read_info, rewrite, write_folder, write_info
 
-from hrc_learn.demos import DatasetError, check_dataset, load_demos
+from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
 from hrc_learn.demos.issues import ValidationReport, warning
 
 STATE = "observation.state"
@@ -575,12 +574,54 @@ def test_speed_limits_of_no_joint_and_that_are_none_are_refused(root, limits, me
 
 def test_a_damaged_sidecar(root):
     (root / "meta/hrc_learn.json").write_text('{"format": 1')
-    assert find(check_dataset(root).errors, "damaged").file == "meta/hrc_learn.json"
-    with pytest.raises(DatasetError, match="damaged"):
+    assert find(check_dataset(root).errors, "not valid JSON").file == "meta/hrc_learn.json"
+    with pytest.raises(DatasetError, match="not valid JSON"):
         load_demos(root)
-    (root / "meta/hrc_learn.json").write_text(json.dumps({"format": 99}))
-    with pytest.raises(DatasetError, match="format 99"):
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A dataset written by this package."""
+    root = tmp_path_factory.mktemp("recorded") / "set"
+    with DatasetWriter(root, FPS, "test", ("a", "b", "c")) as writer:
+        for seed in range(3):
+            writer.start_episode("reach")
+            for q in joint_path(60, seed=seed):
+                writer.add_frame(joint_position=q)
+            writer.save_episode()
+    return root
+
+
+@pytest.mark.parametrize("place", [0.1, 0.35, 0.6, 0.85])
+@pytest.mark.parametrize("file", [DATA, EPISODES, "meta/stats.json"])
+def test_a_flipped_bit_is_found_in_what_we_wrote(recorded, tmp_path, file, place):
+    root = shutil.copytree(recorded, tmp_path / "set")
+    assert check_dataset(root).ok
+    content = bytearray((root / file).read_bytes())
+    content[int(place * len(content))] ^= 4
+    (root / file).write_bytes(content)
+    assert find(check_dataset(root).errors, "checksum differs").file == file
+
+
+def test_a_flipped_bit_in_a_page_of_values_is_not_read(recorded, tmp_path):
+    root = shutil.copytree(recorded, tmp_path / "set")
+    content = bytearray((root / DATA).read_bytes())
+    expected = load_demos(recorded)[0].joint_position
+    place = content.find(expected[30].astype(np.float32).tobytes())
+    assert place > 0
+    content[place] ^= 1
+    (root / DATA).write_bytes(content)
+    with pytest.raises(DatasetError, match="the file is damaged"):
         load_demos(root)
+
+
+def test_a_contract_may_be_edited_and_a_damaged_list_of_checksums_is_said(recorded, tmp_path):
+    root = shutil.copytree(recorded, tmp_path / "set")
+    sidecar = root / "meta/hrc_learn.json"
+    sidecar.write_text(sidecar.read_text().replace('"details": {}', '"details": {"by": "me"}'))
+    assert check_dataset(root).ok
+    (root / ".manifest.json").write_text("{")
+    assert find(check_dataset(root).errors, "not valid JSON").file == ".manifest.json"
 
 
 def test_the_report_reads_as_text(root):

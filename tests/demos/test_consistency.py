@@ -134,9 +134,8 @@ def test_a_state_that_goes_further_or_less_far_than_its_command(tmp_path, gain, 
     assert all(issue.message.endswith(": elbow") for issue in issues)
 
 
-def test_rows_between_episodes_are_passed_over(tmp_path, monkeypatch):
+def test_rows_between_episodes_are_passed_over(tmp_path):
     """The middle one of three episodes in a file is not listed."""
-    monkeypatch.setattr(structure_checks, "_BATCH_ROWS", 8)
     values = [k + np.tile(ramp(frames), (3, 1)).T for k, frames in ((1, 13), (2, 40), (3, 11))]
     root = write_folder(tmp_path / "set", [{STATE: q} for q in values], {STATE: JOINTS})
     folder = open_folder(root)

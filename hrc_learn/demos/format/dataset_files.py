@@ -232,7 +232,7 @@ def read_table(
         groups = list(range(first, bisect_left(starts, rows.stop)))
         table = parquet.read_row_groups(groups, columns=wanted)
         return table.slice(rows.start - starts[first], rows.stop - rows.start)
-    except (pa.ArrowException, OSError, ValueError) as error:
+    except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
         raise DatasetError(
             f"unreadable: the file is damaged ({error}); copy it again", file=file
         ) from error

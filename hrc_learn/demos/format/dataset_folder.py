@@ -3,11 +3,11 @@
 import shlex
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partialmethod
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from hrc_learn.demos.format.dataset_files import (
     INFO_PATH,
@@ -39,16 +39,11 @@ class EpisodeEntry:
     start: int
     """Row of the first frame in that file."""
 
-    @property
-    def location(self) -> dict[str, Any]:
-        """File and episode, as keywords of an `Issue` or a `DatasetError`."""
-        return {"file": self.file, "episode": self.index}
-
     def error(
         self, message: str, frame: int | None = None, key: str | None = None
     ) -> DatasetError:
         """Reading error located in this episode."""
-        return DatasetError(message, **self.location, frame=frame, key=key)
+        return DatasetError(message, file=self.file, episode=self.index, frame=frame, key=key)
 
     def fault(
         self,
@@ -57,28 +52,21 @@ class EpisodeEntry:
         key: str | None = None,
         components: tuple[str, ...] = (),
         severity: float = 0.0,
+        level: Literal["error", "warning"] = "error",
     ) -> Issue:
-        """Issue of level "error" located in this episode; arguments as in `Issue`."""
+        """Issue located in this episode; arguments as in `Issue`."""
         return Issue(
             message=message,
-            **self.location,
+            file=self.file,
+            episode=self.index,
             frame=frame,
             key=key,
             components=components,
             severity=severity,
+            level=level,
         )
 
-    def warning(
-        self,
-        message: str,
-        frame: int | None = None,
-        key: str | None = None,
-        components: tuple[str, ...] = (),
-        severity: float = 0.0,
-    ) -> Issue:
-        """Issue of level "warning" located in this episode; arguments as in `Issue`."""
-        fault = self.fault(message, frame, key, components, severity)
-        return replace(fault, level="warning")
+    warning = partialmethod(fault, level="warning")
 
 
 @dataclass(frozen=True, kw_only=True)

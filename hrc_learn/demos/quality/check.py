@@ -1,7 +1,6 @@
 """Validation of a dataset before anything is learned from it."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,8 @@ from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
 from hrc_learn.demos.quality import consistency_checks as consistency
 from hrc_learn.demos.quality import episode_checks, structure_checks
-from hrc_learn.demos.quality.episode_checks import ColumnSummary, MotionRecord, motion_sketch
+from hrc_learn.demos.quality.episode_checks import MotionRecord, motion_sketch
 from hrc_learn.demos.quality.structure_checks import read_metadata, read_sound_episodes
-from hrc_learn.demos.quality.tracking_checks import command_tracking
 from hrc_learn.demos.quality.video_checks import check_videos
 from hrc_learn.demos.read.columns import (
     ColumnMapping,
@@ -22,7 +20,7 @@ from hrc_learn.demos.read.columns import (
     parse_mapping,
     replaced_roles,
 )
-from hrc_learn.demos.read.contract import Contract, infer_contract
+from hrc_learn.demos.read.contract import infer_contract
 from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quantities
 from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
 from hrc_learn.demos.read.source import OpenedDataset
@@ -42,6 +40,7 @@ METADATA_CHECKS: dict[str, Callable[[DatasetFolder], Iterable[Issue]]] = {
     "component names": structure_checks.component_names,
     "offsets": structure_checks.offsets,
     "unlisted files": structure_checks.unlisted_files,
+    "checksums": structure_checks.unchanged_files,
 }
 RAW_EPISODE_CHECKS: dict[
     str, Callable[[DatasetFolder, EpisodeEntry, RawFrames], Iterable[Issue]]
@@ -52,12 +51,6 @@ RAW_EPISODE_CHECKS: dict[
     "episode length": episode_checks.episode_length,
     "stamps": episode_checks.recorded_stamps,
 }
-SUMMARY_CHECKS: dict[
-    str, Callable[[DatasetFolder, Mapping[str, ColumnSummary]], Iterable[Issue]]
-] = {
-    "column ranges": episode_checks.column_ranges,
-    "statistics fit": structure_checks.statistics_fit,
-}
 MOTION_CHECKS: dict[str, Callable[[MotionRecord], Iterable[Issue]]] = {
     "motion present": episode_checks.motion_present,
     "rest at the ends": episode_checks.rest_at_ends,
@@ -67,7 +60,6 @@ MOTION_CHECKS: dict[str, Callable[[MotionRecord], Iterable[Issue]]] = {
     "frozen encoders": episode_checks.frozen_encoders,
 }
 CONSISTENCY_CHECKS: dict[str, Callable[[consistency.FeatureProfiles], Iterable[Issue]]] = {
-    "sizes": consistency.sizes,
     "holds": consistency.holds,
     "noise": consistency.noise,
     "switches": consistency.switches,
@@ -106,14 +98,17 @@ def check_dataset(
     parse_mapping(mapping or {}, folder.features)
     if speed_limits:
         _require_limits(folder, mapping, speed_limits)
-    survey = _Survey(folder, report)
-    survey.check_raw_episodes()
-    for name, check in SUMMARY_CHECKS.items():
-        report.run(name, check, folder, survey.columns)
     report.attempt(lambda: check_videos(folder, report))
-    report.attempt(
-        lambda: _check_content(survey, mapping or {}, units or {}, speed_limits or {})
-    )
+    survey = _Survey(folder, report)
+    dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
+    if dataset is None:
+        for _ in survey.first_pass(None):
+            pass
+    else:
+        limits = speed_limits or {}
+        report.attempt(
+            lambda: _check_content(survey, dataset, mapping or {}, units or {}, limits)
+        )
     return report
 
 
@@ -136,26 +131,26 @@ def _require_limits(
 
 
 class _Survey:
-    """Readable episodes of a dataset, first without and then with the meaning of columns.
+    """Readable episodes of a dataset, first without and then with the units of columns.
 
     Attributes:
-        columns: Range of each feature over all episodes.
+        profiles: Profile of each episode by its index, from the first pass on.
     """
 
     def __init__(self, folder: DatasetFolder, report: ValidationReport):
         self.folder = folder
         self.report = report
-        self.columns: dict[str, ColumnSummary] = {}
+        self.profiles: dict[int, EpisodeProfile] = {}
         self._kept: list[tuple[EpisodeEntry, RawFrames]] | None = []
 
-    def check_raw_episodes(self) -> None:
-        """Run the checks that need no meaning of the columns."""
+    def first_pass(
+        self, columns: ColumnMapping | None
+    ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
+        """Run the checks that need no units, and give the quantities on disk."""
         folder, report, size = self.folder, self.report, 0
         for entry, frames in read_sound_episodes(folder, report):
             for name, check in RAW_EPISODE_CHECKS.items():
                 report.run(name, check, folder, entry, frames)
-            for key, values in frames.items():
-                self.columns.setdefault(key, ColumnSummary()).add(values)
             report.episodes += 1
             report.frames += entry.length
             size += sum(values.nbytes for values in frames.values())
@@ -166,6 +161,13 @@ class _Survey:
                 # Views into a file's columns would keep all of them in memory.
                 kept = {key: values.copy() for key, values in frames.items()}
                 self._kept.append((entry, kept))
+            found = None
+            if columns is not None and _is_sound(frames, columns):
+                found = select_quantities(frames, columns.selections)
+            profile = profile_episode(entry.index, frames, found, folder.fps)
+            self.profiles[entry.index] = profile
+            if found is not None:
+                yield entry, found
 
     def episodes(self) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
         """The same episodes once more; nothing is reported twice."""
@@ -177,45 +179,49 @@ class _Survey:
 
 def _check_content(
     survey: _Survey,
+    dataset: OpenedDataset,
     mapping: MappingSpec,
     units: Mapping[str, str],
     speed_limits: Mapping[str, float | int],
 ) -> None:
-    """Find the quantities and their units; check every motion, and episodes against others.
+    """Decide on the units; check every motion, and episodes against others.
 
     Raises:
-        DatasetError: The mapping, the units or the sidecar are wrong.
+        DatasetError: The units are wrong.
     """
-    folder, report = survey.folder, survey.report
-    dataset = OpenedDataset.of(folder, mapping)
-    columns = dataset.columns
+    folder, report, profiles, columns = (
+        survey.folder,
+        survey.report,
+        survey.profiles,
+        dataset.columns,
+    )
     if dataset.contract_note is not None:
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
-    profiles: dict[int, EpisodeProfile] = {}
-
-    def quantities() -> Iterator[tuple[EpisodeEntry, Quantities]]:
-        for entry, frames in survey.episodes():
-            found = None
-            if _is_sound(frames, columns):
-                found = select_quantities(frames, columns.selections)
-            profiles[entry.index] = profile_episode(entry.index, frames, found, folder.fps)
-            if found is not None:
-                yield entry, found
-
     decisions, faults = units_from_episodes(
-        columns.selections, quantities(), folder.fps, dataset.declared_units, units
+        columns.selections,
+        survey.first_pass(columns),
+        folder.fps,
+        dataset.declared_units,
+        units,
     )
     for fault in faults:
         report.add_error(fault)
     report.run("guesses", _guesses, columns, decisions if profiles else {})
     report.run("joint sets", _joint_sets, columns)
-    _check_motions(survey, columns, decisions, profiles, speed_limits, faults)
+    _check_motions(survey, columns, decisions, speed_limits, faults)
     _check_consistency(folder, columns, profiles, report)
     report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
     if dataset.contract is not None:
         overruled = replaced_roles(mapping) | {*units}
-        report.contract = _renewed(
-            dataset.contract, report.contract, folder, columns, overruled
+        kept = dataset.contract.selections(folder.features)
+        report.contract = report.contract.keeping(
+            dataset.contract,
+            {
+                column
+                for selections in (kept, columns.selections)
+                for role in overruled & selections.keys()
+                for column in selections[role].columns
+            },
         )
 
 
@@ -223,14 +229,13 @@ def _check_motions(
     survey: _Survey,
     columns: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
-    profiles: Mapping[int, EpisodeProfile],
     speed_limits: Mapping[str, float | int],
     faults: list[DatasetError],
 ) -> None:
     """Check the motion of every sound episode whose units are known."""
     folder, report = survey.folder, survey.report
     doubtful = {fault.episode for fault in faults}
-    usual = _usual_motion(columns, decisions, profiles)
+    usual = _usual_motion(columns, decisions, survey.profiles)
     sketches = []
     for entry, frames in survey.episodes():
         if not _is_sound(frames, columns):
@@ -270,47 +275,18 @@ def _check_consistency(
 ) -> None:
     """Compare every episode with the others."""
     entries = {entry.index: entry for entry in folder.episodes}
+    features = [*consistency.feature_profiles(folder, entries, profiles)]
+    report.run("column ranges", consistency.column_ranges, features)
+    report.run("statistics fit", structure_checks.statistics_fit, folder, features)
     report.run("episode lengths", consistency.lengths, [entries[i] for i in profiles])
-    report.run("command tracking", command_tracking, folder, columns, entries, profiles)
-    for feature in consistency.feature_profiles(folder, entries, profiles):
+    report.run(
+        "command tracking", consistency.command_tracking, folder, columns, entries, profiles
+    )
+    for feature in features:
+        report.run("sizes", consistency.sizes, feature)
         for name, check in CONSISTENCY_CHECKS.items():
-            report.run(name, check, feature)
-
-
-def _renewed(
-    kept: Contract,
-    inferred: Contract,
-    folder: DatasetFolder,
-    columns: ColumnMapping,
-    overruled: set[str],
-) -> Contract:
-    """The inferred contract with the names, roles and units of the kept one.
-
-    Args:
-        kept: Contract kept with the data, perhaps edited.
-        inferred: Contract of the current data.
-        folder: The dataset.
-        columns: Columns as they are read now.
-        overruled: Quantities whose columns or units the caller gives.
-    """
-    known = {(part.key, part.index): part for part in kept.components}
-    quantities: dict[tuple[str, int], set[str]] = {}
-    for selections in (kept.selections(folder.features), columns.selections):
-        for role, selection in selections.items():
-            for column in selection.columns:
-                quantities.setdefault(column, set()).add(role)
-    parts = []
-    for part in inferred.components:
-        column = (part.key, part.index)
-        old = known.get(column)
-        if old is not None:
-            same = (part.role, part.unit) == (old.role, old.unit)
-            if same or quantities.get(column, set()) & overruled:
-                part = replace(part, name=old.name)
-            else:
-                part = replace(old, low=part.low, high=part.high)
-        parts.append(part)
-    return replace(inferred, components=tuple(parts))
+            if len(feature.entries) >= consistency.FEWEST:
+                report.run(name, check, feature)
 
 
 def _usual_motion(

@@ -1,15 +1,23 @@
-"""Checks of one episode against the others: sizes, rests, noise, switches and columns."""
+"""Checks of one episode against the others: sizes, rests, noise, columns and commands."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.issues import Issue
-from hrc_learn.demos.read.profiles import ColumnProfile, EpisodeProfile, is_discrete
-from hrc_learn.demos.read.quantities import meaning_of_component
+from hrc_learn.demos.issues import Issue, warning
+from hrc_learn.demos.read.columns import ColumnMapping
+from hrc_learn.demos.read.profiles import (
+    ColumnProfile,
+    EpisodeProfile,
+    Tracking,
+    gain_over,
+    is_discrete,
+)
+from hrc_learn.demos.read.quantities import INDEX_KEYS, meaning_of_component
 
 FEWEST = 3
 """Fewest episodes among which one can be compared with the others."""
@@ -23,6 +31,12 @@ _HALF_TURN = 0.9 * np.pi
 """Length of a rotation vector [rad] above which noise of the hand can flip its sign."""
 _MOST_NAMED = 6
 """Components named in a message."""
+_SATURATED = 0.25
+"""Fraction of frames at an end of the range above which a component is reported."""
+# R squared above which a state follows its command, and below which it does not.
+_FOLLOWS, _LOST = 0.8, 0.4
+_PROMPT = 0.2
+"""Delay within which an arm follows [s]; a slow motion resembles its own rate later."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +56,13 @@ class FeatureProfiles:
         """One statistic of every profile."""
         return np.stack([getattr(profile, name) for profile in self.profiles]).astype(float)
 
+    def named(self, chosen: np.ndarray) -> str:
+        """Names of components, given by a mask or their numbers."""
+        if chosen.dtype == bool and chosen.all() and len(chosen) > 1:
+            return "all components"
+        places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+        return ", ".join(self.names[int(i)] for i in places[:_MOST_NAMED])
+
     @property
     def lengths(self) -> Int64[np.ndarray, " episodes"]:
         """Number of frames of each episode."""
@@ -52,11 +73,6 @@ class FeatureProfiles:
         """Usual range of each component."""
         return np.median(self.stack("span"), axis=0)
 
-    @property
-    def is_comparable(self) -> bool:
-        """True if there are enough episodes to compare."""
-        return len(self.entries) >= FEWEST
-
 
 def feature_profiles(
     folder: DatasetFolder,
@@ -65,7 +81,7 @@ def feature_profiles(
 ) -> Iterator[FeatureProfiles]:
     """Profiles of all episodes, feature by feature."""
     for key, declared in folder.features.items():
-        known = [p for p in profiles.values() if key in p.columns]
+        known = [p for p in profiles.values() if key in p.columns and key not in INDEX_KEYS]
         widths = {p.columns[key].start.shape for p in known}
         if widths != {(declared.width,)}:
             continue  # reported with the columns
@@ -94,13 +110,38 @@ def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
             )
 
 
+def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
+    """Components that change, and do not stay at an end of their range."""
+    for feature in features:
+        low, high = feature.stack("low"), feature.stack("high")
+        constant = low.min(0) == high.max(0)
+        if constant.any():
+            text = f"never changes: {feature.named(constant)}"
+            yield warning(message=text, key=feature.key)
+        ends = feature.stack("at_ends")
+        at_low = (ends[:, 0] * (low == low.min(0))).sum(0) / feature.lengths.sum()
+        at_high = (ends[:, 1] * (high == high.max(0))).sum(0) / feature.lengths.sum()
+        at_end = np.maximum(at_low, at_high)
+        # Grippers that are open or closed are at one end or the other.
+        saturated = (at_end > _SATURATED) & ~constant & (at_low + at_high < 1)
+        if saturated.any() and feature.key.startswith(("observation.state", "action", "state")):
+            yield warning(
+                message=f"sits at an end of its range for up to "
+                f"{100 * at_end[saturated].max():.0f} % of the frames: "
+                f"{feature.named(saturated)}",
+                key=feature.key,
+            )
+
+
 def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
     """Values that no robot reports."""
     usual = np.median(feature.stack("peak"), axis=0)
-    largest = feature.stack("largest")
+    largest = np.maximum(np.abs(feature.stack("low")), np.abs(feature.stack("high")))
     scale = np.maximum(usual, np.where(feature.smooth, 1e-3, np.inf))
     absurd = (largest > _IMPOSSIBLE) | (largest > _IMPLAUSIBLE * scale)
-    absurd &= np.array([not _is_clock_name(name, feature.key) for name in feature.names])
+    # Clocks are large by nature.
+    texts = [f"{name} {feature.key}".lower() for name in feature.names]
+    absurd &= np.array(["time" not in text and "stamp" not in text for text in texts])
     for number, component in np.argwhere(absurd):
         name, size = feature.names[component], largest[number, component]
         yield feature.entries[number].fault(
@@ -112,15 +153,8 @@ def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
         )
 
 
-def _is_clock_name(name: str, key: str) -> bool:
-    """True for clocks, which are large by nature."""
-    return any("time" in text.lower() or "stamp" in text.lower() for text in (name, key))
-
-
 def holds(feature: FeatureProfiles) -> Iterator[Issue]:
     """Components that froze in one episode, and hardly ever rest in the others."""
-    if not feature.is_comparable:
-        return
     held, frames = feature.stack("held"), feature.lengths
     fraction = held / frames[:, None]
     usual = np.median(fraction, axis=0)
@@ -143,8 +177,6 @@ def holds(feature: FeatureProfiles) -> Iterator[Issue]:
 
 def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     """Components far noisier, or far coarser, in one episode than in the others."""
-    if not feature.is_comparable:
-        return
     noise, span = feature.stack("noise"), feature.span
     moving = feature.smooth & (span > 0)
     # Second differences vary by a factor of three between operators, not by ten.
@@ -156,19 +188,17 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     coarse &= feature.stack("held") / frames < 0.1  # otherwise it rests
     for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
         for number in np.flatnonzero(odd.any(1)):
-            names = [feature.names[i] for i in np.flatnonzero(odd[number])]
+            places = np.flatnonzero(odd[number])
             yield feature.entries[number].warning(
-                (f"is {what} than in the other episodes: {', '.join(names[:_MOST_NAMED])}"),
+                f"is {what} than in the other episodes: {feature.named(places)}",
                 key=feature.key,
-                components=tuple(names),
-                severity=float(odd[number].sum()),
+                components=tuple(feature.names[i] for i in places),
+                severity=float(len(places)),
             )
 
 
 def switches(feature: FeatureProfiles) -> Iterator[Issue]:
     """Grippers and flags that stay, or switch the other way, in one episode alone."""
-    if not feature.is_comparable:
-        return
     span, usual_span = feature.stack("span"), feature.span
     ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)
     usual = np.median(ends, axis=0)
@@ -198,9 +228,7 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
     An episode is described by five figures per component (5, 50 and 95 % quantiles, start and
     goal) and compared with the median over all episodes, in units of their spread.
     """
-    if not feature.is_comparable or not feature.key.startswith(
-        ("observation.", "state", "action")
-    ):
+    if not feature.key.startswith(("observation.", "state", "action")):
         return
     moving = np.flatnonzero(feature.smooth & (feature.span > 0) & ~_without_sign(feature))
     if not len(moving):
@@ -218,21 +246,17 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
         off = np.abs(own - usual).mean(0) / scale
         if not (off > _FAR_OFF).any():
             continue
-        found = (
-            _permuted(own, usual, scale, off, names)
-            or _negated(own, usual, scale, off, names)
-            or _reversed(own, usual, scale, off)
-            or _offset(own, usual, off, names)
+        found = _permuted(own, usual, scale, off, names) or _moved(
+            own, usual, scale, off, names
         )
         if found is not None:
             level, text = found
-            yield Issue(
-                message=text,
-                level=level,
-                **feature.entries[number].location,
+            yield feature.entries[number].fault(
+                text,
                 key=feature.key,
                 components=tuple(names[i] for i in np.flatnonzero(off > _FAR_OFF)),
                 severity=float(off.max()),
+                level=level,
             )
 
 
@@ -249,76 +273,55 @@ def _permuted(
     cost = np.abs(own[:, :, None] - usual[:, None, :]).mean(0) / scale
     # The bound keeps one outlier from deciding the whole assignment.
     _, best = linear_sum_assignment(np.minimum(cost, 50))
-    exchanged = _displaced_cycles(best, off > _FAR_OFF)
+    # Cycles of the permutation in which every component is far from its usual place: if only
+    # some are, they resemble the others by chance.
+    exchanged: list[int] = []
+    for first in range(len(best)):
+        ring = [first]
+        while best[ring[-1]] != first:
+            ring.append(int(best[ring[-1]]))
+        if len(ring) > 1 and (off[ring] > _FAR_OFF).all():
+            exchanged.append(first)
+    if not exchanged:
+        return None
     after = cost[exchanged, best[exchanged]]
     # In their new places all components must look usual: within two spreads.
-    if len(exchanged) < 2 or after.max() >= 2:
-        return None
-    if after.mean() >= 0.3 * off[exchanged].mean():
+    if after.max() >= 2 or after.mean() >= 0.3 * off[exchanged].mean():
         return None
     pairs = ", ".join(f"{names[i]} like {names[best[i]]}" for i in exchanged[:4])
     return "error", f"columns look exchanged, in this episode alone: {pairs}"
 
 
-def _displaced_cycles(
-    best: Int64[np.ndarray, " components"], off: Bool[np.ndarray, " components"]
-) -> Int64[np.ndarray, " _"]:
-    """Components of permutation cycles in which every component is far from its usual place.
-
-    If only some are far off, they resemble the others by chance.
-    """
-    found = []
-    for first in range(len(best)):
-        ring = [first]
-        while best[ring[-1]] != first:
-            ring.append(int(best[ring[-1]]))
-        if len(ring) > 1 and off[ring].all():
-            found.append(first)
-    return np.array(found, dtype=int)
-
-
-def _negated(
+def _moved(
     own: _Figures, usual: _Figures, scale: _PerComponent, off: _PerComponent, names: list[str]
 ) -> tuple | None:
-    """Components with the opposite sign; negation exchanges the quantiles 5 and 95 %."""
+    """Components with the opposite sign, a motion run backwards, or a moved zero."""
+
+    def listed(places: np.ndarray) -> str:
+        return ", ".join(names[i] for i in places[:_MOST_NAMED])
+
+    # Negation exchanges the quantiles 5 and 95 %. The negated figures must be usual, and far
+    # closer than the original ones.
     turned = np.abs(-own[[2, 1, 0, 3, 4]] - usual).mean(0) / scale
-    # The negated figures must be usual, and far closer than the original ones.
     negated = np.flatnonzero((off > _FAR_OFF) & (turned < 1.5) & (turned < 0.25 * off))
-    if not len(negated):
-        return None
-    listed = ", ".join(names[i] for i in negated[:_MOST_NAMED])
-    return "error", f"has the other sign than in the other episodes: {listed}"
-
-
-def _reversed(
-    own: _Figures, usual: _Figures, scale: _PerComponent, off: _PerComponent
-) -> tuple | None:
-    """A motion from the usual goal to the usual start."""
-    back = np.abs(own[[0, 1, 2, 4, 3]] - usual).mean(0) / scale
+    if len(negated):
+        return "error", f"has the other sign than in the other episodes: {listed(negated)}"
     # All components together: single ones look alike in both directions.
+    back = np.abs(own[[0, 1, 2, 4, 3]] - usual).mean(0) / scale
     if off.mean() > 2 and back.mean() < 0.4 * off.mean():
         return "warning", "runs the other way than the other episodes"
-    return None
-
-
-def _offset(
-    own: _Figures, usual: _Figures, off: _PerComponent, names: list[str]
-) -> tuple | None:
-    """Components shifted as a whole, or far from the other episodes in another way."""
-    moved = np.flatnonzero(off > 3 * _FAR_OFF)
-    shift = own - usual
+    moved, shift = np.flatnonzero(off > 3 * _FAR_OFF), own - usual
     # A moved zero shifts all five figures by the same amount.
     alike = np.ptp(shift, axis=0) < 0.2 * np.abs(shift.mean(0))
-    offset = [i for i in moved if alike[i]]
+    offset = [f"{names[i]} by {shift[1, i]:.3g}" for i in moved if alike[i]]
     if offset:
-        listed = ", ".join(f"{names[i]} by {shift[1, i]:.3g}" for i in offset[:_MOST_NAMED])
         return "warning", (
-            f"is offset from the other episodes all along: {listed}: its zero was moved?"
+            f"is offset from the other episodes all along: {', '.join(offset[:_MOST_NAMED])}: "
+            f"its zero was moved?"
         )
-    if not len(moved):
-        return None
-    listed = ", ".join(names[i] for i in moved[:_MOST_NAMED])
-    return "warning", f"is far from the other episodes: {listed}"
+    return (
+        ("warning", f"is far from the other episodes: {listed(moved)}") if len(moved) else None
+    )
 
 
 def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
@@ -332,3 +335,128 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
     middles = np.linalg.norm(feature.stack("levels")[:, 2] * vectors, axis=1)
     near_half_turn = bool((middles > _HALF_TURN).any())
     return np.char.startswith(roles, "quaternion") | (vectors & near_half_turn)
+
+
+def command_tracking(
+    folder: DatasetFolder,
+    mapping: ColumnMapping,
+    entries: Mapping[int, EpisodeEntry],
+    profiles: Mapping[int, EpisodeProfile],
+) -> Iterator[Issue]:
+    """Delays, signs and pairs of commands and states that agree between episodes."""
+    known = [p for p in profiles.values() if "command_position" in p.tracking]
+    if "command_position" not in mapping.selections or not known:
+        return
+    command = mapping.selections["command_position"]
+    key, names = command.columns[0][0], command.labels
+    trackings = [p.tracking["command_position"] for p in known]
+    usual_fit = _median([t.fit for t in trackings])
+    yield from _velocity_commands(folder.fps, key, names, profiles, usual_fit)
+    follow = usual_fit > _FOLLOWS
+    if not follow.any():
+        return
+    usual_slope = _median([t.slope for t in trackings])
+    delays = np.array([t.delay for t in trackings])
+    delay = float(np.median(delays))
+    if delay < -1:
+        yield warning(
+            message=f"the state moves {-delay:.0f} frames before its command in most episodes: "
+            f"actions and states are shifted against each other",
+            key=key,
+        )
+    agreement = (np.abs(delays - delay) <= 2).mean()
+    for profile, tracking in zip(known, trackings, strict=True):
+        entry = entries[profile.index]
+        shift = tracking.delay - delay
+        # The own delay must explain far more of the motion than the usual one.
+        better = gain_over(tracking, round(delay)) > 0.8
+        # Three frames are the scatter of estimated delays.
+        if abs(shift) > max(3, 0.1 * abs(delay)) and better and agreement > 0.5:
+            yield entry.fault(
+                f"the state comes {tracking.delay} frames after its command, in the other "
+                f"episodes {delay:.0f}: actions were shifted against states",
+                key=key,
+                components=names,
+                severity=abs(shift),
+            )
+        elif len(known) >= FEWEST:
+            for text, level in _component_tracking(tracking, usual_slope, follow, names):
+                yield entry.fault(text, key=key, components=names, level=level)
+
+
+def _median(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " components"]:
+    """Median over episodes; components that rest count as 0."""
+    with np.errstate(all="ignore"):
+        return np.nan_to_num(np.median(np.nan_to_num(np.stack(rows)), axis=0))
+
+
+def _component_tracking(
+    tracking: Tracking,
+    usual_slope: Float64[np.ndarray, " components"],
+    follow: Bool[np.ndarray, " components"],
+    names: tuple[str, ...],
+) -> Iterator[tuple[str, Literal["error", "warning"]]]:
+    """Components that follow their command in the other episodes, but not in this one."""
+
+    def listed(components: Int64[np.ndarray, " _"]) -> str:
+        return ", ".join(names[i] for i in components[:_MOST_NAMED])
+
+    fit, slope, partner = tracking.fit, tracking.slope, tracking.partner
+    follows = follow & (fit > _FOLLOWS)
+    lost = np.flatnonzero(follow & ~(fit > _LOST) & ~np.isnan(fit))
+    # The slope equals minus the usual one, within half of it.
+    opposite = np.abs(slope + usual_slope) < 0.5 * np.abs(usual_slope)
+    against = np.flatnonzero(follows & opposite)
+    swapped = [i for i in lost if tracking.similarity[i] > 0.9 and partner[i] != i]
+    if len(against):
+        text = "the state goes the other way than its command, in this episode alone"
+        yield f"{text}: {listed(against)}", "error"
+    elif len(swapped) > 1:
+        pairs = ", ".join(f"{names[i]} as {names[partner[i]]}" for i in swapped[:4])
+        yield f"columns look exchanged against the state: {pairs}", "error"
+    elif len(lost):
+        text = "the state does not follow its command, as it does in the other episodes"
+        yield f"{text}: {listed(lost)}", "warning"
+    with np.errstate(all="ignore"):
+        ratio = np.abs(slope / np.where(usual_slope, usual_slope, 1))
+    # A factor of exp(0.5) = 1.6: payload and contact explain less.
+    size = np.flatnonzero(follows & (np.abs(np.log(ratio + 1e-9)) > 0.5))
+    if len(size):
+        yield (
+            (
+                f"the state goes {slope[size[0]]:.2g} times as far as its command, in the "
+                f"other episodes {usual_slope[size[0]]:.2g}: {listed(size)}"
+            ),
+            "warning",
+        )
+
+
+def _velocity_commands(
+    fps: float,
+    key: str,
+    names: tuple[str, ...],
+    profiles: Mapping[int, EpisodeProfile],
+    position_fit: Float64[np.ndarray, " components"],
+) -> Iterator[Issue]:
+    """Commands that are named like positions but are velocities."""
+    known = [p.tracking for p in profiles.values()]
+    rates = [t["rates"] for t in known if "rates" in t]
+    positions = [t["command_position"] for t in known if "command_position" in t]
+    if not rates:
+        return
+    rate_delay, position_delay = (
+        abs(float(np.median([t.delay for t in group]))) / fps for group in (rates, positions)
+    )
+    # If both readings fit a smooth motion, the one without a long delay is meant.
+    prompt = rate_delay <= _PROMPT < position_delay
+    fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
+    # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
+    speeds = (fit > _FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
+    speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
+    if speeds.sum() > len(speeds) / 2:
+        yield Issue(
+            message=f"is taken for positions, but follows the velocity of the state with slope "
+            f"{float(np.median(slope[speeds])):.2f}: {', '.join(names[:6])}; declare it "
+            f"(mapping={{'command_velocity': {key!r}, 'command_position': None}})",
+            key=key,
+        )

@@ -4,22 +4,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Float64, Shaped
+from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.format.metadata import Feature
-from hrc_learn.demos.issues import Issue, warning
+from hrc_learn.demos.issues import Issue
 from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.quantities import (
-    INDEX_KEYS,
     ORIENTATION_ROLES,
     is_hand,
     to_quaternion,
 )
 from hrc_learn.demos.read.units import Quantities
 
-_SATURATED = 0.25
-"""Fraction of frames at an end of the range above which a component is reported."""
 _REPEATED = 0.05
 """Tolerated fraction of repeated frames."""
 _RATE_TOLERANCE = 0.05
@@ -120,120 +116,47 @@ def stamps(
     steps = np.diff(time)
     if not np.isfinite(time).all() or not len(steps):
         return  # values that are not finite are reported as such
-    place = {**entry.location, "key": key}
     stalled = np.flatnonzero(steps <= 0)
     if len(stalled):
         k = int(stalled[0])
-        yield Issue(
-            message=f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s "
+        yield entry.fault(
+            f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s "
             f"({len(stalled)} times); hrc repair drops the repeated frames",
             frame=k + 1,
-            **place,
+            key=key,
         )
         return
     usual = float(np.median(steps))
     if key == "timestamp" and abs(time[0]) > 0.5 / fps:
-        yield warning(
-            message=f"begins at {time[0]:.6g} s, not at 0: LeRobot's stamps count from the "
-            f"start of the episode",
+        yield entry.warning(
+            f"begins at {time[0]:.6g} s, not at 0: LeRobot's stamps count from the start of "
+            f"the episode",
             frame=0,
-            **place,
+            key=key,
         )
     # The median step ignores gaps and repetitions.
     if abs(usual * fps - 1) > _RATE_TOLERANCE:
-        yield warning(
-            message=f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
+        yield entry.warning(
+            f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
             f"{fps:g}; hrc repair --fps {round(1 / usual)} resamples to the true rate",
-            **place,
+            key=key,
         )
     gaps = np.flatnonzero(steps > _GAP * usual)
     if len(gaps):
         lost = int(np.rint(steps[gaps] / usual - 1).sum())
-        yield warning(
-            message=f"{len(gaps)} gaps, about {lost} frames lost; the first is "
+        yield entry.warning(
+            f"{len(gaps)} gaps, about {lost} frames lost; the first is "
             f"{1e3 * steps[gaps[0]]:.4g} ms long; hrc repair --fps {fps:g} fills them in",
             frame=int(gaps[0]) + 1,
-            **place,
+            key=key,
         )
     jitter = float(np.quantile(np.abs(np.delete(steps, gaps) - usual), 0.95)) / usual
     if jitter > _JITTER_TOLERANCE:
-        yield warning(
-            message=f"steps vary by {100 * jitter:.0f} % (95th percentile); hrc repair "
-            f"--fps {fps:g} resamples",
-            **place,
+        yield entry.warning(
+            f"steps vary by {100 * jitter:.0f} % (95th percentile); hrc repair --fps {fps:g} "
+            f"resamples",
+            key=key,
         )
-
-
-class ColumnSummary:
-    """Range and saturation of one feature, gathered episode by episode."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.finite = True
-        self.low = self.high = np.zeros(0)
-        self._at_low = self._at_high = np.zeros(0)
-
-    def add(self, values: Shaped[np.ndarray, "frames components"]) -> None:
-        """Include an episode."""
-        if not len(values) or not self.finite:
-            return
-        values = values.astype(float)
-        if not np.isfinite(values).all() or (self.count and values.shape[1] != len(self.low)):
-            self.finite = False
-            return
-        low, high = values.min(0), values.max(0)
-        at_low, at_high = (values == low).sum(0), (values == high).sum(0)
-        if self.count:
-            at_low = _count_at_end(low, self.low, at_low, self._at_low)
-            at_high = _count_at_end(-high, -self.high, at_high, self._at_high)
-            low, high = np.minimum(low, self.low), np.maximum(high, self.high)
-        self.low, self.high, self._at_low, self._at_high = low, high, at_low, at_high
-        self.count += len(values)
-
-    @property
-    def at_end(self) -> Float64[np.ndarray, " components"]:
-        """Fraction of the frames at the more frequent end of the range."""
-        return np.maximum(self._at_low, self._at_high) / max(self.count, 1)
-
-    @property
-    def binary(self) -> Bool[np.ndarray, " components"]:
-        """Mask of components with two values, such as a gripper that is open or closed."""
-        return self._at_low + self._at_high >= self.count
-
-
-def _count_at_end(
-    end: np.ndarray, other: np.ndarray, count: np.ndarray, others: np.ndarray
-) -> np.ndarray:
-    """Number of values at the lower of two ends."""
-    return np.where(end < other, count, np.where(end > other, others, count + others))
-
-
-def column_ranges(
-    folder: DatasetFolder, columns: Mapping[str, ColumnSummary]
-) -> Iterator[Issue]:
-    """Components that change, and do not stay at an end of their range."""
-    for key in sorted({*columns} - {*INDEX_KEYS}):
-        summary, feature = columns[key], folder.features[key]
-        if not summary.count or not summary.finite:
-            continue
-        constant = summary.low == summary.high
-        if constant.any():
-            yield warning(message=f"never changes: {_names(feature, constant)}", key=key)
-        at_end = summary.at_end
-        saturated = (at_end > _SATURATED) & ~constant & ~summary.binary
-        if saturated.any() and key.startswith(("observation.state", "action", "state")):
-            yield warning(
-                message=f"sits at an end of its range for up to "
-                f"{100 * at_end[saturated].max():.0f} % of the frames: "
-                f"{_names(feature, saturated)}",
-                key=key,
-            )
-
-
-def _names(feature: Feature, chosen: np.ndarray) -> str:
-    if chosen.all() and len(chosen) > 1:
-        return "all components"
-    return ", ".join(feature.component(int(i)) for i in np.flatnonzero(chosen))
 
 
 @dataclass(frozen=True, kw_only=True)

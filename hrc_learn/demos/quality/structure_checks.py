@@ -4,7 +4,8 @@
 report the faults on the way; the other functions are checks, listed in `check`.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,21 +22,13 @@ from hrc_learn.demos.format.dataset_folder import (
     read_info,
     read_tasks,
 )
-from hrc_learn.demos.format.metadata import Feature, read_features
+from hrc_learn.demos.format.metadata import SIDECAR_PATH, Feature, read_features
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, plain_text, warning
-from hrc_learn.demos.quality.episode_checks import ColumnSummary
-from hrc_learn.demos.read.frames import (
-    BadRowError,
-    RawFrames,
-    require_rows,
-    to_numpy,
-    width_fault,
-)
+from hrc_learn.demos.quality.consistency_checks import FeatureProfiles
+from hrc_learn.demos.read.frames import RawFrames, read_each, read_frames, require_rows
 from hrc_learn.demos.read.quantities import INDEX_KEYS
+from hrc_learn.store import MANIFEST, changed_files
 
-_BATCH_ROWS = 2**14
-_LARGEST_EPISODE = 2**28
-"""Largest episode that is held in memory [bytes]: 75 minutes of 60 numbers at 100 Hz."""
 _MOST_LISTED = 100_000
 _STATISTICS = "meta/stats.json"
 _PLACEHOLDERS = (
@@ -66,82 +59,44 @@ def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
 def read_sound_episodes(
     folder: DatasetFolder, report: ValidationReport
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    """Episodes that can be read, with their sound columns.
-
-    Files are read in pieces, and no more rows than the list of episodes promises.
-    """
+    """Episodes that can be read, with their sound columns; faults go into the report."""
     for file, entries in folder.files.items():
-        try:
-            yield from _read_file(folder, file, entries, report)
-        except DatasetError as error:
-            report.add_error(error)
-        except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
-            report.add_error(
-                DatasetError(
-                    f"unreadable: the file is damaged ({type(error).__name__}: {error}); copy "
-                    f"it again",
-                    file=file,
-                    episode=entries[0].index,
-                )
-            )
+        found = report.attempt(partial(_sound_keys, folder, file, entries, report))
+        if not found:
+            continue
+        keys, rows = found
+        listed = [e for e in entries if e.length > 0 and e.start + e.length <= rows]
+        read = read_each(folder, listed, keys, strict=False) if keys else ()
+        for entry, frames in zip(listed, read, strict=False):
+            if isinstance(frames, DatasetError):
+                frames = _sound_columns(folder, entry, keys, report)
+            if frames:
+                yield entry, frames
 
 
-def _read_file(
+def _sound_keys(
     folder: DatasetFolder, file: str, entries: list[EpisodeEntry], report: ValidationReport
-) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+) -> tuple[list[str], int]:
+    """Numeric columns that a file holds once, and its number of rows."""
     parquet = open_parquet(folder.root, file, entries[0].index)
     rows, schema = parquet.metadata.num_rows, parquet.schema_arrow
     report.attempt(lambda: require_rows(file, entries, rows, folder.promised_rows[file]))
     report.run("declared columns", _column_faults, folder, file, schema, report)
-    features = {k: f for k, f in folder.features.items() if f.numeric}
-    wanted = [key for key in features if schema.names.count(key) == 1]
-    if not wanted:
-        return
-    limit = max(1000, _LARGEST_EPISODE // (8 * max(sum(features[k].width for k in wanted), 1)))
-    pieces = parquet.iter_batches(batch_size=_BATCH_ROWS, columns=wanted)
-    table, first = pa.table({}), 0
-    too_wide: set[str] = set()
-    for entry in sorted(entries, key=lambda entry: entry.start):
-        end = entry.start + entry.length
-        if end > rows or entry.length <= 0 or entry.start < first:
-            continue
-        if entry.length > limit:
-            text = f"is too long to be examined as a whole: {entry.length} frames"
-            report.add(entry.warning(text))
-            end = entry.start + limit
-        while first + len(table) < end and (piece := next(pieces, None)) is not None:
-            arrived = pa.Table.from_batches([piece])
-            table = pa.concat_tables([table, arrived]) if len(table) else arrived
-            if first + len(table) <= entry.start:  # rows between two episodes
-                first, table = first + len(table), table.slice(len(table))
-        part = table.slice(entry.start - first, end - entry.start)
-        frames = _sound_columns(folder, part, entry, too_wide, report)
-        if len(part) == entry.length and frames:
-            yield entry, frames
-        table = table.slice(end - first)
-        first = end
+    numeric = [key for key, feature in folder.features.items() if feature.numeric]
+    return [key for key in numeric if schema.names.count(key) == 1], rows
 
 
 def _sound_columns(
-    folder: DatasetFolder,
-    table: pa.Table,
-    entry: EpisodeEntry,
-    too_wide: set[str],
-    report: ValidationReport,
+    folder: DatasetFolder, entry: EpisodeEntry, keys: list[str], report: ValidationReport
 ) -> RawFrames:
-    """Columns of one episode; a wrong width is reported once per file (`too_wide`)."""
-    columns = {}
-    for key in table.column_names:
+    """Columns of one episode that can be read, one at a time."""
+    columns: RawFrames = {}
+    for key in keys:
         try:
-            columns[key] = to_numpy(table.column(key))
-        except (BadRowError, pa.ArrowException, TypeError) as error:
-            row = error.row if isinstance(error, BadRowError) else 0
-            report.add(entry.fault(str(error), frame=row, key=key))
-            continue
-        fault = width_fault(folder, entry.file, key, columns[key])
-        if fault is not None and key not in too_wide:
-            report.add(fault.issue)
-            too_wide.add(key)
+            for _, frames in read_frames(folder, [entry], [key], strict=False):
+                columns |= frames
+        except DatasetError as error:
+            report.add_error(error)
     return columns
 
 
@@ -217,16 +172,14 @@ def statistics_exist(folder: DatasetFolder) -> Iterator[Issue]:
 
 
 def statistics_fit(
-    folder: DatasetFolder, columns: Mapping[str, ColumnSummary]
+    folder: DatasetFolder, features: Sequence[FeatureProfiles]
 ) -> Iterator[Issue]:
     """Statistics that agree with the data."""
     path = folder.root / _STATISTICS
-    if not path.exists():
-        return
-    recorded = read_json(path)
-    for key, summary in columns.items():
-        stated = recorded.get(key)
-        if key in INDEX_KEYS or not summary.finite or not summary.count or stated is None:
+    recorded = read_json(path) if path.exists() else {}
+    for feature in features:
+        stated = recorded.get(feature.key)
+        if stated is None:
             continue
         try:
             low, high, mean, std = (
@@ -234,20 +187,23 @@ def statistics_fit(
                 for name in ("min", "max", "mean", "std")
             )
         except (KeyError, TypeError, ValueError):
-            yield warning(message="statistics are incomplete", file=_STATISTICS, key=key)
-            continue
-        if {len(low), len(high), len(mean), len(std)} != {len(summary.low)}:
-            yield Issue(
-                message=f"statistics of {len(mean)} components for {len(summary.low)}: LeRobot "
-                f"cannot normalise",
-                file=_STATISTICS,
-                key=key,
+            yield warning(
+                message="statistics are incomplete", file=_STATISTICS, key=feature.key
             )
             continue
-        span = np.maximum(summary.high - summary.low, 1e-6)
+        if {len(low), len(high), len(mean), len(std)} != {len(feature.names)}:
+            yield Issue(
+                message=f"statistics of {len(mean)} components for {len(feature.names)}: "
+                f"LeRobot cannot normalise",
+                file=_STATISTICS,
+                key=feature.key,
+            )
+            continue
+        least, most = feature.stack("low").min(0), feature.stack("high").max(0)
+        span = np.maximum(most - least, 1e-6)
         wrong = ~np.isfinite(low + high + mean + std) | (std < 0) | (low > high)
         # A part of a dataset may keep the statistics of the whole, which enclose it.
-        wrong |= (summary.low < low - 0.02 * span) | (summary.high > high + 0.02 * span)
+        wrong |= (least < low - 0.02 * span) | (most > high + 0.02 * span)
         wrong |= (mean < low - 0.02 * span) | (mean > high + 0.02 * span)
         # Far wider statistics belong to other data or to another unit.
         wrong |= (high - low) > 20 * span + 1
@@ -256,7 +212,23 @@ def statistics_fit(
                 message=f"statistics do not fit the data in {wrong.sum()} components: policies "
                 f"would normalise wrongly; hrc repair computes them anew",
                 file=_STATISTICS,
-                key=key,
+                key=feature.key,
+            )
+
+
+def unchanged_files(folder: DatasetFolder) -> Iterator[Issue]:
+    """Files as this package wrote them; the sidecar may be edited."""
+    try:
+        changed = changed_files(folder.root)
+    except ValueError as error:
+        yield Issue(message=f"cannot be read ({error})", file=MANIFEST)
+        return
+    for name in changed:
+        if name != SIDECAR_PATH:
+            yield Issue(
+                message=f"is not as it was written: its checksum differs. Copy it again, or "
+                f"delete {MANIFEST} if it was changed on purpose",
+                file=name,
             )
 
 

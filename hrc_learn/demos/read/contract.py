@@ -8,7 +8,7 @@ be edited there, and every reader of the dataset obeys it.
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -194,6 +194,24 @@ class Contract:
             )
             for role, parts in found.items()
         }
+
+    def keeping(self, kept: "Contract", overruled: Collection[tuple[str, int]]) -> "Contract":
+        """This contract with the names, roles and units of an older one, perhaps edited.
+
+        Args:
+            kept: The older contract.
+            overruled: Columns whose role or unit the caller gives now.
+        """
+        known = {(part.key, part.index): part for part in kept.components}
+        parts = []
+        for part in self.components:
+            old = known.get((part.key, part.index), part)
+            same = (part.role, part.unit) == (old.role, old.unit)
+            if same or (part.key, part.index) in overruled:
+                parts.append(replace(part, name=old.name))
+            else:
+                parts.append(replace(old, low=part.low, high=part.high))
+        return replace(self, components=tuple(parts))
 
     def content(self) -> dict[str, Any]:
         """The contract as JSON values."""

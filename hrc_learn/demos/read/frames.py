@@ -25,7 +25,10 @@ _ALONE = 64
 
 
 def read_frames(
-    folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
+    folder: DatasetFolder,
+    entries: Sequence[EpisodeEntry],
+    keys: Sequence[str],
+    strict: bool = True,
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
     """Read columns of episodes, in the order of `entries`.
 
@@ -36,6 +39,8 @@ def read_frames(
         folder: The dataset.
         entries: Episodes wanted, in the order they lie on disk.
         keys: Columns wanted; LeRobot's own index columns are added where they exist.
+        strict: Check that the rows are those that the metadata promise. False reads the wanted
+            columns alone, as they are.
 
     Raises:
         DatasetError: A file or column is missing or damaged, a column is not as wide as
@@ -44,17 +49,21 @@ def read_frames(
     for file, group in groupby(entries, key=lambda entry: entry.file):
         listed = list(group)
         parquet = open_parquet(folder.root, file, listed[0].index)
-        require_rows(file, listed, parquet.metadata.num_rows, folder.promised_rows[file])
+        if strict:
+            require_rows(file, listed, parquet.metadata.num_rows, folder.promised_rows[file])
         existing = parquet.schema_arrow.names
         for key in keys:
             if key not in existing:
                 raise DatasetError(
                     "the column is declared in meta/info.json, but missing", file=file, key=key
                 )
-        indices = [k for k in ("timestamp", "episode_index", "task_index") if k in existing]
-        wanted = [*dict.fromkeys([*keys, *indices])]
+        indices = ("timestamp", "episode_index", "task_index") if strict else ()
+        wanted = [*dict.fromkeys([*keys, *(k for k in indices if k in existing)])]
         for batch in _batches(listed, row_group_starts(parquet.metadata)):
-            yield from _read_batch(folder, parquet, batch, wanted)
+            for entry, frames in _read_batch(folder, parquet, batch, wanted):
+                if strict:
+                    _require_episode(entry, frames)
+                yield entry, frames
 
 
 def _batches(
@@ -94,16 +103,21 @@ def _read_batch(
     for key in table.column_names:
         try:
             columns[key] = to_numpy(table.column(key))
-        except BadRowError as error:
-            row = error.row + rows.start
+        except (BadRowError, pa.ArrowException, TypeError) as error:
+            row = rows.start + (error.row if isinstance(error, BadRowError) else 0)
             entry = next(e for e in entries if e.start <= row < e.start + e.length)
             raise entry.error(str(error), frame=row - entry.start, key=key) from error
-        if (fault := width_fault(folder, file, key, columns[key])) is not None:
-            raise fault
+        feature, width = folder.features.get(key), columns[key].shape[1]
+        if feature is not None and len(columns[key]) and width != feature.width:
+            raise DatasetError(
+                f"has {width} components, but meta/info.json declares the shape "
+                f"{list(feature.shape)}",
+                file=file,
+                key=key,
+            )
     for entry in entries:
         start = entry.start - rows.start
         frames = {key: values[start : start + entry.length] for key, values in columns.items()}
-        _require_episode(entry, frames)
         yield entry, frames
 
 
@@ -120,21 +134,6 @@ def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised
             file=file,
             episode=entries[0].index if len(entries) == 1 else None,
         )
-
-
-def width_fault(
-    folder: DatasetFolder, file: str, key: str, values: np.ndarray
-) -> DatasetError | None:
-    """Fault of a column that is not as wide as declared, or None."""
-    feature = folder.features.get(key)
-    if feature is None or not len(values) or values.shape[1] == feature.width:
-        return None
-    return DatasetError(
-        f"has {values.shape[1]} components, but meta/info.json declares the shape "
-        f"{list(feature.shape)}",
-        file=file,
-        key=key,
-    )
 
 
 def _require_episode(entry: EpisodeEntry, frames: RawFrames) -> None:
@@ -180,16 +179,19 @@ def each_or_fault[T](
 
 
 def read_each(
-    folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
+    folder: DatasetFolder,
+    entries: Sequence[EpisodeEntry],
+    keys: Sequence[str],
+    strict: bool = True,
 ) -> Iterator[RawFrames | DatasetError]:
     """Read columns of every episode, in any order; a fault does not stop the others."""
 
     def following(first: int) -> Iterator[RawFrames]:
         for run in disk_runs(entries[first:]):
-            yield from (frames for _, frames in read_frames(folder, run, keys))
+            yield from (frames for _, frames in read_frames(folder, run, keys, strict))
 
     def alone(place: int) -> RawFrames:
-        ((_, frames),) = read_frames(folder, [entries[place]], keys)
+        ((_, frames),) = read_frames(folder, [entries[place]], keys, strict)
         return frames
 
     return each_or_fault(len(entries), following, alone)

@@ -46,8 +46,10 @@ class ColumnProfile:
     """Largest number of consecutive frames without any change."""
     distinct: Int64[np.ndarray, " _components"]
     """Number of distinct values."""
-    largest: Float64[np.ndarray, " _components"]
-    """Largest absolute value."""
+    low: Float64[np.ndarray, " _components"]
+    high: Float64[np.ndarray, " _components"]
+    at_ends: Int64[np.ndarray, "2 _components"]
+    """Number of frames at the lowest and at the highest value."""
     flat: Float64[np.ndarray, " _components"]
     """Fraction of steps without any change."""
 
@@ -133,11 +135,13 @@ def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
         levels=ordered[places],
         start=np.median(values[:few], axis=0),
         goal=np.median(values[-few:], axis=0),
-        step=np.partition(steps, at, axis=0)[at].copy(),  # a view would keep all frames
+        step=np.partition(steps, at, axis=0)[at].copy(),
         noise=np.median(bends, axis=0),
         held=_longest_hold(values),
         distinct=1 + (np.diff(ordered, axis=0) > 0).sum(0),
-        largest=np.maximum(np.abs(ordered[0]), np.abs(ordered[-1])),
+        low=ordered[0].copy(),  # a view would keep all frames
+        high=ordered[-1].copy(),
+        at_ends=np.stack([(values == end).sum(0) for end in (ordered[0], ordered[-1])]),
         flat=(steps == 0).mean(0),
     )
 
