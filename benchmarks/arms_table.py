@@ -37,7 +37,7 @@ from hrc_learn.kinematics import (
     registered_arms,
     solve_inverse,
 )
-from hrc_learn.kinematics._capsule_fit import shape_points
+from hrc_learn.kinematics.capsule_fit import shape_points
 from hrc_learn.kinematics.registry import maker_of
 from hrc_learn.sim.workplace import Workplace
 
@@ -177,7 +177,7 @@ def _compared(described: Arm, q: torch.Tensor) -> dict[str, float]:
     figures = {"difference_from_mujoco": largest_difference(described, q, seen)}
     if find_spec("pinocchio") is not None:
         try:
-            see = _pinocchio_kinematics(described)
+            see = pinocchio_kinematics(described)
         except IndexError:  # what 4.1 says of some files that MuJoCo reads
             return figures
         figures["difference_from_pinocchio"] = largest_difference(described, q, see)
@@ -194,7 +194,7 @@ def largest_difference(
         q: Joint positions (states, joints) [rad, m].
         see: Of one of them, by that library.
     """
-    flange = described.with_tool(torch.eye(4, dtype=torch.float64)).chain
+    flange = described.with_tool(torch.eye(4, dtype=torch.float64))
     poses, jacobians = flange.forward_and_jacobian(q)
     worst = 0.0
     for row, T, J in zip(q.numpy(), poses.matrix().numpy(), jacobians.numpy(), strict=True):
@@ -212,7 +212,8 @@ def mujoco_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
     Raises:
         ValueError: MuJoCo does not read it.
     """
-    model = _mujoco_model(described)
+    assert described.description is not None
+    model = mujoco_model(described.description)
     data, names = mujoco.MjData(model), described.joint_names
     addresses = [int(model.joint(name).qposadr[0]) for name in names]
     columns = [int(model.joint(name).dofadr[0]) for name in names]
@@ -240,11 +241,12 @@ def mujoco_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
     return see
 
 
-def _pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
+def pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
     import pinocchio  # pyright: ignore[reportMissingImports]
 
+    assert described.description is not None
     urdf, mjcf = pinocchio.buildModelFromUrdf, pinocchio.buildModelFromMJCF
-    read = mjcf if described.format == "mjcf" else urdf
+    read = urdf if described.description.suffix == ".urdf" else mjcf
     model = read(str(described.description))
     data, q = model.createData(), pinocchio.neutral(model)
     joints = [model.joints[model.getJointId(name)] for name in described.joint_names]
@@ -275,12 +277,13 @@ def _self_contacts(described: Arm, q: torch.Tensor) -> dict[str, float]:
     chain, n = described.chain, len(described.joint_names)
     capsules = described.body.self_distance(q).numpy() < 0
     spec = mujoco.MjSpec()
-    links = sorted({shape.link for shape in described.shapes})
+    shapes = (_panda_file() if described.is_franka else described).shape.shapes
+    links = sorted({link for link, _ in shapes})
     for link in links:
         body = spec.worldbody.add_body(name=f"{link}")
         body.add_freejoint()
-        for k, shape in enumerate(s for s in described.shapes if s.link == link):
-            points = shape_points(shape.shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        for k, shape in enumerate(shape for number, shape in shapes if number == link):
+            points = shape_points(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
             mesh = spec.add_mesh(name=f"{link}_{k}", uservert=points.ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, mass=1.0)
@@ -311,12 +314,19 @@ def _self_contacts(described: Arm, q: torch.Tensor) -> dict[str, float]:
     }
 
 
-def _mujoco_model(described: Arm) -> mujoco.MjModel:
-    """MuJoCo's own reading of the file; of URDF the kinematics alone."""
-    assert described.description is not None
-    if described.format == "mjcf":
-        return mujoco.MjModel.from_xml_path(str(described.description))
-    robot = ElementTree.parse(described.description).getroot()
+def _panda_file() -> Arm:
+    """The Panda of example-robot-data, for its collision meshes."""
+    ur5 = arm("ur5").description
+    assert ur5 is not None
+    robots = next(folder for folder in ur5.parents if folder.name == "robots")
+    return arm(robots / "panda_description/urdf/panda.urdf", tip="panda_link8")
+
+
+def mujoco_model(path: Path) -> mujoco.MjModel:
+    """MuJoCo's own reading of a file; of URDF the kinematics alone."""
+    if path.suffix != ".urdf":
+        return mujoco.MjModel.from_xml_path(str(path))
+    robot = ElementTree.parse(path).getroot()
     for link in robot.findall("link"):
         for part in list(link):
             link.remove(part)

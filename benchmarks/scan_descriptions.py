@@ -1,10 +1,9 @@
-"""Load every URDF and MJCF file of installed packages that is no registered arm's.
+"""Load every URDF and MJCF file of installed packages, and compare with Pinocchio and MuJoCo.
 
-Each as `--robot FILE` does and, where that asks which of several ends is the tool, with each
-end that something moves. What comes of a file is an arm, or one line that says what is
-missing or why not; anything else is shown with its traceback and ends this with status 1. Of
-each arm the flange's pose and Jacobian in random states are compared with MuJoCo's reading of
-the same file, where MuJoCo reads it.
+Of each file: the arm of its only end or, where several are offered, the arm of each of them;
+whether Pinocchio and MuJoCo load the file; and the largest difference of the flange's pose and
+Jacobian from theirs in random states. What comes of a file is an arm, or one line that says why
+not; anything else is shown with its traceback and ends this with status 1.
 """
 
 import os
@@ -13,72 +12,80 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sysconfig
 import traceback
+import warnings
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import torch
-from arms_table import largest_difference, mujoco_kinematics
+from arms_table import largest_difference, mujoco_kinematics, mujoco_model, pinocchio_kinematics
 from rich.console import Console
 
 from hrc_learn import cli
-from hrc_learn.kinematics import Arm, MissingModelError, arm, registered_arms
-from hrc_learn.kinematics._mjcf import read_mjcf
-from hrc_learn.kinematics._urdf import read_urdf
-from hrc_learn.kinematics.described_arm import arm_from_description
+from hrc_learn.kinematics import Arm, arm
 
-# What a user's mistake, or a file's, is told by: `hrc` prints these in one line.
-_TOLD = (ValueError, FileNotFoundError)
 _SHOWN = Console(soft_wrap=True, highlight=False, markup=False)
+_OFFERED = "likeliest first: "
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     folder: Path = Path(sysconfig.get_paths()["purelib"])
     """Searched with all that is below it."""
-    states: int = 100
-    """Random joint positions in which an arm is compared with MuJoCo."""
+    states: int = 20
+    """Random joint positions in which an arm is compared."""
     ends: int = 10
     """Of the ends of a robot so many at most are taken for a tool."""
-    shapes: bool = False
-    """Also fit capsules to an arm of each file, some seconds each."""
     json: Path | None = None
     """Receives the counts as one flat object."""
+
+
+@dataclass
+class _Outcome:
+    """Result of one file."""
+
+    ours: list[Arm] = field(default_factory=list)
+    refusal: str = ""
+    theirs: dict[str, str] = field(default_factory=dict)
+    """Refusal by library; empty if it loads the file."""
+    differences: list[float] = field(default_factory=list)
 
 
 def main(args: Args) -> int:
     """Load, compare, count, print."""
     torch.set_num_threads(1)
+    warnings.simplefilter("ignore")  # of meshes and grippers
     counts, worst = Counter[str](), 0.0
-    for path in _files(args.folder):
-        shown = str(path.relative_to(args.folder))
-        if not _describes_a_robot(path):
-            counts["other_xml"] += 1
-            counts["tracebacks"] += _ends_otherwise(path)
+    for path in sorted(args.folder.rglob("*")):
+        if path.suffix not in (".urdf", ".xml", ".mjcf") or not _describes_a_robot(path):
             continue
         counts["files"] += 1
         try:
-            arms = list(_arms(path, args.ends))
-            outcome = f"{len(arms)} arm" + "s" * (len(arms) > 1)
-            counts["loaded"] += 1
-            counts["arms"] += len(arms)
-            for described in arms:
-                off = _difference(described, args.states)
-                counts["compared"] += off is not None
-                worst = max(worst, off or 0.0)
-                if off is not None:
-                    outcome += f", {off:.0e}"
-            if args.shapes:
-                outcome += f", {len(arms[0].body.capsules)} capsules"
-        except _TOLD as error:
-            outcome = f"{type(error).__name__}: {cli.one_line(error)}"
-            counts["refused"] += 1
+            found = _read(path, args)
         except Exception:
             counts["tracebacks"] += 1
-            outcome = traceback.format_exc()
-        _SHOWN.print(f"{shown}: {outcome}")
+            _SHOWN.print(f"{path}: {traceback.format_exc()}")
+            continue
+        loaded = bool(found.ours)
+        agrees = any((not refusal) == loaded for refusal in found.theirs.values())
+        counts["loaded" if loaded else "refused"] += 1
+        counts["agree"] += agrees
+        counts["arms"] += len(found.ours)
+        counts["compared"] += len(found.differences)
+        worst = max([worst, *found.differences])
+        theirs = ", ".join(
+            f"{n} {'refuses' if x else 'loads'}" for n, x in found.theirs.items()
+        )
+        told = (
+            found.refusal or f"{len(found.ours)} arms, {max(found.differences, default=0):.0e}"
+        )
+        _SHOWN.print(
+            f"{'' if agrees else 'DIFFERS '}{path.relative_to(args.folder)}: {told} [{theirs}]"
+        )
     figures = {**counts, "tracebacks": counts["tracebacks"], "largest_difference": worst}
     _SHOWN.print(figures)
     if args.json is not None:
@@ -86,74 +93,73 @@ def main(args: Args) -> int:
     return int(counts["tracebacks"] > 0)
 
 
-def _files(folder: Path) -> list[Path]:
-    registered = set[Path]()
-    for name in registered_arms():
-        try:
-            description = arm(name).description
-        except MissingModelError:
-            continue
-        if description is not None:
-            registered.add(description.resolve())
-    found = [path for path in folder.rglob("*") if path.suffix in (".urdf", ".xml", ".mjcf")]
-    return sorted(path for path in found if path.resolve() not in registered)
-
-
 def _describes_a_robot(path: Path) -> bool:
-    """Whether it is a URDF or MJCF file by its first element, however broken otherwise."""
+    """True for a URDF or MJCF file by its first element, however broken otherwise."""
     try:
         return ElementTree.parse(path).getroot().tag in ("robot", "mujoco")
-    except ElementTree.ParseError:
+    except (ElementTree.ParseError, ValueError):
         return path.suffix == ".urdf"
 
 
-def _ends_otherwise(path: Path) -> bool:
-    """Whether anything but one line is said of a file that describes no robot."""
+def _read(path: Path, args: Args) -> _Outcome:
+    found = _Outcome()
     try:
-        arm(path)
-    except _TOLD:
-        return False
-    except Exception:
-        _SHOWN.print(f"{path}: {traceback.format_exc()}")
-    return True
+        found.ours = _arms(path, args.ends)
+    except (ValueError, FileNotFoundError) as error:
+        found.refusal = cli.one_line(error)
+    readers: dict[str, Callable[[Arm], Any]] = {"MuJoCo": mujoco_kinematics}
+    found.theirs["MuJoCo"] = _refusal(lambda: mujoco_model(path))
+    if find_spec("pinocchio") is not None:
+        readers["Pinocchio"] = pinocchio_kinematics
+        found.theirs["Pinocchio"] = _refusal(lambda: _pinocchio_model(path))
+    for described in found.ours:
+        limits, rng = described.limits, torch.Generator().manual_seed(0)
+        shape = (args.states, described.joints)
+        fraction = torch.rand(shape, generator=rng, dtype=torch.float64)
+        q = limits.lower + (limits.upper - limits.lower) * fraction
+        for name, reader in readers.items():
+            if not found.theirs[name]:
+                try:
+                    off = largest_difference(described, q, reader(described))
+                except (KeyError, IndexError, ValueError):  # a joint or frame has no name there
+                    continue
+                found.differences.append(off)
+    return found
 
 
-def _arms(path: Path, most: int) -> Iterator[Arm]:
-    """The arm of a file, or that of each of its ends."""
+def _arms(path: Path, most: int) -> list[Arm]:
+    """The arm of a file, or those of the ends that it offers."""
     try:
-        yield arm(path)
-        return
+        return [arm(path)]
     except ValueError as error:
-        if "say which is the tool" not in str(error):
+        if _OFFERED not in str(error):
             raise
-    read = read_urdf if path.suffix == ".urdf" else read_mjcf
-    description = read(path)
-    ends = [link for link in description.links if not description.below(link)]
-    refusals, loaded = [], 0
-    for tip in ends:
-        if loaded == most:
-            break
+        offered = str(error).partition(_OFFERED)[2].split(", ")
+    arms, refusal = [], None
+    for tip in offered[:most]:
         try:
-            found = arm_from_description(description, tip=tip)
-        except _TOLD as error:
-            refusals.append(error)
-            continue
-        loaded += 1
-        yield found
-    if not loaded:
-        raise refusals[0]
+            arms.append(arm(path, tip=tip))
+        except ValueError as error:
+            refusal = error
+    if refusal is not None and not arms:
+        raise refusal
+    return arms
 
 
-def _difference(described: Arm, states: int) -> float | None:
-    """From MuJoCo; None where it does not read the file, or does not name its joints."""
-    limits, rng = described.chain.limits, torch.Generator().manual_seed(0)
-    share = torch.rand(states, len(limits.lower), generator=rng, dtype=torch.float64)
+def _refusal(load: Callable[[], object]) -> str:
     try:
-        see = mujoco_kinematics(described)
-    except (ValueError, KeyError):  # KeyError: of joints without names
-        return None
-    q = limits.lower + (limits.upper - limits.lower) * share
-    return largest_difference(described, q, see)
+        load()
+    except (ValueError, RuntimeError) as error:
+        return cli.one_line(error) or type(error).__name__
+    return ""
+
+
+def _pinocchio_model(path: Path) -> object:
+    import pinocchio  # pyright: ignore[reportMissingImports]
+
+    if path.suffix == ".urdf":
+        return pinocchio.buildModelFromUrdf(str(path))
+    return pinocchio.buildModelFromMJCF(str(path))
 
 
 if __name__ == "__main__":

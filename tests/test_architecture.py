@@ -113,7 +113,7 @@ LIBRARIES: dict[str, set[str]] = {
 """Libraries that modules of a package may import as soon as they are imported."""
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
-    "kinematics": {"pytorch_kinematics", "frankik", "mujoco", "scipy"},
+    "kinematics": {"frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
     "dmp": {"threadpoolctl"},
     "cli": {"huggingface_hub", "httpx"},
@@ -137,7 +137,6 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
 
 DISTRIBUTIONS = {
     "forcedimension_core": "forcedimension-core",
-    "pytorch_kinematics": "pytorch-kinematics",
     "cv2": "opencv-python-headless",
     "rerun": "rerun-sdk",
     "franky_sim": "franky-sim",

@@ -1,10 +1,8 @@
 """Serial arms from their descriptions: kinematics, Jacobians, inverses, shapes."""
 
-from hrc_learn.kinematics._assembly import FingerJoint as FingerJoint
-from hrc_learn.kinematics._assembly import GripperDescription as GripperDescription
-from hrc_learn.kinematics._assembly import LinkVisual as LinkVisual
 from hrc_learn.kinematics.arm import Arm as Arm
 from hrc_learn.kinematics.arm import ArmShape as ArmShape
+from hrc_learn.kinematics.arm import FingerJoint as FingerJoint
 from hrc_learn.kinematics.arm import NullSpace as NullSpace
 from hrc_learn.kinematics.arm import UnreachableError as UnreachableError
 from hrc_learn.kinematics.arm import comfortable_posture as comfortable_posture
@@ -21,8 +19,6 @@ from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
 from hrc_learn.kinematics.franka import TOOL_LINK as TOOL_LINK
 from hrc_learn.kinematics.franka import fr3 as fr3
 from hrc_learn.kinematics.franka import panda as panda
-from hrc_learn.kinematics.interchange import to_pytorch_kinematics as to_pytorch_kinematics
-from hrc_learn.kinematics.interchange import to_urdf as to_urdf
 from hrc_learn.kinematics.inverse import InverseSolution as InverseSolution
 from hrc_learn.kinematics.inverse import TaskSpace as TaskSpace
 from hrc_learn.kinematics.inverse import null_space_dimension as null_space_dimension
@@ -46,3 +42,4 @@ from hrc_learn.kinematics.registry import arm as arm
 from hrc_learn.kinematics.registry import registered_arms as registered_arms
 from hrc_learn.kinematics.tool_orientation import coarse_orientation as coarse_orientation
 from hrc_learn.kinematics.tool_orientation import gripper_down as gripper_down
+from hrc_learn.kinematics.urdf import to_urdf as to_urdf

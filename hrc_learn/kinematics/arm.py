@@ -8,8 +8,8 @@ wherever something is mounted on a link.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, Protocol, runtime_checkable
@@ -21,13 +21,13 @@ from torch import Tensor
 
 from hrc_learn.geometry import MeshFile, Pose, quaternion
 from hrc_learn.geometry.arrays import ArrayLike, as_tensor
-from hrc_learn.kinematics._assembly import GripperDescription, LinkShape, LinkVisual
-from hrc_learn.kinematics._capsule_fit import fit_body
+from hrc_learn.kinematics.capsule_fit import fit_body
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
-from hrc_learn.kinematics.interchange import to_urdf
+from hrc_learn.kinematics.description import Shape
 from hrc_learn.kinematics.inverse import TaskSpace, solutions_from, solve_inverse, unwound
 from hrc_learn.kinematics.redundancy import best_postures
+from hrc_learn.kinematics.urdf import to_urdf
 
 # Density of aluminium shells with motors and gears in them, a little above water: used for
 # the volume of the capsules where a description gives no masses. A guess.
@@ -68,16 +68,31 @@ class ClosedForm(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class FingerJoint:
+    """A joint of a gripper."""
+
+    name: str
+    kind: str
+    """"revolute" or "prismatic"."""
+    closed: float
+    """[rad] or [m]"""
+    opened: float
+    """[rad] or [m]; the end of its range that is further from zero."""
+    follows: tuple[str, float, float] | None = None
+    """Joint whose position, times the factor and plus the offset, it takes."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ArmShape:
-    """Appearance, collision shapes and masses of an arm."""
+    """Appearance, collision shapes, gripper and masses of an arm."""
 
-    visuals: tuple[LinkVisual, ...] = ()
-    """Meshes; empty where the package that ships them is not installed."""
-    gripper: GripperDescription | None = None
-    """None if the description ends at the flange."""
-    shapes: tuple[LinkShape, ...] = ()
-    """Collision shapes that the capsules contain."""
+    meshes: Mapping[str, tuple[MeshFile, ...]] = field(default_factory=dict)
+    """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
+    gripper: tuple[FingerJoint, ...] = ()
+    """Joints of the gripper in the description; empty if it ends at the flange."""
+    shapes: tuple[tuple[int, Shape], ...] = ()
+    """Number of a link's frame, and a collision shape there; the capsules contain them."""
     masses: tuple[float | None, ...] = ()
     """Masses of base, links, flange and tool [kg], as far as the description gives them."""
 
@@ -90,7 +105,6 @@ class Arm(SerialChain):
     Attributes:
         name: Registered name, or the stem of the description's file.
         description: File of the description; None for arms written in this package.
-        format: "urdf" or "mjcf", the format of that file.
         base: Link of the file that is the base.
         tip: Link of the file that is the flange.
     """
@@ -100,12 +114,11 @@ class Arm(SerialChain):
         *,
         name: str,
         chain: SerialChain,
-        shape: ArmShape | Callable[[], ArmShape] | None = None,
+        shape: ArmShape | None = None,
         capsules: Sequence[LinkCapsule] | None = None,
         overlapping: Sequence[tuple[int, int]] = (),
         closed_form: ClosedForm | None = None,
         description: Path | None = None,
-        format: str | None = None,
         base: str | None = None,
         tip: str | None = None,
     ):
@@ -114,12 +127,11 @@ class Arm(SerialChain):
         Args:
             name: Name of the arm.
             chain: Kinematics from the base to the tool centre point, limits, ready posture.
-            shape: Appearance, shapes and masses, or a function that reads them on first use.
+            shape: Appearance, collision shapes, gripper and masses.
             capsules: Capsules of links and gripper; None fits them to the shapes on first use.
             overlapping: Pairs of links that overlap by design, besides neighbours.
             closed_form: Closed-form inverse; None solves numerically.
             description: File that the arm was read from.
-            format: Format of that file, "urdf" or "mjcf".
             base: Link of the file that is the base.
             tip: Link of the file that is the flange.
         """
@@ -133,8 +145,8 @@ class Arm(SerialChain):
             kinds=chain.kinds,
         )
         self.name = name
-        self.description, self.format, self.base, self.tip = description, format, base, tip
-        self._shape_source = shape or ArmShape()
+        self.description, self.base, self.tip = description, base, tip
+        self.shape = shape or ArmShape()
         self._capsules, self._overlapping = capsules, tuple(overlapping)
         self._closed_form = closed_form
 
@@ -170,20 +182,9 @@ class Arm(SerialChain):
 
     # Shape
 
-    @cached_property
-    def shape(self) -> ArmShape:
-        """Appearance, collision shapes and masses, read on first use."""
-        source = self._shape_source
-        return source if isinstance(source, ArmShape) else source()
-
     @property
-    def visuals(self) -> tuple[LinkVisual, ...]:
-        """Meshes of the links; empty where the package that ships them is not installed."""
-        return self.shape.visuals
-
-    @property
-    def gripper(self) -> GripperDescription | None:
-        """Gripper of the description; None if it ends at the flange."""
+    def gripper(self) -> tuple[FingerJoint, ...]:
+        """Joints of the gripper in the description; empty if it ends at the flange."""
         return self.shape.gripper
 
     @cached_property
@@ -194,7 +195,7 @@ class Arm(SerialChain):
         """
         if self._capsules is not None:
             return CapsuleArm(self, self._capsules, self._overlapping)
-        return fit_body(self, [(s.link, s.shape, s.pose) for s in self.shape.shapes])
+        return fit_body(self, self.shape.shapes)
 
     @cached_property
     def body(self) -> CapsuleArm:
@@ -236,24 +237,10 @@ class Arm(SerialChain):
         """Masses of the moving links [kg]."""
         return self.masses[1 : self.joints + 1]
 
-    def meshes(self) -> dict[str, tuple[MeshFile, ...]]:
+    @property
+    def meshes(self) -> Mapping[str, tuple[MeshFile, ...]]:
         """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
-        flange, found = self.flange.numpy(), {}
-        for visual in self.visuals:
-            if visual.link > self.joints + 1 or visual.finger is not None:
-                continue
-            pose = flange @ visual.pose if visual.link == self.joints + 1 else visual.pose
-            turn = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy())).tolist()
-            name = f"link{min(visual.link, self.joints)}"
-            mesh = MeshFile(
-                path=visual.mesh.path,
-                position=tuple(pose[:3, 3].tolist()),
-                orientation=tuple(turn),
-                scale=visual.mesh.scale,
-                colour=visual.colour,
-            )
-            found[name] = (*found.get(name, ()), mesh)
-        return found
+        return self.shape.meshes
 
     def urdf(self) -> str:
         """URDF text with the links, joints and limits of this arm, without meshes."""
@@ -426,42 +413,6 @@ class Arm(SerialChain):
         found = solutions_from(self, pose, torch.cat([wish, starts], dim=-2))
         return unwound(self, found, wish)
 
-    # Other tools
-
-    def with_tool(self, tcp: Float[Tensor, "4 4"]) -> Arm:
-        """The same arm with another tool centre point.
-
-        Args:
-            tcp: Tool centre point in the frame of the flange.
-        """
-        shift = torch.linalg.inv(tcp.double()) @ self.tcp
-        moved, tool, shape = shift.numpy(), self.tool_link, self.shape
-        whole = None if self._capsules is None else self.whole.on_chain(self, {tool: shift})
-        gripper = shape.gripper and GripperDescription(
-            joints=tuple(replace(j, pose=moved @ j.pose) for j in shape.gripper.joints)
-        )
-
-        def carry[Part: (LinkVisual, LinkShape)](part: Part) -> Part:
-            return replace(part, pose=moved @ part.pose) if part.link == tool else part
-
-        return Arm(
-            name=self.name,
-            chain=self._chain_with_tool(tcp),
-            shape=ArmShape(
-                visuals=tuple(carry(visual) for visual in shape.visuals),
-                gripper=gripper,
-                shapes=tuple(carry(part) for part in shape.shapes),
-                masses=shape.masses,
-            ),
-            capsules=whole and whole.capsules,
-            overlapping=self._overlapping,
-            closed_form=self._closed_form,
-            description=self.description,
-            format=self.format,
-            base=self.base,
-            tip=self.tip,
-        )
-
     def with_hand(self) -> Arm:
         """The same arm with the Franka hand on its flange, whose z axis points away from it.
 
@@ -480,27 +431,15 @@ class Arm(SerialChain):
         links = tuple(capsule for capsule in self.whole.capsules if capsule.link <= n)
         return Arm(
             name=self.name,
-            chain=self._chain_with_tool(tcp),
+            chain=self.with_tool(tcp),
             shape=ArmShape(
-                visuals=self.visuals, masses=(*self.masses[:-1], None), shapes=self.shape.shapes
+                meshes=self.meshes, masses=(*self.masses[:-1], None), shapes=self.shape.shapes
             ),
             capsules=(*links, *hand_capsules(n + 2)),
             overlapping=(*self.whole.overlapping, (n - 1, n + 2), (n, n + 2)),
             description=self.description,
-            format=self.format,
             base=self.base,
             tip=self.tip,
-        )
-
-    def _chain_with_tool(self, tcp: Float[Tensor, "4 4"]) -> SerialChain:
-        return SerialChain(
-            joint_names=self.joint_names,
-            mounts=self.mounts,
-            flange=self.flange,
-            tcp=tcp,
-            limits=self.limits,
-            ready=self.ready,
-            kinds=self.kinds,
         )
 
 

@@ -57,7 +57,7 @@ def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
     """
     if robot.is_franka or body in _HAND:
         return panda_meshes(body)
-    return tuple(robot.meshes().get(body, ()))
+    return tuple(robot.meshes.get(body, ()))
 
 
 @cache

@@ -188,6 +188,18 @@ class SerialChain:
     def __repr__(self) -> str:
         return f"SerialChain({self.joint_names[0]} ... {self.joint_names[-1]})"
 
+    def with_tool(self, tcp: Float[Tensor, "4 4"]) -> SerialChain:
+        """The same chain with another tool centre point, given in the frame of the flange."""
+        return SerialChain(
+            joint_names=self.joint_names,
+            mounts=self.mounts,
+            flange=self.flange,
+            tcp=tcp,
+            limits=self.limits,
+            ready=self.ready,
+            kinds=self.kinds,
+        )
+
     def joint_positions(self, q: ArrayLike) -> Float[Tensor, "*batch joints"]:
         """Joint positions as a tensor, their number checked.
 

@@ -10,8 +10,8 @@ with v the velocity of the person's nearest point.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import combinations
 from typing import final
@@ -102,25 +102,6 @@ class CapsuleArm:
     def with_capsules(self, more: Sequence[LinkCapsule]) -> CapsuleArm:
         """The same arm with further capsules, such as of what is mounted on its hand."""
         return CapsuleArm(self.chain, (*self.capsules, *more), self.overlapping)
-
-    def on_chain(
-        self, chain: SerialChain, moved: Mapping[int, Float[Tensor, "4 4"]]
-    ) -> CapsuleArm:
-        """The same capsules on a chain whose links have other frames.
-
-        Args:
-            chain: The arm, with as many joints.
-            moved: Pose of the old frame of a link in the new one, of links that differ.
-        """
-        capsules = []
-        for capsule in self.capsules:
-            T = moved.get(capsule.link)
-            if T is not None:
-                ends = torch.tensor([capsule.start, capsule.end]).double()
-                (a, b, c), (d, e, f) = (ends @ T[:3, :3].mT + T[:3, 3]).tolist()
-                capsule = replace(capsule, start=(a, b, c), end=(d, e, f))
-            capsules.append(capsule)
-        return CapsuleArm(chain, capsules, self.overlapping)
 
     def segments(
         self,

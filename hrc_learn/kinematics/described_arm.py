@@ -1,28 +1,61 @@
-"""Arms read from URDF and MJCF files."""
+"""Arms made of descriptions in URDF and MJCF files: links numbered from base to tool."""
 
 from __future__ import annotations
 
+import re
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.kinematics._assembly import assemble
-from hrc_learn.kinematics._description import Description
-from hrc_learn.kinematics._mjcf import read_mjcf
-from hrc_learn.kinematics._urdf import read_urdf
-from hrc_learn.kinematics.arm import Arm, ArmShape
-from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.limits import complete_limits, read_limits
+from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.shapes import Colour, MeshFile
+from hrc_learn.kinematics.arm import Arm, ArmShape, FingerJoint
+from hrc_learn.kinematics.chain import JointKind, SerialChain
+from hrc_learn.kinematics.description import (
+    MOVING,
+    Description,
+    Joint,
+    Shape,
+    Transform,
+    transform,
+    turn_to,
+)
+from hrc_learn.kinematics.limits import JointLimits, complete_limits, read_limits
+from hrc_learn.kinematics.mjcf import read_mjcf
+from hrc_learn.kinematics.urdf import read_urdf
 
 type LimitsGiven = Mapping[str, Mapping[str, float]] | Path | None
 """Limits that replace or complete those of a description, see `complete_limits`, or a file."""
 
+_GREY: Colour = (0.7, 0.7, 0.72, 1.0)
+# Number of finger positions, from closed to open, that the capsules contain.
+_FINGER_POSTURES = 5
+
+
+def read_description(path: Path) -> Description:
+    """Read a robot description, URDF or MJCF by its first element.
+
+    Raises:
+        ValueError: The file is neither, or describes no tree of links.
+        FileNotFoundError: There is no such file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no robot description {path}")
+    text = re.sub(rb"<!--.*?-->", b"", path.read_bytes(), flags=re.DOTALL)
+    first = re.search(rb"<([A-Za-z_][\w.:-]*)", text)
+    is_mjcf = first is not None and first[1].startswith(b"mujoco")
+    return read_mjcf(path) if is_mjcf else read_urdf(path)
+
 
 def arm_from_file(
-    path: str | Path,
+    path: Path,
     *,
     base: str | None = None,
     tip: str | None = None,
@@ -30,15 +63,17 @@ def arm_from_file(
     tool: Float[Tensor, "4 4"] | None = None,
     limits: LimitsGiven = None,
     ready: Sequence[float] | None = None,
-    package_dirs: Sequence[str | Path] = (),
-    meshes: bool = True,
 ) -> Arm:
-    """An arm from a URDF (.urdf) or MJCF (.xml, .mjcf) file.
+    """An arm from a URDF or MJCF file.
+
+    What hangs on moving joints beyond the last joint of the arm is the gripper, and belongs to
+    the tool; a hand that only carries the fingers belongs there as well. What hangs on moving
+    joints before is left out.
 
     Args:
         path: The file.
         base: Link (URDF) or body (MJCF) of the base; None: the root, or the world.
-        tip: Link, body or site of the flange; None: the only end that the robot has.
+        tip: Link, body or site of the flange; None: the only end besides a gripper's.
         name: Name of the arm; None: the stem of the file.
         tool: Tool centre point in the frame of the flange, z in the direction of approach;
             None: the flange itself.
@@ -46,90 +81,228 @@ def arm_from_file(
             after it, `ur5e.limits.toml` for `ur5e.urdf`, if there is one.
         ready: A comfortable posture [rad, m]; None: the file's `home`, or a posture near the
             middle of the joints' ranges and far from singularities.
-        package_dirs: Folders in which `package://NAME/` is looked up first (URDF).
-        meshes: False skips the meshes of a URDF: the arm then has only the shapes that the
-            file describes as boxes, cylinders and spheres.
 
     Raises:
-        ValueError: The format is unknown, or the links form no serial chain.
-        FileNotFoundError: The file, or a mesh that it names, is missing.
+        ValueError: The format is unknown, the links form no serial chain, or `ready` is outside
+            the limits.
+        FileNotFoundError: The file is missing.
     """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix == ".urdf":
-        description = read_urdf(path, [Path(folder) for folder in package_dirs], meshes=meshes)
-    elif suffix in (".xml", ".mjcf"):
-        description = read_mjcf(path)
-    else:
-        raise ValueError(f"{path}: a description ends in .urdf, .xml or .mjcf")
-    return arm_from_description(
-        description, base=base, tip=tip, name=name, tool=tool, limits=limits, ready=ready
-    )
-
-
-def arm_from_description(
-    description: Description,
-    *,
-    base: str | None = None,
-    tip: str | None = None,
-    name: str | None = None,
-    tool: Float[Tensor, "4 4"] | None = None,
-    limits: LimitsGiven = None,
-    ready: Sequence[float] | None = None,
-) -> Arm:
-    """An arm from a parsed description; arguments and errors as for `arm_from_file`."""
-    parts = assemble(description, base, tip, tool)
-    names = [joint.name for joint in parts.moving]
+    description = read_description(path)
+    base, tip, joints = description.path_between(base, tip)
+    moving = [joint for joint in joints if joint.kind in MOVING]
+    kinds: list[JointKind] = [cast(JointKind, joint.kind) for joint in moving]
+    places, mounts = _places(description, base, moving)
+    flange = places[tip][1]
+    tcp = np.eye(4) if tool is None else tool.double().numpy()
+    if limits is None and (sidecar := path.with_suffix(".limits.toml")).is_file():
+        limits = sidecar
+    names = [joint.name for joint in moving]
     chain_limits = complete_limits(
         names,
-        parts.kinds,
+        kinds,
         [
-            {
-                "lower": joint.lower,
-                "upper": joint.upper,
-                "velocity": joint.velocity,
-                "torque": joint.effort,
-            }
-            for joint in parts.moving
+            {"lower": j.lower, "upper": j.upper, "velocity": j.velocity, "torque": j.effort}
+            for j in moving
         ],
-        source=str(description.path),
-        overrides=_overrides(description.path, limits),
+        source=str(path),
+        overrides=read_limits(limits) if isinstance(limits, Path) else limits,
     )
-    home = description.home
-    if ready is None and home is not None and all(n in home for n in names):
-        ready = [home[n] for n in names]
+    posture = _ready(description, names, chain_limits, ready)
     chain = SerialChain(
         joint_names=names,
-        mounts=torch.from_numpy(parts.mounts),
-        flange=torch.from_numpy(parts.flange),
-        tcp=torch.from_numpy(parts.tcp),
+        mounts=torch.from_numpy(np.stack(mounts)),
+        flange=torch.from_numpy(flange),
+        tcp=torch.from_numpy(tcp),
         limits=chain_limits,
-        ready=chain_limits.middle if ready is None else torch.tensor(ready).double(),
-        kinds=parts.kinds,
+        ready=chain_limits.middle if posture is None else posture,
+        kinds=kinds,
     )
-    if ready is None:
+    if posture is None:
         chain.ready = _comfortable(chain)
     return Arm(
-        name=name or description.path.stem,
+        name=name or path.stem,
         chain=chain,
-        shape=ArmShape(
-            visuals=parts.visuals,
-            gripper=parts.gripper,
-            shapes=parts.shapes,
-            masses=parts.masses,
-        ),
-        description=description.path,
-        format=description.format,
-        base=parts.base,
-        tip=parts.tip,
+        shape=_shape(description, places, joints, np.linalg.inv(flange @ tcp)),
+        description=path,
+        base=base,
+        tip=tip,
     )
 
 
-def _overrides(path: Path, given: LimitsGiven) -> Mapping[str, Mapping[str, float]] | None:
+def _ready(
+    description: Description,
+    names: Sequence[str],
+    limits: JointLimits,
+    given: Sequence[float] | None,
+) -> Float[Tensor, " joints"] | None:
+    """Ready posture as given, or as the file has it [rad, m]; None if neither is there."""
+    home = description.home or {}
     if given is None:
-        sidecar = path.with_suffix(".limits.toml")
-        return read_limits(sidecar) if sidecar.is_file() else None
-    return read_limits(given) if isinstance(given, Path) else given
+        if any(name not in home for name in names):
+            return None
+        ready = torch.tensor([home[name] for name in names], dtype=torch.float64)
+        if not limits.contain(ready):
+            warnings.warn(
+                f"{description.path}: the posture `home` is outside the limits of joints, and "
+                "was moved to them",
+                stacklevel=3,
+            )
+        return ready.clamp(limits.lower, limits.upper)
+    ready = torch.as_tensor(given, dtype=torch.float64)
+    if len(ready) == len(names) and not limits.contain(ready):
+        wrong = next(
+            i for i, x in enumerate(ready) if not limits.lower[i] <= x <= limits.upper[i]
+        )
+        raise ValueError(
+            f"ready posture: joint {names[wrong]} at {ready[wrong]:g} is outside its limits "
+            f"{limits.lower[wrong]:g} to {limits.upper[wrong]:g}"
+        )
+    return ready
+
+
+def _places(
+    description: Description, base: str, moving: Sequence[Joint]
+) -> tuple[dict[str, tuple[int, Transform]], list[Transform]]:
+    """Number of each link's frame and its pose there, and the mounts of the joints."""
+    places = {name: (0, pose) for name, pose in description.rigid_subtree(base).items()}
+    mounts = []
+    for number, joint in enumerate(moving, start=1):
+        turn = turn_to(joint.axis)
+        mounts.append(places[joint.parent][1] @ joint.origin @ turn)
+        for name, pose in description.rigid_subtree(joint.child).items():
+            places[name] = (number, turn.T @ pose)
+    return places, mounts
+
+
+def _shape(
+    description: Description,
+    places: dict[str, tuple[int, Transform]],
+    path: Sequence[Joint],
+    to_tool: Transform,
+) -> ArmShape:
+    """Meshes, collision shapes, gripper and masses.
+
+    Args:
+        description: The tree.
+        places: Number of each link's frame, and its pose there.
+        path: Joints from base to tip.
+        to_tool: Frame of the last joint in the frame of the tool.
+    """
+    last = max(number for number, _ in places.values())
+    moved = next(joint for joint in reversed(path) if joint.kind in MOVING).child
+    roots = [
+        joint
+        for link, (number, _) in places.items()
+        if number == last
+        for joint in description.below(link)
+        if joint.kind in MOVING and joint not in path
+    ]
+    for hand in {joint.parent for joint in roots} - {moved}:
+        pose = places[hand][1]
+        for link, within in description.rigid_subtree(hand).items():
+            places[link] = (last + 2, to_tool @ pose @ within)
+    shapes = [
+        (number, replace(shape, pose=pose @ shape.pose))
+        for link, (number, pose) in places.items()
+        for shape in _touching(description, link)
+    ]
+    owners = {link: number for link, (number, _) in places.items()}
+    gripper = []
+    ahead = [
+        (joint, pose if number > last else to_tool @ pose)
+        for joint in roots
+        for number, pose in [places[joint.parent]]
+    ]
+    for joint, parent in ahead:
+        finger, postures = _finger(joint, parent)
+        gripper.append(finger)
+        for link, within in description.rigid_subtree(joint.child).items():
+            owners[link] = last + 2
+            shapes += [
+                (last + 2, replace(shape, pose=at @ within @ shape.pose))
+                for shape in _touching(description, link)
+                for at in postures
+            ]
+            further = [below for below in description.below(link) if below.kind in MOVING]
+            ahead += [(below, postures[-1] @ within) for below in further]
+    return ArmShape(
+        meshes=_meshes(description, places, last),
+        gripper=tuple(gripper),
+        shapes=tuple(shapes),
+        masses=_masses(description, owners, last),
+    )
+
+
+def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transform]]:
+    """A joint of the gripper, and poses of its child in the frame of the tool as it opens.
+
+    Args:
+        joint: The joint.
+        parent: Pose of its parent in the frame of the tool.
+    """
+    lower, upper = joint.lower or 0.0, joint.upper or 0.0
+    closed, opened = (lower, upper) if abs(upper) >= abs(lower) else (upper, lower)
+    turn = turn_to(joint.axis)
+    poses = [
+        parent @ joint.origin @ turn @ _motion(joint.kind, value) @ turn.T
+        for value in np.linspace(closed, opened, _FINGER_POSTURES).tolist()
+    ]
+    kind = "prismatic" if joint.kind == "prismatic" else "revolute"
+    follows = joint.follows
+    finger = FingerJoint(joint.name, kind, closed=closed, opened=opened, follows=follows)
+    return finger, poses
+
+
+def _motion(kind: str, value: float) -> Transform:
+    if kind == "prismatic":
+        return transform(np.eye(3), np.array([0.0, 0.0, value]))
+    c, s = np.cos(value), np.sin(value)
+    return transform(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.zeros(3))
+
+
+def _meshes(
+    description: Description, places: dict[str, tuple[int, Transform]], last: int
+) -> dict[str, tuple[MeshFile, ...]]:
+    """Meshes by the name of the link that carries them: link0, link1, ...; no gripper's."""
+    found: dict[str, tuple[MeshFile, ...]] = {}
+    for link, (number, place) in places.items():
+        for shape in description.links[link].visuals:
+            if shape.path is not None and number <= last:
+                pose = place @ shape.pose
+                x, y, z = pose[:3, 3].tolist()
+                turn = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
+                w, i, j, k = turn.tolist()
+                mesh = MeshFile(
+                    path=shape.path,
+                    position=(x, y, z),
+                    orientation=(w, i, j, k),
+                    scale=shape.scale,
+                    colour=shape.colour or _GREY,
+                )
+                name = f"link{number}"
+                found[name] = (*found.get(name, ()), mesh)
+    return found
+
+
+def _touching(description: Description, link: str) -> tuple[Shape, ...]:
+    """Shapes of a link for contacts; those that are drawn where it has no others."""
+    found = description.links[link]
+    return found.collisions or found.visuals
+
+
+def _masses(
+    description: Description, owners: Mapping[str, int], last: int
+) -> tuple[float | None, ...]:
+    """Masses of base, links, flange and tool [kg]; None where the description has none."""
+    masses: list[float | None] = [None] * (last + 3)
+    for link, number in owners.items():
+        if (mass := description.links[link].mass) is not None:
+            masses[number] = (masses[number] or 0.0) + mass
+    # Nothing is mounted on the flange's own frame; without a gripper, nor on the tool's.
+    masses[last + 1] = 0.0
+    if last + 2 not in owners.values():
+        masses[last + 2] = 0.0
+    return tuple(masses)
 
 
 # Number of random postures among which `_comfortable` chooses; the seed repeats the choice.

@@ -18,10 +18,7 @@ Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at mo
 
 from __future__ import annotations
 
-from functools import partial
-from importlib.metadata import PackageNotFoundError, distribution
 from math import cos, pi, sin
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -157,7 +154,6 @@ _JOINTS = (
 )
 _FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
 _HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]
-_DESCRIPTION = "cmeel.prefix/share/example-robot-data/robots/panda_description/urdf/panda.urdf"
 
 
 # A returned branch whose own forward kinematics is further off than this [m, rad] is wrong.
@@ -275,28 +271,6 @@ HAND_MASS = 0.73
 OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, TOOL_LINK), (7, TOOL_LINK))
 
 
-def _shape(chain: SerialChain) -> ArmShape:
-    """Meshes, fingers and masses of both arms, whose meshes differ by at most 2 mm.
-
-    The meshes are in example-robot-data; without that package there are none.
-    """
-    from hrc_learn.kinematics.described_arm import arm_from_file
-
-    masses = (None, *LINK_MASSES, 0.0, HAND_MASS)
-    try:
-        file = Path(str(distribution("example-robot-data").locate_file(_DESCRIPTION)))
-    except PackageNotFoundError:
-        return ArmShape(masses=masses)
-    if not file.is_file():
-        return ArmShape(masses=masses)
-    drawn = arm_from_file(
-        file, base="panda_link0", tip="panda_link8", tool=chain.tcp, ready=chain.ready.tolist()
-    ).shape
-    return ArmShape(
-        visuals=drawn.visuals, gripper=drawn.gripper, shapes=drawn.shapes, masses=masses
-    )
-
-
 def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
     """One of Franka's arms with the Franka hand."""
     chain = SerialChain(
@@ -312,7 +286,7 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
     return Arm(
         name=name,
         chain=chain,
-        shape=partial(_shape, chain),
+        shape=ArmShape(masses=(None, *LINK_MASSES, 0.0, HAND_MASS)),
         capsules=LINK_CAPSULES + hand_capsules(TOOL_LINK),
         overlapping=OVERLAPPING,
         closed_form=FrankaInverse(ranges),

@@ -135,8 +135,8 @@ def complete_limits(
     The default velocity limit is 1 rad/s, or 0.25 m/s for a prismatic joint. The default
     acceleration reaches the velocity limit in 0.2 s, and the default jerk reaches the
     acceleration limit in 20 ms. The default torque is unlimited. A continuous joint may turn
-    once in each direction. A zero limit of velocity, acceleration, jerk or torque counts as
-    missing, because some descriptions write zero for an unknown limit.
+    once in each direction. A torque limit of zero counts as missing, because many descriptions
+    write zero for an unknown one.
 
     Args:
         names: Names of the joints.
@@ -148,8 +148,8 @@ def complete_limits(
             `default` apply to all joints.
 
     Raises:
-        ValueError: A revolute or prismatic joint has no range, a range is empty, or an override
-            names an unknown joint or an unknown limit.
+        ValueError: A revolute or prismatic joint has no range, a range is empty, a limit of
+            motion is not positive and finite, or an override names an unknown joint or limit.
     """
     overrides = overrides or {}
     for name, row in overrides.items():
@@ -159,29 +159,32 @@ def complete_limits(
             raise ValueError(
                 f"unknown limits of {name}: {', '.join(sorted(wrong))}; known are {_COLUMNS}"
             )
+    advice = f"set it with limits=, or in {Path(source).stem}.limits.toml in the same folder"
     table: dict[str, list[float]] = {column: [] for column in _COLUMNS}
     for name, kind, row in zip(names, kinds, known, strict=True):
         given = {**row, **overrides.get("default", {}), **overrides.get(name, {})}
-        slides = kind == "prismatic"
-        lower, upper = given.get("lower"), given.get("upper")
-        if kind == "continuous":
-            lower = -_TURN if lower is None else lower
-            upper = _TURN if upper is None else upper
-        if lower is None or upper is None or not lower < upper:
+        given = {key: value for key, value in given.items() if value is not None}
+        turn = _TURN if kind == "continuous" else math.nan
+        full = {"lower": -turn, "upper": turn, **given}
+        if not -math.inf < full["lower"] < full["upper"] < math.inf:
             raise ValueError(
-                f"{source}: joint {name} has the range {lower} to {upper}; set lower and upper "
-                f"with limits=, or in {Path(source).stem}.limits.toml in the same folder"
+                f"{source}: joint {name} has the range {given.get('lower')} to "
+                f"{given.get('upper')}; {advice}"
             )
-        velocity = given.get("velocity") or (
-            DEFAULT_SLIDING_VELOCITY if slides else DEFAULT_VELOCITY
-        )
-        acceleration = given.get("acceleration") or velocity / _SECONDS_TO_FULL_SPEED
-        jerk = given.get("jerk") or acceleration / _SECONDS_TO_FULL_ACCELERATION
-        torque = given.get("torque") or math.inf
-        for column, value in zip(
-            _COLUMNS, (lower, upper, velocity, acceleration, jerk, torque), strict=True
-        ):
-            table[column].append(float(value))
+        slides = kind == "prismatic"
+        full.setdefault("velocity", DEFAULT_SLIDING_VELOCITY if slides else DEFAULT_VELOCITY)
+        full.setdefault("acceleration", full["velocity"] / _SECONDS_TO_FULL_SPEED)
+        full.setdefault("jerk", full["acceleration"] / _SECONDS_TO_FULL_ACCELERATION)
+        full["torque"] = given.get("torque") or math.inf
+        for column in ("velocity", "acceleration", "jerk", "torque"):
+            unlimited = column == "torque" and full[column] == math.inf
+            if not (0 < full[column] < math.inf or unlimited):
+                raise ValueError(
+                    f"{source}: joint {name} has the {column} limit {full[column]:g}, which is "
+                    f"not positive and finite; {advice}"
+                )
+        for column in _COLUMNS:
+            table[column].append(float(full[column]))
     columns = {name: torch.tensor(row, dtype=torch.float64) for name, row in table.items()}
     return JointLimits(vintage=source, **columns)
 
@@ -197,10 +200,9 @@ def read_limits(path: Path) -> dict[str, dict[str, float]]:
     Raises:
         ValueError: The file is not valid TOML, or a table holds values other than numbers.
     """
-    tables = read_toml(path)
-    for name, row in tables.items():
-        if not isinstance(row, dict) or not all(
-            type(value) in (int, float) for value in row.values()
-        ):
+    limits = {}
+    for name, row in read_toml(path).items():
+        if not isinstance(row, dict) or not all(type(x) in (int, float) for x in row.values()):
             raise ValueError(f"{path}: [{name}] must be a table of numbers")
-    return tables
+        limits[name] = {key: float(value) for key, value in row.items()}
+    return limits

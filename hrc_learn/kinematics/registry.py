@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hrc_learn.kinematics.arm import Arm
 from hrc_learn.kinematics.described_arm import LimitsGiven, arm_from_file
+from hrc_learn.kinematics.description import turn_to
 from hrc_learn.kinematics.franka import fr3, panda
 
 
@@ -201,8 +202,9 @@ def arm(
     Args:
         name_or_file: One of `registered_arms()`, or a path that ends in .urdf, .xml or .mjcf.
         base: Link or body to be the base, of files; None: the root.
-        tip: Link, body or site to be the flange, of files; None: the only end there is.
-        tool: Tool centre point in the frame of the flange.
+        tip: Link, body or site to be the flange, of files; None: the only end besides a
+            gripper's.
+        tool: Tool centre point in the frame of the flange, of files.
         limits: Replacements of limits, see `arm_from_file`.
         ready: A comfortable posture [rad, m].
 
@@ -211,12 +213,11 @@ def arm(
         FileNotFoundError: The file, or a mesh that it names, is not there.
         MissingModelError: The package that ships the arm is not installed: says how to.
     """
-    name = str(name_or_file)
-    path = Path(name_or_file)
+    name, path = str(name_or_file), Path(name_or_file)
     choice = {"base": base, "tip": tip, "tool": tool, "limits": limits, "ready": ready}
+    choice = {key: value for key, value in choice.items() if value is not None}
     if name in registered_arms():
-        given = {key: value for key, value in choice.items() if value is not None}
-        return _registered(name) if not given else _changed(name, **given)
+        return _registered(name) if not choice else _described(name, choice)
     if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return arm_from_file(path, **choice)
     raise ValueError(
@@ -227,21 +228,16 @@ def arm(
 
 @cache
 def _registered(name: str) -> Arm:
-    return _OWN[name] if name in _OWN else _changed(name)
+    return _OWN[name] if name in _OWN else _described(name, {})
 
 
-def _changed(name: str, **choice: Any) -> Arm:
-    """A registered arm with some of its settings replaced."""
+def _described(name: str, choice: Mapping[str, Any]) -> Arm:
+    """A registered arm from its description, with some of its settings replaced."""
     if name in _OWN:
-        found = _registered(name)
-        if unknown := set(choice) - {"tool"}:
-            raise ValueError(
-                f"of {name}, which is written in this package, only the tool can be chosen, "
-                f"not {', '.join(sorted(unknown))}"
-            )
-        return found.with_tool(choice["tool"])
+        raise ValueError(
+            f"{name} is written in this package: {', '.join(choice)} cannot be chosen for it"
+        )
     source = _SOURCES[name]
-    path = _locate(name, source)
     settings: dict[str, Any] = {
         "name": name,
         "base": source.base,
@@ -250,7 +246,7 @@ def _changed(name: str, **choice: Any) -> Arm:
         "limits": source.limits or None,
         "ready": source.ready,
     }
-    return arm_from_file(path, **{**settings, **choice})
+    return arm_from_file(_locate(name, source), **{**settings, **choice})
 
 
 def _locate(name: str, source: _Source) -> Path:
@@ -273,8 +269,6 @@ def _locate(name: str, source: _Source) -> Path:
 
 def _placed(origin: Sequence[float], approach: Sequence[float]) -> Tensor:
     """A frame whose z axis has the direction `approach`."""
-    from hrc_learn.kinematics._description import turn_to
-
     T = torch.from_numpy(turn_to(torch.tensor(approach).double().numpy()))
     T[:3, 3] = torch.tensor(origin)
     return T
@@ -289,7 +283,12 @@ class ArmChoice:
     base: str = ""
     """Base link of a file; empty: its root."""
     tip: str = ""
-    """Flange link of a file; empty: its only end."""
+    """Flange link of a file, or BASE:TIP; empty: its only end."""
+
+    def arm(self) -> Arm:
+        """The arm as its description has it."""
+        base, _, tip = self.tip.rpartition(":")
+        return arm(self.name, base=base or self.base or None, tip=tip or None)
 
     def work_arm(self) -> Arm:
         """The arm with the hand of our work cell: two parallel fingers, as the Franka hand.
@@ -302,5 +301,5 @@ class ArmChoice:
 
 @cache
 def _equipped(choice: ArmChoice) -> Arm:
-    found = arm(choice.name, base=choice.base or None, tip=choice.tip or None)
+    found = choice.arm()
     return found if found.is_franka else found.with_hand()

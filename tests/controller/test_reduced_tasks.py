@@ -13,7 +13,7 @@ from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.controller.resolved_rate import task_descent
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
-from hrc_learn.kinematics import Arm, arm_from_file, panda, solve_inverse, task_basis, task_rank
+from hrc_learn.kinematics import Arm, arm, panda, solve_inverse, task_basis, task_rank
 from hrc_learn.sim.closed_loop import (
     Imperfections,
     PinholeCamera,
@@ -42,7 +42,7 @@ def five(tmp_path_factory) -> Arm:
     path.write_text(f'<robot name="five"><link name="l0"/>{joints}</robot>')
     tool = torch.eye(4, dtype=DOUBLE)
     tool[2, 3] = 0.12
-    return arm_from_file(path, tool=tool, ready=[0.3, 0.5, 1.2, 1.0, 0.2])
+    return arm(path, tool=tool, ready=[0.3, 0.5, 1.2, 1.0, 0.2])
 
 
 def numeric_basis(R: np.ndarray, task: str) -> np.ndarray:

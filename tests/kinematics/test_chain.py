@@ -1,4 +1,4 @@
-"""Forward kinematics and Jacobians against derivatives and against two other libraries."""
+"""Forward kinematics and Jacobians against derivatives and against MuJoCo."""
 
 import mujoco
 import pytest
@@ -11,7 +11,7 @@ from torch.testing import assert_close
 from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import SerialChain, panda, to_pytorch_kinematics
+from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.kinematics.chain import transform_and_jacobian
 
 BATCHES = [(), (1,), (3, 1, 2)]
@@ -69,14 +69,6 @@ def test_joint_jacobian_agrees_with_mujoco(mujoco_arm, joint):
         J = panda.joint_jacobian(q, joint)
         assert_close(J[:3], torch.from_numpy(linear), rtol=0, atol=1e-12)
         assert_close(J[3:], torch.from_numpy(angular), rtol=0, atol=1e-12)
-
-
-def test_agrees_with_pytorch_kinematics():
-    q = joint_positions(200, rng=generator(3))
-    peer = to_pytorch_kinematics(panda)
-    pose, J = panda.forward_and_jacobian(q)
-    assert_close(pose.matrix(), peer.forward_kinematics(q).get_matrix(), rtol=0, atol=1e-12)
-    assert_close(J, peer.jacobian(q), rtol=0, atol=1e-12)
 
 
 def test_ready_posture_points_the_gripper_down():

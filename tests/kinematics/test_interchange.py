@@ -8,14 +8,7 @@ from arm_samples import joint_positions
 from sampling import generator
 from torch.testing import assert_close
 
-from hrc_learn.kinematics import (
-    JointLimits,
-    SerialChain,
-    arm_from_file,
-    panda,
-    to_pytorch_kinematics,
-)
-from hrc_learn.kinematics.interchange import to_urdf
+from hrc_learn.kinematics import JointLimits, SerialChain, arm, panda, to_urdf
 
 # Axes along x, -z and a slant, a fixed joint in the middle and one at the end.
 ODD_ARM = """
@@ -65,18 +58,9 @@ def test_urdf_text_read_by_another_library_moves_alike():
     )
 
 
-def test_to_pytorch_kinematics_keeps_double_precision_and_names():
-    peer = to_pytorch_kinematics(panda)
-    assert tuple(peer.get_joint_parameter_names()) == panda.joint_names
-    q = joint_positions(50, rng=generator(2))
-    assert_close(
-        peer.forward_kinematics(q).get_matrix(), panda.forward(q).matrix(), rtol=0, atol=1e-14
-    )
-
-
 def test_axes_of_any_direction_move_as_in_pytorch_kinematics(tmp_path):
     (tmp_path / "odd.urdf").write_text(ODD_ARM, encoding="utf-8")
-    robot = arm_from_file(tmp_path / "odd.urdf", tip="tip")
+    robot = arm(tmp_path / "odd.urdf", tip="tip")
     peer = pytorch_kinematics.build_serial_chain_from_urdf(ODD_ARM.encode(), "tip")
     peer = peer.to(dtype=torch.float64)
     assert robot.joint_names == ("one", "two", "three")
@@ -114,7 +98,7 @@ def test_urdf_keeps_the_kind_of_each_joint(tmp_path):
     )
     file = tmp_path / "sliding.urdf"
     file.write_text(to_urdf(chain))
-    read = arm_from_file(file, base="link0", tip="tcp").chain
+    read = arm(file, base="link0", tip="tcp").chain
     assert read.kinds == chain.kinds
     q = torch.tensor([[0.3, 0.2, -0.7], [-2.0, -0.1, 1.5]]).double()
     assert_close(read.forward(q).matrix(), chain.forward(q).matrix(), rtol=0, atol=1e-12)

@@ -65,7 +65,7 @@ def test_joints_that_slide_go_on_sliding_and_are_not_turned():
     described.chain.limits = JointLimits(**{**vars(limits), "upper": far})
     arm = described.with_hand()
     q, _ = poses_of(bare(()).chain, 3, seed=2)
-    pose = described.with_tool(arm.chain.tcp).chain.forward(q)
+    pose = described.with_tool(arm.chain.tcp).forward(q)
     assert arm.chain.forward(q).twist_to(pose).abs().max() < 1e-12
     away = torch.zeros(7, dtype=torch.float64)
     away[0] = 2 * math.pi

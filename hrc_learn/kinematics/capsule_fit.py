@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Bool, Float
 
 from hrc_learn.geometry import mesh_points
-from hrc_learn.kinematics._description import Shape, Transform
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+from hrc_learn.kinematics.description import Shape
 
 # Capsules hold every point with this much to spare [m]: far above rounding.
 _SLACK = 1e-6
@@ -48,7 +48,7 @@ _GRID = 73
 _PARTING_STEPS = 200
 
 
-def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape, Transform]]) -> CapsuleArm:
+def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> CapsuleArm:
     """Fit capsules around the shapes on an arm's links.
 
     Like MoveIt's setup assistant, this ignores pairs of links that are neighbours, that overlap
@@ -60,16 +60,16 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape, Transform]])
 
     Args:
         chain: The arm.
-        shapes: Number of the link's frame, the shape, and its pose there. Without any shape,
-            each link gets a capsule from its own frame to the next.
+        shapes: Number of a link's frame, and a shape there. Without any shape, each link gets a
+            capsule from its own frame to the next.
     """
     hulls: dict[int, list[_Hull]] = defaultdict(list)
     capsules: list[LinkCapsule] = []
-    for link, shape, pose in shapes:
+    for link, shape in shapes:
         if shape.kind in ("sphere", "capsule"):
-            capsules.append(_round(link, shape, pose))
+            capsules.append(_round(link, shape))
         else:
-            hulls[link].append(hull_of(shape, pose))
+            hulls[link].append(hull_of(shape))
     for link, parts in hulls.items():
         capsules += [_named(link, *fitted) for fitted in fit_link(parts)]
     if not capsules:
@@ -97,7 +97,7 @@ class _Hull:
         return np.concatenate(found)
 
 
-def hull_of(shape: Shape, pose: Transform) -> _Hull:
+def hull_of(shape: Shape) -> _Hull:
     """Convex hull of a shape, of a round one that of a prism around it.
 
     Raises:
@@ -112,7 +112,7 @@ def hull_of(shape: Shape, pose: Transform) -> _Hull:
             name="scipy",
         ) from error
 
-    points = shape_points(shape) @ pose[:3, :3].T + pose[:3, 3]
+    points = shape_points(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
     try:
         hull = ConvexHull(points)
     except QhullError:  # flat: every pair of points may be an edge, of the few there are
@@ -263,8 +263,8 @@ def _named(link: int, start: np.ndarray, end: np.ndarray, radius: float) -> Link
     return LinkCapsule(link=link, start=(a, b, c), end=(d, e, f), radius=radius)
 
 
-def _round(link: int, shape: Shape, pose: Transform) -> LinkCapsule:
-    radius, half = shape.size
+def _round(link: int, shape: Shape) -> LinkCapsule:
+    (radius, half), pose = shape.size, shape.pose
     start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
     return _named(link, start, end, radius)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.geometry.shapes import Colour
-from hrc_learn.kinematics._description import (
+from hrc_learn.kinematics.description import (
     Description,
     Joint,
     Link,
@@ -26,11 +26,8 @@ def read_mjcf(path: Path) -> Description:
 
     Raises:
         ValueError: The file is not MJCF.
-        FileNotFoundError: The file is not there.
         ModuleNotFoundError: MuJoCo is not installed.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no robot description {path}")
     try:
         import mujoco
     except ModuleNotFoundError:
@@ -38,56 +35,41 @@ def read_mjcf(path: Path) -> Description:
             f"{path} is MJCF, which MuJoCo reads: install hrc-learn[sim]", name="mujoco"
         ) from None
     try:
-        spec: Any = mujoco.MjSpec.from_file(str(path))  # pyright: ignore[reportAttributeAccessIssue]
-        # A material without a texture draws alike for us, and textures may be missing.
-        model = spec.compile()
+        model: Any = mujoco.MjModel.from_xml_path(str(path))  # pyright: ignore
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return _Reader(path, spec, model, mujoco).description()
+        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+    return _Reader(path, model, mujoco).description()
 
 
 class _Reader:
-    def __init__(self, path: Path, spec: Any, model: Any, mujoco: Any):
+    def __init__(self, path: Path, model: Any, mujoco: Any):
         self.path, self.model, self.mujoco = path, model, mujoco
-        folder = path.parent / (spec.meshdir or "")
-        self.files = [folder / mesh.file for mesh in spec.meshes]
 
     def description(self) -> Description:
         model = self.model
-        links: dict[str, Link] = {}
-        joints: list[Joint] = []
+        links, joints = [], []
         followers = self._followers()
         for i in range(model.nbody):
-            body = model.body(i)
-            name = body.name or ("world" if i == 0 else f"body{i}")
-            links[name] = self._link(i, name)
+            links.append(self._link(i))
             if i > 0:
-                joints += self._joints(i, name, links, followers)
+                joints += self._joints(i, links, followers)
+        taken = {link.name for link in links}
         for i in range(model.nsite):
             site = model.site(i)
-            if site.name and site.name not in links:
-                links[site.name] = Link(name=site.name)
-                joints.append(
-                    _fixed(
-                        f"{site.name} (site)",
-                        self._name(int(model.site_bodyid[i])),
-                        site.name,
-                        self._pose(site.pos, site.quat),
-                    )
-                )
-        return Description(
-            name=self.path.stem,
-            path=self.path,
-            format="mjcf",
-            links=links,
-            joints=tuple(joints),
-            home=self._home(),
-        )
+            if site.name and site.name not in taken:
+                links.append(Link(name=site.name))
+                pose = self._pose(site.pos, site.quat)
+                body = self._name(int(model.site_bodyid[i]))
+                joints.append(_fixed(f"{site.name} (site)", body, site.name, pose))
+        return Description(self.path, links, joints, self._home())
 
     def _name(self, body: int) -> str:
-        return self.model.body(body).name or ("world" if body == 0 else f"body{body}")
+        return self.model.body(body).name or ("world" if body == 0 else f"(body {body})")
 
-    def _link(self, i: int, name: str) -> Link:
+    def _joint_name(self, joint: int) -> str:
+        return self.model.joint(joint).name or f"(joint {joint})"
+
+    def _link(self, i: int) -> Link:
         model, visuals, collisions = self.model, [], []
         first = int(model.body_geomadr[i])
         for g in range(first, first + int(model.body_geomnum[i])):
@@ -104,7 +86,7 @@ class _Reader:
         drawn = alone or [shape for _, shape in visuals]
         mass = float(model.body_mass[i])
         return Link(
-            name=name,
+            name=self._name(i),
             mass=mass if mass > 0 else None,
             visuals=tuple(drawn),
             collisions=tuple(collisions),
@@ -122,7 +104,11 @@ class _Reader:
             moved = self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh])
             place["pose"] = pose @ np.linalg.inv(moved)
             sx, sy, sz = model.mesh_scale[mesh].tolist()
-            path = self.files[mesh]
+            place_of_name = int(model.mesh_pathadr[mesh])
+            if place_of_name < 0:  # its vertices stand in the description itself
+                return None
+            name = bytes(model.paths[place_of_name:]).partition(b"\0")[0]
+            path = Path(name.decode())
             return Shape(kind="mesh", path=path, scale=(sx, sy, sz), **place)
         if kind == kinds.mjGEOM_BOX:
             return Shape(kind="box", size=(x, y, z), **place)
@@ -140,10 +126,8 @@ class _Reader:
         red, green, blue, opacity = rgba.tolist()
         return (red, green, blue, opacity)
 
-    def _joints(
-        self, i: int, name: str, links: dict[str, Link], followers: dict[int, Any]
-    ) -> list[Joint]:
-        model = self.model
+    def _joints(self, i: int, links: list[Link], followers: dict[int, Any]) -> list[Joint]:
+        model, name = self.model, self._name(i)
         parent = self._name(int(model.body_parentid[i]))
         placed = self._pose(model.body_pos[i], model.body_quat[i])
         first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
@@ -151,21 +135,20 @@ class _Reader:
             return [_fixed(f"{name} (fixed)", parent, name, placed)]
         joints = []
         for j in range(first, first + count):
-            joint = model.joint(j)
             kind = ("free", "ball", "prismatic", "revolute")[int(model.jnt_type[j])]
             anchor = np.eye(4)
             anchor[:3, 3] = model.jnt_pos[j]
             # A joint's position counts from the reference that the file gives it.
-            moving = f"{name}/{joint.name}"
+            moving = f"{name} ({self._joint_name(j)})"
             zero = _moved(kind, model.jnt_axis[j], -float(model.qpos0[model.jnt_qposadr[j]]))
             limited = bool(model.jnt_limited[j])
             lower, upper = model.jnt_range[j].tolist() if limited else (None, None)
             if kind == "revolute" and not limited:
                 kind = "continuous"
-            links[moving] = Link(name=moving)
+            links.append(Link(name=moving))
             joints.append(
                 Joint(
-                    name=joint.name or moving,
+                    name=self._joint_name(j),
                     kind=kind,
                     parent=parent,
                     child=moving,
@@ -197,24 +180,23 @@ class _Reader:
         return None
 
     def _followers(self) -> dict[int, tuple[str, float, float]]:
-        """Joints that an equality ties to another, with factor and offset."""
-        model = self.model
-        tied = {}
+        """Joints that an active equality ties to another or holds, with factor and offset."""
+        model, tied = self.model, {}
         for e in range(model.neq):
-            other = int(model.eq_obj2id[e])
-            if model.eq_type[e] == self.mujoco.mjtEq.mjEQ_JOINT and other >= 0:
+            if model.eq_type[e] == self.mujoco.mjtEq.mjEQ_JOINT and model.eq_active0[e]:
+                other = int(model.eq_obj2id[e])
+                leader = self._joint_name(other) if other >= 0 else ""
                 offset, factor = model.eq_data[e, :2].tolist()
-                tied[int(model.eq_obj1id[e])] = (model.joint(other).name, factor, offset)
+                tied[int(model.eq_obj1id[e])] = (leader, factor, offset)
         return tied
 
     def _home(self) -> dict[str, float] | None:
-        for k in range(self.model.nkey):
-            if self.model.key(k).name == "home":
-                qpos = self.model.key_qpos[k]
-                return {
-                    self.model.joint(j).name: float(qpos[self.model.jnt_qposadr[j]])
-                    for j in range(self.model.njnt)
-                }
+        model = self.model
+        for k in range(model.nkey):
+            if model.key(k).name == "home":
+                qpos = model.key_qpos[k].tolist()
+                addresses = model.jnt_qposadr.tolist()
+                return {self._joint_name(j): qpos[a] for j, a in enumerate(addresses)}
         return None
 
     def _pose(self, position: np.ndarray, quat: np.ndarray) -> Transform:

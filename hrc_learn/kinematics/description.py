@@ -1,0 +1,359 @@
+"""Robot descriptions: a tree of links and joints, checked once for all file formats.
+
+Readers of URDF and MJCF make links and joints of a file. `Description` refuses what is no tree
+of rigid bodies, tells the joints of a gripper from those of an arm, and finds the tool frame.
+All transforms are homogeneous, float64, with the numbers of the file.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.geometry.shapes import Colour
+
+Transform = Float[np.ndarray, "4 4"]
+
+MOVING = ("revolute", "continuous", "prismatic")
+_KINDS = (*MOVING, "fixed", "floating", "planar", "ball", "free")
+# No robot's joints are further apart [m]; a file in millimetres gives some hundreds.
+_FURTHEST = 100.0
+
+# Names of a gripper's joints and of the links that they move, and words which show that such a
+# joint turns the whole gripper, or that the link is fixed to the arm.
+_GRIPPER_JOINT = re.compile("gripper|jaw|finger|knuckle|thumb|claw")
+_FINGER_LINK = re.compile("jaw|finger|knuckle|thumb|claw")
+_ARM_JOINT = re.compile("wrist|elbow|shoulder|forearm|roll|pitch|yaw|rotat|swivel|turn")
+_FIXED_LINK = re.compile("fixed|static")
+# Words in the names of tool frames, the likeliest first, and in those of frames that are none.
+_TOOL_FRAMES = (r"\btcp\b", r"tool", r"grasp|pinch", r"\bee|effector", r"gripper", r"hand|tip")
+_NO_TOOL_FRAME = re.compile(
+    r"camera|optical|depth|laser|lidar|sensor|accelerometer|marker|safety|motor|finger|knuckle"
+    r"|\b(cam|imu|fts?|led|prop)\b"
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shape:
+    """A mesh, box, cylinder, sphere or capsule on a link."""
+
+    pose: Transform
+    """In the frame of the link; a cylinder or capsule lies along z, centred."""
+    kind: str
+    """"mesh", "box", "cylinder", "sphere" or "capsule"."""
+    size: tuple[float, ...] = ()
+    """Half edges of a box; radius and half length of other shapes [m]."""
+    path: Path | None = None
+    """File of a mesh."""
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Scale of a mesh along its axes."""
+    colour: Colour | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Link:
+    """A rigid body."""
+
+    name: str
+    mass: float | None = None
+    """[kg]"""
+    visuals: tuple[Shape, ...] = ()
+    collisions: tuple[Shape, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Joint:
+    """A joint; its child's frame is `origin`, then the motion about or along `axis`."""
+
+    name: str
+    kind: str
+    """"revolute", "continuous", "prismatic", "fixed", or a kind that no serial arm has."""
+    parent: str
+    child: str
+    origin: Transform
+    axis: Float[np.ndarray, "3"]
+    """Unit vector."""
+    lower: float | None = None
+    """[rad] or [m]; None where the file has none."""
+    upper: float | None = None
+    velocity: float | None = None
+    """[rad/s] or [m/s]"""
+    effort: float | None = None
+    """[N m] or [N]"""
+    follows: tuple[str, float, float] | None = None
+    """Joint that it mimics, with factor and offset; no name if it is held at the offset."""
+
+    @property
+    def is_finger(self) -> bool:
+        """True if its name, or that of the link it moves, is one of a gripper's joint."""
+        name, child = self.name.lower(), self.child.lower()
+        if _ARM_JOINT.search(name):
+            return False
+        moves_finger = _FINGER_LINK.search(child) and not _FIXED_LINK.search(child)
+        return bool(_GRIPPER_JOINT.search(name) or moves_finger)
+
+
+@dataclass(frozen=True)
+class _End:
+    """A rigid body at which an arm ends."""
+
+    joints: int
+    """Number of the arm's joints before it."""
+    frames: list[str]
+    """Links that may be the tool frame."""
+
+
+class Description:
+    """A tree of links and joints.
+
+    Attributes:
+        path: File of the description.
+        links: Links by name.
+        joints: Joints, in the order of the file.
+        home: Positions of joints by name [rad, m] of a posture that the file names, or None.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        links: Sequence[Link],
+        joints: Sequence[Joint],
+        home: dict[str, float] | None = None,
+    ):
+        """Check that the joints connect the links to trees.
+
+        Raises:
+            ValueError: A name is used twice, a joint names a link that does not exist, a link
+                has two parents, joints form a cycle, or joints are absurdly far apart.
+        """
+        if not links:
+            raise ValueError(f"{path} has no links: is it complete, and made from its xacro?")
+        self.path, self.joints, self.home = path, tuple(joints), home
+        self.links = {link.name: link for link in links}
+        self._below: dict[str, list[Joint]] = defaultdict(list)
+        self._above: dict[str, Joint] = {}
+        self._check_names("links", [link.name for link in links])
+        self._check_names("joints", [joint.name for joint in joints])
+        for joint in joints:
+            self._check_joint(joint)
+            self._below[joint.parent].append(joint)
+            self._above[joint.child] = joint
+        reached = {link for root in self.roots for link in self.subtree(root)}
+        if cycle := [name for name in self.links if name not in reached]:
+            raise ValueError(
+                f"{path}: link {cycle[0]} is its own ancestor (joint "
+                f"{self._above[cycle[0]].name}): the joints form a cycle, but a robot is a tree"
+            )
+
+    def _check_names(self, what: str, names: Sequence[str]) -> None:
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"{self.path} has two {what} of the name {twice!r}: rename one")
+
+    def _check_joint(self, joint: Joint) -> None:
+        where = f"{self.path}: joint {joint.name}"
+        if joint.kind not in _KINDS:
+            raise ValueError(f"{where} has the unknown type {joint.kind!r}")
+        for role, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in self.links:
+                raise ValueError(f"{where} has the {role} {link!r}, but there is no such link")
+        if before := self.above(joint.child):
+            raise ValueError(
+                f"{self.path}: link {joint.child} has two parents, by the joints {before.name} "
+                f"and {joint.name}: a robot is a tree"
+            )
+        if not np.abs(joint.origin[:3, 3]).max() < _FURTHEST:
+            raise ValueError(
+                f"{where} is {np.abs(joint.origin[:3, 3]).max():.3g} m from its parent's "
+                "frame: lengths are in metres"
+            )
+
+    @property
+    def roots(self) -> list[str]:
+        """Links that no joint carries."""
+        return [name for name in self.links if name not in self._above]
+
+    def below(self, link: str) -> Sequence[Joint]:
+        """Joints whose parent a link is."""
+        return self._below.get(link, ())
+
+    def above(self, link: str) -> Joint | None:
+        """Joint that carries a link; None for the root."""
+        return self._above.get(link)
+
+    def subtree(self, link: str) -> list[str]:
+        """A link and all that it carries, parents first."""
+        found = [link]
+        for name in found:  # which grows on the way
+            found += [joint.child for joint in self.below(name)]
+        return found
+
+    def rigid_subtree(self, link: str) -> dict[str, Transform]:
+        """A link and all that is fixed to it, with poses in its frame."""
+        found, ahead = {link: np.eye(4)}, [link]
+        for name in ahead:
+            for joint in self.below(name):
+                if joint.kind == "fixed":
+                    found[joint.child] = found[name] @ joint.origin
+                    ahead.append(joint.child)
+        return found
+
+    def path_between(self, base: str | None, tip: str | None) -> tuple[str, str, list[Joint]]:
+        """Joints from one link to another, with the names of both.
+
+        Args:
+            base: A link; None: the root.
+            tip: A link; None: the tool frame, if there is only one end besides a gripper's. The
+                joints of the gripper are left out with a warning.
+
+        Raises:
+            ValueError: There is no such link, no way between them that moves, several roots or
+                ends to choose from, or a joint of a kind that no serial chain has.
+        """
+        for role, name in (("base", base), ("tip", tip)):
+            if name is not None and name not in self.links:
+                raise ValueError(
+                    f"{self.path} has no link {name!r} to be the {role}; its links are "
+                    f"{', '.join(self.links)}"
+                )
+        if base is None and len(self.roots) > 1:
+            raise ValueError(
+                f"{self.path} is in several pieces, since no joint carries the links "
+                f"{', '.join(self.roots)}: add a joint, or say which is the base (base=, --tip "
+                "BASE:TIP)"
+            )
+        base = self.roots[0] if base is None else base
+        ends, fingers = self._ends(base)
+        if tip is None:
+            tip = self._only_tip(base, ends, fingers)
+        joints, link = [], tip
+        while link != base:
+            joint = self.above(link)
+            if joint is None:
+                raise ValueError(
+                    f"{self.path}: link {tip!r} does not hang on {base!r}, but on {link!r}: "
+                    "name another base or tip (base=, tip=; --tip BASE:TIP)"
+                )
+            joints.insert(0, joint)
+            link = joint.parent
+        self._check_path(base, tip, joints)
+        if wrong := [joint.name for joint in joints if joint in fingers]:
+            warnings.warn(
+                f"{self.path}: joint {wrong[0]} looks like a gripper's, but is taken for the "
+                f"arm's, since the tip {tip!r} lies behind it",
+                stacklevel=2,
+            )
+        return base, tip, joints
+
+    def _check_path(self, base: str, tip: str, joints: Sequence[Joint]) -> None:
+        for joint in joints:
+            if joint.kind not in (*MOVING, "fixed"):
+                raise ValueError(
+                    f"{self.path}: joint {joint.name} is {joint.kind}, which no serial "
+                    f"chain has: name a base or a tip (base=, tip=; --tip BASE:TIP) so that it "
+                    f"is outside (its parent is {joint.parent}, its child {joint.child})"
+                )
+            if joint.follows is not None:
+                leader, _, offset = joint.follows
+                raise ValueError(
+                    f"{self.path}: joint {joint.name} "
+                    + (f"only follows {leader}" if leader else f"is held at {offset:g}")
+                    + f": end the chain before it (tip=, --tip), at {joint.parent!r}"
+                )
+        if not any(joint.kind in MOVING for joint in joints):
+            raise ValueError(f"{self.path}: no joint moves between {base!r} and {tip!r}")
+
+    def _only_tip(self, base: str, ends: Sequence[_End], fingers: Sequence[Joint]) -> str:
+        ends = sorted(ends, key=lambda end: -end.joints)
+        frames = [frame for end in ends for frame in sorted(end.frames, key=_unlikely)]
+        if not frames:
+            raise ValueError(f"{self.path}: no joint moves a link that hangs on {base!r}")
+        if len(frames) > 1:
+            raise ValueError(
+                f"{self.path} has several ends; say which is the tool (tip=, --tip), the "
+                f"likeliest first: {', '.join(frames)}"
+            )
+        if fingers:
+            names = ", ".join(joint.name for joint in fingers)
+            warnings.warn(
+                f"{self.path}: the arm ends at {frames[0]!r}; joints of its gripper: {names}",
+                stacklevel=3,
+            )
+        return frames[0]
+
+    def _ends(self, base: str) -> tuple[list[_End], list[Joint]]:
+        """Bodies at which an arm may end, and the first joints of grippers.
+
+        A joint is a gripper's by its name, or if several branch off where the arm ends, each
+        shorter than the arm.
+        """
+        height: dict[str, int] = {}  # joints in a row that a link carries
+        for link in reversed(self.subtree(base)):
+            height[link] = max((_length(j, height) for j in self.below(link)), default=0)
+        ends: list[_End] = []
+        fingers: list[Joint] = []
+        bodies = [(base, 0)]
+        for root, count in bodies:  # which grows on the way
+            body = self.rigid_subtree(root)
+            moving = [j for link in body for j in self.below(link) if j.kind != "fixed"]
+            spread = len(moving) > 1 and all(_length(j, height) < count for j in moving)
+            gripping = [
+                j for j in moving if spread or (j.is_finger and _length(j, height) <= count)
+            ]
+            fingers += gripping
+            further = [joint for joint in moving if joint not in gripping]
+            bodies += [(joint.child, count + 1) for joint in further]
+            if count and not further:
+                frames = [link for link in body if not _NO_TOOL_FRAME.search(_words(link))]
+                leaves = [link for link in frames if not self.below(link)]
+                hands = [joint.parent for joint in gripping[:1]]
+                ends.append(_End(count, leaves or hands or frames[-1:] or [root]))
+        return ends, fingers
+
+
+def _length(joint: Joint, height: dict[str, int]) -> int:
+    """Number of joints in a row from a joint to the furthest leaf that it carries."""
+    return height[joint.child] + (joint.kind != "fixed")
+
+
+def _unlikely(frame: str) -> int:
+    """Rank of a link among those that may be the tool frame, from 0."""
+    words = _words(frame)
+    ranks = [rank for rank, word in enumerate(_TOOL_FRAMES) if re.search(word, words)]
+    return min(ranks, default=len(_TOOL_FRAMES))
+
+
+def _words(name: str) -> str:
+    """A name as words of small letters."""
+    return re.sub("[^a-z]+", " ", name.lower())
+
+
+def turn_to(axis: Float[np.ndarray, "3"]) -> Transform:
+    """A rotation that takes z to a unit axis; exact for axes along a coordinate axis."""
+    turn = np.eye(4)
+    along = int(np.abs(axis).argmax())
+    if abs(axis[along]) == 1.0:
+        # Columns z, x, y in turn for z, x, y: no rounding. Half a turn for the other sense.
+        turn[:3, :3] = np.roll(np.eye(3), along + 1, axis=0)
+        if axis[along] < 0:
+            turn[:3, :3] = turn[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+        return turn
+    z = axis / np.linalg.norm(axis)
+    x = np.cross(np.eye(3)[int(np.abs(axis).argmin())], z)
+    x /= np.linalg.norm(x)
+    turn[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    return turn
+
+
+def transform(R: Float[np.ndarray, "3 3"], p: Float[np.ndarray, "3"]) -> Transform:
+    """Homogeneous transform of a rotation and an origin [m]."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, p
+    return T

@@ -1,0 +1,314 @@
+"""URDF: descriptions read with all numbers in double precision, and serial chains written."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.parsers import expat
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry.shapes import Colour
+from hrc_learn.kinematics.chain import SerialChain
+from hrc_learn.kinematics.description import (
+    Description,
+    Joint,
+    Link,
+    Shape,
+    Transform,
+    transform,
+)
+
+_BOUNDS = ("lower", "upper", "velocity", "effort")
+
+
+def read_urdf(path: Path) -> Description:
+    """Read a file, with what urdfdom allows: blank first lines, undeclared namespaces, unused
+    properties of xacro.
+
+    Meshes `package://NAME/...` are looked for in the folders above the file and in
+    ROS_PACKAGE_PATH. A warning names the first mesh that is missing; links do without.
+
+    Raises:
+        ValueError: The file is not URDF, holds unexpanded xacro, misses an attribute, or
+            describes no tree.
+        FileNotFoundError: The file is not there.
+    """
+    robot = _parsed(path)
+    if robot.tag != "robot":
+        raise ValueError(
+            f"{path} is neither URDF nor MJCF: it begins with <{robot.tag}>, not with <robot> "
+            "or <mujoco>"
+        )
+    _refuse_xacro(path, robot)
+    reader = _Reader(path, robot)
+    links = [reader.link(element) for element in robot.findall("link")]
+    joints = [reader.joint(element) for element in robot.findall("joint")]
+    if reader.missing:
+        warnings.warn(
+            f"{path}: {len(reader.missing)} meshes are missing, such as {reader.missing[0]}: "
+            "their links have no shape (ROS_PACKAGE_PATH names folders of packages)",
+            stacklevel=2,
+        )
+    return Description(path, links, joints)
+
+
+def _parsed(path: Path) -> ElementTree.Element:
+    """Elements of an XML file, names with their prefixes as they are."""
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    try:
+        parser.Parse(path.read_bytes().lstrip(b"\xef\xbb\xbf \t\r\n"), True)
+    except expat.ExpatError as error:
+        raise ValueError(f"{path} is no XML: {error}") from None
+    return builder.close()
+
+
+def _refuse_xacro(path: Path, robot: ElementTree.Element) -> None:
+    """Raise a ValueError if macros or expressions of xacro are left; properties may be."""
+    names = [key for key, value in robot.attrib.items() if "xacro" in value]
+    prefixes = ("xacro:", *(f"{name.removeprefix('xmlns:')}:" for name in names))
+    harmless = tuple(prefix + kind for prefix in prefixes for kind in ("property", "arg"))
+    for element in robot.iter():
+        found = [element.tag] if element.tag.startswith(prefixes) else []
+        if element.tag in harmless:
+            continue
+        if element.tag in ("link", "joint"):
+            texts = (text for part in element.iter() for text in part.attrib.values())
+            found += [text for text in texts if "${" in text or "$(" in text]
+        if found:
+            raise ValueError(f"{path} holds {found[0]}: make URDF of it with xacro first")
+
+
+class _Reader:
+    def __init__(self, path: Path, robot: ElementTree.Element):
+        self.path = path
+        self.missing: list[str] = []
+        self.materials = {
+            material.get("name"): colour
+            for material in robot.iter("material")
+            if (colour := self._colour(material)) is not None
+        }
+        ros = [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(":") if p]
+        self.folders = [*path.resolve().parents, *ros]
+
+    def link(self, element: ElementTree.Element) -> Link:
+        name = self._attribute(element, "name", "a link")
+        mass, value = element.find("inertial/mass"), None
+        if mass is not None:
+            value = self._number(mass, "value", f"mass of link {name}")
+            if value < 0:
+                raise ValueError(f"{self.path}: link {name} has the negative mass {value:g} kg")
+        return Link(
+            name=name,
+            mass=value,
+            visuals=self._shapes(element, "visual", name),
+            collisions=self._shapes(element, "collision", name),
+        )
+
+    def joint(self, element: ElementTree.Element) -> Joint:
+        name = self._attribute(element, "name", "a joint")
+        kind = self._attribute(element, "type", f"joint {name}")
+        ends = {}
+        for role in ("parent", "child"):
+            end = element.find(role)
+            if end is None:
+                raise ValueError(f"{self.path}: joint {name} has no <{role}>")
+            ends[role] = self._attribute(end, "link", f"<{role}> of joint {name}")
+        axis = np.array([1.0, 0.0, 0.0])  # the default of URDF
+        if (given := element.find("axis")) is not None and kind != "fixed":
+            axis = self._numbers(given, "xyz", (1.0, 0.0, 0.0), f"joint {name}")
+            length = np.linalg.norm(axis)
+            if length == 0:
+                raise ValueError(f"{self.path}: the axis of joint {name} is zero")
+            axis = axis / length
+        limit, mimic = element.find("limit"), element.find("mimic")
+        bounds, follows = {}, None
+        if limit is not None:
+            # A continuous joint has no limits of position, whatever they say.
+            keys = ("velocity", "effort") if kind == "continuous" else _BOUNDS
+            for key in keys:
+                if limit.get(key) is not None:
+                    bounds[key] = self._number(limit, key, f"limit of joint {name}")
+        if mimic is not None:
+            what = f"<mimic> of joint {name}"
+            factor = float(self._numbers(mimic, "multiplier", (1.0,), what, 1)[0])
+            offset = float(self._numbers(mimic, "offset", (0.0,), what, 1)[0])
+            follows = (self._attribute(mimic, "joint", what), factor, offset)
+        return Joint(
+            name=name,
+            kind=kind,
+            parent=ends["parent"],
+            child=ends["child"],
+            origin=self._origin(element, f"joint {name}"),
+            axis=axis,
+            follows=follows,
+            **bounds,
+        )
+
+    def _shapes(self, link: ElementTree.Element, role: str, name: str) -> tuple[Shape, ...]:
+        shapes = []
+        for element in link.findall(role):
+            what = f"<{role}> of link {name}"
+            geometry = element.find("geometry/*")
+            if geometry is None:
+                continue
+            colour = None
+            if (material := element.find("material")) is not None:
+                colour = self._colour(material) or self.materials.get(material.get("name"))
+            place = {"pose": self._origin(element, what), "colour": colour}
+            if geometry.tag == "mesh":
+                file = self._attribute(geometry, "filename", what)
+                x, y, z = self._numbers(geometry, "scale", (1.0, 1.0, 1.0), what).tolist()
+                if path := self._mesh(file):
+                    shapes.append(Shape(kind="mesh", path=path, scale=(x, y, z), **place))
+                else:
+                    self.missing.append(file)
+            elif geometry.tag == "box":
+                x, y, z = (self._numbers(geometry, "size", None, what) / 2).tolist()
+                shapes.append(Shape(kind="box", size=(x, y, z), **place))
+            elif geometry.tag in ("cylinder", "capsule", "sphere"):
+                radius = self._number(geometry, "radius", what)
+                half = 0.0
+                if geometry.tag != "sphere":
+                    half = self._number(geometry, "length", what) / 2
+                shapes.append(Shape(kind=geometry.tag, size=(radius, half), **place))
+        return tuple(shapes)
+
+    def _mesh(self, name: str) -> Path | None:
+        scheme, _, place = name.rpartition("://")
+        if scheme in ("package", "model"):
+            package, _, rest = place.partition("/")
+            tried = [folder / package / rest for folder in self.folders]
+            tried += [f / rest for f in self.folders if f.name == package]
+        else:
+            tried = [self.path.parent / place]
+        return next((path for path in tried if os.path.isfile(path)), None)
+
+    def _origin(self, element: ElementTree.Element, what: str) -> Transform:
+        origin = element.find("origin")
+        if origin is None:
+            return np.eye(4)
+        zero = (0.0, 0.0, 0.0)
+        p = self._numbers(origin, "xyz", zero, what)
+        return transform(_rotation(*self._numbers(origin, "rpy", zero, what)), p)
+
+    def _colour(self, material: ElementTree.Element) -> Colour | None:
+        colour = material.find("color")
+        if colour is None:
+            return None
+        r, g, b, a = self._numbers(colour, "rgba", None, "a colour", 4).tolist()
+        return (r, g, b, a)
+
+    def _attribute(self, element: ElementTree.Element, key: str, what: str) -> str:
+        value = element.get(key)
+        if not value:
+            raise ValueError(f"{self.path}: {what} has no {key}")
+        return value
+
+    def _number(self, element: ElementTree.Element, key: str, what: str) -> float:
+        return float(self._numbers(element, key, None, what, 1)[0])
+
+    def _numbers(
+        self,
+        element: ElementTree.Element,
+        key: str,
+        default: tuple[float, ...] | None,
+        what: str,
+        count: int = 3,
+    ) -> np.ndarray:
+        text = element.get(key)
+        if text is None and default is not None:
+            return np.array(default)
+        try:
+            values = [float(word) for word in self._attribute(element, key, what).split()]
+        except ValueError:
+            values = []
+        if "_" in (text or ""):  # which Python allows between digits
+            values = []
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise ValueError(
+                f"{self.path}: {what} has {key}={text!r}, not {count} finite number"
+                f"{'s' if count > 1 else ''}"
+            )
+        return np.array(values)
+
+
+def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Rz(yaw) Ry(pitch) Rx(roll): about the fixed axes x, y, z in turn."""
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def to_urdf(chain: SerialChain, name: str = "arm") -> str:
+    """Describe a chain: links link0 to linkN, `flange` and `tcp`, joints under their names.
+
+    Args:
+        chain: Arm to describe.
+        name: Name of the robot.
+
+    Returns:
+        URDF with links as bare frames: no masses, meshes or collision shapes.
+    """
+    robot = ElementTree.Element("robot", name=name)
+    links = [f"link{i}" for i in range(len(chain.joint_names) + 1)] + ["flange", "tcp"]
+    for link in links:
+        ElementTree.SubElement(robot, "link", name=link)
+    limits = chain.limits
+    for i, joint_name in enumerate(chain.joint_names):
+        joint = _add_joint(
+            robot, joint_name, chain.kinds[i], links[i], links[i + 1], chain.mounts[i]
+        )
+        ElementTree.SubElement(joint, "axis", xyz="0 0 1")
+        ElementTree.SubElement(
+            joint,
+            "limit",
+            lower=repr(float(limits.lower[i])),
+            upper=repr(float(limits.upper[i])),
+            velocity=repr(float(limits.velocity[i])),
+            effort=repr(float(limits.torque[i])),
+        )
+    _add_joint(robot, "flange_joint", "fixed", links[-3], "flange", chain.flange)
+    _add_joint(robot, "tcp_joint", "fixed", "flange", "tcp", chain.tcp)
+    ElementTree.indent(robot)
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _add_joint(
+    robot: ElementTree.Element,
+    name: str,
+    kind: str,
+    parent: str,
+    child: str,
+    transform: Float[Tensor, "4 4"],
+) -> ElementTree.Element:
+    joint = ElementTree.SubElement(robot, "joint", name=name, type=kind)
+    rpy = " ".join(repr(angle) for angle in _roll_pitch_yaw(transform[:3, :3]))
+    xyz = " ".join(repr(value) for value in transform[:3, 3].tolist())
+    ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=child)
+    return joint
+
+
+def _roll_pitch_yaw(R: Float[Tensor, "3 3"]) -> list[float]:
+    """Angles about fixed x, y, z [rad]; at pitch +-pi/2, where two coincide, yaw is zero."""
+    horizontal = torch.hypot(R[0, 0], R[1, 0])
+    pitch = torch.atan2(-R[2, 0], horizontal)
+    if horizontal < 1e-12:  # beyond rounding of entries of size 1: roll and yaw coincide
+        return [torch.atan2(-R[1, 2], R[1, 1]).item(), pitch.item(), 0.0]
+    roll, yaw = torch.atan2(R[2, 1], R[2, 2]), torch.atan2(R[1, 0], R[0, 0])
+    return [roll.item(), pitch.item(), yaw.item()]
