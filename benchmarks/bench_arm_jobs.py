@@ -39,9 +39,9 @@ from hrc_learn.experiments.collaboration_trial import (
 )
 from hrc_learn.experiments.simulated_cell import through_franka, through_franky
 from hrc_learn.hardware import DriverError
+from hrc_learn.hardware.protocol_server import ArmServer, DrivenCycle, serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, World
-from hrc_learn.sim.protocol_server import ArmServer, DrivenCycle, serve_world
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill

@@ -5,9 +5,9 @@ from contextlib import closing, contextmanager
 from types import SimpleNamespace
 
 from hrc_learn.hardware import FrankyArm, FrankyConfig
+from hrc_learn.hardware.protocol_server import ServedArm, loopback_addresses, serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import SceneConfig, World
-from hrc_learn.sim.protocol_server import ServedArm, loopback_addresses, serve_world
 
 READY = panda.ready.numpy()
 

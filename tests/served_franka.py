@@ -9,10 +9,10 @@ import numpy as np
 from franky_servers import READY
 from lerobot.robots import make_robot_from_config
 
+from hrc_learn.hardware.protocol_server import ArmServer, serve_world
 from hrc_learn.lerobot.franka_panda import FrankaPanda, FrankaPandaConfig
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim import SceneConfig, World
-from hrc_learn.sim.protocol_server import ArmServer, serve_world
 
 
 @dataclass

@@ -119,9 +119,8 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "cli": {"huggingface_hub", "httpx"},
     "demos": {"av", "scipy", "huggingface_hub"},
     "vision": {"cv2"},
-    "sim": {"franky_sim"},
     "viz": {"av", "rich"},
-    "hardware": {"franky", "pylibfranka", "cv2"},
+    "hardware": {"franky", "franky_sim", "pylibfranka", "cv2"},
     "teleoperation": {
         "viser",
         "pygame",

@@ -15,10 +15,10 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
+from hrc_learn.hardware.protocol_server import ArmServer, ServedArm, serve_world
 from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import Imperfections, MotionLog, World
-from hrc_learn.sim.protocol_server import ArmServer, ServedArm, serve_world
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.person_watch import PersonWatch

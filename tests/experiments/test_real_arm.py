@@ -12,9 +12,9 @@ from unchecked import shapes_unchecked
 from hrc_learn.experiments import real_arm as on_arm
 from hrc_learn.experiments.real_arm import ArmSite, placing_task, run_on_arm
 from hrc_learn.geometry import Pose
+from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
-from hrc_learn.sim.protocol_server import serve_world
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.grasping import as_load, joint_plan

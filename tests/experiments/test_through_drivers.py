@@ -20,9 +20,9 @@ from hrc_learn.experiments.grasping_trial import (
 from hrc_learn.experiments.placing_trial import place
 from hrc_learn.experiments.simulated_cell import through_franka, through_franky
 from hrc_learn.hardware import FrankyConfig
+from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections
-from hrc_learn.sim.protocol_server import serve_world
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 

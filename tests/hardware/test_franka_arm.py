@@ -20,11 +20,11 @@ from loop_on_franka import loop_of
 
 from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, Load
 from hrc_learn.hardware.franka_arm import step_of
+from hrc_learn.hardware.protocol_server import ServedArm, serve_world
 from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.kinematics import fr3 as FR3
 from hrc_learn.protocols import Arm, Gripper
 from hrc_learn.sim import SceneConfig, World
-from hrc_learn.sim.protocol_server import ServedArm, serve_world
 
 # Not imported: one process cannot have both drivers, and this one may get the other.
 pytestmark = [

@@ -11,11 +11,11 @@ from lerobot.robots import make_robot_from_config
 from served_franka import served_franka
 
 from hrc_learn.hardware import CollisionConfig, DriverError, Load
+from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_values import GRIPPER, ArmValues
 from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.sim import SceneConfig, World
-from hrc_learn.sim.protocol_server import serve_world
 
 FPS = 20.0
 JOINTS = ArmValues(panda).joints

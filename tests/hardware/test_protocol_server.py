@@ -9,8 +9,8 @@ from franky_servers import READY, served_world
 
 from hrc_learn.experiments.simulated_cell import PROTOCOL_DELAY, SIMULATED, through_franky
 from hrc_learn.hardware import FrankyConfig
+from hrc_learn.hardware.protocol_server import CYCLE, loopback_addresses, serve_world
 from hrc_learn.sim import Imperfections, World
-from hrc_learn.sim.protocol_server import CYCLE, loopback_addresses, serve_world
 from hrc_learn.sim.workplace import Workplace
 
 pytest.importorskip("franky")
