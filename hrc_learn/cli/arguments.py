@@ -349,8 +349,6 @@ class Evaluate(OnDataset, Written):
     """Episodes to evaluate on. Default: those not learned from, or all."""
     most_nrmse: float | None = None
     """Largest median error of primitives that passes."""
-    closed_loop: bool = True
-    """Also run closed loops with an image Jacobian, which takes a minute."""
 
 
 @dataclass(frozen=True, kw_only=True)
