@@ -14,8 +14,7 @@ from torch import Tensor
 
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit
-from hrc_learn.sim.worker import PARTS
-from hrc_learn.sim.worker_tracking import IMAGE_RATE
+from hrc_learn.sim.worker import IMAGE_RATE, PARTS
 
 # A worker who has left stands still. The tables hold this much of that time, and repeat its
 # last part, a whole number of images and of control steps [s].

@@ -28,8 +28,7 @@ from hrc_learn.sim import (
     whole_arm,
 )
 from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over
-from hrc_learn.sim.worker import PARTS
-from hrc_learn.sim.worker_tracking import IMAGE_RATE
+from hrc_learn.sim.worker import IMAGE_RATE, PARTS
 from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig

@@ -4,7 +4,7 @@ OpenGL, and what disturbs a camera in use: it is moved, refocused, or a marker i
 
 import sys
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -37,8 +37,6 @@ from hrc_learn.vision import (
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
-
-_TOUCHING: Colour = (0.84, 0.37, 0.0, 1.0)  # of a link that touches something
 
 CameraKind = Literal["auto", "egl", "synthetic"]
 
@@ -110,19 +108,17 @@ class OffscreenRenderer:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
 
     def render(
-        self, camera: CameraModel, arrows: Sequence[Arrow] = (), touching: Iterable[str] = ()
+        self, camera: CameraModel, arrows: Sequence[Arrow] = ()
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The image of an undistorted camera of the renderer's size, RGB.
 
         Args:
             camera: Camera to render.
             arrows: Drawn besides what is in the world.
-            touching: Names of geoms that stand out, as they touch something.
         """
         width, height = self._size
         self._gl.make_current()
         self._drawn.update()
-        self._drawn.paint(touching, _TOUCHING)
         mujoco.mjv_updateScene(
             self._drawn.model,
             self._drawn.data,

@@ -7,7 +7,6 @@ gripper.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,13 +16,13 @@ from jaxtyping import Float
 from hrc_learn.geometry import Box
 from hrc_learn.sim.worker import Worker
 from hrc_learn.sim.worker_visit import (
-    STEP,
+    BenchScript,
     HumanSpeeds,
     PoseWriter,
     WorkerPose,
     WorkerVisit,
     direction,
-    lean_for,
+    in_worker_frame,
     nearest_turn,
 )
 
@@ -97,11 +96,13 @@ class HandOver:
     def brought_to(self, place: Float[np.ndarray, "3"], now: float) -> HandOver:
         """Bring the object to a place from this time on, as far as the arm reaches [m, s]."""
         visit, last = self.visit, self._last()
-        target = _own(visit.worker, last.place, last.heading, place - HELD_OUT)
+        target = in_worker_frame(visit.worker, last.place, last.heading, place - HELD_OUT)
         lean = visit.worker.lean_to(target, RIGHT)
         slow = replace(self.speeds, reaching=_CAREFUL * self.speeds.reaching)
         script = PoseWriter(last, now, slow, visit.worker.config.stature)
-        script.go(hands=_hands(last, target), lean=_LEANS if lean is None else lean)
+        hands = last.hands.copy()
+        hands[RIGHT] = target
+        script.go(hands=hands, lean=_LEANS if lean is None else lean)
         return self._continued(script)
 
     def left(self, now: float) -> HandOver:
@@ -138,7 +139,6 @@ def random_hand_over(
     bench: Box,
     thickness: float,
     begin: tuple[float, float] = (1.0, 3.0),
-    speeds: HumanSpeeds | None = None,
 ) -> HandOver:
     """Draw a worker's walk to the far side of the bench, with an object for the robot.
 
@@ -148,90 +148,49 @@ def random_hand_over(
         bench: The table, whose far side (+y) is free.
         thickness: Half the height of the object [m].
         begin: Earliest and latest time of entering [s].
-        speeds: Largest speeds; each visit takes 50 to 95 % of them.
 
     Raises:
         ValueError: The worker is too small to hold an object out over the bench.
     """
-    most, h = speeds or UNHURRIED, worker.config.stature
-    pace = HumanSpeeds(
-        walking=rng.uniform(0.6, 0.9) * most.walking,
-        reaching=rng.uniform(0.5, 0.85) * most.reaching,
-        turning=rng.uniform(0.6, 0.95) * most.turning,
-    )
-    top = bench.centre[2] + bench.half_size[2]
-    edge = bench.centre[1] + bench.half_size[1]
-    stand = np.array([rng.uniform(0.15, 0.45), edge + 0.1 * h + rng.uniform(0, 0.05)])
-    facing = -np.pi / 2 + rng.uniform(-0.1, 0.1)
-    entrance, leaving = (
-        np.array([rng.uniform(-1.0, 1.4), edge + rng.uniform(1.2, 1.5)]) for _ in range(2)
-    )
-    place, target, lean = _held_out(worker, rng, stand, facing, edge, top)
-    ready = np.array(
-        [[0.16 * h, s * 0.13 * h, top + 0.12 - worker.config.floor] for s in (1, -1)]
-    )
-    carrying = worker.hanging_hands()
-    carrying[RIGHT] = [0.20 * h, -0.05 * h, 0.63 * h]
-    start = WorkerPose(
-        entrance, nearest_turn(direction(stand - entrance), facing), 0.0, carrying
-    )
-    script = PoseWriter(start, rng.uniform(*begin), pace, h)
-    script.go(place=stand)
+    pace = UNHURRIED.drawn(rng)
+    script = BenchScript(worker, rng, bench, (0.15, 0.45), sway=0.1)
+    place, target, lean = _held_out(worker, rng, script)
+    script.enter(rng.uniform(*begin), pace, RIGHT)
     # Down on the bench, near its edge, to the worker's right.
-    x, y = stand[0] + rng.uniform(-0.25, 0.0), edge - rng.uniform(0.10, 0.16)
-    spot = np.array([x, y, top + thickness]) - HELD_OUT
-    bench_hand = _own(worker, stand, facing, spot)
+    x, y = script.stand[0] + rng.uniform(-0.25, 0.0), script.edge - rng.uniform(0.10, 0.16)
+    laid_at = script.own(np.array([x, y, script.top + thickness]) - HELD_OUT)
     reaches: list[Reach] = []
 
-    def reach(kind: str, **changes) -> None:
-        begun = script.times[-1]
-        script.go(**changes)
-        reaches.append(Reach(kind, begun, script.times[-1]))
+    def note(kind: str) -> None:
+        """Note the movement that was written last."""
+        reaches.append(Reach(kind, script.times[-2], script.times[-1]))
 
-    def lay_hand_on(kind: str) -> None:
-        reach(
-            kind, hands=_hands(script.now, bench_hand), lean=lean_for(worker, bench_hand, RIGHT)
-        )
-
-    reach(BACK, heading=facing, hands=ready)
+    script.go(heading=script.facing, hands=script.ready)
+    note(BACK)
+    handled: list[float] = []
+    for _ in range(2):  # lay it down, then take it up again
+        script.wait(rng.uniform(0.6, 1.5))
+        script.reach(laid_at, RIGHT)
+        note(BENCH)
+        script.wait(rng.uniform(0.2, 0.5))
+        handled.append(script.times[-1])
+        script.go(hands=script.ready, lean=0.05)
+        note(BACK)
     script.wait(rng.uniform(0.6, 1.5))
-    lay_hand_on(BENCH)
-    script.wait(rng.uniform(0.2, 0.5))
-    laid = script.times[-1]
-    reach(BACK, hands=ready, lean=0.05)
-    script.wait(rng.uniform(0.6, 1.5))
-    lay_hand_on(BENCH)
-    script.wait(rng.uniform(0.2, 0.5))
-    taken = script.times[-1]
-    reach(BACK, hands=ready, lean=0.05)
-    script.wait(rng.uniform(0.6, 1.5))
-    reach(HAND_OVER, hands=_hands(script.now, target), lean=lean)
+    script.go(hands=script.hands(target, RIGHT), lean=lean)
+    note(HAND_OVER)
     return HandOver(
-        visit=WorkerVisit(
-            worker=worker,
-            time=np.array(script.times),
-            poses=np.array(script.rows),
-            step=STEP * h,
-            side=RIGHT,
-            released=np.inf,
-            markers=np.empty((0, 3)),
-            reaches=np.empty((0, 2)),
-        ),
+        visit=script.visit(RIGHT),
         reaches=tuple(reaches),
-        carried=((-np.inf, laid), (taken, np.inf)),
+        carried=((-np.inf, handled[0]), (handled[1], np.inf)),
         place=place,
-        leaving=leaving,
+        leaving=script.leaving,
         speeds=pace,
     )
 
 
 def _held_out(
-    worker: Worker,
-    rng: np.random.Generator,
-    stand: np.ndarray,
-    facing: float,
-    edge: float,
-    top: float,
+    worker: Worker, rng: np.random.Generator, script: BenchScript
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Position of the offered object, hand position in the worker's frame, and lean of the
     trunk.
@@ -239,28 +198,15 @@ def _held_out(
     for _ in range(_TRIED):
         place = np.array(
             [
-                np.clip(stand[0] + rng.uniform(*_ASIDE), *_WITHIN),
-                edge - rng.uniform(*_OVER_BENCH),
-                top + rng.uniform(*_HEIGHT),
+                np.clip(script.stand[0] + rng.uniform(*_ASIDE), *_WITHIN),
+                script.edge - rng.uniform(*_OVER_BENCH),
+                script.top + rng.uniform(*_HEIGHT),
             ]
         )
-        target = _own(worker, stand, facing, place - HELD_OUT)
+        target = script.own(place - HELD_OUT)
         lean = worker.lean_to(target, RIGHT)
         if lean is not None and lean <= _LEANS:
             return place, target, lean
     raise ValueError(
         f"a worker of {worker.config.stature:.2f} m cannot hold anything out over the bench"
     )
-
-
-def _own(worker: Worker, stand: np.ndarray, facing: float, point: Sequence[float] | np.ndarray):
-    """A point of the base frame in the frame of a standing worker [m]."""
-    c, s = np.cos(facing), np.sin(facing)
-    x, y = np.asarray(point)[:2] - stand
-    return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])
-
-
-def _hands(pose: WorkerPose, target: np.ndarray) -> np.ndarray:
-    hands = pose.hands.copy()
-    hands[RIGHT] = target
-    return hands

@@ -4,19 +4,19 @@ The physics knows the arm by its capsules: meshes would cost time in each step a
 contacts. Pictures are rendered from a second model that takes over the state of the first.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile, read_mesh
-from hrc_learn.geometry.shapes import Colour
 from hrc_learn.kinematics.arm_shapes import arm_meshes
 from hrc_learn.log import RunRecording
 from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM, add_surroundings
-from hrc_learn.sim.worker_tracking import NearestPair, WorkerDistance
-from hrc_learn.sim.world import World, body_geoms
+from hrc_learn.sim.step_checks import body_geoms
+from hrc_learn.sim.world import World
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -96,6 +96,64 @@ def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tupl
 def _triple(vector: np.ndarray) -> tuple[float, float, float]:
     x, y, z = vector.tolist()
     return x, y, z
+
+
+_FARTHEST = 100.0  # distances are measured up to here [m]
+
+
+class NearestPair(NamedTuple):
+    """Nearest pair of points of worker and robot."""
+
+    distance: float
+    """Between their surfaces; negative is how deep they overlap [m]."""
+    points: Float[np.ndarray, "2 3"]
+    """Nearest point on the robot or its load, and on the worker [m]."""
+    arm_geom: str
+    """Geom of the robot or of its load."""
+    worker_geom: str
+
+
+class WorkerDistance:
+    """Finds the smallest distance between the worker and all of the robot in a world."""
+
+    def __init__(self, world: World):
+        """Find the geoms.
+
+        Raises:
+            ValueError: If there is no worker in the scene.
+        """
+        if world.config.worker is None:
+            raise ValueError("there is no worker in this scene: give it a WorkerConfig.")
+        self._world, model = world, world.model
+        solid = model.geom_contype != 0
+        self._arm = np.flatnonzero(body_geoms(model, ["link0"]) & solid)
+        self._worker = np.array([model.geom(name).id for name in WORKER_BODIES])
+
+    def now(self, held: Collection[str] = ()) -> NearestPair:
+        """The nearest of all pairs of geoms.
+
+        Args:
+            held: Names of the objects that the robot holds: they count as parts of it.
+        """
+        model, data = self._world.model, self._world.data
+        loads = [model.geom(name).id for name in held]
+        geoms = np.concatenate([self._arm, np.array(loads, dtype=int)])
+        # Distances of spheres around the geoms are lower bounds. Pairs are measured in their
+        # order, until the bound exceeds what was found: a dozen of four hundred.
+        centres = data.geom_xpos[geoms][:, None] - data.geom_xpos[self._worker]
+        radii = model.geom_rbound[geoms][:, None] + model.geom_rbound[self._worker]
+        bounds = (np.linalg.norm(centres, axis=-1) - radii).ravel()
+        best, pair, points = _FARTHEST, (0, 0), np.zeros(6)
+        for k in np.argsort(bounds):
+            if bounds[k] > best:
+                break
+            a, b = geoms[k // len(self._worker)], self._worker[k % len(self._worker)]
+            between = np.zeros(6)
+            distance = mujoco.mj_geomDistance(model, data, a, b, _FARTHEST, between)
+            if distance < best:
+                best, pair, points = distance, (a, b), between
+        arm_geom, worker_geom = (model.geom(int(g)).name for g in pair)
+        return NearestPair(best, points.reshape(2, 3), arm_geom, worker_geom)
 
 
 class MotionLog:
@@ -182,7 +240,6 @@ class DrawnWorld:
                     add_mesh(spec, body, mesh)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self._colours = self.model.geom_rgba.copy()
         self.update()
 
     def update(self) -> None:
@@ -192,22 +249,6 @@ class DrawnWorld:
         data.mocap_pos[:], data.mocap_quat[:] = now.mocap_pos, now.mocap_quat
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_camlight(self.model, data)
-
-    def paint(self, geoms: Iterable[str], colour: Colour) -> None:
-        """Let geoms of the world stand out, or the bodies that are drawn in their place.
-
-        Args:
-            geoms: Names of the geoms; all others regain their own colour.
-            colour: RGBA, 0 to 1.
-        """
-        self.model.geom_rgba[:] = self._colours
-        for name in geoms:
-            geom = self.model.geom(name)
-            if geom.group == _HIDDEN:
-                own = self.model.geom_bodyid == geom.bodyid
-                self.model.geom_rgba[own & (self.model.geom_group == _SHOWN)] = colour
-            else:
-                self.model.geom_rgba[geom.id] = colour
 
 
 class RecordedWorld:
@@ -245,9 +286,6 @@ class RecordedWorld:
         """Make ready to be rendered."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-
-    def paint(self, geoms: Iterable[str], colour: Colour) -> None:
-        """Nothing stands out: a recording does not know what touched what."""
 
 
 def _add_drawn_body(spec: mujoco.MjSpec, body: Body, name: str) -> None:

@@ -7,7 +7,7 @@ and walks away, without regard for the robot.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -44,12 +44,14 @@ class HumanSpeeds:
     turning: float = 2.5
     """About the vertical [rad/s]."""
 
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                raise ValueError(
-                    f"{field.name} must be positive, but is {getattr(self, field.name)}."
-                )
+    def drawn(self, rng: np.random.Generator) -> HumanSpeeds:
+        """Speeds of one visit: 50 to 95 % of these."""
+        # The body sways up and down besides, and elbows may be faster than the hands.
+        return HumanSpeeds(
+            walking=rng.uniform(0.6, 0.9) * self.walking,
+            reaching=rng.uniform(0.5, 0.85) * self.reaching,
+            turning=rng.uniform(0.6, 0.95) * self.turning,
+        )
 
 
 class WorkerPose(NamedTuple):
@@ -232,6 +234,110 @@ class PoseWriter:
         self.now = following
 
 
+class BenchScript(PoseWriter):
+    """Script of a visit to the far side of a bench, from the entrance on.
+
+    Attributes:
+        top: Height of the bench [m].
+        edge: y of its far edge [m].
+        ready: Hands over the edge of the bench, in the worker's frame [m].
+        leaving: Final position of the worker [m].
+    """
+
+    def __init__(
+        self,
+        worker: Worker,
+        rng: np.random.Generator,
+        bench: Box,
+        across: tuple[float, float],
+        sway: float,
+    ):
+        """Draw stand, entrance and exit; `enter` begins.
+
+        Args:
+            worker: Body of the worker.
+            rng: Random generator.
+            bench: The table, whose far side (+y) is free.
+            across: Least and greatest x of the stand [m].
+            sway: Largest angle of the stand from facing the bench [rad].
+        """
+        self._worker, h = worker, worker.config.stature
+        self.top = bench.centre[2] + bench.half_size[2]
+        self.edge = bench.centre[1] + bench.half_size[1]
+        # As near to the bench as the body allows.
+        y = self.edge + 0.1 * h
+        self.stand = np.array([rng.uniform(*across), y + rng.uniform(0, 0.05)])
+        self.facing = -np.pi / 2 + rng.uniform(-sway, sway)
+        self._entrance, self.leaving = (
+            np.array([rng.uniform(-1.0, 1.4), self.edge + rng.uniform(1.2, 1.5)])
+            for _ in range(2)
+        )
+        above = self.top + 0.12 - worker.config.floor
+        self.ready = np.array([[0.16 * h, s * 0.13 * h, above] for s in (1, -1)])
+
+    def enter(self, begin: float, speeds: HumanSpeeds, side: int) -> None:
+        """Walk to the bench from a time on [s], with something in a hand (0 left, 1 right)."""
+        h, hands = self._worker.config.stature, self._worker.hanging_hands()
+        hands[side] = [0.20 * h, (0.05, -0.05)[side] * h, 0.63 * h]
+        heading = nearest_turn(direction(self.stand - self._entrance), self.facing)
+        super().__init__(WorkerPose(self._entrance, heading, 0.0, hands), begin, speeds, h)
+        self.go(place=self.stand)
+
+    def own(self, point: np.ndarray) -> np.ndarray:
+        """A point of the base frame in the frame of the worker at the bench [m]."""
+        return in_worker_frame(self._worker, self.stand, self.facing, point)
+
+    def hands(self, target: np.ndarray, side: int) -> np.ndarray:
+        """Hands with one of them at a point, all in the worker's frame [m]."""
+        hands = self.ready.copy()
+        hands[side] = target
+        return hands
+
+    def reach(self, target: np.ndarray, side: int) -> None:
+        """Move a hand to a point within reach, in the worker's frame [m]."""
+        lean = self._worker.lean_to(target, side)
+        assert lean is not None  # places are drawn within reach
+        self.go(hands=self.hands(target, side), lean=lean)
+
+    def reaching(self, target: np.ndarray, side: int, lean: float) -> np.ndarray:
+        """Ends of the capsules in four postures on the way of a hand to a point [m]."""
+        way = np.linspace(0.4, 1.0, 4)[:, None, None]
+        posture = Posture(
+            place=np.repeat(self.stand[None], len(way), axis=0),
+            heading=np.full(len(way), self.facing),
+            lean=way[:, 0, 0] * lean,
+            stride=np.zeros(len(way)),
+            swing=np.zeros(len(way)),
+            hands=self.ready + way * (self.hands(target, side) - self.ready),
+        )
+        return self._worker.ends(posture)
+
+    def leave(self) -> None:
+        """Let the arms hang and walk away."""
+        self.go(hands=self._worker.hanging_hands(), lean=0.0)
+        self.go(heading=nearest_turn(direction(self.leaving - self.stand), self.facing))
+        self.go(place=self.leaving)
+
+    def visit(
+        self,
+        side: int,
+        released: float = np.inf,
+        markers: list[np.ndarray] | None = None,
+        reaches: list[list[float]] | None = None,
+    ) -> WorkerVisit:
+        """Visit with the postures written so far."""
+        return WorkerVisit(
+            worker=self._worker,
+            time=np.array(self.times),
+            poses=np.array(self.rows),
+            step=STEP * self._worker.config.stature,
+            side=side,
+            released=released,
+            markers=np.array(markers or np.empty((0, 3))),
+            reaches=np.array(reaches or np.empty((0, 2))),
+        )
+
+
 def random_visit(
     worker: Worker,
     rng: np.random.Generator,
@@ -240,7 +346,6 @@ def random_visit(
     under: tuple[float, float],
     begin: tuple[float, float] = (1.0, 8.0),
     reaches: tuple[int, int] = (2, 4),
-    speeds: HumanSpeeds | None = None,
     is_clear: Callable[[Float[np.ndarray, "*time parts 2 3"]], bool] = lambda ends: True,
 ) -> WorkerVisit:
     """Draw a visit to the side of the bench that is opposite to the robot.
@@ -252,108 +357,36 @@ def random_visit(
         under: Point below the arm's task, x and y [m]: markers lie around it.
         begin: Earliest and latest time of entering [s].
         reaches: Smallest and largest number of markers to reach for.
-        speeds: Largest speeds; each visit takes 50 to 95 % of them.
         is_clear: Predicate on postures that is true if they touch nothing at the bench; the
             worker reaches only for what such postures reach.
 
     Raises:
         ValueError: No marker under the arm is within reach.
     """
-    most = speeds or HumanSpeeds()
-    pace = HumanSpeeds(
-        # The body sways up and down besides, and elbows may be faster than the hands.
-        walking=rng.uniform(0.6, 0.9) * most.walking,
-        reaching=rng.uniform(0.5, 0.85) * most.reaching,
-        turning=rng.uniform(0.6, 0.95) * most.turning,
-    )
-    h, side = worker.config.stature, int(rng.uniform() < 0.8)  # most people are right-handed
-    top = bench.centre[2] + bench.half_size[2]
-    edge = bench.centre[1] + bench.half_size[1]
-    # As near to the bench as the body allows, a little to one side of what is under the arm.
-    stand = np.array(
-        [under[0] + rng.uniform(-0.18, 0.18), edge + 0.1 * h + rng.uniform(0, 0.05)]
-    )
-    facing = -np.pi / 2 + rng.uniform(-0.15, 0.15)
-    entrance, leaving = (
-        np.array([rng.uniform(-1.0, 1.4), edge + rng.uniform(1.2, 1.5)]) for _ in range(2)
-    )
-
-    def own(point: np.ndarray) -> np.ndarray:
-        """A point in the frame of a standing worker."""
-        c, s = np.cos(facing), np.sin(facing)
-        x, y = point[:2] - stand
-        return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])
-
-    def hand(point: np.ndarray, which: int) -> np.ndarray:
-        hands = ready.copy()
-        hands[which] = point
-        return hands
-
-    hanging = worker.hanging_hands()
-    ready = np.array(
-        [[0.16 * h, s * 0.13 * h, top + 0.12 - worker.config.floor] for s in (1, -1)]
-    )
-    carrying = hanging.copy()
-    carrying[side] = [0.20 * h, (0.05, -0.05)[side] * h, 0.63 * h]
-
-    inwards, outwards = (direction(b - a) for a, b in ((entrance, stand), (stand, leaving)))
-    start = WorkerPose(entrance, nearest_turn(inwards, facing), 0.0, carrying)
-    script = PoseWriter(start, rng.uniform(*begin), pace, h)
-    script.go(place=stand)
-    script.go(heading=facing)
+    pace = HumanSpeeds().drawn(rng)
+    side = int(rng.uniform() < 0.8)  # most people are right-handed
+    # A little to one side of what is under the arm.
+    script = BenchScript(worker, rng, bench, (under[0] - 0.18, under[0] + 0.18), sway=0.15)
+    script.enter(rng.uniform(*begin), pace, side)
+    script.go(heading=script.facing)
     # Down on the bench, near its edge, and away from what is under the arm.
-    spot = np.array(
-        [
-            stand[0] + rng.uniform(-0.2, 0.2),
-            edge - rng.uniform(0.10, 0.16),
-            top + HAND_OVER_BENCH,
-        ]
-    )
-    above = own(spot + np.array([0.0, 0.0, 0.12]))
-    script.go(hands=hand(above, side), lean=lean_for(worker, above, side))
-    script.go(hands=hand(own(spot), side), lean=lean_for(worker, own(spot), side))
+    x, y = script.stand[0] + rng.uniform(-0.2, 0.2), script.edge - rng.uniform(0.10, 0.16)
+    spot = np.array([x, y, script.top + HAND_OVER_BENCH])
+    script.reach(script.own(spot + np.array([0.0, 0.0, 0.12])), side)
+    script.reach(script.own(spot), side)
     script.wait(rng.uniform(0.2, 0.5))
     released = script.times[-1]
-    script.go(hands=ready, lean=0.05)
-
-    def is_reached(target: np.ndarray, which: int, lean: float) -> bool:
-        """True if the worker can reach a posture from the present place and touches nothing
-        there.
-        """
-        way = np.linspace(0.4, 1.0, 4)[:, None, None]
-        leans = way[:, 0, 0] * lean
-        posture = Posture(
-            place=np.repeat(stand[None], len(way), axis=0),
-            heading=np.full(len(way), facing),
-            lean=leans,
-            stride=np.zeros(len(way)),
-            swing=np.zeros(len(way)),
-            hands=ready + way * (hand(target, which) - ready),
-        )
-        return is_clear(worker.ends(posture))
-
+    script.go(hands=script.ready, lean=0.05)
     markers, spans = [], []
     for _ in range(rng.integers(reaches[0], reaches[1] + 1)):
-        markers.append(_marker(worker, rng, own, np.array([*under, top]), is_reached))
-        target = own(markers[-1])
-        which = _hand_for(target)
-        script.go(hands=hand(target, which), lean=lean_for(worker, target, which))
+        markers.append(_marker(worker, rng, script, under, is_clear))
+        target = script.own(markers[-1])
+        script.reach(target, _hand_for(target))
         script.wait(rng.uniform(0.3, 1.2))
         spans.append(script.times[-2:])
-        script.go(hands=ready, lean=rng.uniform(0.0, 0.15))
-    script.go(hands=hanging, lean=0.0)
-    script.go(heading=nearest_turn(outwards, facing))
-    script.go(place=leaving)
-    return WorkerVisit(
-        worker=worker,
-        time=np.array(script.times),
-        poses=np.array(script.rows),
-        step=STEP * h,
-        side=side,
-        released=released,
-        markers=np.array(markers),
-        reaches=np.array(spans),
-    )
+        script.go(hands=script.ready, lean=rng.uniform(0.0, 0.15))
+    script.leave()
+    return script.visit(side, released, markers, spans)
 
 
 def _hand_for(target: np.ndarray) -> int:
@@ -364,19 +397,20 @@ def _hand_for(target: np.ndarray) -> int:
 def _marker(
     worker: Worker,
     rng: np.random.Generator,
-    own: Callable[[np.ndarray], np.ndarray],
-    under: np.ndarray,
-    is_reached: Callable[[np.ndarray, int, float], bool],
+    script: BenchScript,
+    under: tuple[float, float],
+    is_clear: Callable[[np.ndarray], bool],
 ) -> np.ndarray:
     """A reachable point around the arm's working point, low over the bench [m]."""
+    middle = np.array([*under, script.top])
     for _ in range(_MARKERS_TRIED):
         # To either side of the gripper that hovers there: a hand cannot reach through it.
         x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
-        point = under + np.array([x, rng.uniform(-0.10, 0.12), HAND_OVER_BENCH])
-        target = own(point)
+        point = middle + np.array([x, rng.uniform(-0.10, 0.12), HAND_OVER_BENCH])
+        target = script.own(point)
         which = _hand_for(target)
         lean = worker.lean_to(target, which)
-        if lean is not None and is_reached(target, which, lean):
+        if lean is not None and is_clear(script.reaching(target, which, lean)):
             return point
     raise ValueError(
         f"a worker of {worker.config.stature:.2f} m cannot reach under the arm at "
@@ -384,10 +418,16 @@ def _marker(
     )
 
 
-def lean_for(worker: Worker, target: np.ndarray, side: int) -> float:
-    lean = worker.lean_to(target, side)
-    assert lean is not None  # places are drawn within reach
-    return lean
+def in_worker_frame(
+    worker: Worker,
+    stand: Float[np.ndarray, "2"],
+    facing: float,
+    point: Float[np.ndarray, "3"],
+) -> Float[np.ndarray, "3"]:
+    """A point of the base frame in the frame of a standing worker [m]."""
+    c, s = np.cos(facing), np.sin(facing)
+    x, y = point[:2] - stand
+    return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])
 
 
 def direction(vector: np.ndarray) -> float:

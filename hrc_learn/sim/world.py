@@ -1,17 +1,16 @@
 """The workplace in motion: a MuJoCo world to reset, to step, and to query for contacts."""
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from hrc_learn.protocols import ArmState, OpenedArm
 from hrc_learn.sim.arm_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
-from hrc_learn.sim.physics_watch import PhysicsWatch
 from hrc_learn.sim.scene import (
     HAND_MARKER,
     WORKER_BODIES,
@@ -19,105 +18,10 @@ from hrc_learn.sim.scene import (
     SceneConfig,
     build_scene,
 )
+from hrc_learn.sim.step_checks import ContactMonitor, PhysicsWatch, Touch
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
-
-
-@dataclass(frozen=True, kw_only=True)
-class Touch:
-    """Two objects in contact, from `start` until `end`."""
-
-    first: str
-    """Geom of the moving side (arm, hand or carried object)."""
-    second: str
-    """Geom that it met."""
-    start: float
-    """[s]"""
-    end: float
-    """Time of the last step in contact [s]."""
-    depth: float
-    """Deepest penetration [m]."""
-
-    def __str__(self) -> str:
-        depth_mm = 1e3 * self.depth
-        return f"{self.first} met {self.second} at {self.start:.2f} s, {depth_mm:.1f} mm deep"
-
-
-def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
-    """Mask over geoms: those of the named bodies and of all that hangs on them."""
-    roots = {model.body(name).id for name in bodies}
-    member = np.zeros(model.nbody, dtype=bool)
-    for body in range(model.nbody):  # parents come before children
-        member[body] = body in roots or (body != 0 and member[model.body_parentid[body]])
-    return member[model.geom_bodyid]
-
-
-class ContactMonitor:
-    """Remembers every touch between two groups of geoms.
-
-    Attributes:
-        touches: Finished and running touches, in order of their start.
-    """
-
-    def __init__(self, model: mujoco.MjModel, movers: Iterable[str], obstacles: Iterable[str]):
-        """Watch contacts of one group of bodies with another.
-
-        Args:
-            model: The model.
-            movers: Bodies that move, with all that hangs on them.
-            obstacles: Bodies they should not meet.
-        """
-        self._model = model
-        mover, obstacle = body_geoms(model, movers), body_geoms(model, obstacles)
-        self._mover, self._obstacle = mover, obstacle
-        # One look-up a contact: most steps end there, five times a control step.
-        self._matters = np.outer(mover, obstacle) | np.outer(obstacle, mover)
-        self.touches: list[Touch] = []
-        self._running: dict[tuple[int, int], int] = {}
-
-    def clear(self) -> None:
-        """Forget all touches."""
-        self.touches = []
-        self._running = {}
-
-    @property
-    def watched(self) -> Bool[np.ndarray, "geoms geoms"]:
-        """Watched pairs of geoms."""
-        return self._matters
-
-    def update(self, data: mujoco.MjData) -> None:
-        """Look at the contacts of one step."""
-        running = {}
-        for pair, depth in self._current(data).items():
-            k = self._running.get(pair, len(self.touches))
-            if k == len(self.touches):
-                first, second = (self._model.geom(g).name for g in pair)
-                self.touches.append(
-                    Touch(
-                        first=first, second=second, start=data.time, end=data.time, depth=depth
-                    )
-                )
-            else:
-                old = self.touches[k]
-                self.touches[k] = replace(old, end=data.time, depth=max(old.depth, depth))
-            running[pair] = k
-        self._running = running
-
-    def pause(self) -> None:
-        """Take note of a step in which nothing that it watches touches."""
-        self._running = {}
-
-    def _current(self, data: mujoco.MjData) -> dict[tuple[int, int], float]:
-        geoms = data.contact.geom
-        matters = self._matters[geoms[:, 0], geoms[:, 1]]
-        found: dict[tuple[int, int], float] = {}
-        for i in np.flatnonzero(matters & (data.contact.dist < 0)):
-            a, b = geoms[i].tolist()
-            pair = (a, b) if self._mover[a] and self._obstacle[b] else (b, a)
-            found[pair] = max(found.get(pair, 0.0), -float(data.contact.dist[i]))
-        return found
-
 
 _PADS = ("finger_left_pad", "finger_right_pad")
 # A tenth of a millimetre apart still counts as touching [m].

@@ -10,7 +10,7 @@ from grasp_trials import PEDESTAL, TABLE
 from hrc_learn.kinematics import LINK_CAPSULES, CapsuleArm, panda
 from hrc_learn.kinematics.collision import segment_box_distance
 from hrc_learn.sim import FINGER_STROKE, SceneConfig, build_scene, whole_arm
-from hrc_learn.sim.world import body_geoms
+from hrc_learn.sim.step_checks import body_geoms
 
 FAR = 3.0
 

@@ -123,19 +123,6 @@ def test_a_drawn_world_is_where_the_world_is_and_leaves_it_alone():
     assert seen == 0 or seen > 50
 
 
-def test_links_that_touch_stand_out_and_are_themselves_again():
-    world = World(Workplace.of(panda).scene)
-    drawn = DrawnWorld(world)
-    before = drawn.model.geom_rgba.copy()
-    red = (1.0, 0.0, 0.0, 1.0)
-    drawn.paint(["link5_0", "table"], red)
-    changed = (drawn.model.geom_rgba != before).any(axis=1)
-    names = {drawn.model.body(int(b)).name for b in drawn.model.geom_bodyid[changed]}
-    assert names == {"link5", "table"}
-    drawn.paint([], red)
-    np.testing.assert_array_equal(drawn.model.geom_rgba, before)
-
-
 def test_a_capsule_without_a_length_is_a_ball_and_a_base_may_have_several():
     point, radius = (0.0, 0.0, 0.1), 0.05
     balls = [LinkCapsule(link=i, start=point, end=point, radius=radius) for i in range(8)]

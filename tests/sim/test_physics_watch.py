@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.sim import PhysicsError, World
-from hrc_learn.sim.physics_watch import PhysicsWatch
+from hrc_learn.sim.step_checks import PhysicsWatch
 from hrc_learn.sim.workplace import Workplace
 
 # pyright: reportAttributeAccessIssue=false

@@ -25,7 +25,7 @@ def every(visit, dt=0.01):
     return np.arange(visit.begin - 0.5, visit.end + 0.5, dt)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(5))
 def test_he_moves_at_human_speeds(seed):
     visit = drawn(seed)
     speed = np.linalg.norm(visit.capsules_at(every(visit)).velocity, axis=-1)
@@ -36,16 +36,7 @@ def test_he_moves_at_human_speeds(seed):
     assert speed[still].max() < 1e-3
 
 
-def test_a_slower_person_takes_longer():
-    usual = drawn(3)
-    half = HumanSpeeds(walking=0.8, reaching=1.0, turning=1.25)
-    slow = drawn(3, speeds=half)
-    assert slow.end - slow.begin > 1.3 * (usual.end - usual.begin)
-    speed = np.linalg.norm(slow.capsules_at(every(slow)).velocity, axis=-1)
-    assert speed[:, TRUNK].max() <= half.walking
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_velocities_are_those_of_the_ends(seed):
     visit = drawn(seed)
     time = every(visit, dt=1e-3)[::7]
@@ -64,7 +55,7 @@ def test_one_time_is_like_many():
         np.testing.assert_allclose(one.velocity, many.velocity[k], atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(5))
 def test_he_reaches_every_marker_and_leaves_what_he_brought(seed):
     visit = drawn(seed)
     ends = visit.capsules_at(every(visit)).ends
@@ -86,7 +77,7 @@ def test_he_reaches_every_marker_and_leaves_what_he_brought(seed):
     assert np.linalg.norm(visit.item_at(early) - hand) == pytest.approx(c)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(5))
 def test_he_comes_from_outside_and_goes_there(seed):
     visit = drawn(seed)
     place = visit.posture(np.array([visit.begin - 1, visit.end + 1])).place
@@ -95,7 +86,7 @@ def test_he_comes_from_outside_and_goes_there(seed):
     assert 8.0 < visit.end - visit.begin < 35.0
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_his_body_stays_out_of_the_bench(seed):
     visit = drawn(seed)
     body = [i for i in TRUNK + LEGS if not PARTS[i].startswith("foot")]
@@ -119,11 +110,6 @@ def test_what_is_out_of_reach_is_refused():
     worker = Worker()
     with pytest.raises(ValueError, match="cannot reach"):
         random_visit(worker, np.random.default_rng(0), bench=TABLE, under=(0.2, -0.5))
-
-
-def test_nobody_stands_still_for_ever():
-    with pytest.raises(ValueError, match="walking"):
-        HumanSpeeds(walking=0.0)
 
 
 def test_a_turned_visit_is_the_same_seen_from_elsewhere():
