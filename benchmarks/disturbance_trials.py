@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from grasp_trials import MARKER
 from jaxtyping import Bool, Float, Int
 from limit_monitor import LimitMonitor
@@ -27,12 +28,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.closed_loop import (
-    Imperfections,
-    PinholeCamera,
-    VirtualCamera,
-    simulate_closed_loop,
-)
+from hrc_learn.sim.pinhole_camera import PinholeCamera
 from hrc_learn.skills.visual_skill import guessed_network
 
 ELBOW = 4

@@ -10,6 +10,7 @@ from functools import cache, cached_property
 from typing import Literal
 
 import torch
+from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from jaxtyping import Bool, Float, Int
 from limit_monitor import LimitMonitor
 from paper_law import paper_goals, paper_joint_region
@@ -43,12 +44,7 @@ from hrc_learn.kinematics import (
 from hrc_learn.kinematics.inverse import solutions_from
 from hrc_learn.kinematics.redundancy import best_postures
 from hrc_learn.regions import JointRegion
-from hrc_learn.sim.closed_loop import (
-    Imperfections,
-    PinholeCamera,
-    VirtualCamera,
-    simulate_closed_loop,
-)
+from hrc_learn.sim.pinhole_camera import PinholeCamera
 
 TABLE = ((0.26, 0.54, -0.02), (0.42, 0.34, 0.02))
 """Centre and half edges of the table [m], as simulated."""

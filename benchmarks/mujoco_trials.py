@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from closed_loop import VirtualCamera, simulate_closed_loop
 from grasp_trials import (
     MARKER,
     Judge,
@@ -25,7 +26,7 @@ from hrc_learn.controller import GRIPPER_DOWN
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian
 from hrc_learn.sim import SceneConfig, World, open_camera
-from hrc_learn.sim.closed_loop import PinholeCamera, VirtualCamera, simulate_closed_loop
+from hrc_learn.sim.pinhole_camera import PinholeCamera
 from hrc_learn.sim.scene import HAND_MARKER, CabinetConfig
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.vision import CameraModel

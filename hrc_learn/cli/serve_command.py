@@ -38,7 +38,7 @@ from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Arm, OpenedArm
 from hrc_learn.sim import SceneConfig, World
-from hrc_learn.sim.closed_loop import PinholeCamera
+from hrc_learn.sim.pinhole_camera import PinholeCamera
 
 FRAME_TIME = 0.032
 """Time between images [s]."""

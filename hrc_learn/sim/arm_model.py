@@ -115,14 +115,10 @@ def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ArmModelConfig:
-    """Construction and servo gains of the simulated arm."""
+    """Construction of the simulated arm."""
 
     robot: Arm
     """Kinematics, limits and shape of the arm."""
-    stiffness: tuple[float, ...] = ()
-    """Position gain of the joint servos [N m/rad]; none given: by the torques of the joints."""
-    damping: tuple[float, ...] = ()
-    """Velocity gain of the joint servos [N m s/rad]; likewise."""
     grip_force: float = 40.0
     """Largest force of a finger [N] (the end effector's continuous rating is 70 N)."""
     marker: Plate | None = None
@@ -130,8 +126,6 @@ class ArmModelConfig:
 
     def servo(self, joint: int) -> tuple[float, float]:
         """Position [N m/rad] and velocity gain [N m s/rad] of a joint, counted from 0."""
-        if self.stiffness and self.damping:
-            return self.stiffness[joint], self.damping[joint]
         if self.robot.name in _SERVOS:
             stiffness, damping = _SERVOS[self.robot.name]
             return stiffness[joint], damping[joint]

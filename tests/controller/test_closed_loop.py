@@ -6,6 +6,7 @@ from collections.abc import Iterator
 import pytest
 import sampling
 import torch
+from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from paper_law import paper_goals, paper_joint_region
 from servoing import (
     CENTRE,
@@ -39,7 +40,6 @@ from hrc_learn.jacobian import (
     PaperEstimator,
 )
 from hrc_learn.kinematics import panda, pseudo_inverse
-from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 
 
 @pytest.fixture(autouse=True)

@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
+from closed_loop import Imperfections
 from disturbance_trials import EffortConfig, run_effort_trials
 from grasp_trials import TrialConfig, run_trials
 from unchecked import shapes_unchecked
 
 from hrc_learn.jacobian import FixedEstimator, KalmanConfig, KalmanEstimator
-from hrc_learn.sim.closed_loop import Imperfections
 
 QUICK = TrialConfig(
     count=20, duration=6.0, dt=0.02, imperfections=Imperfections(frame_steps=2, noise=0.5)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import sampling
 import torch
+from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from servoing import CENTRE, DOUBLE, DOWN, grasping, near_starts, network, observe
 from unchecked import shapes_unchecked
 
@@ -14,12 +15,7 @@ from hrc_learn.controller.resolved_rate import task_descent
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
 from hrc_learn.kinematics import Arm, arm, panda, solve_inverse, task_basis, task_rank
-from hrc_learn.sim.closed_loop import (
-    Imperfections,
-    PinholeCamera,
-    VirtualCamera,
-    simulate_closed_loop,
-)
+from hrc_learn.sim.pinhole_camera import PinholeCamera
 from hrc_learn.skills.placing import follow_pose
 
 TASKS = ("position+axis", "position")

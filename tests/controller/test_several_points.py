@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import sampling
 import torch
+from closed_loop import Imperfections
 from grasp_trials import CORNERS, TrialConfig, run_trials
 from torch.utils import _pytree
 from unchecked import shapes_unchecked
@@ -23,7 +24,7 @@ from hrc_learn.jacobian import (
     stack_networks,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.closed_loop import Imperfections, PinholeCamera
+from hrc_learn.sim.pinhole_camera import PinholeCamera
 
 DOUBLE = torch.float64
 J0 = torch.tensor([[-1500.0, 0, 0, 0, -200, 60], [0, 2400, 170, -200, 0, 180]], dtype=DOUBLE)
