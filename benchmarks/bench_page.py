@@ -63,10 +63,10 @@ if (window.jumped.length % 2) {
 _WATCH = """
 import asyncio, sys
 from websockets.asyncio.client import connect
-url, cookie, origin = sys.argv[1:]
+url, secret, origin = sys.argv[1:]
 async def main():
-    headers = {"Cookie": cookie}
-    async with connect(url, additional_headers=headers, origin=origin, proxy=None) as socket:
+    offered = ["hrc", f"secret.{secret}"]
+    async with connect(url, subprotocols=offered, origin=origin, proxy=None) as socket:
         await socket.send('{"type": "hello", "wants": "scene"}')
         async for _ in socket:
             await socket.send('{"type": "beat", "lag": 0}')
@@ -179,15 +179,14 @@ def figures(delays: np.ndarray) -> dict[str, float]:
 @contextmanager
 def watched(page: Page, count: int):
     """Others who are told the scene, in processes of their own."""
-    from hostile_clients import cookie  # pyright: ignore[reportMissingImports]
-
     urls = [
         f"ws://127.0.0.1:{page.address.port}/session/somebody-who-watches-{k}"
         for k in range(count)
     ]
     command = [sys.executable, "-c", _WATCH]
+    address = page.address
     watchers = [
-        subprocess.Popen([*command, url, cookie(page), page.address.origin]) for url in urls
+        subprocess.Popen([*command, url, address.token, address.origin]) for url in urls
     ]
     try:
         while page.control.people < count + 1:

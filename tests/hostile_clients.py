@@ -4,9 +4,9 @@ import asyncio
 import json
 import secrets
 import time
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from urllib.error import HTTPError
-from urllib.request import HTTPRedirectHandler, Request, build_opener
+from urllib.request import Request, urlopen
 
 import msgspec
 import numpy as np
@@ -18,34 +18,43 @@ from hrc_learn.teleoperation.page import Page
 VISER = "viser-v1.1.1"
 
 
-class _Stay(HTTPRedirectHandler):
-    def redirect_request(self, *_):
-        return None
-
-
-def http(page: Page, path: str, **headers) -> tuple[int, dict, bytes]:
+def http(page: Page, path: str, *, secret: str = "", **headers) -> tuple[int, dict, bytes]:
     """Status, headers and body of a request to the page's server."""
+    if secret:
+        headers["Authorization"] = f"Bearer {secret}"
     where = f"http://127.0.0.1:{page.address.port}{path}"
     try:
-        answer = build_opener(_Stay).open(Request(where, headers=headers), timeout=10)
+        answer = urlopen(Request(where, headers=headers), timeout=10)
     except HTTPError as error:
         answer = error
     return answer.status, dict(answer.headers), answer.read()
 
 
-def cookie(page: Page) -> str:
-    """What somebody has who opened the address with its secret."""
-    _, headers, _ = http(page, f"/?token={page.address.token}")
-    return headers["Set-Cookie"].split(";")[0]
+def new_client() -> str:
+    return secrets.token_urlsafe(18)
 
 
-def socket(page: Page, route: str, *, cookie="", origin=None, client="", **options):
-    """A socket of the page: who has all that it takes leaves the defaults."""
-    where = f"ws://127.0.0.1:{page.address.port}/{route}/{client or secrets.token_urlsafe(18)}"
-    headers = {"Cookie": cookie} if cookie else {}
+def socket(page: Page, route="session", *, secret=None, origin=None, client="", **options):
+    """A socket of the page: a client with all that it takes leaves the defaults."""
+    where = f"ws://127.0.0.1:{page.address.port}/{route}/{client or new_client()}"
+    secret = page.address.token if secret is None else secret
+    offered = ["hrc", f"secret.{secret}"] if route == "session" else [VISER]
+    options = {
+        "proxy": None,
+        "open_timeout": 20,
+        "close_timeout": 1,
+        "max_size": None,
+    } | options
     origin = page.address.origin if origin is None else origin
-    options = {"proxy": None, "open_timeout": 10, "close_timeout": 1} | options
-    return connect(where, additional_headers=headers, origin=origin or None, **options)
+    return connect(where, subprotocols=offered, origin=origin or None, **options)
+
+
+@asynccontextmanager
+async def viewer(page: Page, client=""):
+    """Session and view of one client."""
+    client = client or new_client()
+    async with socket(page, client=client) as session, socket(page, "view", client=client) as v:
+        yield session, v
 
 
 def hands(pointer=(0.3, 0.0, 0.9), joint=4, start=(0.3, 0.0, 0.5)) -> str:
@@ -73,6 +82,9 @@ JUNK = (
     hands(joint=0),
     hands(joint=99),
     "[" * 2000,
+    '{"type": "hello", "wants": ' + "[" * 5000,
+    '{"type": "beat", "lag": 0, "more": {}}',
+    '{"type": "beat", "lag": true}',
     "x" * 100_000,
     b"\x00\xff" * 50,
 )
@@ -135,34 +147,36 @@ async def until_closed(connection) -> None:
         pass
 
 
-async def attack(page: Page, kind: str, known: str, rng: np.random.Generator) -> None:
+async def attack(page: Page, kind: str, rng: np.random.Generator) -> None:
     """One hostile client.
 
     Args:
         page: Served, and led by somebody else.
         kind: One of `ATTACKS`.
-        known: Cookie of somebody who has the secret.
         rng: Varies what is sent.
     """
     route = ("session", "view")[rng.integers(2)]
     match kind:
         case "foreign origin":
-            origin = ("http://evil.example", "null", "http://127.0.0.1:1", "https://localhost")
-            await refused(socket(page, route, cookie=known, origin=origin[rng.integers(4)]))
+            origin = FOREIGN[rng.integers(len(FOREIGN))]
+            await refused(socket(page, route, origin=origin))
         case "no origin":
-            await refused(socket(page, route, cookie=known, origin=""))
-        case "no token":
-            await refused(socket(page, route))
-        case "wrong token":
+            await refused(socket(page, route, origin=""))
+        case "no secret":
+            await refused(socket(page, route, secret="x"))
+            # As cookies came before, which other ports of this host receive.
+            name = f"hrc_page_{page.address.port}={page.address.token}"
+            status, *_ = await asyncio.to_thread(http, page, "/xr/scene.json", Cookie=name)
+            assert status == 401
+        case "wrong secret":
             wrong = secrets.token_urlsafe(18)
-            name = known.partition("=")[0]
-            await refused(socket(page, route, cookie=f"{name}={wrong}"))
-            status, *_ = await asyncio.to_thread(http, page, f"/?token={wrong}")
+            await refused(socket(page, secret=wrong))
+            status, *_ = await asyncio.to_thread(http, page, "/xr/scene.json", secret=wrong)
             assert status in (403, 429)
         case "rebound name":
-            status, *_ = await asyncio.to_thread(
-                http, page, "/", Cookie=known, Host=f"evil.example:{page.address.port}"
-            )
+            host = f"evil.example:{page.address.port}"
+            secret = page.address.token
+            status, *_ = await asyncio.to_thread(http, page, "/", secret=secret, Host=host)
             assert status == 403
         case "past the gate":
             inner = page._server.get_port()
@@ -180,47 +194,65 @@ async def attack(page: Page, kind: str, known: str, rng: np.random.Generator) ->
             await asyncio.sleep(1.0)
             writer.transport.abort()
         case "junk":
-            async with socket(page, "session", cookie=known) as one:
+            async with socket(page) as one:
                 await one.send(JUNK[rng.integers(len(JUNK))])
                 await until_closed(one)
         case "viewer's junk":
-            async with socket(page, "view", cookie=known, subprotocols=[VISER]) as one:
+            async with viewer(page) as (_, one):
                 await one.send(VIEW_JUNK[rng.integers(len(VIEW_JUNK))])
                 await until_closed(one)
         case "flood":
-            async with socket(page, "session", cookie=known) as one:
+            async with socket(page) as one:
                 try:
                     for _ in range(3000):
                         await one.send(BEAT)
                 except ConnectionClosed:
                     pass
                 await until_closed(one)
-        case "stolen control":
-            async with socket(page, "session", cookie=known) as one:
+        case "stolen control" | "acting watcher":
+            watches = kind == "acting watcher"
+            secret = page.address.watch_token if watches else page.address.token
+            async with socket(page, secret=secret) as one:
                 for _ in range(20):
+                    if watches:
+                        await one.send(json.dumps({"type": "lead", "wish": "ask"}))
                     await one.send(hands())
                     await one.send(json.dumps({"type": "ask", "request": "finish"}))
                     await one.send(json.dumps({"type": "lead", "wish": "hand_over"}))
                     await one.send(json.dumps({"type": "gripper", "width": 0.0}))
                     await asyncio.sleep(0.02)
         case "stolen drag":
-            async with socket(page, "view", cookie=known, subprotocols=[VISER]) as one:
+            async with viewer(page) as (_, one):
                 for phase in ("start", "update", "update"):
                     await one.send(packed("SceneNodeDragMessage", phase=phase, **DRAG))
                     await asyncio.sleep(0.05)
                 one.transport.abort()
         case "vanishing":
-            async with socket(page, "session", cookie=known) as one:
+            async with socket(page) as one:
                 await one.send(json.dumps({"type": "lead", "wish": "ask"}))
                 await one.send(hands())
                 one.transport.abort()
 
 
+FOREIGN = (
+    "http://evil.example",
+    "null",
+    "http://127.0.0.1",
+    "http://localhost",
+    "https://localhost",
+    "http://127.0.0.1:1",
+    "http://127.0.0.1.evil.example",
+    "http://user@127.0.0.1",
+    "http://[::1]",
+    "http://127.0.0.1:",
+)
+"""Origins of other sites, some of them on other ports of this host."""
+
 ATTACKS = (
     "foreign origin",
     "no origin",
-    "no token",
-    "wrong token",
+    "no secret",
+    "wrong secret",
     "rebound name",
     "past the gate",
     "raw junk",
@@ -229,6 +261,7 @@ ATTACKS = (
     "viewer's junk",
     "flood",
     "stolen control",
+    "acting watcher",
     "stolen drag",
     "vanishing",
 )
@@ -237,13 +270,13 @@ ATTACKS = (
 class Leader:
     """Somebody who leads well: pulls the elbow up and gives signs of life."""
 
-    def __init__(self, page: Page, known: str):
-        self._page, self._known = page, known
+    def __init__(self, page: Page):
+        self._page = page
         self.leads = asyncio.Event()
         self.silent = False
 
     async def run(self) -> None:
-        async with socket(self._page, "session", cookie=self._known) as one:
+        async with socket(self._page) as one:
             listening = asyncio.create_task(self._listen(one))
             await one.send('{"type": "hands", "grips": []}')
             try:
@@ -264,8 +297,7 @@ class Leader:
 
 async def siege(page: Page, kinds, seed: int, at_once: int = 6) -> None:
     """Clients of these kinds, some at a time, while somebody leads on."""
-    known = await asyncio.to_thread(cookie, page)
-    leader = Leader(page, known)
+    leader = Leader(page)
     leading = asyncio.create_task(leader.run())
     await asyncio.wait_for(leader.leads.wait(), 20)
     gap = asyncio.Semaphore(at_once)
@@ -274,7 +306,7 @@ async def siege(page: Page, kinds, seed: int, at_once: int = 6) -> None:
         async with gap:
             rng = np.random.default_rng([seed, k])
             with suppress(ConnectionClosed, ConnectionError):  # thrown out
-                await asyncio.wait_for(attack(page, kind, known, rng), 60)
+                await asyncio.wait_for(attack(page, kind, rng), 60)
 
     await asyncio.gather(*(one(k, kind) for k, kind in enumerate(kinds)))
     assert not leading.done(), leading.exception()
@@ -282,11 +314,11 @@ async def siege(page: Page, kinds, seed: int, at_once: int = 6) -> None:
     leading.cancel()
 
 
-def time_to_rest(page: Page, asked, known: str) -> float:
+def time_to_rest(page: Page, asked) -> float:
     """How long an effort outlives the client that asks for it and vanishes [s]."""
 
     async def go() -> float:
-        leader = Leader(page, known)
+        leader = Leader(page)
         leading = asyncio.create_task(leader.run())
         await asyncio.wait_for(leader.leads.wait(), 20)
         while not asked().nullspace_input.any():

@@ -128,6 +128,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
         "websockets",
         "trimesh",
         "cv2",
+        "rerun",
     },
     "experiments": {"rich"},
     "lerobot": {"torchvision", "pyarrow"},
@@ -144,8 +145,6 @@ DISTRIBUTIONS = {
     "mpl_toolkits": "matplotlib",
     "cycler": "matplotlib",
     "PIL": "matplotlib",
-    # Requirements of viser's own.
-    "websockets": "viser",
     "trimesh": "viser",
     # Requirements of lerobot's own.
     "torchvision": "lerobot",

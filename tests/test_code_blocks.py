@@ -4,7 +4,6 @@ import functools
 import importlib
 import importlib.util
 import re
-import socket
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import PoseDMP
 from hrc_learn.kinematics import panda, to_urdf
-from hrc_learn.viz import run_dashboard
+from hrc_learn.teleoperation import dashboard_page
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -77,24 +76,15 @@ def fitted_pose(folder: Path) -> None:
     PoseDMP.fit(time, position, upright, n_basis=20).save(folder)
 
 
-def free_ports(count: int) -> tuple[int, ...]:
-    """Ports that nobody listens on, all open at once so that they differ."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    try:
-        return tuple(one.getsockname()[1] for one in sockets)
-    finally:
-        for one in sockets:
-            one.close()
-
-
 @pytest.fixture
 def reader(tmp_path, monkeypatch):
-    """A reader's session: an empty folder but for a dataset, the ports usual for us free."""
+    """A reader's session: an empty folder but for a dataset, the port usual for us free."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    # Whoever else works on this machine may use the usual ones.
-    serve = functools.partial(run_dashboard.serve_stream, *free_ports(2))
-    monkeypatch.setattr(run_dashboard, "serve_stream", serve)
+    # Other programs on this machine may use the usual port. The viewer's files take seconds.
+    monkeypatch.setattr(dashboard_page, "_viewer_contents", dict)
+    serve = functools.partial(dashboard_page.serve_stream, 0)
+    monkeypatch.setattr(dashboard_page, "serve_stream", serve)
     recorded_dataset(tmp_path / "path/to/dataset")
     fitted_pose(tmp_path / "models/place/pose")
     (tmp_path / "my.urdf").write_text(to_urdf(panda))

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 import tempfile
+import threading
+import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -41,28 +43,31 @@ def recordings_in(path: Path) -> list[Path]:
     return sorted(path.glob("*.rrd"), key=lambda file: (file.stem != "run", file.name))
 
 
-def viewer_command(recordings: Sequence[Path], web: bool) -> list[str]:
-    """Command line of Rerun's viewer, run by this Python so that it need not be on the path.
-
-    Args:
-        recordings: Files to open.
-        web: Open them in the browser.
-    """
-    # Bound to this machine, as the viewer would listen on all networks by default.
-    serving = ["--serve-web", "--bind", "127.0.0.1"] if web else []
-    return [sys.executable, "-m", "rerun", *serving, *map(str, recordings)]
-
-
 def _open(recordings: Sequence[Path], web: bool) -> int:
+    """Open recordings in Rerun's viewer, or serve them to the browser until Ctrl-C."""
     screen = has_screen()
     if not screen and not web:
         print("no screen: the dashboard is served to the browser (Ctrl-C ends it)")
     try:
-        return subprocess.run(
-            viewer_command(recordings, web or not screen), check=False
-        ).returncode
+        if web or not screen:
+            return _serve(recordings)
+        # Run by this Python, so that the viewer need not be on the path.
+        command = [sys.executable, "-m", "rerun", *map(str, recordings)]
+        return subprocess.run(command, check=False).returncode
     except KeyboardInterrupt:
         return 0
+
+
+def _serve(recordings: Sequence[Path]) -> int:
+    # The gate, which a window does not need.
+    from hrc_learn.teleoperation.dashboard_page import serve_recordings
+
+    with serve_recordings(recordings) as url:
+        print(f"Dashboard at {url} (Ctrl-C ends it)", flush=True)
+        if has_screen():
+            webbrowser.open(url)
+        threading.Event().wait()
+    return 0
 
 
 _SHOWN, _SHOWN_FRAMES = 200, 1_000_000

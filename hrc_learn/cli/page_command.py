@@ -132,6 +132,7 @@ def _opened(
 def _announce(console: Console, page: Page) -> None:
     """Print the addresses of the page, with the secret that opens it."""
     console.print(f"Page at [bold]{page.url}[/]", soft_wrap=True)
+    console.print(f"To watch only: [bold]{page.watch_url}[/]", soft_wrap=True)
     if page.headset_url:
         console.print(f"For headsets and phones: [bold]{page.headset_url}[/]", soft_wrap=True)
     else:

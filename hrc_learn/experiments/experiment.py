@@ -177,7 +177,7 @@ class RunOptions:
     serve: bool = False
     """Serve the dashboard of the run in the browser while it goes on."""
     serving: LiveViewConfig = field(default_factory=LiveViewConfig)
-    """Ports of the dashboard, with --serve."""
+    """Port of the dashboard, with --serve."""
     film: bool = True
     """Make a film of the run, in the folder and in the report."""
     verbose: bool = False

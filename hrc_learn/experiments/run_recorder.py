@@ -191,12 +191,10 @@ def demonstrated_joints(
 
 @dataclass(frozen=True, kw_only=True)
 class LiveViewConfig:
-    """Ports and rate of the live dashboard of a run."""
+    """Port and rate of the live dashboard of a run."""
 
     port: int = 9090
     """Port of the page."""
-    data_port: int = 9876
-    """Port of the data, for the page and for `rerun rerun+http://HOST:PORT/proxy`."""
     period: float = 0.25
     """Time between two updates [s]."""
 
@@ -209,19 +207,20 @@ def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]
 
     Args:
         title: Title of the dashboard.
-        config: Ports and rate.
+        config: Port and rate.
         on_open: Called with the address of the page.
     """
 
     @contextmanager
     def watch(cell: WorkCell, world: World, motion: MotionLog) -> Iterator[None]:
         # Rerun takes a second to import.
-        from hrc_learn.viz.run_dashboard import live_dashboard, serve_stream
+        from hrc_learn.teleoperation.dashboard_page import serve_stream
+        from hrc_learn.viz.run_dashboard import live_dashboard
 
         def snapshot() -> RunRecording | None:
             return record(title, cell, world, motion) if len(motion) else None
 
-        with serve_stream(config.port, config.data_port) as server:
+        with serve_stream(config.port) as server:
             on_open(server.viewer)
             with live_dashboard(server.stream, snapshot, period=config.period):
                 yield

@@ -4,16 +4,12 @@ The same dashboard shows a finished run from a file, and a running one in a brow
 """
 
 import os
-import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple
-from urllib.parse import quote
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -357,7 +353,8 @@ def live_dashboard(
     """Show a run while it goes on, in the layout of `record_run`.
 
     Args:
-        stream: Recording stream; `serve_stream` makes one for a browser.
+        stream: Recording stream; `teleoperation.dashboard_page.serve_stream` makes one for a
+            browser.
         snapshot: Returns the run so far, or None before its start; called by another thread.
         period: Time between two updates [s].
     """
@@ -376,77 +373,3 @@ def live_dashboard(
     with LiveSender(send, period=period):
         yield
     stream.flush()
-
-
-class DashboardServer(NamedTuple):
-    """Recording stream served on this machine."""
-
-    stream: rr.RecordingStream
-    viewer: str
-    """Address of the viewer in a browser."""
-    data: str
-    """Address of the data, for `rerun ADDRESS`."""
-
-
-@contextmanager
-def serve_stream(port: int = 9090, data_port: int = 9876) -> Iterator[DashboardServer]:
-    """Serve a recording stream and its viewer until the `with` block ends.
-
-    A page that is opened later shows all earlier data, up to one gigabyte.
-
-    Args:
-        port: Port of the page of the viewer.
-        data_port: Port of the data.
-
-    Raises:
-        ValueError: If a port is taken.
-    """
-    for number in (port, data_port):
-        _check_free(number)
-    stream, data = rr.RecordingStream("hrc_learn"), f"rerun+http://127.0.0.1:{data_port}/proxy"
-    # A program of its own, as servers within this process listen on all interfaces.
-    command = [
-        *(sys.executable, "-m", "rerun", "--serve-web", "--bind", "127.0.0.1"),
-        *("--port", str(data_port), "--web-viewer-port", str(port)),
-        *("--server-memory-limit", "1GiB", "--hide-welcome-screen"),
-    ]
-    # In a session of its own, so that Ctrl-C reaches it after what is still to be sent.
-    quiet = subprocess.DEVNULL
-    server = subprocess.Popen(command, start_new_session=True, stdout=quiet, stderr=quiet)
-    try:
-        _await_listening(server, (port, data_port))
-        stream.connect_grpc(data)
-        yield DashboardServer(
-            stream, f"http://127.0.0.1:{port}?url={quote(data, safe='')}", data
-        )
-    finally:
-        stream.disconnect()
-        server.terminate()
-        server.wait()
-
-
-def _await_listening(server: subprocess.Popen[bytes], ports: Sequence[int]) -> None:
-    """Wait until a server answers at all its ports.
-
-    Raises:
-        RuntimeError: It has ended, or does not answer within a minute.
-    """
-    end = time.monotonic() + 60
-    for port in ports:
-        while True:
-            with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
-                break
-            if server.poll() is not None or time.monotonic() > end:
-                raise RuntimeError(f"rerun does not serve at port {port}: see `rerun --help`.")
-            time.sleep(0.05)
-
-
-def _check_free(port: int) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise ValueError(
-                f"port {port} is in use: end the program that uses it, or choose another port."
-            ) from error

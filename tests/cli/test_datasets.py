@@ -1,5 +1,6 @@
 """The commands for datasets as a user runs them: results, messages, exit status."""
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from rrd_reading import Rrd
 from hrc_learn.cli import dashboard_commands, dataset_commands
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.demos.format.videos import decode_image
+from hrc_learn.teleoperation import dashboard_page
 
 ROOT = Path(__file__).parents[2]
 
@@ -308,7 +310,16 @@ def viewer(monkeypatch):
         opened.append(command)
         return subprocess.CompletedProcess(command, 0)
 
+    @contextlib.contextmanager
+    def serve(recordings):
+        assert all(recording.is_file() for recording in recordings)
+        opened.append(["serve", *map(str, recordings)])
+        yield "http://127.0.0.1:8080/#token=secret"
+        raise KeyboardInterrupt  # instead of waiting for it
+
     monkeypatch.setattr(dashboard_commands.subprocess, "run", start)
+    monkeypatch.setattr(dashboard_commands.threading.Event, "wait", lambda event: None)
+    monkeypatch.setattr(dashboard_page, "serve_recordings", serve)
     return opened
 
 
@@ -323,15 +334,14 @@ def test_recordings_of_a_folder_are_opened_the_run_first(viewer, tmp_path, monke
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="has a screen")
-def test_without_a_screen_a_recording_is_served_to_this_machine_alone(
-    viewer, tmp_path, monkeypatch
-):
+def test_without_a_screen_a_recording_is_served_through_the_gate(viewer, tmp_path, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     (tmp_path / "run.rrd").touch()
     shown = hrc("show", tmp_path / "run.rrd")
     assert (shown.status, "no screen" in shown.output) == (0, True)
-    assert viewer[0][3:6] == ["--serve-web", "--bind", "127.0.0.1"]
+    assert "#token=" in shown.output
+    assert viewer == [["serve", str(tmp_path / "run.rrd")]]
 
 
 def test_demonstrations_are_opened_from_a_recording_that_does_not_stay(

@@ -13,15 +13,15 @@ from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
-from hrc_learn.viz import run_dashboard as servers
+from hrc_learn.teleoperation import dashboard_page as servers
 
 
 def test_a_cell_is_shown_while_it_works(tmp_path, monkeypatch):
     @contextmanager
-    def into_a_file(port, data_port):
+    def into_a_file(port):
         stream = rr.RecordingStream("test")
         stream.save(tmp_path / "live.rrd")
-        yield servers.DashboardServer(stream, f"http://viewer:{port}", f"data:{data_port}")
+        yield servers.DashboardServer(stream, f"http://viewer:{port}")
         stream.disconnect()
 
     monkeypatch.setattr(servers, "serve_stream", into_a_file)
@@ -36,7 +36,7 @@ def test_a_cell_is_shown_while_it_works(tmp_path, monkeypatch):
         human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
     )
-    config = LiveViewConfig(port=1, data_port=2, period=0.01)
+    config = LiveViewConfig(port=1, period=0.01)
     with (
         torch.inference_mode(),
         live_view("Held", config, opened.append)(cell, world, motion),

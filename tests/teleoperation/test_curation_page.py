@@ -1,7 +1,9 @@
 """The page for decisions on demonstrations: who gets in, what it sends, what it takes."""
 
+import contextlib
 import http.client
 import json
+import shutil
 import struct
 
 import numpy as np
@@ -9,6 +11,8 @@ import pytest
 from clean_sets import CAMERA, write_set
 from lerobot_folders import write_folder
 from page_in_browser import chromium, wait_until
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
 
 from hrc_learn.demos import load_demos
 from hrc_learn.demos.format.videos import decode_image
@@ -19,34 +23,48 @@ from hrc_learn.teleoperation.curation_page import CurationPage
 from hrc_learn.teleoperation.gate import AddressConfig
 
 
+@pytest.fixture(scope="module")
+def cleaned(tmp_path_factory):
+    return write_set(tmp_path_factory.mktemp("clean") / "set", "v3.0", camera=True)
+
+
 @pytest.fixture
-def page(tmp_path):
-    root = write_set(tmp_path / "set", "v3.0", camera=True)
+def page(cleaned, tmp_path):
+    root = shutil.copytree(cleaned, tmp_path / "set")
     config = AddressConfig(port=0)
     with CurationPage(rank_episodes(root), tmp_path / "out", config) as page:
         yield page
 
 
 class Client:
-    """Speaks HTTP to the page, with its cookie unless told otherwise."""
+    """Speaks to the page with its secret, unless told otherwise."""
 
     def __init__(self, page):
-        address = page.admission.address
-        self.origin, self.port = address.origin, address.port
-        self.cookie = f"hrc_page_{address.port}={address.token}"
+        origin, _, self.secret = page.url.partition("/#token=")
+        self.origin, self.port = origin, int(origin.rpartition(":")[2])
 
-    def ask(self, path, body=None, **headers):
+    def ask(self, path, **headers):
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
-        method = "GET" if body is None else "POST"
-        said = {"Cookie": self.cookie, "Origin": self.origin} | headers
-        connection.request(method, path, body, {k: v for k, v in said.items() if v})
+        said = {"Authorization": f"Bearer {self.secret}"} | headers
+        connection.request("GET", path, headers={k: v for k, v in said.items() if v})
         answer = connection.getresponse()
         content = answer.read()
         connection.close()
         return answer, content
 
+    def say(self, text, origin=None):
+        """Answer of the page to a message; None if it closes the socket instead."""
+        where = f"ws://127.0.0.1:{self.port}/session/{'c' * 24}"
+        offered = ["hrc", f"secret.{self.secret}"]
+        origin = self.origin if origin is None else origin
+        with connect(where, subprotocols=offered, origin=origin or None, proxy=None) as one:
+            one.send(text)
+            with contextlib.suppress(ConnectionClosed):
+                return json.loads(one.recv(timeout=20))
+        return None
+
     def decide(self, **said):
-        return self.ask("/decide", json.dumps(said))
+        return self.say(json.dumps({"type": "decide", **said}))
 
 
 @pytest.fixture
@@ -54,50 +72,64 @@ def client(page):
     return Client(page)
 
 
-def test_only_who_has_the_secret_gets_in(page, client):
-    for path in ("/", "/data/overview", "/static/curation.js"):
-        assert client.ask(path, Cookie="")[0].status == 401
-    assert client.ask("/", Cookie="hrc_page_1=x")[0].status == 401
-    assert client.ask("/?token=wrong", Cookie="")[0].status == 403
+def test_only_who_has_the_secret_gets_in(client):
+    for path in ("/data/overview", "/data/state", "/data/images/0/0/0"):
+        assert client.ask(path, Authorization="")[0].status == 401
+        assert client.ask(path, Authorization="Bearer wrong")[0].status == 403
     assert client.ask("/", Host="evil.example")[0].status == 403
-    answer, _ = client.ask(page.url.removeprefix(client.origin), Cookie="")
-    assert answer.status == 303
-    assert "HttpOnly; SameSite=Strict" in answer.headers["Set-Cookie"]
-    answer, body = client.ask("/")
+    answer, body = client.ask("/", Authorization="")
     assert answer.status == 200
     assert b"hrc curate" in body
     assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
 
 
 def test_another_site_decides_nothing(page, client):
-    said = json.dumps({"episode": 0, "verdict": "reject"})
-    for origin in ("https://evil.example", "", "null"):
-        assert client.ask("/decide", said, Origin=origin)[0].status == 403
+    said = json.dumps({"type": "decide", "episode": 0, "verdict": "reject"})
+    for origin in ("https://evil.example", "http://127.0.0.1", "http://localhost", "null", ""):
+        with pytest.raises(InvalidStatus):
+            client.say(said, origin=origin)
     assert not page.decisions
 
 
 @pytest.mark.parametrize(
-    ("path", "body", "status"),
+    "said",
     [
-        ("/decide", "{", 400),
-        ("/decide", "[]", 404),
-        ("/decide", '{"episode": "0", "verdict": "reject"}', 400),
-        ("/decide", '{"episode": 9, "verdict": "reject"}', 404),
-        ("/decide", '{"episode": 0, "verdict": "burn"}', 400),
-        ("/decide", '{"episode": 0, "verdict": "cut", "start": 5, "stop": 6}', 400),
-        ("/decide", "x" * 5000, 413),
-        ("/else", "{}", 404),
-        ("/data/curves/99", None, 422),
-        ("/data/curves/x", None, 404),
-        ("/data/images/0/5/0", None, 404),
-        ("/data/images/0/0/9999", None, 404),
-        ("/../../etc/passwd", None, 404),
-        ("/static/../server.py", None, 404),
+        "{",
+        "[]",
+        '{"type": "decide", "episode": ' + "[" * 10_000,
+        '{"type": "decide", "episode": "0", "verdict": "reject"}',
+        '{"type": "decide", "episode": true, "verdict": "reject"}',
+        '{"type": "decide", "episode": 0, "verdict": "burn"}',
+        '{"type": "decide", "episode": 0}',
+        '{"type": "else"}',
+        "x" * 50_000,
     ],
 )
-def test_what_makes_no_sense_is_refused(page, client, path, body, status):
-    assert client.ask(path, body)[0].status == status
+def test_what_is_no_decision_closes_the_socket(page, client, said):
+    assert client.say(said) is None
     assert not page.decisions
+    assert not read_decisions(page.ranking.path)
+
+
+def test_a_decision_that_makes_no_sense_is_refused_with_its_reason(page, client):
+    assert "no episode 9" in client.decide(episode=9, verdict="reject")["refused"]
+    assert client.decide(episode=0, verdict="cut", start=5, stop=6)["refused"]
+    assert not page.decisions
+
+
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("/data/curves/99", 422),
+        ("/data/curves/x", 404),
+        ("/data/images/0/5/0", 404),
+        ("/data/images/0/0/9999", 404),
+        ("/../../etc/passwd", 404),
+        ("/static/../curation_page.py", 404),
+    ],
+)
+def test_there_is_nothing_elsewhere(client, path, status):
+    assert client.ask(path)[0].status == status
 
 
 def test_images_and_curves_are_those_of_the_dataset(page, client):
@@ -137,7 +169,7 @@ def test_curves_of_columns_without_a_meaning_go_by_their_own_names(tmp_path):
 
 
 def test_curves_of_long_episodes_lose_no_spike():
-    from hrc_learn.teleoperation.curation_page.server import _points
+    from hrc_learn.teleoperation.curation_page import _points
 
     values = np.zeros(100_000)
     values[54_321] = 7.0
@@ -148,18 +180,18 @@ def test_curves_of_long_episodes_lose_no_spike():
 
 
 def test_decisions_are_kept_at_once_and_taken_back(page, client):
-    assert client.decide(episode=1, verdict="reject")[0].status == 200
-    assert client.decide(episode=2, verdict="cut", start=4, stop=60)[0].status == 200
+    client.decide(episode=1, verdict="reject")
+    client.decide(episode=2, verdict="cut", start=4, stop=60)
     assert read_decisions(page.ranking.path) == page.decisions
     assert page.decisions[2].start == 4
-    state = json.loads(client.decide(episode=1, verdict=None)[1])
+    state = client.decide(episode=1, verdict=None)
     assert [*state["decisions"]] == ["2"]
     assert read_decisions(page.ranking.path) == page.decisions
 
 
 def test_a_set_that_cannot_be_written_says_why(page, client):
     page.out.mkdir()
-    client.ask("/write", "{}")
+    client.say('{"type": "write"}')
     wait_until(lambda: not page.state()["written"]["writing"], "an answer")
     assert page.state()["written"]["failed"]
     assert str(page.out) in page.state()["written"]["said"]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hrc_learn.teleoperation.gate import Control, Gate, GateCallbacks, address, qr_code
+from hrc_learn.teleoperation.gate import Control, Gate, address, qr_code
 from hrc_learn.teleoperation.gate.address import (
     Address,
     AddressConfig,
@@ -18,7 +18,7 @@ from hrc_learn.teleoperation.gate.address import (
     network_name,
     tls_context,
 )
-from hrc_learn.teleoperation.gate.admission import Admission, Bucket
+from hrc_learn.teleoperation.gate.admission import Admission, Bucket, RefusedError
 from hrc_learn.teleoperation.gate.control import Link
 from hrc_learn.teleoperation.gate.messages import (
     Hands,
@@ -206,7 +206,7 @@ def test_no_number_is_let_through_that_is_none(number):
 
     fields = {"name": "/region", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, number, 0.0)}
     raw = msgspec.msgpack.encode({"type": "TransformControlsUpdateMessage", **fields})
-    with pytest.raises(MessageError, match="finite"):
+    with pytest.raises(MessageError, match="position"):
         view_message(raw)
 
 
@@ -221,7 +221,9 @@ def test_an_address_is_ours_alone_unless_asked_for():
     assert one.origin == "http://[::1]:8080"
     assert one.token != other.token
     assert one.token not in repr(one)
-    assert one.link("/xr") == f"http://[::1]:8080/xr?token={one.token}"
+    assert one.link("/xr") == f"http://[::1]:8080/xr#token={one.token}"
+    assert one.watch_token in one.link(watch=True)
+    assert one.token not in one.link(watch=True)
 
 
 def test_what_cannot_be_served_is_refused():
@@ -280,33 +282,46 @@ NO_TEXT = b"\xff".decode("ascii", "surrogateescape")
 """As headers come that hold other bytes."""
 
 
-def test_what_is_no_address_name_or_text_is_refused():
+def test_hosts_and_origins_are_exact():
     admission = Admission(AddressConfig(), 8080, tls=False)
-    cookie = f"hrc_page_8080={admission.address.token}"
+    for host in ("127.0.0.1:8080", "LOCALHOST:8080", "[::1]:8080"):
+        assert admission.is_ours(host)
+        assert admission.from_ours(f"http://{host.lower()}")
+        assert not admission.from_ours(f"https://{host.lower()}")
+    for host in ("127.0.0.1", "localhost", "localhost:80", "[abc", "", "x@localhost:8080"):
+        assert not admission.is_ours(host)
+        assert not admission.from_ours(f"http://{host}")
+    # Browsers leave the default port out.
+    default = Admission(AddressConfig(), 443, tls=True)
+    assert default.from_ours("https://localhost")
+    assert default.is_ours("localhost:443")
+    assert not default.from_ours("http://localhost")
 
-    def code(target, host="127.0.0.1:8080", cookies=()):
-        verdict = admission.refuse(target, host, cookies, lambda _: True)
-        return None if verdict is None else verdict.code
 
-    assert code("/", cookies=[cookie]) is None
-    assert code("//[x", cookies=[cookie]) == 403
-    assert code("/", "[abc", [cookie]) == 403
-    assert code("/", cookies=[f"hrc_page_8080={NO_TEXT}"]) == 401
-    assert code(f"/?token={NO_TEXT}") == 403
-    assert not admission.from_ours("http://[abc")
+def test_each_secret_has_its_right_and_wrong_ones_are_counted():
+    admission = Admission(AddressConfig(), 8080, tls=False)
+    assert admission.right(admission.address.token) == "act"
+    assert admission.right(admission.address.watch_token) == "watch"
+    codes = []
+    for secret in ["", NO_TEXT, *["wrong"] * 30]:
+        with pytest.raises(RefusedError) as refused:
+            admission.right(secret)
+        codes.append(refused.value.code)
+    assert codes[:3] == [401, 403, 403]
+    assert codes[-1] == 429
+    assert admission.right(admission.address.token) == "act"
 
 
-def test_a_gate_whose_thread_fails_says_so_instead_of_waiting(control, monkeypatch):
-    callbacks = GateCallbacks(heard=id, fits=bool, status=dict, scene=dict)
-    gate = Gate(AddressConfig(port=0), control, {}, callbacks, "ws://127.0.0.1:9", "secret")
+def test_a_gate_whose_thread_fails_says_so_instead_of_waiting(monkeypatch):
+    gate = Gate(AddressConfig(port=0), {}, {"session": lambda *_: None})
     monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
     with pytest.raises(ImportError, match="websockets"):
         gate.start()
-    gate.close("")
+    gate.close()
 
 
 def test_a_phone_reads_the_code():
-    text = "https://192.0.2.7:8080/xr?token=" + "aB3_-x" * 4
+    text = "https://192.0.2.7:8080/xr#token=" + "aB3_-x" * 4
     lines = qr_code(text).splitlines()
     cells = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
     rows = [[cells[cell][half] for cell in line] for line in lines for half in (0, 1)]

@@ -60,9 +60,9 @@ def asked_by_wire(grips, region):
     """What a page beside the same arm asks for when a scripted person says the same."""
     with still_page() as (page, state):
         where = f"ws://127.0.0.1:{page.address.port}/session/a-scripted-person"
-        headers = {"Cookie": wire.cookie(page)}
+        offered = ["hrc", f"secret.{page.address.token}"]
         with connect(
-            where, additional_headers=headers, origin=page.address.origin, proxy=None
+            where, subprotocols=offered, origin=page.address.origin, proxy=None
         ) as socket:
             socket.send(wire.BEAT)
             socket.send(json.dumps({"type": "region", **region, "active": True}))

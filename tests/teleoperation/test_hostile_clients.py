@@ -2,13 +2,17 @@
 
 import asyncio
 import json
+import math
+import threading
+import time
 
 import numpy as np
 import pytest
 from hostile_clients import (
     ATTACKS,
+    BEAT,
+    FOREIGN,
     VISER,
-    cookie,
     hands,
     http,
     packed,
@@ -16,11 +20,15 @@ from hostile_clients import (
     siege,
     socket,
     until_closed,
+    viewer,
 )
 from page_in_browser import Session, wait_until
 from websockets.asyncio.client import connect
 
 pytest.importorskip("viser", reason="the extra `ui` is not installed")
+
+
+REGION = {"centre": [0.35, 0.45, 0.22], "half_size": [0.1, 0.1, 0.1], "active": False}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +68,7 @@ def besieged(session, kinds, seed=0):
 
 def test_one_of_each_kind_changes_nothing(session):
     besieged(session, ATTACKS)
-    assert http(session.page, "/", Cookie=cookie(session.page))[0] == 200
+    assert http(session.page, "/")[0] == 200
 
 
 @pytest.mark.slow
@@ -68,23 +76,139 @@ def test_two_hundred_change_nothing(session):
     rng = np.random.default_rng(7)
     kinds = [ATTACKS[k % len(ATTACKS)] for k in range(200)]
     besieged(session, [kinds[k] for k in rng.permutation(200)], seed=1)
-    assert http(session.page, "/", Cookie=cookie(session.page))[0] == 200
+    assert http(session.page, "/")[0] == 200
 
 
-def test_the_page_opens_to_those_who_have_its_secret(session):
+def test_data_opens_to_those_who_have_a_secret(session):
     page = session.page
-    assert http(page, "/")[0] == 401
-    status, headers, _ = http(page, f"/?token={page.address.token}")
-    assert (status, headers["Location"]) == (303, "/")
-    assert "HttpOnly" in headers["Set-Cookie"]
-    assert "SameSite=Strict" in headers["Set-Cookie"]
-    status, headers, body = http(page, "/", Cookie=cookie(page))
+    for secret in (page.address.token, page.address.watch_token):
+        assert http(page, "/admitted", secret=secret)[0] == 200
+    assert http(page, "/admitted")[0] == 401
+    assert http(page, "/admitted", secret="wrong")[0] == 403
+    assert http(page, "/static/../gate.py", secret=page.address.token)[0] == 404
+    # The page itself is public: it is what keeps the secret that comes in the fragment.
+    status, headers, body = http(page, "/")
     assert status == 200
-    assert b"/static/session.js" in body
+    assert body.index(b"/static/door.js") < body.index(b"/static/session.js")
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
-    assert http(page, "/static/../gate.py", Cookie=cookie(page))[0] == 404
-    # Only what is served is a place to go to.
-    assert http(page, f"//evil.example?token={page.address.token}")[1]["Location"] == "/"
+    assert "Set-Cookie" not in headers
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "localhost:1", "", "[abc"])
+def test_a_foreign_name_opens_nothing(session, host):
+    assert http(session.page, "/", secret=session.page.address.token, Host=host)[0] == 403
+
+
+@pytest.mark.parametrize("origin", FOREIGN)
+def test_a_foreign_site_opens_no_socket(session, origin):
+    for route in ("session", "view"):
+        asyncio.run(refused(socket(session.page, route, origin=origin), codes=(403,)))
+
+
+def test_a_view_needs_the_session_of_its_client(session):
+    asyncio.run(refused(socket(session.page, "view"), codes=(401,)))
+
+
+def test_a_watcher_leads_at_no_time(session):
+    page = session.page
+
+    async def watch():
+        async with socket(page, secret=page.address.watch_token) as one:
+            await one.send(json.dumps({"type": "lead", "wish": "ask"}))
+            await one.send(json.dumps({"type": "gripper", "width": 0.0}))
+            await one.send(hands())
+            states = [json.loads(await one.recv())["status"] for _ in range(3)]
+        return states[-1]
+
+    told = asyncio.run(watch())
+    assert (told["role"], told["taken"], told["may_lead"]) == ("watches", False, False)
+    assert session.asked.gripper is None
+
+
+def test_an_error_of_ours_closes_that_client_only(session, monkeypatch):
+    page = session.page
+
+    async def go():
+        async with socket(page) as leader, socket(page) as other:
+            await leader.recv(), await other.recv()
+            monkeypatch.setattr(page._sockets, "_heard", lambda message: 1 / 0)
+            await leader.send(json.dumps({"type": "gripper", "width": 0.0}))
+            await until_closed(leader)
+            await other.recv()
+            return leader.close_code
+
+    assert asyncio.run(go()) == 1011
+    assert page.alive
+
+
+def test_a_picture_that_fails_does_not_end_the_page(session, monkeypatch):
+    page, failures = session.page, []
+
+    def fail(*_):
+        failures.append(1)
+        raise RuntimeError("deque mutated during iteration")
+
+    monkeypatch.setattr(page._scene, "move", fail)
+    wait_until(lambda: len(failures) >= 3, "failing pictures")
+    monkeypatch.undo()
+    assert page.alive
+
+
+def test_viser_is_touched_in_its_own_loop_while_many_watch(session, monkeypatch):
+    """24 watchers and a leader: viser's queues break if another thread pushes into them."""
+    from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+    page, threads, delays = session.page, set(), []
+    push = AsyncMessageBuffer.push
+
+    def noted(buffer, message):
+        threads.add(threading.current_thread())
+        push(buffer, message)
+
+    monkeypatch.setattr(AsyncMessageBuffer, "push", noted)
+
+    async def watch(stop):
+        async with viewer(page) as (one, view):
+            drain = asyncio.create_task(until_closed(view))
+            await one.send(json.dumps({"type": "hello", "wants": "scene"}))
+            states = 0
+            while not stop.is_set():
+                states += bool(json.loads(await one.recv()).get("scene"))
+            drain.cancel()
+        return states
+
+    async def lead(stop):
+        async with viewer(page) as (one, view):
+            drain = asyncio.create_task(until_closed(view))
+            await one.send(json.dumps({"type": "region", **REGION}))
+            end = time.monotonic() + 4.0
+            while time.monotonic() < end:
+                sent = time.monotonic()
+                side = 0.1 * math.sin(5 * sent)
+                grips = json.loads(hands(pointer=(0.3, side, 0.9)))["grips"]
+                await one.send(BEAT)
+                await one.send(json.dumps({"type": "hands", "grips": grips, "sent": sent}))
+                while (told := json.loads(await one.recv())).get("status") is None:
+                    pass
+                if told["status"]["sent"]:
+                    delays.append(time.monotonic() - told["status"]["sent"])
+            stop.set()
+            drain.cancel()
+
+    async def go():
+        stop = asyncio.Event()
+        leading = asyncio.create_task(lead(stop))
+        await asyncio.sleep(0.3)
+        states = await asyncio.gather(*(watch(stop) for _ in range(24)))
+        await leading
+        return states
+
+    states = asyncio.run(go())
+    assert page.alive
+    assert min(states) > 5
+    assert len(delays) > 5
+    assert len(threads) == 1, threads
+    wait_until(lambda: page.control.people == 0, "everybody gone")
 
 
 @pytest.mark.parametrize("value", [-100.0, 1e9, True, "strong"])
@@ -93,13 +217,10 @@ def test_a_control_takes_only_what_it_offers(session, value):
     uuid = page._panel._strength._impl.uuid
 
     async def set_strength():
-        known = await asyncio.to_thread(cookie, page)
-        async with socket(page, "session", cookie=known, client="a" * 24):
-            options = {"subprotocols": [VISER], "client": "a" * 24, "max_size": None}
-            async with socket(page, "view", cookie=known, **options) as view:
-                await view.send(packed("GuiUpdateMessage", uuid=uuid, updates={"value": value}))
-                await until_closed(view)
-                assert view.close_code == 1008
+        async with viewer(page) as (_, view):
+            await view.send(packed("GuiUpdateMessage", uuid=uuid, updates={"value": value}))
+            await until_closed(view)
+            assert view.close_code == 1008
 
     asyncio.run(set_strength())
     assert page._panel.forces == before
@@ -111,20 +232,15 @@ def test_what_the_leader_sets_arrives(session):
     uuid, initial = page._panel._strength._impl.uuid, page._panel.forces
 
     async def set_strength():
-        known = await asyncio.to_thread(cookie, page)
-        async with socket(page, "session", cookie=known, client="b" * 24):
-            options = {"subprotocols": [VISER], "client": "b" * 24, "max_size": None}
-            async with socket(page, "view", cookie=known, **options) as view:
-                for value in (50, 100):
-                    update = {"uuid": uuid, "updates": {"value": value}}
-                    await view.send(packed("GuiUpdateMessage", **update))
-                    await asyncio.to_thread(
-                        wait_until,
-                        lambda v=value: (
-                            page._panel.forces.stiffness == initial.stiffness * v / 100
-                        ),
-                        "the strength",
-                    )
+        async with viewer(page) as (_, view):
+            for value in (50, 100):
+                await view.send(packed("GuiUpdateMessage", uuid=uuid, updates={"value": value}))
+                wanted = initial.stiffness * value / 100
+                await asyncio.to_thread(
+                    wait_until,
+                    lambda wanted=wanted: page._panel.forces.stiffness == wanted,
+                    "the strength",
+                )
 
     asyncio.run(set_strength())
 
@@ -138,9 +254,8 @@ def test_as_many_come_in_as_may(session):
     page = session.page
 
     async def crowd():
-        known = await asyncio.to_thread(cookie, page)
         most = page._config.most_clients
-        people = [await socket(page, "session", cookie=known) for _ in range(most + 3)]
+        people = [await socket(page, "session") for _ in range(most + 3)]
         for late in people[most:]:
             await asyncio.wait_for(until_closed(late), 20)
             assert late.close_code == 1013
@@ -156,9 +271,8 @@ def test_a_grip_that_was_held_before_the_hand_over_moves_nothing(session):
     page = session.page
 
     async def go():
-        known = await asyncio.to_thread(cookie, page)
-        first = await socket(page, "session", cookie=known)
-        second = await socket(page, "session", cookie=known)
+        first = await socket(page, "session")
+        second = await socket(page, "session")
         await second.send(hands())  # watches, and pinches already
         await second.send(json.dumps({"type": "lead", "wish": "ask"}))
         await first.send(json.dumps({"type": "lead", "wish": "hand_over"}))
@@ -183,8 +297,7 @@ def test_a_client_that_draws_the_scene_itself_is_told_where_everything_is(sessio
     page = session.page
 
     async def go():
-        known = await asyncio.to_thread(cookie, page)
-        async with socket(page, "session", cookie=known) as one:
+        async with socket(page, "session") as one:
             await one.send(json.dumps({"type": "hello", "wants": "scene"}))
             async for raw in one:
                 if "scene" in (told := json.loads(raw)):

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
-from hostile_clients import BEAT, cookie, hands, socket
+from hostile_clients import BEAT, hands, socket
 
 from hrc_learn.demos import load_demos, recover_dataset
 from hrc_learn.teleoperation.gate import Address
@@ -26,16 +26,15 @@ def served(log, timeout=180.0):
         assert time.monotonic() < end, log.read_text()
         time.sleep(0.1)
     parts = urlsplit(found[1])
-    (token,) = parse_qs(parts.query)["token"]
+    (token,) = parse_qs(parts.fragment)["token"]
     address = Address(scheme="http", host="127.0.0.1", port=parts.port, token=token)
     return SimpleNamespace(address=address)
 
 
 async def record(page, until):
     """Lead the end effector to and fro while recording; the last that the page said of it."""
-    known = await asyncio.to_thread(cookie, page)
     status, began = {}, None
-    async with socket(page, "session", cookie=known) as client:
+    async with socket(page) as client:
         await client.send(json.dumps({"type": "ask", "request": "start"}))
         await client.send(json.dumps({"type": "hands", "grips": []}))  # then takes hold
         while not until(status):

@@ -1,16 +1,9 @@
 """Recordings of runs, finished and going on, read again."""
 
-import os
-import shutil
-import signal
-import socket
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import replace
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,7 +22,6 @@ from hrc_learn.viz.run_dashboard import (
     live_dashboard,
     record_run,
     run_layout,
-    serve_stream,
 )
 
 
@@ -348,73 +340,6 @@ def test_a_run_sent_as_it_grows_arrives_like_a_finished_one(tmp_path):
         ]
         assert last[0] == last[1], entity
         assert set(saved.time(entity)[[0, -1]]) <= set(live.time(entity))
-
-
-def free_ports() -> tuple[int, int]:
-    with socket.socket() as one, socket.socket() as two:
-        one.bind(("", 0))
-        two.bind(("", 0))
-        return one.getsockname()[1], two.getsockname()[1]
-
-
-def test_a_viewer_that_connects_gets_the_run(tmp_path):
-    """The viewer is rerun's own, told to write down what it receives."""
-    rerun = shutil.which("rerun", path=str(Path(sys.executable).parent))
-    if rerun is None:
-        pytest.skip("no rerun command beside python")
-    run, got = sample_run(), tmp_path / "got.rrd"
-    page, data = free_ports()
-    with serve_stream(page, data) as server:
-        assert server.viewer.startswith(f"http://127.0.0.1:{page}?url=")
-        assert reachable(page, "127.0.0.1")
-        assert reachable(data, "127.0.0.1")
-        # This machine has addresses other than 127.0.0.1: nothing listens there.
-        assert not reachable(page, "127.0.0.2")
-        assert not reachable(data, "127.0.0.2")
-        with live_dashboard(server.stream, lambda: run):
-            pass
-        # Late: what was sent before is kept for it.
-        viewer = subprocess.Popen(
-            [rerun, server.data, "--save", got, "--port", str(free_ports()[0])],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        try:
-            assert arrives(got, size=200_000)
-        finally:
-            os.killpg(viewer.pid, signal.SIGTERM)
-            viewer.wait(timeout=120)
-    rrd = Rrd(got)
-    (tab,) = (tab for tab in run_tabs(run) if tab.title == "Primitive")
-    joint = tab.plots[0].curves[-1]
-    np.testing.assert_array_equal(rrd.scalars(joint.path), joint.values)
-
-
-def reachable(port: int, host: str) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex((host, port)) == 0
-
-
-def arrives(path: Path, size: int, timeout: float = 60.0) -> bool:
-    """Whether a file grows to a size, and then no more."""
-    end, before = time.monotonic() + timeout, -1
-    while time.monotonic() < end:
-        now = path.stat().st_size if path.exists() else 0
-        if now >= size and now == before:
-            return True
-        before = now
-        time.sleep(0.2)
-    return False
-
-
-def test_a_port_that_is_taken_is_said():
-    with socket.socket() as taken:
-        taken.bind(("", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=f"port {port} is in use"), serve_stream(port):
-            pass
 
 
 CUBE = """solid cube

@@ -9,19 +9,13 @@ python tools/docs/dashboards.py --run outputs/beside/run.rrd \
     --demonstrations outputs/demonstrations.rrd
 """
 
-import os
-import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from urllib.parse import quote
 
 from PIL import Image
 
@@ -30,6 +24,7 @@ sys.path.append(str(Path(__file__).parents[2] / "tests"))
 from page_in_browser import chromium  # pyright: ignore[reportMissingImports]
 
 from hrc_learn import cli
+from hrc_learn.teleoperation.dashboard_page import serve_recordings
 
 SIZE = (1600, 1000)
 """Of the window [px]."""
@@ -82,7 +77,7 @@ def _pictures(
 ) -> Iterator[tuple[str, bytes]]:
     with (
         tempfile.TemporaryDirectory() as profile,
-        _served(recording) as address,
+        serve_recordings([recording], 0) as address,
         chromium(Path(profile), SIZE) as tab,
     ):
         tab.goto(address, timeout=120e3)
@@ -100,36 +95,6 @@ def _pictures(
             time.sleep(REDRAWN / 3)
             yield f"_{title.split()[0].lower()}", _picture(tab)
             left += width
-
-
-@contextmanager
-def _served(recording: Path) -> Iterator[str]:
-    """The address at which the viewer shows a recording to this machine."""
-    page, data = _free_port(), _free_port()
-    ports = ["--web-viewer-port", str(page), "--port", str(data)]
-    served = ["--serve-web", "--bind", "127.0.0.1", *ports, str(recording)]
-    # A group of its own: what this starts is a program that starts the viewer.
-    command = [sys.executable, "-m", "rerun", *served]
-    viewer = subprocess.Popen(command, start_new_session=True)
-    try:
-        while viewer.poll() is None and not _listens(page):
-            time.sleep(0.1)
-        source = quote(f"rerun+http://127.0.0.1:{data}/proxy")
-        yield f"http://127.0.0.1:{page}/?url={source}&renderer=webgl"
-    finally:
-        os.killpg(viewer.pid, signal.SIGTERM)
-        viewer.wait()
-
-
-def _free_port() -> int:
-    with closing(socket.socket()) as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
-def _listens(port: int) -> bool:
-    with closing(socket.socket()) as asking:
-        return asking.connect_ex(("127.0.0.1", port)) == 0
 
 
 def _picture(tab) -> bytes:

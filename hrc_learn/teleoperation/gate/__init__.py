@@ -1,4 +1,4 @@
-"""Authenticated entrance for browsers: address and secret, TLS, control and message schemas."""
+"""Authenticated entrance for browsers: address and secrets, TLS, control and schemas."""
 
 from hrc_learn.teleoperation.gate.address import Address as Address
 from hrc_learn.teleoperation.gate.address import AddressConfig as AddressConfig
@@ -6,6 +6,4 @@ from hrc_learn.teleoperation.gate.address import qr_code as qr_code
 from hrc_learn.teleoperation.gate.control import Control as Control
 from hrc_learn.teleoperation.gate.gate import Content as Content
 from hrc_learn.teleoperation.gate.gate import Gate as Gate
-from hrc_learn.teleoperation.gate.gate import GateCallbacks as GateCallbacks
-from hrc_learn.teleoperation.gate.gate import guarded_servers as guarded_servers
-from hrc_learn.teleoperation.gate.gate import page_contents as page_contents
+from hrc_learn.teleoperation.gate.gate import folder_contents as folder_contents

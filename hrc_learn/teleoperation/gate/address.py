@@ -34,8 +34,8 @@ class AddressConfig:
     """Certificate for TLS (PEM); one of our own, which browsers ask about once, if None."""
     key: Path | None = None
     """Private key of that certificate (PEM)."""
-    most_clients: int = 8
-    """Browsers that may be there at once."""
+    most_clients: int = 32
+    """Largest number of browsers that are connected at once."""
 
     def __post_init__(self) -> None:
         if self.port is not None and not 0 <= self.port <= 65535:
@@ -54,6 +54,10 @@ class AddressConfig:
             return self.host == "localhost"
 
 
+def _secret() -> str:
+    return secrets.token_urlsafe(18)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Address:
     """Address of a page that is being served."""
@@ -61,18 +65,25 @@ class Address:
     scheme: str
     host: str
     port: int
-    token: str = field(default_factory=lambda: secrets.token_urlsafe(18), repr=False)
-    """The secret that opens it; new with each start."""
+    token: str = field(default_factory=_secret, repr=False)
+    """Secret that opens the page; new with each start."""
+    watch_token: str = field(default_factory=_secret, repr=False)
+    """Secret that opens the page for watching only."""
 
     @property
     def origin(self) -> str:
-        """Without the secret."""
+        """Address without the secret."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.scheme}://{host}:{self.port}"
 
-    def link(self, path: str = "/") -> str:
-        """Address with the secret. Anyone with this link can move the arm."""
-        return f"{self.origin}{path}?token={self.token}"
+    def link(self, path: str = "/", *, watch: bool = False) -> str:
+        """Address with a secret in its fragment, which browsers send to no server.
+
+        Args:
+            path: Path of the page.
+            watch: Read-only. Anyone with a link that is not can move the arm.
+        """
+        return f"{self.origin}{path}#token={self.watch_token if watch else self.token}"
 
 
 def network_name(config: AddressConfig) -> str:

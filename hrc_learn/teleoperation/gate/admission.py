@@ -1,19 +1,20 @@
-"""Admission of clients: the secret of the address, a session cookie, and checks of host and
-origin.
-"""
+"""Admission of clients: exact hosts and origins, and the two secrets of an address."""
 
 from __future__ import annotations
 
 import hmac
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from urllib.parse import parse_qs, urlsplit
+from typing import Literal
 
 from hrc_learn.teleoperation.gate.address import Address, AddressConfig, network_name
 
-_WRONG_TOKENS, _FORGIVEN = 20.0, 1.0  # at once, then one a second: 144 bits cannot be guessed
+Right = Literal["act", "watch"]
+"""Right of a client: to act on the arm or the data, or only to watch."""
+
+_WRONG_SECRETS, _FORGIVEN = 20.0, 1.0  # at once, then one a second: 144 bits cannot be guessed
+_DEFAULT_PORTS = {"http": 80, "https": 443}
 
 _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
@@ -27,15 +28,17 @@ HEADERS = {
     "X-Frame-Options": "DENY",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
+    "Permissions-Policy": "xr-spatial-tracking=(self)",
 }
 """Security headers sent with every response."""
 
 
 @dataclass(kw_only=True)
 class Bucket:
-    """Lets so many through a second, and so many at once."""
+    """Token bucket that bounds a rate and allows a burst."""
 
     rate: float
+    """[1/s]"""
     burst: float
     clock: Callable[[], float] = time.monotonic
     left: float = field(init=False)
@@ -55,23 +58,22 @@ class Bucket:
         return True
 
 
-@dataclass(frozen=True, kw_only=True)
-class Verdict:
-    """Early response to a request that is refused or redirected."""
+class RefusedError(Exception):
+    """Refusal of a request, with its HTTP status code."""
 
-    code: int
-    """HTTP status code."""
-    words: str = ""
-    headers: dict[str, str] = field(default_factory=dict)
+    def __init__(self, code: int, words: str):
+        super().__init__(words)
+        self.code = code
 
 
 class Admission:
-    """Checks if a request comes from an authorised client.
+    """Checks of the host, the origin and the secret of a request.
 
-    The secret of the address is exchanged for a cookie, which no other site can send.
+    The secret travels in a header or a WebSocket subprotocol and never in a cookie: browsers
+    send the cookies of a host to all its ports, and so to other servers.
 
     Attributes:
-        address: Address of the page, with its secret.
+        address: Address of the page, with its secrets.
     """
 
     def __init__(self, config: AddressConfig, port: int, *, tls: bool):
@@ -81,73 +83,45 @@ class Admission:
             port: Port of the page.
             tls: True if the page is served by TLS.
         """
-        self.address = Address(
-            scheme="https" if tls else "http", host=network_name(config), port=port
-        )
-        self._cookie = f"hrc_page_{port}"
-        self._hosts = {self.address.host, "localhost", "127.0.0.1", "::1"}
-        self._wrong = Bucket(rate=_FORGIVEN, burst=_WRONG_TOKENS)
-
-    def refuse(
-        self, target: str, host: str, cookies: Iterable[str], known: Callable[[str], bool]
-    ) -> Verdict | None:
-        """Check a request.
-
-        Args:
-            target: Requested path and query.
-            host: Host header.
-            cookies: Cookie headers.
-            known: True for paths that exist.
-
-        Returns:
-            The response that refuses or redirects the request; None if it may pass.
-        """
-        if not self.is_ours(host):
-            return Verdict(code=403, words="This page is not served under that name.")
-        try:
-            parts = urlsplit(target)
-        except ValueError:
-            return Verdict(code=403, words="That is no address of this page.")
-        if "token" in (query := parse_qs(parts.query)):
-            return self._enter(query["token"][0], parts.path if known(parts.path) else "/")
-        if not self._knows(cookies):
-            return Verdict(
-                code=401,
-                words="Open the whole address that the terminal shows: it has a secret.",
-            )
-        return None
+        scheme = "https" if tls else "http"
+        self.address = Address(scheme=scheme, host=network_name(config), port=port)
+        names = {self.address.host.lower(), "localhost", "127.0.0.1", "::1"}
+        hosts = {f"[{name}]" if ":" in name else name for name in names}
+        self._hosts = {f"{host}:{port}" for host in hosts}
+        if port == _DEFAULT_PORTS[scheme]:  # which browsers leave out
+            self._hosts |= hosts
+        self._wrong = Bucket(rate=_FORGIVEN, burst=_WRONG_SECRETS)
 
     def is_ours(self, host: str) -> bool:
         """True if a Host header names this server. Another name may have been bound to our
         address (DNS rebinding).
         """
-        with suppress(ValueError):
-            parts = urlsplit(f"//{host}")
-            return parts.hostname in self._hosts and parts.port in (self.address.port, None)
-        return False
+        return host.lower() in self._hosts
 
     def from_ours(self, origin: str) -> bool:
-        """True if an Origin header is that of our own page."""
-        with suppress(ValueError):
-            parts = urlsplit(origin)
-            return parts.scheme == self.address.scheme and self.is_ours(parts.netloc)
-        return False
+        """True if an Origin header is that of our own page: scheme, host and port."""
+        scheme, _, host = origin.partition("://")
+        return scheme == self.address.scheme and self.is_ours(host)
 
-    def _enter(self, token: str, path: str) -> Verdict:
-        if not same_secret(token, self.address.token):
-            if self._wrong.take():
-                return Verdict(code=403, words="That secret is not the one of this start.")
-            return Verdict(code=429, words="Too many wrong secrets.")
-        secure = "; Secure" if self.address.scheme == "https" else ""
-        cookie = f"{self._cookie}={token}; HttpOnly; SameSite=Strict; Path=/{secure}"
-        return Verdict(code=303, headers={"Location": path, "Set-Cookie": cookie})
+    def right(self, secret: str) -> Right:
+        """Right of a client with this secret.
 
-    def _knows(self, cookies: Iterable[str]) -> bool:
-        for cookie in "; ".join(cookies).split(";"):
-            name, _, value = cookie.strip().partition("=")
-            if name == self._cookie:
-                return same_secret(value, self.address.token)
-        return False
+        Raises:
+            RefusedError: There is none, or it is wrong.
+        """
+        if not secret:
+            raise RefusedError(
+                401, "Open the whole address that the terminal shows: it has a secret."
+            )
+        if same_secret(secret, self.address.token):
+            return "act"
+        if same_secret(secret, self.address.watch_token):
+            return "watch"
+        if self._wrong.take():
+            raise RefusedError(
+                403, "This secret is not valid: open the address that the terminal shows."
+            )
+        raise RefusedError(429, "Too many wrong secrets.")
 
 
 def same_secret(given: str, secret: str) -> bool:

@@ -23,6 +23,8 @@ class ControlView:
     """For the controlling client: true if another client requests control. For a watching
     client: true if it has requested control itself.
     """
+    may_lead: bool = True
+    """False for a client that may only watch."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,27 +83,31 @@ class Control:
         self._lag: dict[str, float] = {}
         self._links: dict[str, deque[tuple[float, Link]]] = {}
         self._asking: dict[str, float] = {}
+        self._able: set[str] = set()
         self._leader: str | None = None
         self._acted = float("-inf")
         self._turn = 0
         self._lock = RLock()
 
-    def join(self, client: str) -> None:
-        """Add a client. It gets control if no other client has it."""
+    def join(self, client: str, *, may_lead: bool = True) -> None:
+        """Add a client. It gets control if no other client has it and it may lead."""
         with self._lock:
             self._heard[client], self._links[client] = self._clock(), deque()
-            if self._leader is None:
-                self._give(client)
+            if may_lead:
+                self._able.add(client)
+                if self._leader is None:
+                    self._give(client)
 
     def leave(self, client: str) -> None:
         """Remove a client."""
         with self._lock:
             for table in (self._heard, self._lag, self._links, self._asking):
                 table.pop(client, None)
+            self._able.discard(client)
             if client == self._leader:
-                # Who is left alone leads, as the first to come does: a page that is loaded anew
-                # may come before the old one has left.
-                alone = next(iter(self._heard)) if len(self._heard) == 1 else None
+                # The only client left leads, as the first to come does: a page that is loaded
+                # anew may come before the old one has left.
+                alone = next(iter(self._able)) if len(self._able) == 1 else None
                 self._give(min(self._asking, key=self._asking.__getitem__, default=alone))
 
     def hear(self, client: str, lag: float = 0.0, delay: float = 0.0) -> None:
@@ -149,7 +155,7 @@ class Control:
         over.
         """
         with self._lock:
-            if client not in self._heard or client == self._leader:
+            if client not in self._able or client == self._leader:
                 return
             if self._leader is None:
                 self._give(client)
@@ -214,6 +220,7 @@ class Control:
                 role="leads" if leads else "watches",
                 taken=self._leader is not None,
                 asked=bool(self._asking) if leads else client in self._asking,
+                may_lead=client in self._able,
             )
 
     def _within(self, limit: float) -> bool:

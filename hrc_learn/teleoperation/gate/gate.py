@@ -1,7 +1,8 @@
-"""Entrance for all browser traffic, which is validated before it reaches anything else.
+"""Entrance for all browser traffic: page, headset, curation and dashboards.
 
-The gate stands in front of viser, which accepts any client that reaches its port, and of the XR
-client's socket.
+The gate serves files and sockets in a thread of its own. Files of a page are public; its data
+and sockets need a secret (see `Admission`). Every socket belongs to a client that its page
+draws at random, and an error of one client closes the sockets of that client only.
 """
 
 from __future__ import annotations
@@ -11,35 +12,25 @@ import http
 import json
 import logging
 import mimetypes
-import time
-from collections.abc import Awaitable, Callable, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from hrc_learn.teleoperation.gate.address import (
-    AddressConfig,
-    listening_socket,
-    tls_context,
+from hrc_learn.teleoperation.gate.address import AddressConfig, listening_socket, tls_context
+from hrc_learn.teleoperation.gate.admission import (
+    HEADERS,
+    Admission,
+    Bucket,
+    RefusedError,
+    Right,
 )
-from hrc_learn.teleoperation.gate.admission import HEADERS, Admission, Bucket, same_secret
-from hrc_learn.teleoperation.gate.control import Control
-from hrc_learn.teleoperation.gate.messages import (
-    Beat,
-    GuiUpdate,
-    Hands,
-    Hello,
-    Lead,
-    Message,
-    MessageError,
-    session_message,
-    view_message,
-)
+from hrc_learn.teleoperation.gate.messages import MessageError
 
-# websockets comes with viser, and is imported when a page is opened.
+# websockets is imported when a page is opened.
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection as ServerConnection
     from websockets.http11 import Request as Request
@@ -49,10 +40,14 @@ else:
 
 _LARGEST = 16_384  # bytes of a message: the longest of ours has 1.5 kB
 _RATE, _BURST = 400.0, 800.0  # messages a second and at once: a mouse makes 2 x 125
-_CONNECTIONS = 64  # open at once, whatever they are: a browser needs 8
-_PER_PERSON = 2  # a page and its socket
-_STATUS_EVERY, _SCENE_EVERY = 0.1, 1 / 60
-_GONE, _TOO_MUCH, _FULL = 1001, 1008, 1013  # codes of the WebSocket protocol (RFC 6455)
+_HANDSHAKE = 30.0
+"""Longest time from connecting to the answer [s]; the slowest is a block of images."""
+_SESSION_WAIT = 3.0
+"""Longest time that another socket waits for the session of its client [s]."""
+_TOO_MUCH, _FAILED, _FULL = 1008, 1011, 1013  # codes of the WebSocket protocol (RFC 6455)
+_SECRET = "secret."  # begins the subprotocol that carries the secret
+
+_logger = logging.getLogger("hrc_learn.gate")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,102 +62,93 @@ class Content:
     def of(cls, name: str, body: bytes) -> Content:
         """Content with the MIME type that belongs to a file name."""
         kinds = {".js": "text/javascript", ".glb": "model/gltf-binary"}
-        suffix = name[name.rfind(".") :]
-        guess = kinds.get(suffix) or mimetypes.guess_type(name)[0]
+        guess = kinds.get(Path(name).suffix) or mimetypes.guess_type(name)[0]
         return cls(body=body, kind=guess or "application/octet-stream")
 
 
-_STATIC = Path(__file__).parent / "static"
-
-
-def page_contents(viser: Path) -> dict[str, Content]:
-    """The page of viser with our part of it, by path.
-
-    Args:
-        viser: Folder of the package.
-    """
-    page = (viser / "client" / "build" / "index.html").read_bytes()
-    # Ours come first: one says which socket viser's client opens, one how it draws.
-    ours = b"".join(
-        b'<script src="/static/%s"></script>' % name for name in (b"session.js", b"prompt.js")
-    )
-    page = page.replace(b"<head>", b"<head>" + ours, 1)
-    page = page.replace(b"<title>Viser</title>", b"<title>hrc page</title>", 1)
-    return {"/": Content.of("index.html", page), **static_contents(_STATIC)}
-
-
-def static_contents(folder: Path) -> dict[str, Content]:
+def folder_contents(folder: Path, prefix: str = "/static/") -> dict[str, Content]:
     """Files of a folder, by path."""
     return {
-        f"/static/{file.name}": Content.of(file.name, file.read_bytes())
+        f"{prefix}{file.name}": Content.of(file.name, file.read_bytes())
         for file in sorted(folder.iterdir())
         if file.is_file()
     }
 
 
 @dataclass(frozen=True, kw_only=True)
-class GateCallbacks:
-    """Callbacks of the page for validated messages; the gate's thread calls them."""
+class Visitor:
+    """Client of a page."""
 
-    heard: Callable[[Message], None]
-    """A message of the controlling client."""
-    fits: Callable[[GuiUpdate], bool]
-    """True if a control of viser's panel accepts a value."""
-    status: Callable[[], Mapping[str, Any]]
-    """Status sent to all clients ten times a second."""
-    scene: Callable[[], Mapping[str, Any]]
-    """Scene sent on each change to clients that render it themselves."""
+    client: str
+    """Random name that its page has drawn."""
+    right: Right
+
+
+type Route = Callable[[ServerConnection, Visitor], Awaitable[None]]
+"""Conversation with a client over one socket; it ends when the socket closes."""
+
+
+async def incoming[T](
+    connection: ServerConnection, decode: Callable[[str | bytes], T]
+) -> AsyncIterator[tuple[str | bytes, T]]:
+    """Messages of a client, raw and decoded.
+
+    Raises:
+        MessageError: A message fits no schema, or there are too many.
+    """
+    bucket = Bucket(rate=_RATE, burst=_BURST)
+    async for raw in connection:
+        if not bucket.take():
+            raise MessageError("too many messages")
+        yield raw, decode(raw)
 
 
 class Gate:
-    """Serves pages and sockets to clients with the token, in a thread of its own.
+    """Server of a page, its data and its sockets, in a thread of its own.
 
     Attributes:
-        address: Address, with the secret.
-        control: Control of the arm.
+        address: Address of the page, with its secrets.
     """
 
     def __init__(
         self,
         config: AddressConfig,
-        control: Control,
         contents: Mapping[str, Content],
-        callbacks: GateCallbacks,
-        viewer: str,
-        secret: str,
+        routes: Mapping[str, Route],
+        data: Callable[[str], Content] | None = None,
     ):
         """Bind the port; no client is accepted before `start`.
 
         Args:
             config: Host, port and certificate.
-            control: Control of the arm.
-            contents: Content by path.
-            callbacks: Callbacks of the page.
-            viewer: Address of viser's socket.
-            secret: Secret that viser's socket requires.
+            contents: Public content by path.
+            routes: Conversations by the first part of the path of a socket. "session" needs the
+                secret; the others need an open session of the same client.
+            data: Content of a path for clients with the secret, called in threads; raises
+                `RefusedError`.
 
         Raises:
             ValueError: The page cannot be served at this address, or not securely.
         """
         self._context = tls_context(config)
         self._socket = listening_socket(config)
-        self._config, self.control, self._contents = config, control, contents
-        self._callbacks, self._viewer, self._secret = callbacks, viewer, secret
+        self._contents = {**folder_contents(_STATIC), **contents}
+        self._routes, self._data = routes, data
+        self._most_clients = config.most_clients
         port = self._socket.getsockname()[1]
         self._admission = Admission(config, port, tls=self._context is not None)
         self.address = self._admission.address
-        self._sessions: dict[str, ServerConnection] = {}
-        self._views: dict[str, ServerConnection] = {}
-        self._open = 0
+        self._open: dict[str, dict[str, ServerConnection]] = {name: {} for name in routes}
+        self._visitors: dict[str, Visitor] = {}
         self._ready, self._farewell = Event(), ""
         self._failure: BaseException | None = None
         self._thread = Thread(target=self._run, name="page gate", daemon=True)
 
     def start(self) -> None:
-        """Let people in.
+        """Accept clients.
 
         Raises:
-            Exception: Whatever kept the gate's thread from serving.
+            Exception: The gate's thread cannot serve.
         """
         self._thread.start()
         self._ready.wait()
@@ -170,8 +156,12 @@ class Gate:
             self._thread.join()
             raise self._failure
 
-    def close(self, words: str) -> None:
-        """Tell everybody that it is over, and why, and stop."""
+    def wait(self) -> None:
+        """Wait until the gate is closed by another thread, or for Ctrl-C."""
+        self._thread.join()
+
+    def close(self, words: str = "") -> None:
+        """Send a farewell to all clients, and stop."""
         self._farewell = words
         if self._thread.is_alive():
             with suppress(RuntimeError):  # it has just ended
@@ -197,13 +187,13 @@ class Gate:
             self._handle,
             sock=self._socket,
             ssl=self._context,
-            process_request=self._admit,
+            process_request=self._answer,
             select_subprotocol=lambda _, offered: next(
-                (name for name in offered if name.startswith("viser-v")), None
+                (name for name in offered if not name.startswith(_SECRET)), None
             ),
             max_size=_LARGEST,
             compression=None,
-            open_timeout=5,
+            open_timeout=_HANDSHAKE,
             close_timeout=1,
             ping_interval=5,
             ping_timeout=10,
@@ -212,218 +202,147 @@ class Gate:
             self._ready.set()
             await self._end.wait()
             words = json.dumps({"type": "end", "words": self._farewell})
-            for session in list(self._sessions.values()):
+            for session in list(self._open["session"].values()):
                 with suppress(Exception):  # the client may be gone
                     await asyncio.wait_for(session.send(words), 0.5)
 
-    # Admission.
-
-    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+    async def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket through."""
-        verdict = self._admission.refuse(
-            request.path,
-            request.headers.get("Host", ""),
-            request.headers.get_all("Cookie"),
-            self._contents.__contains__,
-        )
-        if verdict is not None:
-            words = f"{verdict.words}\n".encode() if verdict.words else b""
-            return _response(verdict.code, words, _PLAIN, **verdict.headers)
-        parts = urlsplit(request.path)
-        if request.headers.get("Upgrade", "").lower() != "websocket":
-            content = self._contents.get(parts.path)
-            if content is None:
-                return _refused(404, "There is nothing here.")
-            return _response(200, content.body, content.kind)
-        if not self._admission.from_ours(request.headers.get("Origin", "")):
-            return _refused(403, "Another site may not connect.")
-        route, _, client = parts.path.strip("/").partition("/")
-        if route not in ("session", "view") or not 16 <= len(client) <= 64:
-            return _refused(404, "There is nothing here.")
-        if self._open >= _CONNECTIONS:
-            return _refused(503, "Too many connections.")
-        return None
+        try:
+            hosts = request.headers.get_all("Host")
+            if len(hosts) != 1 or not self._admission.is_ours(hosts[0]):
+                raise RefusedError(403, "This page is not served under that name.")
+            if request.headers.get("Upgrade", "").lower() == "websocket":
+                await self._admit(request)
+                return None
+            content = await self._content(request)
+        except RefusedError as error:
+            return _response(error.code, Content(body=f"{error}\n".encode(), kind=_PLAIN))
+        except Exception as error:  # a fault of ours ends this request only
+            _logger.exception("%s failed", request.path)
+            words = f"{type(error).__name__}: {error}\n"
+            return _response(500, Content(body=words.encode(), kind=_PLAIN))
+        return _response(200, content)
 
-    # What they may say.
+    async def _content(self, request: Request) -> Content:
+        path = _path(request)
+        if path in self._contents:
+            return self._contents[path]
+        kind, _, secret = request.headers.get("Authorization", "").partition(" ")
+        self._admission.right(secret if kind == "Bearer" else "")
+        if path == "/admitted":
+            return Content(body=b"", kind=_PLAIN)
+        if self._data is None:
+            raise RefusedError(404, "There is nothing here.")
+        return await asyncio.to_thread(self._data, path)
+
+    async def _admit(self, request: Request) -> None:
+        """Check a socket that asks to be opened.
+
+        Raises:
+            RefusedError: It may not be.
+        """
+        if not self._admission.from_ours(request.headers.get("Origin", "")):
+            raise RefusedError(403, "Another site may not connect.")
+        route, client = _place(request)
+        if route not in self._routes or not 16 <= len(client) <= 64:
+            raise RefusedError(404, "There is nothing here.")
+        if route == "session":
+            self._admission.right(_secret(request))
+            return
+        for _ in range(round(_SESSION_WAIT / 0.05)):
+            if client in self._visitors:
+                return
+            await asyncio.sleep(0.05)
+        raise RefusedError(401, "This client has no session.")
 
     async def _handle(self, connection: ServerConnection) -> None:
-        assert connection.request is not None
-        route, _, client = urlsplit(connection.request.path).path.strip("/").partition("/")
-        table = self._sessions if route == "session" else self._views
-        if client in table or len(table) >= self._config.most_clients:
+        from websockets.exceptions import ConnectionClosed
+
+        request = connection.request
+        assert request is not None
+        route, client = _place(request)
+        table = self._open[route]
+        if client in table or len(table) >= self._most_clients:
             await connection.close(_FULL, "as many people are here as may be")
             return
         table[client] = connection
-        self._open += 1
         try:
-            await (self._session if route == "session" else self._view)(connection, client)
+            if route == "session":
+                right = self._admission.right(_secret(request))
+                self._visitors[client] = Visitor(client=client, right=right)
+            await self._routes[route](connection, self._visitors[client])
+        except ConnectionClosed:
+            pass
         except MessageError as error:
             await connection.close(_TOO_MUCH, str(error)[:120])
+        except Exception:  # a fault of ours ends this client only
+            _logger.exception("a client of %s failed", route)
+            await connection.close(_FAILED, "the program failed on a message")
         finally:
-            self._open -= 1
             del table[client]
-
-    async def _session(self, connection: ServerConnection, client: str) -> None:
-        """Serve our own clients: signs of life, control requests and hands in, status out."""
-        self.control.join(client)
-        wants = {"scene": False}
-
-        async def listen() -> None:
-            bucket = Bucket(rate=_RATE, burst=_BURST)
-            async for raw in connection:
-                if not bucket.take():
-                    raise MessageError("too many messages")
-                self._hear(client, session_message(raw), wants)
-
-        async def tell() -> None:
-            status, last = 0.0, None
-            while True:
-                now = time.monotonic()
-                content: dict[str, Any] = {}
-                if now - status >= _STATUS_EVERY:
-                    status, view = now, vars(self.control.view(client))
-                    content = {"status": {**self._callbacks.status(), **view}, "clock": now}
-                if wants["scene"] and (scene := self._callbacks.scene()) is not last:
-                    last, content["scene"] = scene, scene
-                if content:
-                    await connection.send(json.dumps({"type": "state", **content}))
-                await asyncio.sleep(_SCENE_EVERY if wants["scene"] else _STATUS_EVERY)
-
-        try:
-            await _first(listen(), tell())
-        finally:
-            self.control.leave(client)
-
-    def _hear(self, client: str, message: Message, wants: dict[str, bool]) -> None:
-        match message:
-            case Beat(lag=lag, echo=echo):
-                delay = 0.0 if echo is None else max(time.monotonic() - echo, 0.0)
-                self.control.hear(client, lag, delay)
-            case Hello():
-                wants["scene"] = message.wants == "scene"
-            case Lead(wish="ask"):
-                self.control.ask(client)
-            case Lead():
-                self.control.hand_over(client)
-            case _:
-                # A watching client may have had control when it sent this: no error.
-                idle = isinstance(message, Hands) and not message.grips
-                if self.control.act(client, idle=idle):
-                    self._callbacks.heard(message)
-
-    async def _view(self, connection: ServerConnection, client: str) -> None:
-        """The page of viser: what fits goes on to it, and all that it says comes back."""
-        from websockets.asyncio.client import connect
-        from websockets.typing import Subprotocol
-
-        protocols = [Subprotocol(connection.subprotocol)] if connection.subprotocol else None
-        async with connect(
-            self._viewer,
-            subprotocols=protocols,
-            additional_headers={SECRET_HEADER: self._secret},
-            max_size=None,
-            compression=None,
-            ping_interval=None,
-            proxy=None,
-        ) as viewer:
-
-            async def up() -> None:
-                bucket = Bucket(rate=_RATE, burst=_BURST)
-                async for raw in connection:
-                    if not bucket.take():
-                        raise MessageError("too many messages")
-                    message = view_message(raw)
-                    if isinstance(message.content, GuiUpdate) and not self._callbacks.fits(
-                        message.content
-                    ):
-                        raise MessageError("no value of that control")
-                    if not message.acts or self.control.act(client):
-                        await viewer.send(raw)
-
-            async def down() -> None:
-                async for raw in viewer:
-                    await connection.send(raw)
-
-            await _first(up(), down())
+            if route == "session":
+                del self._visitors[client]
+                for others in self._open.values():
+                    if client in others:
+                        await others[client].close()
 
 
-async def _first(*work: Awaitable[None]) -> None:
-    """Wait until one ends, and end the others; a connection that closes is no error."""
-    from websockets.exceptions import ConnectionClosed
-
+async def first_of(*work: Awaitable[None]) -> None:
+    """Wait until one ends, and end the others."""
     tasks = [asyncio.ensure_future(one) for one in work]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
-            error = task.exception()
-            if error is not None and not isinstance(error, ConnectionClosed):
-                raise error
+            task.result()
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
+_STATIC = Path(__file__).parent / "static"
+_PLAIN = "text/plain; charset=utf-8"
+
+
+def _path(request: Request) -> str:
+    try:
+        return urlsplit(request.path).path
+    except ValueError as error:
+        raise RefusedError(400, "That is no address.") from error
+
+
+def _place(request: Request) -> tuple[str, str]:
+    """Route and client of a socket's path."""
+    route, _, client = _path(request).strip("/").partition("/")
+    return route, client
+
+
+def _secret(request: Request) -> str:
+    """Secret among the subprotocols that a client offers."""
+    offered = ",".join(request.headers.get_all("Sec-WebSocket-Protocol"))
+    words = [word.strip() for word in offered.split(",")]
+    return next((w.removeprefix(_SECRET) for w in words if w.startswith(_SECRET)), "")
+
+
 def _quiet_logger() -> logging.Logger:
     """Drop log lines about refused clients, which could otherwise flood the terminal."""
-    logger = logging.getLogger("hrc_learn.gate")
+    logger = logging.getLogger("hrc_learn.gate.sockets")
     if not logger.filters:
         logger.addFilter(lambda record: not record.getMessage().startswith("opening handshake"))
     return logger
 
 
-_PLAIN = "text/plain; charset=utf-8"
-
-
-def _refused(code: int, words: str) -> Response:
-    return _response(code, f"{words}\n".encode(), _PLAIN)
-
-
-def _response(code: int, body: bytes, kind: str, **more: str) -> Response:
+def _response(code: int, content: Content) -> Response:
     from websockets.datastructures import Headers
     from websockets.http11 import Response
 
     headers = Headers(
         {
-            "Content-Type": kind,
-            "Content-Length": str(len(body)),
-            **HEADERS,
-            "Permissions-Policy": "xr-spatial-tracking=(self)",
+            "Content-Type": content.kind,
+            "Content-Length": str(len(content.body)),
             "Connection": "close",
-            **more,
+            **HEADERS,
         }
     )
-    return Response(code, http.HTTPStatus(code).phrase, headers, body)
-
-
-SECRET_HEADER = "X-Page-Secret"
-
-
-@contextmanager
-def guarded_servers(secret: str):
-    """Make servers of `websockets` created within this block require a secret.
-
-    viser has no hook to check its clients, and serves any that reach its port, including any
-    site open in a browser of this machine.
-
-    Args:
-        secret: Required value of the header `SECRET_HEADER`.
-    """
-    import websockets.asyncio.server as server
-
-    plain = server.serve
-
-    def serve(*args: Any, **options: Any) -> Any:
-        def check(connection: ServerConnection, request: Request) -> Response | None:
-            given = request.headers.get(SECRET_HEADER, "")
-            if same_secret(given, secret):
-                return None
-            return _refused(403, "This port is not for browsers.")
-
-        return plain(*args, **{**options, "process_request": check})
-
-    server.serve = serve  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        server.serve = plain
+    return Response(code, http.HTTPStatus(code).phrase, headers, content.body)

@@ -1,15 +1,16 @@
 """Schemas of the messages that browsers may send: those of our own clients, and of viser's
 page.
 
-A message that fits no schema raises `MessageError` and is dropped.
+A message that fits no schema raises `MessageError`. Decoders go no deeper than the schema does.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
 
 from hrc_learn.protocols import Request
 
@@ -18,114 +19,92 @@ REACH = 10.0
 _LONGEST_TEXT = 200
 _MOST_GRIPS = 4
 
-Point = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+_Number = Annotated[float, Meta(ge=-1e9, le=1e9)]  # finite
+_Coordinate = Annotated[float, Meta(ge=-REACH, le=REACH)]
+_Pair = tuple[_Number, _Number]
+_Vector = tuple[_Number, _Number, _Number]
+Point = tuple[_Coordinate, _Coordinate, _Coordinate]
+"""Point near the arm, in the base frame [m]."""
+Quaternion = tuple[_Number, _Number, _Number, _Number]
+_Time = Annotated[float, Meta(ge=0, le=1e12)]
+_Text = Annotated[str, Meta(max_length=_LONGEST_TEXT)]
+_Positive = Annotated[float, Meta(gt=0, le=REACH)]
 
 
 class MessageError(ValueError):
     """A message that no client of ours sends."""
 
 
-def _near(*points: Point | None) -> None:
-    for point in points:
-        if point is not None and max(map(abs, point)) > REACH:
-            raise ValueError(f"a point must lie within {REACH} m of the arm, but is {point}.")
+class _Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    pass
 
 
-def _unit(orientation: Quaternion) -> None:
+def _check_unit(orientation: Quaternion) -> None:
     if abs(math.hypot(*orientation) - 1) > 1e-3:  # browsers compute in single precision
         raise ValueError(f"an orientation must be a unit quaternion, but is {orientation}.")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Beat:
+class Beat(_Message, tag="beat"):
     """A sign of life, several times a second."""
 
-    lag: float
+    lag: _Time
     """Time since the page last responded [s]."""
-    echo: float | None = None
+    echo: _Time | None = None
     """Last server time that the client received, returned at once to measure the round trip."""
 
-    def __post_init__(self) -> None:
-        if self.lag < 0:
-            raise ValueError(f"lag must not be negative, but is {self.lag}.")
 
-
-@dataclass(frozen=True, kw_only=True)
-class Hello:
+class Hello(_Message, tag="hello"):
     """Subscription of a client: status only, or also the moving scene."""
 
     wants: Literal["status", "scene"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Lead:
+class Lead(_Message, tag="lead"):
     """Request for control, or hand-over."""
 
     wish: Literal["ask", "hand_over"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Ask:
+class Ask(_Message, tag="ask"):
     """Start, stop, save, ..."""
 
     request: Request
 
 
-@dataclass(frozen=True, kw_only=True)
-class Task:
+class Task(_Message, tag="task"):
     """Description of the task."""
 
-    task: str
-
-    def __post_init__(self) -> None:
-        if len(self.task) > _LONGEST_TEXT:
-            raise ValueError(f"a task has {_LONGEST_TEXT} characters at most.")
+    task: _Text
 
 
-@dataclass(frozen=True, kw_only=True)
-class Gripper:
+class Gripper(_Message, tag="gripper"):
     """Open or close."""
 
-    width: float
+    # The widest of our parallel grippers opens by 0.14 m.
+    width: Annotated[float, Meta(ge=0, le=0.3)]
     """[m]"""
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.width <= 0.3:  # the widest parallel gripper of ours opens by 0.14 m
-            raise ValueError(f"width must be 0 to 0.3 m, but is {self.width}.")
 
-
-@dataclass(frozen=True, kw_only=True)
-class Region:
+class Region(_Message, tag="region"):
     """The box drawn."""
 
     centre: Point
-    half_size: Point
+    half_size: tuple[_Positive, _Positive, _Positive]
     active: bool
 
-    def __post_init__(self) -> None:
-        _near(self.centre, self.half_size)
-        if min(self.half_size) <= 0:
-            raise ValueError(f"half_size must be positive, but is {self.half_size}.")
 
-
-@dataclass(frozen=True, kw_only=True)
-class Target:
-    """The point marked; None: none is."""
+class Target(_Message, tag="target"):
+    """The point marked; None: there is none."""
 
     point: Point | None
 
-    def __post_init__(self) -> None:
-        _near(self.point)
 
-
-@dataclass(frozen=True, kw_only=True)
-class Grip:
+class Grip(_Message):
     """Link or end effector held by one hand."""
 
     hand: Literal["left", "right", "touch"]
-    joint: int | None
-    """That moves the link held, counted from 1; None: the end effector."""
+    joint: Annotated[int, Meta(ge=1, le=100)] | None
+    """Joint that moves the link held, counted from 1; None: the end effector."""
     start: Point
     """Point at which the hand took hold, in the base frame [m]."""
     pointer: Point
@@ -136,15 +115,11 @@ class Grip:
     """
 
     def __post_init__(self) -> None:
-        _near(self.start, self.pointer)
-        if self.joint is not None and self.joint < 1:
-            raise ValueError(f"joints count from 1, but joint is {self.joint}.")
         if self.orientation is not None:
-            _unit(self.orientation)
+            _check_unit(self.orientation)
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackedHand:
+class TrackedHand(_Message):
     """Tracked pose of a hand, holding an object or not."""
 
     hand: Literal["left", "right"]
@@ -154,103 +129,79 @@ class TrackedHand:
     """Orientation of the hand's grip (wxyz, base frame)."""
 
     def __post_init__(self) -> None:
-        _near(self.position)
-        _unit(self.orientation)
+        _check_unit(self.orientation)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Hands:
-    """All that is held now: what is not named is let go."""
+class Hands(_Message, tag="hands"):
+    """All that is held now; anything not named is released."""
 
-    grips: tuple[Grip, ...]
-    tracked: tuple[TrackedHand, ...] = ()
+    grips: Annotated[tuple[Grip, ...], Meta(max_length=_MOST_GRIPS)]
+    tracked: Annotated[tuple[TrackedHand, ...], Meta(max_length=2)] = ()
     """Hands that are seen now."""
-    sent: float = 0.0
+    sent: _Time = 0.0
     """Clock of the client, returned with the status: to measure the round trip."""
 
     def __post_init__(self) -> None:
-        if len(self.grips) > _MOST_GRIPS:
-            raise ValueError(f"{_MOST_GRIPS} hands at most.")
-        if len({grip.hand for grip in self.grips}) < len(self.grips):
-            raise ValueError("a hand holds one thing.")
-        if len({seen.hand for seen in self.tracked}) < len(self.tracked):
-            raise ValueError("a hand is in one place.")
+        for hands in (self.grips, self.tracked):
+            if len({one.hand for one in hands}) < len(hands):
+                raise ValueError("a hand holds one thing and is in one place.")
 
 
 Message = Beat | Hello | Lead | Ask | Task | Gripper | Region | Target | Hands
-_MESSAGES = {
-    kind.__name__.lower(): kind
-    for kind in (Beat, Hello, Lead, Ask, Task, Gripper, Region, Target, Hands)
-}
 
 
-def session_message(raw: str | bytes) -> Message:
-    """A message of our own clients, in JSON.
+class Decide(_Message, tag="decide"):
+    """Decision on an episode of a dataset."""
 
-    Raises:
-        MessageError: It fits no schema.
-    """
-    import msgspec
-
-    try:
-        content = msgspec.json.decode(raw)
-        _check_finite(content)
-        return msgspec.convert(content, _MESSAGES[content.pop("type")])
-    except (msgspec.MsgspecError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise MessageError(f"no message of ours: {error}") from error
+    episode: int
+    verdict: Literal["accept", "cut", "reject"] | None
+    """None takes an earlier decision back."""
+    start: int = 0
+    """First frame of the part that is kept."""
+    stop: int = 0
+    """Frame after the last."""
 
 
-def _check_finite(content: Any, depth: int = 0) -> None:
-    if isinstance(content, float) and not math.isfinite(content):
-        raise ValueError("numbers must be finite")
-    if depth > 8:  # the deepest of ours has 5
-        raise ValueError("too deep")
-    if isinstance(content, Mapping):
-        content = [*content.values()]
-    if isinstance(content, list | tuple):
-        for part in content:
-            _check_finite(part, depth + 1)
+class Write(_Message, tag="write"):
+    """Request to write the cleaned dataset."""
 
 
-# Of viser's page. Names and fields are those of its own messages: what it adds in a later
-# version is refused until it is listed here, which tests in a browser show.
-
-_Pair = tuple[float, float]
+CurationMessage = Decide | Write
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Camera:
+# Messages of viser's page, with its own names and fields. A field that a later version adds is
+# refused until it is listed here, which tests in a browser show.
+
+
+class _Camera(_Message, tag="ViewerCameraMessage"):
     wxyz: Quaternion
-    position: Point
-    fov: float
-    near: float
-    far: float
+    position: _Vector
+    fov: _Number
+    near: _Number
+    far: _Number
     image_height: int
     image_width: int
-    look_at: Point
-    up_direction: Point
+    look_at: _Vector
+    up_direction: _Vector
 
     def __post_init__(self) -> None:
-        _unit(self.wxyz)
+        _check_unit(self.wxyz)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _StoredItem:
+class _StoredItem(_Message, tag="LocalStorageGetItemResponseMessage"):
     request_uuid: str
     value: str | None
     error: str | None
 
 
-@dataclass(frozen=True, kw_only=True)
-class GuiUpdate:
+class GuiUpdate(_Message, tag="GuiUpdateMessage"):
     """A control of the panel that has been used."""
 
     uuid: str
-    updates: dict[str, bool | float | str]
+    updates: dict[str, bool | _Number | str]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Drag:
+class _Drag(_Message, tag="SceneNodeDragMessage"):
     phase: Literal["start", "update", "end"]
     name: str
     start_position: Point
@@ -262,82 +213,80 @@ class _Drag:
     modifier: str | None = None
     owner: str = ""
 
-    def __post_init__(self) -> None:
-        _near(self.start_position, self.end_position)
 
-
-@dataclass(frozen=True, kw_only=True)
-class _Pointer:
+class _Pointer(_Message, tag="ScenePointerMessage"):
     event_type: Literal["click", "rect-select"]
-    ray_origin: Point | None
-    ray_direction: Point | None
-    screen_pos: tuple[_Pair, ...]
+    ray_origin: _Vector | None
+    ray_direction: _Vector | None
+    screen_pos: Annotated[tuple[_Pair, ...], Meta(max_length=2)]
     modifier: str | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Turned:
+class _Turned(_Message, tag="TransformControlsUpdateMessage"):
     name: str
     wxyz: Quaternion
     position: Point
     owner: str = ""
 
     def __post_init__(self) -> None:
-        _unit(self.wxyz)
-        _near(self.position)
+        _check_unit(self.wxyz)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Named:
+class _TurnStart(_Message, tag="TransformControlsDragStartMessage"):
     name: str
     owner: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Command:
+class _TurnEnd(_Message, tag="TransformControlsDragEndMessage"):
+    name: str
+    owner: str = ""
+
+
+class _Command(_Message, tag="CommandTriggerMessage"):
     uuid: str
 
 
-_WATCHING: dict[str, type] = {
-    "ViewerCameraMessage": _Camera,
-    "LocalStorageGetItemResponseMessage": _StoredItem,
-}
-_LEADING: dict[str, type] = {
-    "GuiUpdateMessage": GuiUpdate,
-    "SceneNodeDragMessage": _Drag,
-    "ScenePointerMessage": _Pointer,
-    "TransformControlsUpdateMessage": _Turned,
-    "TransformControlsDragStartMessage": _Named,
-    "TransformControlsDragEndMessage": _Named,
-    "CommandTriggerMessage": _Command,
+_Watching = _Camera | _StoredItem
+ViewMessage = (
+    _Watching | GuiUpdate | _Drag | _Pointer | _Turned | _TurnStart | _TurnEnd | _Command
+)
+"""A message of viser's page; see `acts`."""
+
+_DECODERS: dict[str, Any] = {
+    "session": msgspec.json.Decoder(Message),
+    "curation": msgspec.json.Decoder(CurationMessage),
+    "view": msgspec.msgpack.Decoder(ViewMessage),
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViewMessage:
-    """A message of viser's page that fits its schema."""
+def acts(message: Any) -> bool:
+    """True if a message of viser's page acts on the arm or the session."""
+    return not isinstance(message, _Watching)
 
-    content: Any
-    acts: bool
-    """True if the message acts on the arm or the session."""
+
+def _decoded(kind: str, raw: str | bytes) -> Any:
+    if kind == "view" and isinstance(raw, str):
+        raise MessageError("viser's messages are binary.")
+    try:
+        return _DECODERS[kind].decode(raw)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MessageError(f"not a message of this page: {error}") from error
+
+
+def session_message(raw: str | bytes) -> Message:
+    """Decode a message of our own clients, in JSON.
+
+    Raises:
+        MessageError: It fits no schema.
+    """
+    return _decoded("session", raw)
+
+
+def curation_message(raw: str | bytes) -> CurationMessage:
+    """Decode a message of the curation page, in JSON; errors as in `session_message`."""
+    return _decoded("curation", raw)
 
 
 def view_message(raw: str | bytes) -> ViewMessage:
-    """A message of viser's page, in MessagePack.
-
-    Raises:
-        MessageError: It is none that the page needs, or does not fit its schema.
-    """
-    import msgspec
-
-    try:
-        if isinstance(raw, str):
-            raise ValueError("viser's messages are binary")
-        content = msgspec.msgpack.decode(raw)
-        _check_finite(content)
-        name = content.pop("type")
-        acts = name in _LEADING
-        schema = (_LEADING if acts else _WATCHING)[name]
-        return ViewMessage(content=msgspec.convert(content, schema), acts=acts)
-    except (msgspec.MsgspecError, AttributeError, KeyError, TypeError, ValueError) as error:
-        raise MessageError(f"no message of the page: {error}") from error
+    """Decode a message of viser's page, in MessagePack; errors as in `session_message`."""
+    return _decoded("view", raw)

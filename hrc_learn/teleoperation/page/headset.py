@@ -148,16 +148,8 @@ def scene_state(
     }
 
 
-def headset_contents(
-    bodies: Sequence[Body], boxes: Sequence[Box], **more: Any
-) -> dict[str, Content]:
-    """Files of the headset client by path; empty if it has not been built.
-
-    Args:
-        bodies: Moving bodies.
-        boxes: Fixed boxes.
-        more: Further entries of the description, such as the page's features.
-    """
+def headset_contents() -> dict[str, Content]:
+    """Public files of the headset client by path; empty if it has not been built."""
     built = CLIENT / "built"
     if not (built / "client.js").is_file():
         return {}
@@ -167,14 +159,24 @@ def headset_contents(
         "/xr/client.js": built / "client.js",
         "/xr/licences.txt": built / "licences.txt",
     }
+    return {path: Content.of(file.name, file.read_bytes()) for path, file in files.items()}
+
+
+def headset_data(
+    bodies: Sequence[Body], boxes: Sequence[Box], **more: Any
+) -> dict[str, Content]:
+    """Scene for the headset client by path, for clients with the secret.
+
+    Args:
+        bodies: Moving bodies.
+        boxes: Fixed boxes.
+        more: Further entries of the description, such as the page's features.
+    """
     made = {
         "scene.glb": scene_glb(bodies, [*boxes, PEDESTAL]),
         "scene.json": json.dumps({"bodies": [*map(_held, bodies)], **more}).encode(),
     }
-    return {
-        **{path: Content.of(file.name, file.read_bytes()) for path, file in files.items()},
-        **{f"/xr/{name}": Content.of(name, body) for name, body in made.items()},
-    }
+    return {f"/xr/{name}": Content.of(name, body) for name, body in made.items()}
 
 
 def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
-import secrets
+import logging
 import time
 from collections.abc import Hashable, Mapping, Sequence
+from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -20,14 +23,8 @@ from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.teleoperation.devices import RumbleConfig, rumble_strength
-from hrc_learn.teleoperation.gate import (
-    AddressConfig,
-    Control,
-    Gate,
-    GateCallbacks,
-    guarded_servers,
-    page_contents,
-)
+from hrc_learn.teleoperation.gate import AddressConfig, Content, Control, Gate
+from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.control import Link
 from hrc_learn.teleoperation.gate.messages import (
     Ask,
@@ -41,6 +38,7 @@ from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, steerin
 from hrc_learn.teleoperation.page.headset import (
     HeadsetHands,
     headset_contents,
+    headset_data,
     scene_state,
 )
 from hrc_learn.teleoperation.page.page_operator import (
@@ -52,6 +50,11 @@ from hrc_learn.teleoperation.page.page_operator import (
     gizmo_command,
 )
 from hrc_learn.teleoperation.page.page_scene import Gizmos, PageScene
+from hrc_learn.teleoperation.page.page_sockets import (
+    PageSockets,
+    guarded_viser,
+    page_contents,
+)
 from hrc_learn.teleoperation.page.panel import OPEN, PageStatus, Panel, felt_words
 from hrc_learn.viz.palette import followed_colour
 
@@ -100,6 +103,11 @@ _APART = 0.1
 _PULSES = RumbleConfig()  # a headset's controllers shake as a gamepad does
 _SLOW = 0.25  # round trip from which drags visibly lag [s]
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
+_MOST_FAILURES = 25
+"""Refreshes in a row that may fail before the page ends: one second of them. Each failure asks
+for no motion, as nothing is posted."""
+
+_logger = logging.getLogger("hrc_learn.page")
 
 
 class Page:
@@ -113,11 +121,13 @@ class Page:
                 page.show(status)
 
     The control loop pays for `human.read`, `place` and `show` only, which exchange references.
+    viser's objects are changed in viser's own event loop only, as its queues break otherwise.
 
     Attributes:
         human: Combined input of the people at the page.
         address: Address of the page.
         url: Link with the secret. Anyone with this link can move the arm.
+        watch_url: Link for watching only.
         headset_url: Link for headsets and phones; empty if that client is not built.
         control: Control of the arm by one client at a time.
         farewell: Text shown in browsers when the page is closed.
@@ -157,38 +167,23 @@ class Page:
         self.control = control = Control(config.silence, config.timeout)
         self.human = PageHuman(len(chain.joint_names), present=lambda: control.present)
         draws = guides if draws is None else draws
-        headset = headset_contents(
-            bodies,
-            boxes,
-            touch_points=config.touch_points,
-            guides=guides,
-            draws=draws,
-            task=task,
-            opening=OPEN,
+        headset = headset_contents()
+        features = {"guides": guides, "draws": draws, "task": task, "opening": OPEN}
+        features["touch_points"] = config.touch_points
+        self._data = headset_data(bodies, boxes, **features) if headset else {}
+        self._server, secret = guarded_viser()
+        self._sockets = PageSockets(
+            control, self._heard, self._fits, self._told, self._server.get_port(), secret
         )
-        secret = secrets.token_urlsafe(18)
-        # It prints its own address, which is of no use to people.
-        with guarded_servers(secret), contextlib.redirect_stdout(io.StringIO()):
-            self._server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        routes = {"session": self._sockets.session, "view": self._sockets.view}
+        contents = {**page_contents(Path(viser.__file__).parent), **headset}
         try:
-            self._gate = Gate(
-                config,
-                self.control,
-                {**page_contents(Path(viser.__file__).parent), **headset},
-                GateCallbacks(
-                    heard=self._heard,
-                    fits=self._fits,
-                    status=self._told,
-                    scene=lambda: self._scene_state,
-                ),
-                viewer=f"ws://127.0.0.1:{self._server.get_port()}",
-                secret=secret,
-            )
+            self._gate = Gate(config, contents, routes, self._answer)
         except ValueError:
             self._stop_viewer()
             raise
         self.address = self._gate.address
-        self.url = self.address.link()
+        self.url, self.watch_url = self.address.link(), self.address.link(watch=True)
         self.headset_url = self.address.link("/xr") if headset else ""
         self._wake = Event()
         self._held_gizmos, self._turn = HeldGizmos(self._wake.set), AddedTurn()
@@ -226,7 +221,7 @@ class Page:
         self.farewell = "The session has ended."
         self._last_turn, self._last_turn_lock = self.control.turn, Lock()
         self._asked = 0.0
-        self._scene_state: dict[str, Any] = {}
+        self._drawing: Future[None] | None = None
         self._thread = Thread(target=self._guarded, name="page refresh", daemon=True)
 
     def __enter__(self) -> Page:
@@ -238,6 +233,8 @@ class Page:
         self._closing.set()
         self._wake.set()
         self._thread.join()
+        if self._drawing is not None:
+            wait([self._drawing])
         self._gate.close(self.farewell)
         self._stop_viewer()
         if self._error is not None and error is None:
@@ -279,54 +276,81 @@ class Page:
         """Tell how the session stands."""
         self._status = status
 
-    def _guarded(self) -> None:
-        try:
-            self._refresh()
-        except Exception as error:  # handed over to the thread that closes
-            self._error = error
+    def _answer(self, path: str) -> Content:
+        if path not in self._data:
+            raise RefusedError(404, "There is nothing here.")
+        return self._data[path]
 
     def _links(self) -> Pose | None:
         state = self.human.state
         return None if state is None else self._chain.link_poses(_joints(state))
 
-    def _refresh(self) -> None:
+    def _guarded(self) -> None:
         """Follow the arm, and renew what is asked of it: at once when hands have moved."""
-        period, ticks, due = 1 / self._config.refresh, 0, 0.0
+        period, due, ticks, failures = 1 / self._config.refresh, 0.0, 0, 0
         while not self._closing.is_set():
             self._wake.wait(max(due - time.monotonic(), 0.0))
             self._wake.clear()
-            state = self.human.state
-            if state is None:
-                due = time.monotonic() + period
-                continue
-            command = self._command(state)
-            links = self._chain.link_poses(_joints(state))
-            feedback = self.human.feedback
+            try:
+                command = self._refresh()
+                if time.monotonic() >= due:
+                    due = time.monotonic() + period
+                    if command is not None:
+                        self._draw(command, panel=ticks % _PANEL_EVERY == 0)
+                        ticks += 1
+                failures = 0
+            except Exception as error:
+                failures, due = failures + 1, time.monotonic() + period
+                _logger.exception("the page could not follow the arm")
+                if failures >= _MOST_FAILURES:  # handed over to the thread that closes
+                    self._error = error
+                    return
+
+    def _refresh(self) -> GizmoCommand | None:
+        """Renew the input and the scene of headsets; None before the arm is known."""
+        state = self.human.state
+        if state is None:
+            return None
+        command = self._command(state)
+        scene = scene_state(
+            *self._poses,
+            self._chain.link_poses(_joints(state)),
+            command.arrows,
+            followed_colour(self.human.feedback.followed),
+            self._status.region,
+            *self._panel.drawn,
+            self._status.plan,
+        )
+        self._sockets.scene = msgspec.Raw(msgspec.json.encode(scene))
+        return command
+
+    def _draw(self, command: GizmoCommand, *, panel: bool) -> None:
+        """Have viser's event loop draw; a picture that is late is left out.
+
+        Raises:
+            Exception: The last picture failed.
+        """
+        if self._drawing is not None:
+            if not self._drawing.done():
+                return
+            drawn, self._drawing = self._drawing, None
+            drawn.result()
+
+        async def draw() -> None:
+            links, feedback = self._links(), self.human.feedback
+            assert links is not None
             colour = followed_colour(feedback.followed)
-            self._scene_state = scene_state(
-                *self._poses,
-                links,
-                command.arrows,
-                colour,
-                self._status.region,
-                *self._panel.drawn,
-                self._status.plan,
-            )
-            if time.monotonic() < due:
-                continue
-            due = time.monotonic() + period
-            with self._server.atomic():
-                self._scene.move(*self._poses, links.position.numpy())
-                self._scene.point(command.arrows, colour, command.held)
-                self._scene.show_region(self._status.region)
-                self._gizmos.follow(links[-1])
-                if ticks % _PANEL_EVERY == 0:
-                    people = self.control.people
-                    self._panel.refresh(
-                        self._status, command.nullspace_input, self._rate(), people
-                    )
-                    self._panel.tell(feedback)
-            ticks += 1
+            self._scene.move(*self._poses, links.position.numpy())
+            self._scene.point(command.arrows, colour, command.held)
+            self._scene.show_region(self._status.region)
+            self._gizmos.follow(links[-1])
+            if panel:
+                people = self.control.people
+                self._panel.refresh(self._status, command.nullspace_input, self._rate(), people)
+                self._panel.tell(feedback)
+
+        loop = self._server.get_event_loop()
+        self._drawing = asyncio.run_coroutine_threadsafe(draw(), loop)
 
     def _rate(self) -> float:
         """Steps that the loop has taken since the last time this was asked [1/s]."""
@@ -394,7 +418,8 @@ class Page:
             case Ask(request=request):
                 self.human.request(request)
             case _:
-                self._panel.hear(message)
+                loop = self._server.get_event_loop()
+                loop.call_soon_threadsafe(self._panel.hear, message)
 
     def _fits(self, update: GuiUpdate) -> bool:
         return self._panel.fits(update.uuid, update.updates)

@@ -38,6 +38,17 @@ else:
     SceneClickEvent = SceneNodeDragEvent = SceneRectSelectEvent = Any
 
 
+def in_loop[Event](callback: Callable[[Event], object]) -> Callable[[Event], Any]:
+    """A callback that viser calls in its event loop, not in a thread of its pool: its handles
+    may be changed in that loop only.
+    """
+
+    async def called(event: Event) -> None:
+        callback(event)
+
+    return called
+
+
 def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 3"]:
     """Both ends of each edge of a box about the origin [m]."""
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -282,7 +293,7 @@ _CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)
 _ASPECT = 1.2  # of a view at which cabinet and twin are both in it
 
 
-def _step_back(client: ClientHandle) -> None:
+async def _step_back(client: ClientHandle) -> None:
     """Let a camera stand back whose view is narrow, as a phone's is: what is seen stays."""
     aspect = client.camera.aspect
     if aspect < _ASPECT:
@@ -298,7 +309,8 @@ _BASE_AXES = (1.0, 0.0, 0.0, 0.0)  # unit quaternion (wxyz)
 class Gizmos:
     """Lets people hold links, knobs and the end effector's gizmo with the mouse.
 
-    Callbacks are coroutines: the browser's messages then come in their order.
+    Callbacks are coroutines: the browser's messages then come in their order, and in viser's
+    event loop.
     """
 
     def __init__(
@@ -340,7 +352,7 @@ class Gizmos:
                 depth_test=False,
             )
             self._gizmo.on_update(self._gizmo_dragged if guides else self._gizmo_turned)
-        server.on_client_disconnect(lambda client: self._release(client.client_id))
+        server.on_client_disconnect(self._release)
 
     def follow(self, pose: Pose) -> None:
         """Keep the end effector's gizmo at the end effector while it is not held."""
@@ -365,10 +377,10 @@ class Gizmos:
         if self._gizmo is not None:
             self._gizmo.disable_rotations = not rings
 
-    def _release(self, holder: int) -> None:
+    async def _release(self, client: ClientHandle) -> None:
         """Forget a client that has left."""
-        self._held_gizmos.release_all(holder)
-        self._turn.release(holder)
+        self._held_gizmos.release_all(client.client_id)
+        self._turn.release(client.client_id)
 
     def _connect(
         self, node: Holdable, joint: int | None, offset: Float[np.ndarray, "3"]

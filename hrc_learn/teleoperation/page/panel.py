@@ -17,7 +17,7 @@ from hrc_learn.teleoperation.devices import DIRECTIONS, KeyboardState
 from hrc_learn.teleoperation.gate.messages import Gripper, Message, Region, Target, Task
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.page.page_operator import AddedTurn
-from hrc_learn.teleoperation.page.page_scene import ViserServer
+from hrc_learn.teleoperation.page.page_scene import ViserServer, in_loop
 from hrc_learn.teleoperation.page.region_editor import RegionEditor
 from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed_colour
 
@@ -287,7 +287,7 @@ class Panel:
             if guides:
                 self._add_end_effector(let_turn)
             twin = gui.add_checkbox("Virtual twin", True, hint="Hold it instead of the arm.")
-            twin.on_update(lambda _: show_twin(twin.value))
+            twin.on_update(in_loop(lambda _: show_twin(twin.value)))
             first = next(word for word, m in _MAPPINGS.items() if m == forces.mapping)
             pulls = tuple(_MAPPINGS)
             self._mapping = gui.add_dropdown("A pull is a", pulls, initial_value=first)
@@ -295,7 +295,8 @@ class Panel:
         if draws:
             with gui.add_folder("Region, target and turn"):
                 self._region = RegionEditor(server, boxes)
-                gui.add_button("Clear the turn", color="gray").on_click(lambda _: turn.clear())
+                clear = gui.add_button("Clear the turn", color="gray")
+                clear.on_click(in_loop(lambda _: turn.clear()))
                 self._turn_text = gui.add_markdown(_turn_words(None))
         self._seen: Mapping[str, int] = {}
         self._latest = ""
@@ -304,16 +305,14 @@ class Panel:
         """Start, stop, save and discard demonstrations."""
         self._task = self._gui.add_text("Task", task)
         self._switch = self._gui.add_button("Start", color="red", icon=_ICONS["start"])
-        self._switch.on_click(lambda _: request(self._next))
+        self._switch.on_click(in_loop(lambda _: request(self._next)))
         rows: dict[str, dict[str, Request]] = {
             "Keep it?": {"save": "save", "discard": "discard"},
             "Session": {"back to start": "home", "finish": "finish"},
         }
         for label, requests in rows.items():
             group = self._gui.add_button_group(label, tuple(requests))
-            group.on_click(
-                lambda event, requests=requests: request(requests[event.target.value])
-            )
+            group.on_click(in_loop(lambda event, of=requests: request(of[event.target.value])))
             self._keep = self._keep or group  # the first: save and discard
 
     def _add_end_effector(self, let_turn: Callable[[bool, bool], None]) -> None:
@@ -327,14 +326,14 @@ class Panel:
             "Fine turn", False, hint="Rings turn the end effector on top of that rule."
         )
 
-        def chosen(_: object) -> None:
+        async def chosen(_: object) -> None:
             fine.disabled = not coarse.value
             let_turn(fine.value or not coarse.value, not coarse.value)
 
         coarse.on_update(chosen)
         fine.on_update(chosen)
         gripper = self._gui.add_button_group("Gripper", ("open", "close"))
-        gripper.on_click(lambda _: self._move_gripper(gripper.value))
+        gripper.on_click(in_loop(lambda _: self._move_gripper(gripper.value)))
         for key in DIRECTIONS:
             command = self._gui.add_command(
                 f"Move the end effector {_KEYS[key]}",

@@ -17,6 +17,7 @@ from hrc_learn.teleoperation.page.page_scene import (
     SceneRectSelectEvent,
     ViserServer,
     box_edges,
+    in_loop,
 )
 from hrc_learn.viz.palette import GREEN, VERMILION, rgba
 
@@ -171,20 +172,21 @@ class RegionEditor:
     def _add_controls(self) -> None:
         gui = self._server.gui
         self._draw = gui.add_button("Draw on the table", icon=_DRAW)
-        self._draw.on_click(lambda _: self._draw_next())
+        self._draw.on_click(in_loop(lambda _: self._draw_next()))
         self._in_force = gui.add_checkbox(
             "Active", False, hint="The end effector is attracted into the region."
         )
-        self._in_force.on_update(lambda _: self._update())
+        self._in_force.on_update(in_loop(lambda _: self._update()))
         self._sizes = [
             gui.add_slider(f"Size {axis}", 2 * _SMALLEST, 2 * _LARGEST, 0.01, 0.1)
             for axis in "xyz"
         ]
         for slider in self._sizes:
-            slider.on_update(self._resized)
+            slider.on_update(in_loop(self._resized))
         self._mark_next_button = gui.add_button("Mark the target", icon=_MARK)
-        self._mark_next_button.on_click(lambda _: self._mark_next())
-        gui.add_button("Clear the target", color="gray").on_click(lambda _: self.mark(None))
+        self._mark_next_button.on_click(in_loop(lambda _: self._mark_next()))
+        clear = gui.add_button("Clear the target", color="gray")
+        clear.on_click(in_loop(lambda _: self.mark(None)))
 
     def _add_nodes(self) -> None:
         scene, region = self._scene, self._region
@@ -254,7 +256,7 @@ class RegionEditor:
         self._draw.disabled = True
 
         @self._scene.on_rect_select()
-        def drawn(event: SceneRectSelectEvent) -> None:
+        async def drawn(event: SceneRectSelectEvent) -> None:
             self._scene.remove_rect_select_callback(drawn)
             self._draw.disabled = False
             footprint = self._footprint(event)
@@ -279,7 +281,7 @@ class RegionEditor:
         self._mark_next_button.disabled = True
 
         @self._scene.on_click()
-        def clicked(event: SceneClickEvent) -> None:
+        async def clicked(event: SceneClickEvent) -> None:
             self._scene.remove_click_callback(clicked)
             self._mark_next_button.disabled = False
             point = self._surface(np.array(event.ray_origin), np.array(event.ray_direction))

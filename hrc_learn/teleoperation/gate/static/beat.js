@@ -7,7 +7,7 @@ self.onmessage = ({ data }) => {
   if (data.alive) alive = Date.now();
   else if (data.send && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(data.send));
   else if (data.open) {
-    socket = new WebSocket(data.open);
+    socket = new WebSocket(data.open.url, data.open.protocols);
     socket.onmessage = (event) => {
       const message = JSON.parse(event.data);
       if (message.clock !== undefined) beat(message.clock);

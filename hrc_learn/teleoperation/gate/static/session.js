@@ -4,17 +4,15 @@
 // draws, and tell for how long the page itself has not reacted.
 (() => {
   "use strict";
-  const bytes = crypto.getRandomValues(new Uint8Array(18));
-  const client = btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_");
-  const origin = location.origin.replace(/^http/, "ws");
+  const client = hrcDoor.draw();
 
   // viser's client reads from the address which socket to open.
   const address = new URL(location.href);
-  address.searchParams.set("websocket", `${origin}/view/${client}`);
+  address.searchParams.set("websocket", hrcDoor.socket("view", client).url);
   history.replaceState(null, "", address);
 
   const worker = new Worker("/static/beat.js");
-  worker.postMessage({ open: `${origin}/session/${client}` });
+  worker.postMessage({ open: hrcDoor.socket("session", client) });
   const send = (message) => worker.postMessage({ send: message });
   setInterval(() => worker.postMessage({ alive: true }), 50);
 
@@ -44,7 +42,8 @@
     role = status.role;
     bar.className = role;
     if (role === "watches") {
-      if (status.asked) show("You watch. Who leads has been asked; give it ten seconds.");
+      if (!status.may_lead) show("You watch: this link is for watching only.");
+      else if (status.asked) show("You watch. Who leads has been asked; give it ten seconds.");
       else if (status.taken) show("You watch: somebody else leads.", "Ask to lead", "ask");
       else show("Nobody leads.", "Lead", "ask");
     } else if (status.asked) {

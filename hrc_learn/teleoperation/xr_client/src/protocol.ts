@@ -89,6 +89,9 @@ export type Message =
 const REACH = 9.9;
 export const within = (point: Triple): boolean => point.every((x) => Math.abs(x) <= REACH);
 
+/** Of door.js, which the page loads first: it keeps the secret and adds it to each `fetch`. */
+declare const hrcDoor: { socket(route: string): { url: string; protocols: string[] } };
+
 /** The socket, held by a worker that goes on giving signs of life while this page draws. */
 export class Connection {
   status: Status | null = null;
@@ -99,11 +102,8 @@ export class Connection {
   private greeted = false;
 
   constructor() {
-    const bytes = crypto.getRandomValues(new Uint8Array(18));
-    const client = btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_");
-    const origin = location.origin.replace(/^http/, "ws");
     this.worker.onmessage = ({ data }) => this.hear(data);
-    this.worker.postMessage({ open: `${origin}/session/${client}` });
+    this.worker.postMessage({ open: hrcDoor.socket("session") });
     setInterval(() => this.alive(), 50);
   }
 

@@ -1,19 +1,17 @@
-"""HTTP server of the curation page, on which episodes are accepted, trimmed and rejected."""
+"""Curation page in a browser, on which episodes are accepted, trimmed and rejected."""
 
 from __future__ import annotations
 
+import asyncio
 import json
-import logging
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import pairwise
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Lock
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -31,9 +29,10 @@ from hrc_learn.demos.quality.decisions import (
 )
 from hrc_learn.demos.quality.ranking import MEASURES, Ranking
 from hrc_learn.demos.read.columns import MappingSpec
-from hrc_learn.teleoperation.gate.address import AddressConfig, listening_socket, tls_context
-from hrc_learn.teleoperation.gate.admission import HEADERS, Admission
-from hrc_learn.teleoperation.gate.gate import Content, static_contents
+from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
+from hrc_learn.teleoperation.gate.admission import RefusedError
+from hrc_learn.teleoperation.gate.gate import Visitor, incoming
+from hrc_learn.teleoperation.gate.messages import CurationMessage, Decide, curation_message
 
 _BLOCK = 32
 """Images sent at once: a second of a video, few enough to be shown soon."""
@@ -41,19 +40,7 @@ _TALLEST = 360
 """Images are scaled down to this height [px]."""
 _MOST_POINTS = 2000
 """Points of a curve; of longer ones the extremes of every stretch are sent."""
-_LONGEST_BODY = 4096
-_PATIENCE = 30
-"""Seconds that a request may take to arrive."""
-
-_logger = logging.getLogger("hrc_learn.curation")
-
-
-class RefusedError(Exception):
-    """A request that cannot be answered."""
-
-    def __init__(self, code: int, words: str):
-        super().__init__(words)
-        self.code = code
+_CLIENT = Path(__file__).parent / "curation_client"
 
 
 class CurationPage:
@@ -96,51 +83,26 @@ class CurationPage:
         self.decisions = read_decisions(ranking.path)
         self._options: dict[str, Any] = {"mapping": mapping, "units": units}
         self._lengths = {q.episode: q.length for q in ranking.episodes}
-        self._broken = {q.episode for q in ranking.episodes if q.broken}
         self._images = ImageReader(ranking.path)
         self._features = open_folder(ranking.path).features
         self._lock, self._writing = Lock(), ThreadPoolExecutor(1)
         self._written: Future[str] | None = None
-        self.contents = {
-            **static_contents(Path(__file__).parent / "static"),
-            "/": Content.of("index.html", (_STATIC / "index.html").read_bytes()),
-        }
-        context = tls_context(config)
-        self._socket = listening_socket(config)
-        self.admission = Admission(
-            config, self._socket.getsockname()[1], tls=context is not None
-        )
-        handler = type("Handler", (_Handler,), {"page": self})
-        self._server = _Server(self._socket.getsockname()[:2], handler, bind_and_activate=False)
-        self._server.socket.close()
-        self._server.socket = (
-            self._socket
-            if context is None
-            else context.wrap_socket(
-                self._socket, server_side=True, do_handshake_on_connect=False
-            )
-        )
-        self._thread = Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
-
-    @property
-    def url(self) -> str:
-        return self.admission.address.link()
+        files = folder_contents(_CLIENT)
+        contents = {**files, "/": files["/static/index.html"]}
+        self._gate = Gate(config, contents, {"session": self._session}, self.answer)
+        self.url = self._gate.address.link()
 
     def __enter__(self) -> CurationPage:
-        self._thread.start()
+        self._gate.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
-        self._thread.join()
-        self._server.server_close()
+        self._gate.close()
         self._writing.shutdown()
 
     def wait(self) -> None:
-        """Until the page is closed by another thread, or Ctrl-C."""
-        self._thread.join()
-
-    # What is asked for.
+        """Wait until the page is closed by another thread, or for Ctrl-C."""
+        self._gate.wait()
 
     def answer(self, path: str) -> Content:
         """Content at a path.
@@ -148,8 +110,6 @@ class CurationPage:
         Raises:
             RefusedError: There is nothing at the path, or it cannot be read.
         """
-        if path in self.contents:
-            return self.contents[path]
         words = path.strip("/").split("/")
         try:
             match words:
@@ -239,41 +199,40 @@ class CurationPage:
         scale = min(1.0, _TALLEST / height)
         return 2 * max(1, round(scale * height / 2)), 2 * max(1, round(scale * width / 2))
 
-    # What is decided.
+    async def _session(self, connection: Any, visitor: Visitor) -> None:
+        """Take decisions, and answer each with the state or the reason of its refusal."""
+        async for _, message in incoming(connection, curation_message):
+            try:
+                await asyncio.to_thread(self.act, message)
+                told = self.state()
+            except (ValueError, OSError) as error:
+                told = {"refused": str(error)}
+            await connection.send(_json(told).body.decode())
 
-    def act(self, path: str, said: Any) -> Content:
-        """Take a decision, or write the cleaned dataset.
+    def act(self, message: CurationMessage) -> None:
+        """Take a decision, or begin to write the cleaned dataset.
 
         Raises:
-            RefusedError: It makes no sense.
+            ValueError: It makes no sense.
         """
-        if path == "/decide" and isinstance(said, dict):
-            self._decide(said)
-        elif path == "/write":
-            with self._lock:
-                if self._written is not None and not self._written.done():
-                    raise RefusedError(409, "It is being written.")
-                self._written = self._writing.submit(self._write, dict(self.decisions))
-        else:
-            raise RefusedError(404, "There is nothing here.")
-        return _json(self.state())
-
-    def _decide(self, said: dict[str, Any]) -> None:
-        episode, start, stop = (said.get(name, 0) for name in ("episode", "start", "stop"))
-        if not all(isinstance(value, int) for value in (episode, start, stop)):
-            raise RefusedError(400, "Numbers are missing.")
-        if episode not in self._lengths:
-            raise RefusedError(404, "There is no such episode.")
         with self._lock:
-            if said.get("verdict") is None:
-                self.decisions.pop(episode, None)
+            if isinstance(message, Decide):
+                self._decide(message)
+            elif self._written is not None and not self._written.done():
+                raise ValueError("The cleaned dataset is being written.")
             else:
-                try:
-                    made = decide(str(said["verdict"]), self._lengths[episode], start, stop)
-                except ValueError as error:
-                    raise RefusedError(400, str(error)) from error
-                self.decisions[episode] = made
-            keep_decisions(self.ranking.path, self.decisions)
+                self._written = self._writing.submit(self._write, dict(self.decisions))
+
+    def _decide(self, message: Decide) -> None:
+        episode = message.episode
+        if episode not in self._lengths:
+            raise ValueError(f"There is no episode {episode}.")
+        decisions = {index: d for index, d in self.decisions.items() if index != episode}
+        if message.verdict is not None:
+            length = self._lengths[episode]
+            decisions[episode] = decide(message.verdict, length, message.start, message.stop)
+        keep_decisions(self.ranking.path, decisions)
+        self.decisions = decisions
 
     def _write(self, decisions: dict[int, Decision]) -> str:
         report = write_curated(self.ranking.path, self.out, decisions, **self._options)
@@ -281,9 +240,6 @@ class CurationPage:
             f"{len(report.changes)} episodes with {report.frames} of {report.frames_before} "
             f"frames are in {self.out}"
         )
-
-
-_STATIC = Path(__file__).parent / "static"
 
 
 def _json(content: Any) -> Content:
@@ -352,76 +308,3 @@ def _points(values: np.ndarray, edges: np.ndarray | None) -> tuple[list[int], li
         part = values[first:last]
         chosen += sorted({first + int(part.argmin()), first + int(part.argmax())})
     return chosen, values[chosen].tolist()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    request_queue_size = 32
-
-    def handle_error(self, request: object, client_address: object) -> None:
-        """Ignore clients that disconnect or do not speak HTTP."""
-        _logger.debug("a request failed", exc_info=True)
-
-
-class _Handler(BaseHTTPRequestHandler):
-    page: CurationPage
-    protocol_version = "HTTP/1.1"
-    server_version, sys_version = "hrc", ""
-    timeout = _PATIENCE
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Requests are no news."""
-
-    def do_GET(self) -> None:
-        self._reply(lambda: self.page.answer(urlsplit(self.path).path))
-
-    def do_POST(self) -> None:
-        self._reply(self._act)
-
-    def _act(self) -> Content:
-        if not self.page.admission.from_ours(self.headers.get("Origin", "")):
-            raise RefusedError(403, "Another site may not decide.")
-        try:
-            length = int(self.headers.get("Content-Length", ""))
-        except ValueError:
-            raise RefusedError(411, "Its length is missing.") from None
-        if not 0 <= length <= _LONGEST_BODY:
-            self.close_connection = True
-            raise RefusedError(413, "That is too long.")
-        try:
-            said = json.loads(self.rfile.read(length) or b"{}")
-        except (ValueError, RecursionError):
-            raise RefusedError(400, "That is no JSON.") from None
-        return self.page.act(urlsplit(self.path).path, said)
-
-    def _reply(self, answer: Callable[[], Content]) -> None:
-        refusal = self.page.admission.refuse(
-            self.path,
-            self.headers.get("Host", ""),
-            self.headers.get_all("Cookie", []),
-            self.page.contents.__contains__,
-        )
-        if refusal is not None:
-            self.close_connection = True
-            self._send(refusal.code, refusal.words.encode(), _PLAIN, refusal.headers)
-            return
-        try:
-            content = answer()
-        except RefusedError as error:
-            self._send(error.code, str(error).encode(), _PLAIN, {})
-        except Exception as error:  # a fault of ours: the page shows it and goes on
-            _logger.exception("%s failed", self.path)
-            self._send(500, f"{type(error).__name__}: {error}".encode(), _PLAIN, {})
-        else:
-            self._send(200, content.body, content.kind, {})
-
-    def _send(self, code: int, body: bytes, kind: str, more: Mapping[str, str]) -> None:
-        self.send_response(code)
-        headers = {**HEADERS, "Content-Type": kind, "Content-Length": str(len(body)), **more}
-        for name, value in headers.items():
-            self.send_header(name, value)
-        self.end_headers()
-        self.wfile.write(body)
-
-
-_PLAIN = "text/plain; charset=utf-8"

@@ -17,13 +17,27 @@ let playing = false;
 let marks = { start: 0, stop: 0 }; // of the cut, not decided yet
 let blocks = new Map(); // "camera:number" -> promise of images
 
-async function ask(path, body) {
-  const options = body === undefined ? {} : { method: "POST", body: JSON.stringify(body) };
-  const answer = await fetch(path, options);
+async function ask(path) {
+  const answer = await fetch(path);
   if (!answer.ok) throw new Error(await answer.text());
   return answer;
 }
 const get = async (path) => (await ask(path)).json();
+
+// One message to the program, and the state that it answers with.
+const tell = (message) =>
+  new Promise((resolve, reject) => {
+    const { url, protocols } = hrcDoor.socket("session");
+    const socket = new WebSocket(url, protocols);
+    socket.onopen = () => socket.send(JSON.stringify(message));
+    socket.onmessage = ({ data }) => {
+      const told = JSON.parse(data);
+      if (told.refused) reject(new Error(told.refused));
+      else resolve(told);
+      socket.close();
+    };
+    socket.onclose = ({ reason }) => reject(new Error(reason || "The program does not answer."));
+  });
 
 function say(words, failed = false) {
   const box = byId("said");
@@ -366,7 +380,7 @@ async function decide(verdict) {
   const cut = verdict === "cut" ? marks : {};
   const said = { episode: episode.episode, verdict: undo ? null : verdict, ...cut };
   try {
-    Object.assign(overview, await (await ask("/decide", said)).json());
+    Object.assign(overview, await tell({ type: "decide", ...said }));
     say("");
   } catch (error) {
     say(error.message, true);
@@ -383,7 +397,7 @@ async function decide(verdict) {
 async function write() {
   byId("write").disabled = true;
   try {
-    let state = await (await ask("/write", {})).json();
+    let state = await tell({ type: "write" });
     say("Writing ...");
     while (state.written.writing) {
       await new Promise((done) => setTimeout(done, 300));

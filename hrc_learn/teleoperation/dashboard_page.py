@@ -1,0 +1,168 @@
+"""Dashboards in a browser: Rerun's viewer and recordings, served through the gate.
+
+Rerun's own servers ask for no secret and answer to any host name. They serve no data here: one
+hands over the files of the viewer once, and the gate serves these.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.error import URLError
+from urllib.request import urlopen
+
+from hrc_learn.store import new_file
+from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
+from hrc_learn.teleoperation.gate.gate import Visitor, first_of, incoming
+from hrc_learn.teleoperation.gate.messages import MessageError
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream as RecordingStream
+else:
+    RecordingStream = Any
+
+_CLIENT = Path(__file__).parent / "dashboard_client"
+_VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
+_START = 60.0
+"""Longest time that Rerun's viewer may take to start [s]."""
+_EVERY = 0.1
+"""Time between two looks for new data [s]."""
+
+
+class DashboardServer(NamedTuple):
+    """Recording stream that is served to browsers."""
+
+    stream: RecordingStream
+    viewer: str
+    """Address of the page, with its secret."""
+
+
+@contextmanager
+def serve_stream(port: int = 9090) -> Iterator[DashboardServer]:
+    """Serve a recording stream and its viewer until the `with` block ends.
+
+    A page that is opened later shows all earlier data.
+
+    Args:
+        port: Port of the page.
+
+    Raises:
+        ValueError: The port is taken.
+    """
+    import rerun
+
+    stream = rerun.RecordingStream("hrc_learn")
+    binary, parts = stream.binary_stream(), []
+
+    def data() -> Sequence[bytes]:
+        if part := binary.read():
+            parts.append(part)
+        return parts
+
+    with _served(port, data) as url:
+        yield DashboardServer(stream, url)
+        data()
+        time.sleep(2 * _EVERY)  # pages that are open receive the end
+
+
+@contextmanager
+def serve_recordings(files: Sequence[Path], port: int | None = None) -> Iterator[str]:
+    """Serve recordings in Rerun's viewer, and return the address of the page.
+
+    Args:
+        files: Recordings (`.rrd`).
+        port: Port of the page; None: the first free one from 8080 on.
+    """
+    with _served(port, lambda: [file.read_bytes() for file in files]) as url:
+        yield url
+
+
+@contextmanager
+def _served(port: int | None, data: Callable[[], Sequence[bytes]]) -> Iterator[str]:
+    """Serve the viewer and the parts of a recording, which grow at their end."""
+    looking = asyncio.Lock()
+
+    async def session(connection: Any, visitor: Visitor) -> None:
+        async def listen() -> None:
+            async for _ in incoming(connection, _nothing):
+                pass
+
+        async def speak() -> None:
+            sent = 0
+            while True:
+                async with looking:
+                    parts = await asyncio.to_thread(data)
+                for part in parts[sent:]:
+                    await connection.send(part)
+                sent = len(parts)
+                await asyncio.sleep(_EVERY)
+
+        await first_of(listen(), speak())
+
+    files = folder_contents(_CLIENT)
+    contents = {**files, "/": files["/static/index.html"], **_viewer_contents()}
+    gate = Gate(AddressConfig(port=port), contents, {"session": session})
+    gate.start()
+    try:
+        yield gate.address.link()
+    finally:
+        gate.close()
+
+
+def _nothing(raw: str | bytes) -> None:
+    raise MessageError("a dashboard sends no messages")
+
+
+def _viewer_contents() -> dict[str, Content]:
+    """Files of Rerun's web viewer by path, from the cache folder."""
+    import rerun
+
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    folder = cache / "hrc_learn" / f"rerun_viewer_{rerun.__version__}"
+    if not all((folder / name).is_file() for name in _VIEWER_FILES):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, body in _fetched_viewer().items():
+            with new_file(folder / name) as part:
+                part.write_bytes(body)
+    return folder_contents(folder, "/viewer/")
+
+
+def _fetched_viewer() -> dict[str, bytes]:
+    """Files of the viewer, which Rerun's program hands over by HTTP only."""
+    ports = []
+    for _ in range(2):
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            ports.append(free.getsockname()[1])
+    command = [
+        *(sys.executable, "-m", "rerun", "--serve-web", "--bind", "127.0.0.1"),
+        *("--web-viewer-port", str(ports[0]), "--port", str(ports[1])),
+    ]
+    quiet = subprocess.DEVNULL
+    server = subprocess.Popen(command, stdout=quiet, stderr=quiet)
+    try:
+        end = time.monotonic() + _START
+        while True:
+            try:
+                return {name: _get(ports[0], name) for name in _VIEWER_FILES}
+            except URLError as error:
+                if server.poll() is not None or time.monotonic() > end:
+                    raise ValueError(
+                        f"Rerun's viewer does not start; try `python -m rerun`. {error}"
+                    ) from error
+                time.sleep(0.1)
+    finally:
+        server.kill()
+        server.wait()
+
+
+def _get(port: int, name: str) -> bytes:
+    with urlopen(f"http://127.0.0.1:{port}/{name}", timeout=_START) as answer:
+        return answer.read()
