@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from hrc_learn.controller import ActionChunkFilter
 from hrc_learn.kinematics import MotionLimits, panda
-from hrc_learn.lerobot.smoothing import ActionLimits, MotionFilter, MotionState
+from hrc_learn.lerobot.smoothing import ActionLimits
+from hrc_learn.lerobot.smoothing.motion_filter import MotionFilter, MotionState
 
 
 def limits(width=1, **change):
@@ -108,6 +109,11 @@ def test_limits_hold_for_anything(asked, velocity, brake_time, ramp_time, dt, re
 def test_limits_that_make_no_sense_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         limits(**change)
+
+
+def test_a_start_that_is_not_finite_is_refused():
+    with pytest.raises(ValueError, match="finite position"):
+        MotionState.moving(np.array([0.0, np.nan]))
 
 
 @pytest.mark.parametrize("dt", [0.0, float("inf"), float("nan")])

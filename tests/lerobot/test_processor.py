@@ -17,15 +17,14 @@ from lerobot.processor.converters import (
 )
 
 from hrc_learn.lerobot.smoothing import (
-    POSTPROCESSOR,
     PREPROCESSOR,
     ActionLimits,
-    Changes,
     SmoothActionsStep,
-    WatchStateStep,
     add_smoothing,
     remove_smoothing,
 )
+from hrc_learn.lerobot.smoothing.motion_filter import LIMIT_KINDS
+from hrc_learn.lerobot.smoothing.processor import POSTPROCESSOR, Changes, WatchStateStep
 
 SETTINGS = {
     "fps": 50.0,
@@ -116,8 +115,8 @@ def test_single_actions_start_where_the_robot_is_and_keep_the_limits(checkpoint)
     assert a[-1] == pytest.approx(0.8, abs=5e-3)
     changes = smooth.changes
     assert changes.steps == 120
-    assert changes.broken["jerk"] > 0
-    assert changes.largest["a.pos"] == pytest.approx(0.3, abs=0.02)
+    assert changes.broken[LIMIT_KINDS.index("jerk")] > 0
+    assert changes.largest[0] == pytest.approx(0.3, abs=0.02)
     assert "120 actions changed" in str(changes)
 
 
@@ -158,8 +157,8 @@ def test_two_robots_of_one_checkpoint_do_not_see_each_other(checkpoint):
 
 
 def test_a_step_that_is_gone_is_no_longer_asked():
-    watch = WatchStateStep(pair="of a policy")
-    smooth = SmoothActionsStep(**SETTINGS | {"pair": "of a policy"})
+    watch = WatchStateStep()
+    smooth = SmoothActionsStep(**SETTINGS)
     assert smooth.watch is watch
     del watch
     gc.collect()
@@ -167,10 +166,10 @@ def test_a_step_that_is_gone_is_no_longer_asked():
 
 
 def test_steps_find_each_other_built_in_either_order():
-    smooth = SmoothActionsStep(**SETTINGS | {"pair": "late"})
-    watch = WatchStateStep(pair="late")
+    smooth = SmoothActionsStep(**SETTINGS)
+    watch = WatchStateStep()
     assert smooth.watch is watch
-    assert SmoothActionsStep(**SETTINGS | {"pair": "late"}).watch is None
+    assert SmoothActionsStep(**SETTINGS).watch is None
 
 
 def chunk_of(a, b=0.0, batch=1):
@@ -184,8 +183,8 @@ def chunk_of(a, b=0.0, batch=1):
 @pytest.mark.parametrize("reached", [0, 1, 2, 5, 19])
 def test_a_chunk_goes_on_from_the_three_actions_up_to_where_the_robot_is(reached):
     """Or from the first three, where it has not come that far: an acceleration takes three."""
-    watch = WatchStateStep(pair="reached")
-    smooth = SmoothActionsStep(**SETTINGS | {"pair": "reached"})
+    watch = WatchStateStep()
+    smooth = SmoothActionsStep(**SETTINGS)
     wave = 0.2 * (1 - np.cos(2 * np.arange(1, 41) / 50))
     send = functools.partial(sent_by, watch, smooth)
     whole = chunk_of(wave, wave)
@@ -209,8 +208,8 @@ def sent_by(watch, smooth, a, chunk):
 )
 def test_only_what_no_motion_explains_begins_an_episode(moved, jumps):
     """Five times the limit of 1/s, at 50 actions a second, is 0.1."""
-    watch = WatchStateStep(pair="jump")
-    smooth = SmoothActionsStep(**SETTINGS | {"pair": "jump"})
+    watch = WatchStateStep()
+    smooth = SmoothActionsStep(**SETTINGS)
     send = functools.partial(sent_by, watch, smooth)
     still = [0.2, 0.2]  # of two robots
     for _ in range(5):
@@ -223,15 +222,15 @@ def test_only_what_no_motion_explains_begins_an_episode(moved, jumps):
 
 
 def test_a_state_of_other_robots_is_not_taken_for_these():
-    watch = WatchStateStep(pair="others")
-    smooth = SmoothActionsStep(**SETTINGS | {"pair": "others"})
+    watch = WatchStateStep()
+    smooth = SmoothActionsStep(**SETTINGS)
     actions = torch.tensor([[0.5, 0.1], [0.6, 0.2]], dtype=torch.float64)
     torch.testing.assert_close(sent_by(watch, smooth, 0.0, actions), actions)
 
 
 def test_a_reset_begins_where_the_robot_then_is():
-    watch = WatchStateStep(pair="reset")
-    smooth = SmoothActionsStep(**SETTINGS | {"pair": "reset"})
+    watch = WatchStateStep()
+    smooth = SmoothActionsStep(**SETTINGS)
     send = functools.partial(sent_by, watch, smooth)
     send(0.0, torch.tensor([[0.9, 0.0]], dtype=torch.float64))
     assert smooth.changes.steps == 1
@@ -256,8 +255,8 @@ def test_what_is_no_action_or_no_observation_passes():
 def test_settings_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="velocity must have one entry for each of"):
         SmoothActionsStep(**SETTINGS | {"velocity": [1.0]})
-    watch = WatchStateStep(pair="short")
-    smooth = SmoothActionsStep(**SETTINGS | {"pair": "short", "state_columns": [-1, 1]})
+    watch = WatchStateStep()
+    smooth = SmoothActionsStep(**SETTINGS | {"state_columns": [-1, 1]})
     action = torch.zeros(1, 2, dtype=torch.float64)
     with pytest.raises(ValueError, match="state_columns reach 1, but the state has 1 values"):
         sent_by(watch, smooth, 0.0, action)
@@ -270,16 +269,65 @@ def test_changes_add_up():
     change = np.array([[[0.0, 2e-6], [-0.3, 0.0], [1e-7, 0.0]]])
     changes.add(broken, change)
     assert (changes.steps, changes.changed) == (3, 2)
-    assert changes.broken == {"position": 0, "velocity": 2, "acceleration": 0, "jerk": 1}
-    assert changes.largest == {"a": pytest.approx(0.3), "b": pytest.approx(2e-6)}
+    assert changes.broken.tolist() == [0, 2, 0, 1]
+    np.testing.assert_allclose(changes.largest, [0.3, 2e-6])
     changes.add(broken, change[..., ::-1] / 3)
-    assert (changes.steps, changes.changed) == (6, 3)
-    assert changes.broken["velocity"] == 4
-    assert changes.largest == {"a": pytest.approx(0.3), "b": pytest.approx(0.1)}
+    assert (changes.steps, changes.changed, changes.broken[1]) == (6, 3, 4)
+    np.testing.assert_allclose(changes.largest, [0.3, 0.1])
     assert "3 of 6 actions changed, by at most 0.3 (a)" in str(changes)
     changes.clear()
-    assert (changes.steps, changes.changed, changes.broken["jerk"]) == (0, 0, 0)
-    assert changes.largest == {"a": 0.0, "b": 0.0}
+    assert (changes.steps, changes.changed) == (0, 0)
+    assert not changes.broken.any()
+    assert not changes.largest.any()
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("bad", [0, 3])
+def test_a_value_that_is_not_finite_is_held_or_goes_on_and_recovers(whole, bad):
+    """In the first state, and in the middle of a motion."""
+    watch = WatchStateStep()
+    smooth = SmoothActionsStep(**SETTINGS | {"state_columns": [0, 1]})
+    asked = torch.tensor([[0.3, 0.4]], dtype=torch.float64)
+    asked = asked.expand(1, 5, 2) if whole else asked
+    path = [np.array([0.0, 0.1])]
+    for k in range(8):
+        a, b = path[-1] if k > (bad == 0) else path[0]
+        state = torch.tensor([[a, np.nan if k == bad else b]], dtype=torch.float64)
+        watch(batch_to_transition({"observation.state": state}))
+        action = smooth(policy_action_to_transition(asked))[TransitionKey.ACTION]
+        path.append(action.reshape(-1, 2)[0].numpy())
+    if bad == 0:  # held where it was sent first; then it begins where it is
+        assert path.pop(1)[1] == pytest.approx(0.4)
+    assert np.isfinite(path).all()
+    path = np.array([path[0]] * 2 + path)
+    limits = SETTINGS["velocity"], SETTINGS["acceleration"], SETTINGS["jerk"]
+    for order, limit in enumerate(() if whole else limits, 1):  # of a chunk more is executed
+        change = np.abs(np.diff(path[:, 1], n=order)).max() * 50**order
+        assert change <= limit[1] * (1 + 1e-6)
+
+
+def test_a_motion_that_is_reset_goes_on_with_the_measured_velocity():
+    watch, smooth = WatchStateStep(), SmoothActionsStep(**SETTINGS)
+    send = functools.partial(sent_by, watch, smooth)
+    action = torch.tensor([[0.5, 0.0]], dtype=torch.float64)
+    send(0.0, action)
+    watch.reset()
+    smooth.reset()
+    first = send(0.012, action)[0, 0]  # 0.6 rad/s
+    # One step at the limit of acceleration changes the velocity by 0.08 rad/s.
+    assert (first - 0.012) * 50 == pytest.approx(0.6, abs=0.08)
+    watch.reset()
+    smooth.reset()
+    assert send(0.3, action)[0, 0] - 0.3 < 1e-3  # put there: faster than any motion
+
+
+def test_without_a_state_a_jump_is_no_episode():
+    smooth = SmoothActionsStep(**SETTINGS)
+    for a, b in ((0.0, 0.0), (0.9, 1.5)):
+        action = smooth(
+            policy_action_to_transition(torch.tensor([[a, b]], dtype=torch.float64))
+        )
+    assert action[TransitionKey.ACTION].abs().max() < 0.01
 
 
 def test_what_is_no_processor_is_refused(tmp_path):

@@ -97,6 +97,12 @@ def test_after_a_hand_it_begins_where_the_robot_is(make):
     np.testing.assert_allclose(robot.inner.sent[-10:], [[0.6, 0.4]] * 10, atol=1e-12)
 
 
+def test_a_robot_without_a_finite_position_is_not_led(make):
+    robot = make(clock="actions", options={"start": float("nan")})
+    with pytest.raises(ValueError, match=r"does not report a.pos, b.pos.*check the sensor"):
+        robot.connect()
+
+
 def send_for(robot, seconds, of_time, fps=20.0):
     begun = time.perf_counter()
     for k in range(round(seconds * fps)):
@@ -167,9 +173,13 @@ def test_limits_are_kept_in_a_file(tmp_path):
     assert ActionLimits.load(file) == LIMITS
     file.write_text(json.dumps({"names": []}))
     with pytest.raises(
-        ValueError, match="holds no limits of actions: there must be acceleration"
+        ValueError, match=r"holds no limits of actions: Missing required field.*acceleration"
     ):
         ActionLimits.load(file)
+    for value in (None, "fast", float("nan"), []):
+        file.write_text(json.dumps(asdict(LIMITS) | {"velocity": [value, 1.0]}))
+        with pytest.raises(ValueError, match=r"limits.json holds no limits of (?s:.)*velocity"):
+            ActionLimits.load(file)
     file.write_text("{")
     with pytest.raises(ValueError, match="is damaged"):
         ActionLimits.load(file)

@@ -1,17 +1,17 @@
-"""Limits of a robot's actions: by its demonstrators, its URDF or its calibration."""
+"""Limits of a robot's actions, from demonstrations, a URDF or a calibration."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import draccus
 import numpy as np
 from jaxtyping import Float
 
@@ -65,7 +65,7 @@ class ActionLimits:
                 )
         for kind in kinds:
             for name, value in zip(self.names, getattr(self, kind), strict=True):
-                if not 0 < value < math.inf:
+                if not (isinstance(value, float | int) and 0 < value < math.inf):
                     raise ValueError(
                         f"smooth actions: the limit of {kind} of {name} must be positive and "
                         f"finite, but is {value}."
@@ -105,19 +105,18 @@ class ActionLimits:
 
     @classmethod
     def load(cls, path: Path) -> ActionLimits:
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
 
         Raises:
             FileNotFoundError: There is no such file.
             ValueError: It holds no limits.
         """
-        content = read_json(path)
-        names = {f.name for f in fields(cls)}
-        if not isinstance(content, dict) or content.keys() != names:
-            raise ValueError(
-                f"{path} holds no limits of actions: there must be {', '.join(sorted(names))}"
-            )
-        return cls(**content)
+        try:
+            return draccus.decode(cls, read_json(path))
+        except (draccus.utils.DraccusException, AttributeError) as error:
+            # The limits' own refusal is the cause of a ParsingError.
+            why = error.__cause__ if type(error) is draccus.ParsingError else error
+            raise ValueError(f"{path} holds no limits of actions: {why}") from error
 
 
 def gathered_limits(
@@ -286,9 +285,6 @@ def calibrated_ranges(
     return ranges
 
 
-# Files.
-
-
 def read_json(path: Path) -> Any:
     """Content of a file.
 
@@ -300,46 +296,38 @@ def read_json(path: Path) -> Any:
         raise FileNotFoundError(f"there is no {path}")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error}") from None
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write a file that is whole or as it was."""
-    with tempfile.NamedTemporaryFile(
-        "w", encoding="utf-8", dir=path.parent, prefix=f".{path.name}.", delete=False
-    ) as new:
-        json.dump(content, new, indent=2)
-        new.flush()
-        os.fsync(new.fileno())
-    # As readable as any file that is written; temporary ones are private.
-    umask = os.umask(0)
-    os.umask(umask)
-    Path(new.name).chmod(0o666 & ~umask)
-    Path(new.name).replace(path)
+    """Write a file that is complete or as it was."""
+    new = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with new.open("w", encoding="utf-8") as file:
+            json.dump(content, file, indent=2)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)
 
 
-def _read_actions(dataset: Path) -> list[Float[np.ndarray, "frames D"]]:
+def _read_actions(folder: Path) -> list[Float[np.ndarray, "frames D"]]:
     """Actions of each episode, of all versions of the format that keep them in Parquet."""
-    from pyarrow import ArrowInvalid, parquet
+    from pyarrow import ArrowInvalid
+    from pyarrow.dataset import dataset
 
-    files = sorted((dataset / "data").glob("chunk-*/*.parquet"))
-    episodes: dict[int, list[np.ndarray]] = {}
-    for file in files:
-        try:
-            table = parquet.read_table(file, columns=["episode_index", ACTION])
-        except (ArrowInvalid, OSError) as error:
-            raise ValueError(f"{file} cannot be read: {error}") from None
-        if table.num_columns != 2:
-            raise ValueError(f"{file} lacks the columns episode_index and {ACTION}.")
-        index = table["episode_index"].to_numpy()
-        actions = np.array(table[ACTION].to_pylist(), dtype=np.float64)
-        actions = actions.reshape(len(index), -1)
-        for k in np.unique(index):
-            episodes.setdefault(int(k), []).append(actions[index == k])
-    if not episodes:
-        raise ValueError(f"{dataset} has no episodes.")
-    return [np.concatenate(parts) for _, parts in sorted(episodes.items())]
+    files = [str(file) for file in sorted((folder / "data").glob("chunk-*/*.parquet"))]
+    if not files:
+        raise ValueError(f"{folder} has no episodes.")
+    try:
+        table = dataset(files, format="parquet").to_table(columns=["episode_index", ACTION])
+    except (ArrowInvalid, OSError) as error:
+        raise ValueError(f"{folder}: the actions cannot be read: {error}") from None
+    index = table["episode_index"].to_numpy()
+    actions = np.array(table[ACTION].to_pylist(), dtype=np.float64).reshape(len(index), -1)
+    return [actions[index == k] for k in np.unique(index)]
 
 
 def _largest(episodes: Sequence[np.ndarray], order: int, fps: float) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Smooth, limit-checked actions for any policy, as steps of its processors.
 
-One step watches where the robot is, one smooths what it is sent; `add_smoothing` adds both to a
+One step watches the state of the robot, one smooths its actions; `add_smoothing` adds both to a
 checkpoint that was trained without them.
 """
 
@@ -25,10 +25,16 @@ from torch import Tensor
 from .action_limits import ActionLimits, read_json, write_json
 from .motion_filter import LIMIT_KINDS, MotionFilter, MotionState
 
-# What smoothing has changed, added up.
+WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
+PREPROCESSOR = "policy_preprocessor.json"
+POSTPROCESSOR = "policy_postprocessor.json"
 
+_JUMP = 5.0
+"""A robot that moves this many times faster than its limit was put there: an episode began."""
 _SAME = 1e-6
 """Changes below this are rounding."""
+
+_Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
 class Changes:
@@ -48,13 +54,13 @@ class Changes:
     def clear(self) -> None:
         """Start over."""
         self.steps = self.changed = 0
-        self.broken = dict.fromkeys(LIMIT_KINDS, 0)
-        self.largest = dict.fromkeys(self.names, 0.0)
+        self.broken = np.zeros(len(LIMIT_KINDS), dtype=int)
+        self.largest = np.zeros(len(self.names))
 
     def add(
         self, broken: Bool[np.ndarray, "*batch T 4"], change: Float[np.ndarray, "*batch T D"]
     ) -> None:
-        """Count what was done to a chunk.
+        """Count the changes of a chunk.
 
         Args:
             broken: True for each of `LIMIT_KINDS` that an action would have violated.
@@ -63,68 +69,58 @@ class Changes:
         change = np.abs(change).reshape(-1, len(self.names))
         self.steps += len(change)
         self.changed += int((change > _SAME).any(-1).sum())
-        counts = broken.reshape(-1, len(LIMIT_KINDS)).sum(0).tolist()
-        for kind, count in zip(LIMIT_KINDS, counts, strict=True):
-            self.broken[kind] += count
-        for name, most in zip(self.names, change.max(0).tolist(), strict=True):
-            self.largest[name] = max(self.largest[name], most)
+        self.broken += broken.reshape(-1, len(LIMIT_KINDS)).sum(0)
+        self.largest = np.maximum(self.largest, change.max(0))
 
     def __str__(self) -> str:
-        broken = ", ".join(f"{kind} {count}" for kind, count in self.broken.items())
-        name = max(self.largest, key=self.largest.__getitem__)
+        broken = ", ".join(f"{k} {n}" for k, n in zip(LIMIT_KINDS, self.broken, strict=True))
+        most = int(self.largest.argmax())
         return (
             f"{self.changed} of {self.steps} actions changed, by at most "
-            f"{self.largest[name]:.4g} ({name}); asked for beyond limits of {broken}"
+            f"{self.largest[most]:.4g} ({self.names[most]}); beyond the limits: {broken}"
         )
-
-
-# The steps.
-
-WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
-_JUMP = 5.0
-"""A robot that moves this many times faster than its limit was put there: an episode began."""
-
-_Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
 @dataclass
 class WatchStateStep(ProcessorStep):
-    """Keeps the state as the robot reports it, for the `SmoothActionsStep` of the same policy.
+    """Keeps the state that the robot reports, for the `SmoothActionsStep` of the same policy.
 
     Belongs at the beginning of the preprocessor, where the state has its name and units.
     """
 
-    pair: str = "smooth"
-    """Name by which both steps of a policy find each other."""
     state: Tensor | None = field(default=None, init=False, repr=False)
     """Newest state of the robot, (batch, values); None before the first observation."""
+    previous: Tensor | None = field(default=None, init=False, repr=False)
+    """State before that one, also of before a reset."""
 
     # LeRobot builds a policy's processors from two files, first the one with this step, and
-    # gives neither to the other. So the next step to be built that smooths takes the newest of
-    # its name, once: what is built for another robot later is not asked.
-    _built: ClassVar[dict[str, weakref.ref[Any]]] = {}
+    # gives neither to the other. So the next step to be built that smooths takes the newest,
+    # once: steps that are built for another robot later do not.
+    _newest: ClassVar[weakref.ref[Any] | None] = None
 
     def __post_init__(self) -> None:
-        self._built[self.pair] = weakref.ref(self)
+        self._last: Tensor | None = None
+        WatchStateStep._newest = weakref.ref(self)
 
     @classmethod
-    def take_newest(cls, pair: str) -> WatchStateStep | None:
-        """The step of that name that was built last; None where it is gone or taken."""
-        step = cls._built.pop(pair, None)
+    def take_newest(cls) -> WatchStateStep | None:
+        """The step that was built last; None if it is gone or taken."""
+        step, WatchStateStep._newest = cls._newest, None
         return None if step is None else step()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         state = observation.get(OBS_STATE)
         if state is not None:
-            self.state = torch.atleast_2d(state).detach().cpu()
+            self.previous = self._last
+            self.state = self._last = torch.atleast_2d(state).detach().cpu()
         return transition
 
     def reset(self) -> None:
         self.state = None
 
     def get_config(self) -> dict[str, Any]:
-        return {"pair": self.pair}
+        return {}
 
     def transform_features(self, features: _Features) -> _Features:
         return features
@@ -136,8 +132,10 @@ class SmoothActionsStep(ProcessorStep):
 
     Belongs at the end of the postprocessor, where actions have their units. Takes one action at
     a time, (batch, values), as lerobot-rollout and lerobot-eval hand them on, or whole chunks
-    (batch, steps, values). A motion begins where the robot is, and anew where it is put; a
-    chunk begins where the robot is on the one before. See `MotionFilter`.
+    (batch, steps, values). A motion begins with the measured position and velocity, and anew
+    where the robot is put; a chunk begins where the robot is on the one before. A value whose
+    measurement is not finite keeps its motion, and before the first finite one it is held. See
+    `MotionFilter`.
     """
 
     fps: float
@@ -156,33 +154,25 @@ class SmoothActionsStep(ProcessorStep):
     """Highest of each value; None: no limit."""
     state_columns: list[int]
     """Columns of `observation.state` that measure each value; -1: not measured."""
-    pair: str = "smooth"
-    """Name of the `WatchStateStep` that tells where the robot is."""
     changes: Changes = field(init=False, repr=False)
     """Report of changes since the last reset."""
 
     def __post_init__(self) -> None:
-        limits = {f.name: getattr(self, f.name) for f in fields(ActionLimits)}
-        self._filter = MotionFilter(ActionLimits(**limits), 1.0 / self.fps)
+        self._filter = MotionFilter(ActionLimits(**self.get_config()), 1.0 / self.fps)
         self._columns = np.array(self.state_columns)
         self._watch: weakref.ref[WatchStateStep] | None = None
-        self.watch = WatchStateStep.take_newest(self.pair)
+        _ = self.watch
+        self.changes = Changes(self.names)
         self._state: MotionState | None = None
         self._chunk: np.ndarray | None = None
-        self._before: np.ndarray | None = None
-        self.changes = Changes(self.names)
         weakref.finalize(self, _log, self.changes)
 
     @property
     def watch(self) -> WatchStateStep | None:
-        """The step that tells where the robot is; None: none does."""
-        if self._watch is None:
-            self.watch = WatchStateStep.take_newest(self.pair)
+        """The step that reports the robot's state; None: there is none."""
+        if self._watch is None and (step := WatchStateStep.take_newest()) is not None:
+            self._watch = weakref.ref(step)
         return None if self._watch is None else self._watch()
-
-    @watch.setter
-    def watch(self, step: WatchStateStep | None) -> None:
-        self._watch = None if step is None else weakref.ref(step)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         action = transition.get(TransitionKey.ACTION)
@@ -195,7 +185,8 @@ class SmoothActionsStep(ProcessorStep):
             )
         whole = action.dim() == 3
         asked = (action if whole else action.unsqueeze(-2)).detach().cpu().double().numpy()
-        state = self._start(asked, whole)
+        state, held = self._start(asked, whole)
+        asked = np.where(held[:, None], state.position[:, None], asked)
         broken, made = self._filter.broken(state, asked), []
         for k in range(asked.shape[-2]):
             state = self._filter.step(state, asked[..., k, :])
@@ -211,52 +202,67 @@ class SmoothActionsStep(ProcessorStep):
         """Forget the motion: the next one begins where the robot then is."""
         _log(self.changes)
         self.changes.clear()
-        self._state = self._chunk = self._before = None
+        self._state = self._chunk = None
 
     def get_config(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.init}
+        return {f.name: getattr(self, f.name) for f in fields(ActionLimits)}
 
     def transform_features(self, features: _Features) -> _Features:
         return features
 
-    def _start(self, asked: np.ndarray, whole: bool) -> MotionState:
-        """State from which the motion continues."""
-        measured = self._measured(asked)
-        state = self._state
-        if state is None or state.position.shape != measured.shape:
-            self._before = measured
-            return MotionState.moving(measured)
-        if whole and self._chunk is not None:
-            state = self._reached(measured, self._chunk)
-        jumped = self._jumped(measured)
-        self._before = measured
-        return _where(jumped, MotionState.moving(measured), state)
-
-    def _measured(self, asked: np.ndarray) -> Float[np.ndarray, "batch values"]:
-        """Measured position of the robot; unmeasured values are taken as commanded."""
+    def _start(self, asked: np.ndarray, whole: bool) -> tuple[MotionState, np.ndarray]:
+        """State from which the motion continues, and True for values that must be held."""
         here = np.nan_to_num(asked[..., 0, :])
-        state = None if self.watch is None else self.watch.state
-        if state is None or state.shape[0] != here.shape[0]:
-            return here
+        seen = self._measured(len(here))
+        unknown = np.full_like(here, np.nan)
+        measured, velocity = (unknown, unknown) if seen is None else seen
+        finite = np.isfinite(measured)
+        state = self._state
+        if state is None or state.position.shape != here.shape:
+            self._before = unknown
+            start = np.where(finite, measured, here)
+            state = MotionState.moving(start, np.where(finite, velocity, 0.0))
+        else:
+            if whole and self._chunk is not None:
+                state = self._reached(np.where(finite, measured, here), finite, self._chunk)
+            # A value is measured for the first time, or the robot was moved by other means.
+            first = finite & np.isnan(self._before)
+            farthest = _JUMP * self._filter.velocity / self.fps
+            jumped = (np.abs(measured - self._before) > farthest).any(-1, keepdims=True)
+            state = _restarted(first | (jumped & finite), measured, state)
+        self._before = np.where(finite, measured, self._before)
+        held = np.isnan(self._before) & (self._columns >= 0) & (seen is not None)
+        return state, held
+
+    def _measured(self, batch: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Measured position, NaN where there is none, and velocity, (batch, values) each.
+
+        The velocity is zero unless two states in a row lead to one within the limits.
+        """
+        watch = self.watch
+        state = None if watch is None else watch.state
+        if watch is None or state is None or len(state) != batch:
+            return None
         if int(self._columns.max()) >= state.shape[-1]:
             raise ValueError(
                 f"smooth actions: state_columns reach {int(self._columns.max())}, but the "
                 f"state has {state.shape[-1]} values."
             )
-        values = state.double().numpy()[..., np.maximum(self._columns, 0)]
-        return np.where(self._columns >= 0, values, here)
+        previous = watch.previous
+        if previous is None or previous.shape != state.shape:
+            previous = state
+        now, before = (
+            np.where(self._columns >= 0, x.double().numpy()[:, self._columns], np.nan)
+            for x in (state, previous)
+        )
+        velocity = np.nan_to_num((now - before) * self.fps)
+        slow = (np.abs(velocity) <= self._filter.velocity).all(-1, keepdims=True)
+        return now, np.where(slow, velocity, 0.0)
 
-    def _jumped(self, measured: np.ndarray) -> Bool[np.ndarray, " batch"]:
-        """True if the robot was moved by other means than its motion."""
-        assert self._before is not None  # there is one as soon as there is a state
-        farthest = _JUMP * self._filter.velocity / self.fps
-        moved = np.abs(measured - self._before) > farthest
-        return np.any(moved & (self._columns >= 0), axis=-1)
-
-    def _reached(self, measured: np.ndarray, chunk: np.ndarray) -> MotionState:
-        """State on the chunk before, where it is nearest to the robot."""
-        scaled = (chunk - measured[..., None, :]) / self._filter.velocity
-        seen = np.where(self._columns >= 0, scaled, 0.0)
+    def _reached(self, here: np.ndarray, finite: np.ndarray, chunk: np.ndarray) -> MotionState:
+        """State on the previous chunk, where it is nearest to the robot."""
+        scaled = (chunk - here[..., None, :]) / self._filter.velocity
+        seen = np.where((finite | ~finite.any(-1, keepdims=True))[:, None], scaled, 0.0)
         nearest = np.maximum(np.square(seen).sum(-1).argmin(-1), 2)
         rows = np.arange(len(chunk))
         last, middle, first = (chunk[rows, nearest - k] for k in range(3))
@@ -265,14 +271,16 @@ class SmoothActionsStep(ProcessorStep):
         return MotionState.moving(last, velocity, acceleration)
 
 
-def _where(rows: Bool[np.ndarray, " batch"], yes: MotionState, no: MotionState) -> MotionState:
-    if not rows.any():
-        return no
-    values = {
-        name: np.where(rows[..., None], getattr(yes, name), getattr(no, name))
-        for name in vars(no)
-    }
-    return MotionState(**values)
+def _restarted(
+    restarted: Bool[np.ndarray, "batch values"],
+    position: Float[np.ndarray, "batch values"],
+    state: MotionState,
+) -> MotionState:
+    """The state with some values at rest at other positions."""
+    if not restarted.any():
+        return state
+    rest = vars(MotionState.moving(np.where(restarted, position, state.position)))
+    return MotionState(**{k: np.where(restarted, rest[k], x) for k, x in vars(state).items()})
 
 
 def _log(changes: Changes) -> None:
@@ -286,14 +294,8 @@ for _name, _step in ((WATCH, WatchStateStep), (SMOOTH, SmoothActionsStep)):
         ProcessorStepRegistry.register(_name)(_step)
 
 
-# Adding the steps to a checkpoint.
-
-PREPROCESSOR = "policy_preprocessor.json"
-POSTPROCESSOR = "policy_postprocessor.json"
-
-
 def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
-    """Let a trained policy's actions be smoothed wherever its checkpoint is used.
+    """Add smoothing of the actions to a trained policy's checkpoint.
 
     Steps from an earlier call are replaced. Weights and all other steps stay as they are.
 
@@ -306,8 +308,8 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
         ValueError: They cannot be read.
     """
     before, after = (read_pipeline(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
-    watch = {"registry_name": WATCH, "config": {"pair": "smooth"}}
-    smooth = {"registry_name": SMOOTH, "config": {**asdict(limits), "pair": "smooth"}}
+    watch = {"registry_name": WATCH, "config": {}}
+    smooth = {"registry_name": SMOOTH, "config": asdict(limits)}
     before["steps"].insert(0, watch)  # before a step that renames or normalises the state
     after["steps"].append(smooth)
     # Without the one that watches, the other still works: so it comes first.
@@ -316,7 +318,7 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
 
 
 def remove_smoothing(checkpoint: Path) -> None:
-    """Take the steps out again; complains as `add_smoothing`."""
+    """Remove the steps; raises like `add_smoothing`."""
     for name in (PREPROCESSOR, POSTPROCESSOR):
         write_json(checkpoint / name, read_pipeline(checkpoint / name))
 

@@ -16,7 +16,7 @@ from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from .action_limits import ActionLimits
-from .upsampling import ActionUpsampler
+from .motion_filter import ActionUpsampler
 
 logger = logging.getLogger(__name__)
 
@@ -50,8 +50,8 @@ class SmoothRobotConfig(RobotConfig):
     latency: float | None = None
     """Latency of the curve, in actions; at most (degree + 1)/2, the default."""
     clock: Literal["wall", "actions"] = "wall"
-    """True: a thread sends setpoints in real time. False: all setpoints of an action are sent
-    at once, for a simulated robot whose time advances with them.
+    """"wall": a thread sends setpoints in real time. "actions": all setpoints of an action are
+    sent at once, for a simulated robot whose time advances with them.
     """
 
 
@@ -149,21 +149,22 @@ class SmoothRobot(Robot):
             self._thread.start()
 
     def begin(self) -> None:
-        """Begin the path anew where the robot is, at rest, as after moving it by hand.
+        """Restart the path at rest at the robot's position, as after moving it by hand.
 
         Raises:
             ValueError: The robot does not report where a value of its actions is.
         """
         with self._bus:
             seen = self.inner.get_observation()
-            if missing := [name for name in self._names if name not in seen]:
+            here = np.array([float(seen.get(name, np.nan)) for name in self._names])
+            if unknown := [n for n, x in zip(self._names, here, strict=True) if x != x]:
                 raise ValueError(
-                    f"{self.inner} does not report {', '.join(missing)}, so it is not known "
-                    "where its motion begins"
+                    f"{self.inner} does not report {', '.join(unknown)}, so it is not known "
+                    "where its motion begins: check the sensor"
                 )
             self._actions.clear()
             self._started = None
-            self.upsampler.reset(np.array([float(seen[name]) for name in self._names]))
+            self.upsampler.reset(here)
 
     def get_observation(self) -> dict[str, Any]:
         self._complain()
