@@ -1,9 +1,9 @@
 """Regions of joint, Cartesian and image space and the potentials that steer by them."""
 
-from hrc_learn.regions.joint import JointRegion as JointRegion
-from hrc_learn.regions.joint import PostureRegion as PostureRegion
 from hrc_learn.regions.region import AxisRegion as AxisRegion
+from hrc_learn.regions.region import JointRegion as JointRegion
 from hrc_learn.regions.region import OrientationRegion as OrientationRegion
 from hrc_learn.regions.region import PositionRegion as PositionRegion
+from hrc_learn.regions.region import PostureRegion as PostureRegion
 from hrc_learn.regions.region import Region as Region
 from hrc_learn.regions.region import VisionRegion as VisionRegion

@@ -1,4 +1,4 @@
-"""Regions of task space: box, orientation cone, axis cone, and ellipse in the image."""
+"""Regions of task space (box, cones, ellipse in the image) and of joint space."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.numerics import cos_and_sinc
 from hrc_learn.pytree import pytree, static
 
 
@@ -116,10 +115,6 @@ class PositionRegion(Region):
 # Shorter axes are rounding noise. They occur only at the goal, inside the cone, where the
 # gradient is zero.
 _SHORTEST_AXIS = 1e-12
-# Smaller components are never divisors: the printed form has poles there.
-_LEAST_COMPONENT = 1e-9
-# Below this squared angle the closed form of the last term loses digits; its series does not.
-_SMALL = 1e-3
 
 
 @pytree
@@ -140,8 +135,9 @@ class OrientationRegion(Region):
     which has the same direction and 2 phi times the length.
 
     With `coordinates="rotation_vector"` the gradient is that of the analytic Jacobian, dP over
-    the rotation vector of x: J_l^T times the above. `formulation="paper"` is then the printed
-    chain (PartialV2Quat), (JacobianQuatAngAxisDetailed), which is twice as long.
+    the rotation vector of x: J_l^T times the above. `formulation="paper"` is then twice that,
+    as is the printed chain (PartialV2Quat), (JacobianQuatAngAxisDetailed) wherever its
+    divisions by the components of both quaternions are defined.
     """
 
     goal: Float[Tensor, "*#batch 4"]
@@ -177,15 +173,15 @@ class OrientationRegion(Region):
         P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
         # Divided by the sine, because the vector part of the error is sin(phi/2) n.
         slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
-        if self.coordinates == "rotation_vector":
-            if self.formulation == "paper":
-                return P, -2 * slope * printed_derivative(quaternion.canonical(x), self.goal)
-            gradient = slope * error[..., 1:]
-            r = quaternion.log(x).expand_as(gradient)
-            return P, quaternion.left_jacobian_transposed(r, gradient)
+        over_vector = self.coordinates == "rotation_vector"
         if self.formulation == "paper":
-            slope = slope * (4 * half_angle)
-        return P, slope * error[..., 1:]
+            # The printed chain over the rotation vector is twice the derivative.
+            slope = slope * (2 if over_vector else 4 * half_angle)
+        gradient = slope * error[..., 1:]
+        if not over_vector:
+            return P, gradient
+        r = quaternion.log(x).expand_as(gradient)
+        return P, quaternion.left_jacobian_transposed(r, gradient)
 
     def _error(self, x: Tensor) -> Tensor:
         """Error p * p_g^-1 with the sign of the shortest rotation."""
@@ -247,46 +243,6 @@ class AxisRegion(Region):
         c, s = torch.where(half_turn, 1.0, w / length), torch.where(half_turn, 0.0, k / length)
         swing = torch.cat([c * i - s * j, c * j + s * i, torch.zeros_like(i)], dim=-1)
         return swing, sine, cosine
-
-
-def printed_derivative(
-    p: Float[Tensor, "*#batch 4"], goal: Float[Tensor, "*#batch 4"]
-) -> Float[Tensor, "*both 3"]:
-    """Printed derivative of v_e: (PartialV2Quat) times J_rot (JacobianQuatAngAxisDetailed).
-
-    It divides by the components of both quaternions and counts the unit-length constraint
-    twice: along unit quaternions it is twice the true derivative, for which `OrientationRegion`
-    has a form without divisions.
-
-    Args:
-        p: Orientation with p_w >= 0; r_o is its rotation vector.
-        goal: Goal p_g, of either sign.
-    """
-    g = quaternion.conjugate(goal)  # (v_g, u_g) are components of the inverse
-    real = quaternion.multiply(p, g)[..., :1]
-    g = torch.where(real < 0, -g, g)
-    p, g = torch.broadcast_tensors(p, g)
-    sign = p.new_tensor([1.0, -1.0, -1.0, -1.0])
-    tiny = p.abs() < _LEAST_COMPONENT
-    ratio = torch.where(tiny, 0.0, sign * g / torch.where(tiny, 1.0, p))
-    # Each component subtracts p_i times the ratios of the other three.
-    over_p = sign * g - p * (ratio.sum(-1, keepdim=True) - ratio)
-    return _over_rotation_vector(over_p, quaternion.log(p))
-
-
-def _over_rotation_vector(over_p: Tensor, r: Tensor) -> Tensor:
-    """The row d v_e/d p times J_rot, whose columns are
-
-    d p_w/d r = -sinc(phi/2)/4 r,   d p_u/d r = sinc(phi/2)/2 (I - n n^T) + cos(phi/2)/2 n n^T.
-    """
-    square = (r * r).sum(-1, keepdim=True)
-    cosine, sinc = cos_and_sinc(square / 4)
-    closed = (cosine - sinc) / (2 * square.clamp(min=_SMALL))
-    series = -1 / 24 + square.clamp(max=_SMALL) / 960
-    along = torch.where(square < _SMALL, series, closed) * (over_p[..., 1:] * r).sum(
-        -1, keepdim=True
-    )
-    return sinc / 2 * over_p[..., 1:] + (along - sinc / 4 * over_p[..., :1]) * r
 
 
 # Normalised distance at which the pull of the saturated form levels off.
@@ -383,3 +339,101 @@ class VisionRegion(Region):
     def _saturated(self, square: Tensor) -> tuple[Tensor, Tensor]:
         root = torch.sqrt(1 + square / _SATURATION**2)
         return (2 * self.stiffness * _SATURATION**2) * (root - 1), 2 * self.stiffness / root
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class JointRegion(Region):
+    """Range of the joints; repels each joint from the nearer of its limits.
+
+    With the distance delta_i to the limit, negative past it:
+
+        f_i = delta_i - margin,   f_ri = delta_i - reference_margin
+        P   = sum_i k_q/2 min(0, f_i)^2 + k_r/2 min(0, f_ri)^2           (jointxp)
+
+    `formulation="paper"` is Table I's f_i = delta_i^2 - margin^2. Its push vanishes at the
+    limit and points outwards past it, because the square loses the sign.
+    """
+
+    centre: Float[Tensor, "*#batch n"]
+    """Middle of the joint range [rad]."""
+    half_range: Float[Tensor, "*#batch n"]
+    """Half of the joint range [rad]."""
+    margin: float = static(0.1)
+    """Distance from the limit at which the steep repulsion starts [rad]."""
+    reference_margin: float = static(0.3)
+    """Distance at which the weak repulsion of the reference region starts [rad]."""
+    stiffness: float = static(10.0)
+    """k_q."""
+    reference_stiffness: float = static(1.0)
+    """k_r."""
+    formulation: Literal["one_sided", "paper"] = static("one_sided")
+
+    @classmethod
+    def from_limits(
+        cls, lower: Float[Tensor, "*batch n"], upper: Float[Tensor, "*batch n"], **options
+    ) -> JointRegion:
+        """Region of the joint limits [rad]; `options` are the remaining fields."""
+        return cls(centre=(lower + upper) / 2, half_range=(upper - lower) / 2, **options)
+
+    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both n"]:
+        """f_i of every joint at the nearer limit [rad] ("paper": [rad^2])."""
+        return self._depths(self.half_range - (x - self.centre).abs())[0]
+
+    def feedback(
+        self, x: Float[Tensor, "*batch n"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
+        """Potential and its gradient over the joint positions."""
+        offset = x - self.centre
+        distance = self.half_range - offset.abs()
+        f, f_reference = (depth.clamp(max=0) for depth in self._depths(distance))
+        pull, pull_reference = self.stiffness * f, self.reference_stiffness * f_reference
+        P = 0.5 * (pull * f + pull_reference * f_reference).sum(-1)
+        slope = pull + pull_reference  # dP/d delta, at most zero
+        if self.formulation == "paper":
+            slope = slope * (2 * distance)
+        # The distance to the nearer limit falls on both sides of the centre.
+        return P, -torch.sign(offset) * slope
+
+    def _depths(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """Region functions f and f_r from the distance to the limit."""
+        if self.formulation == "paper":
+            square = distance * distance
+            return square - self.margin**2, square - self.reference_margin**2
+        return distance - self.margin, distance - self.reference_margin
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class PostureRegion(Region):
+    """Ball about a posture; attracts the joints, with a pull that saturates with the distance.
+
+    f = |q - q_g| / tolerance - 1
+    P = k s^2 (sqrt(1 + |q - q_g|^2/s^2) - 1)
+
+    Between two admissible postures, a joint-space approach meets neither singularities nor
+    joint limits; a straight line of the tool may meet both.
+    """
+
+    goal: Float[Tensor, "*#batch n"]
+    """Goal posture within the joint limits [rad]."""
+    tolerance: float = static(0.5)
+    """Radius of the region [rad], inside which task-space feedback may take over."""
+    stiffness: float = static(2.0)
+    """k, convergence rate close to the goal [1/s]."""
+    saturation: float = static(0.75)
+    """s, distance at which the pull saturates [rad]; its limit is k s [rad/s]."""
+
+    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both"]:
+        """Region function f at the joint position x [rad]."""
+        return torch.linalg.vector_norm(x - self.goal, dim=-1) / self.tolerance - 1
+
+    def feedback(
+        self, x: Float[Tensor, "*batch n"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
+        """Potential and its gradient over the joint positions."""
+        offset = x - self.goal
+        square = torch.linalg.vecdot(offset, offset).unsqueeze(-1)
+        root = torch.sqrt(1 + square / self.saturation**2)
+        P = (self.stiffness * self.saturation**2) * (root.squeeze(-1) - 1)
+        return P, self.stiffness / root * offset
