@@ -58,9 +58,7 @@ def main(args: Args) -> None:
         camera = feature_trajectories(demos)
         config = ImageJacobianFitConfig(pixel_noise=0.1)
         took, network = _timed(
-            lambda: RBFImageJacobian.fit_demonstrations(
-                camera, RBFCenters.around(camera), config
-            )
+            lambda: RBFImageJacobian.fit(camera, RBFCenters.around(camera), config)
         )
         figures["jacobian_fit_s"] = took
         figures["peak_growth_mb"] = _peak_memory() - before

@@ -33,7 +33,6 @@ from hrc_learn.jacobian import (
     KalmanEstimator,
     PaperEstimator,
     RBFImageJacobian,
-    RecursiveLeastSquaresEstimator,
 )
 from hrc_learn.kinematics import ArmChoice
 
@@ -195,9 +194,6 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
         **_imperfect(encoder_noise=1e-4),
     ),
     "composite": _grasp("composite adaptation", CompositeEstimator, suite="estimators"),
-    "least_squares": _grasp(
-        "recursive least squares", RecursiveLeastSquaresEstimator, suite="estimators"
-    ),
     "broyden": _grasp("Broyden's update", BroydenEstimator, suite="estimators"),
     "corners": _grasp(
         "the four corners of the marker instead of its centre",

@@ -35,7 +35,6 @@ from hrc_learn.jacobian import (
     FixedEstimator,
     KalmanEstimator,
     PaperEstimator,
-    RecursiveLeastSquaresEstimator,
 )
 from hrc_learn.kinematics import panda
 
@@ -44,7 +43,6 @@ _POISONS = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e300, -1e30], dtype=
 _ESTIMATORS = {
     "kalman": KalmanEstimator,
     "composite": CompositeEstimator,
-    "least_squares": RecursiveLeastSquaresEstimator,
     "paper": PaperEstimator,
     "fixed": FixedEstimator,
 }

@@ -9,7 +9,7 @@ from torch import Tensor
 from hrc_learn.controller import GRIPPER_DOWN, Goals
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import Measurement, PaperEstimator, RBFImageJacobian
-from hrc_learn.jacobian.estimator import WeightState
+from hrc_learn.jacobian.estimators import WeightState
 from hrc_learn.kinematics import JointLimits
 from hrc_learn.regions import JointRegion, OrientationRegion, PositionRegion, VisionRegion
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import ImageDemonstration
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,3 +75,13 @@ def wander(
     motion = wave * size
     turned = quaternion.multiply(quaternion.exp(motion[..., 3:]), down)
     return Pose(center + motion[..., :3], turned)
+
+
+def image_demonstrations(poses, features, visible=None) -> list[ImageDemonstration]:
+    """Demonstrations from their columns; a feature is visible where it is not NaN."""
+    if visible is None:
+        visible = [~feature.isnan().any(-1) for feature in features]
+    return [
+        ImageDemonstration(pose=pose, feature=feature, visible=seen)
+        for pose, feature, seen in zip(poses, features, visible, strict=True)
+    ]

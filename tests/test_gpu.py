@@ -8,13 +8,13 @@ import sampling
 import step_equality
 import torch
 from demo_motions import arm_motion
-from pinhole import Pinhole, wander
+from pinhole import Pinhole, image_demonstrations, wander
 from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import constrained_velocity
 from hrc_learn.dmp import ContextualDMP, JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
-from hrc_learn.jacobian import RBFImageJacobian, paper_grid
+from hrc_learn.jacobian import RBFCenters, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, panda, separation, solve_inverse
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
@@ -65,10 +65,8 @@ def image_jacobian(device: str):
     poses = wander(100, 3, rng=sampling.generator(0))
     features = camera.project(poses)
     network = RBFImageJacobian.fit(
-        [to(device, poses[i]) for i in range(3)],
-        list(features.to(device)),
-        centers=paper_grid().to(device),
-        width=0.1,
+        image_demonstrations([to(device, poses[i]) for i in range(3)], features.to(device)),
+        RBFCenters(centers=paper_grid().to(device), width=0.1),
     )
     return network(to(device, poses)), network.uncertainty(to(device, poses[0]))
 

@@ -24,9 +24,9 @@ from hrc_learn.dmp import fit_shared
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     EvidenceConfig,
+    ImageDemonstration,
     RBFCenters,
     RBFImageJacobian,
-    image_demonstrations,
     maximize_evidence,
 )
 
@@ -57,11 +57,14 @@ views = [view(80 + 3 * i) for i in range(5)]
 with distributed.processes() as rank:
     shared = fit_shared(motions, 20)
     poses, features = [pose for pose, _ in views], [pixel for _, pixel in views]
-    demonstrations = image_demonstrations(poses, features)
+    demonstrations = [
+        ImageDemonstration(pose=pose, feature=x, visible=torch.ones(len(x), dtype=torch.bool))
+        for pose, x in zip(poses, features, strict=True)
+    ]
     around = RBFCenters.around(demonstrations)
     few = EvidenceConfig(rounds=2, iterations=3)
     learned = maximize_evidence(demonstrations, around, learning=few)
-    network = RBFImageJacobian.fit_demonstrations(
+    network = RBFImageJacobian.fit(
         demonstrations, learned.neurons, learned.config
     )
     result = {

@@ -28,7 +28,7 @@ from hrc_learn.learning.fit_recordings import fit_recording, fit_report, learnin
 from hrc_learn.learning.large_datasets import fit_all, fit_streamed, sampled
 from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import FittedPrimitives, fit_contextual
-from hrc_learn.learning.primitive_fitting import fit_primitives as fit_demonstrations
+from hrc_learn.learning.primitive_fitting import fit_primitives as fit
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
@@ -93,7 +93,7 @@ def _learn(
     """
     # Only some channels take a scaling.
     scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
-    fitted = fit_demonstrations(
+    fitted = fit(
         demos,
         args.n_basis,
         args.method,

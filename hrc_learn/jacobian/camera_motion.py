@@ -22,8 +22,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian.fitting import RBFCenters
-from hrc_learn.jacobian.motion_samples import FOLDS, ImageDemonstration
+from hrc_learn.jacobian.fitting import FOLDS, ImageDemonstration, RBFCenters
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.perspective import MarkerCamera
 
@@ -360,7 +359,7 @@ def _camera_of(
     demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
 ) -> MarkerCamera:
     neurons = RBFCenters.around(demonstrations)
-    network = RBFImageJacobian.fit_demonstrations(demonstrations, neurons)
+    network = RBFImageJacobian.fit(demonstrations, neurons)
     return MarkerCamera.fit(demonstrations, network.double(), image_size)
 
 

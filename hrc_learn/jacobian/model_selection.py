@@ -20,20 +20,18 @@ from torch.utils._pytree import tree_map
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import (
-    ImageJacobianFitConfig,
-    RBFCenters,
-    prior_precision,
-    solve,
-    weight_covariance,
-    weights_without_each,
-)
-from hrc_learn.jacobian.motion_samples import (
     ImageDemonstration,
+    ImageJacobianFitConfig,
     MotionSamples,
+    RBFCenters,
     RegressionStatistics,
     component_scale,
+    prior_precision,
     samples_by_fold,
+    solve,
     statistics_by_fold,
+    weight_covariance,
+    weights_without_each,
 )
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import pytree

@@ -6,23 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import (
+    ImageDemonstration,
     ImageJacobianFitConfig,
     ImageJacobianFitReport,
     RBFCenters,
+    component_scale,
     fit_weights,
     pose_inputs,
     prior_precision,
     radial_basis,
-)
-from hrc_learn.jacobian.motion_samples import (
-    ImageDemonstration,
-    component_scale,
-    image_demonstrations,
     statistics_by_fold,
 )
 from hrc_learn.model_files import SavedModel, write_model
@@ -118,40 +115,6 @@ class RBFImageJacobian(nn.Module):
 
     @classmethod
     def fit(
-        cls,
-        poses: Sequence[Pose],
-        features: Sequence[Float[Tensor, "_ 2"]],
-        visible: Sequence[Bool[Tensor, "_"]] | None = None,
-        *,
-        centers: Float[Tensor, "K n"],
-        width: float,
-        input_indices: Sequence[int] = (0, 1),
-        config: ImageJacobianFitConfig | None = None,
-    ) -> RBFImageJacobian:
-        """Fit to demonstrations in which the camera saw the tool.
-
-        Args:
-            poses: Poses of the tool along each demonstration, (time,).
-            features: Image feature along each [px]; any value where it is not visible.
-            visible: True where the feature was found; None: wherever it is not NaN.
-            centers: Centres of the neurons.
-            width: Standard deviation of the neurons.
-            input_indices: Components of r that are inputs of the neurons.
-            config: Noise, prior and the choice of key frames.
-
-        Returns:
-            The network, with `report` and `covariance` set.
-
-        Raises:
-            ValueError: Lengths differ, or no pair of key frames is left.
-        """
-        neurons = RBFCenters(centers=centers, width=width, input_indices=tuple(input_indices))
-        return cls.fit_demonstrations(
-            image_demonstrations(poses, features, visible), neurons, config
-        )
-
-    @classmethod
-    def fit_demonstrations(
         cls,
         demonstrations: Sequence[ImageDemonstration],
         neurons: RBFCenters,
@@ -296,43 +259,3 @@ def _checked_indices(indices: Sequence[int], centers: Tensor) -> tuple[int, ...]
             f"but got {tuple(indices)} for centers with {centers.shape[-1]} columns."
         )
     return tuple(indices)
-
-
-def stack_networks(networks: Sequence[RBFImageJacobian]) -> RBFImageJacobian:
-    """One network for a feature of several points, from one network for each point.
-
-    Points fitted to the same demonstrations have the same regressors, so all image rows use
-    one covariance: that of the least certain point.
-
-    Raises:
-        ValueError: Their neurons differ.
-    """
-    first = networks[0]
-    for i, other in enumerate(networks[1:], start=1):
-        if not _same_neurons(first, other):
-            raise ValueError(
-                f"network {i} has other neurons than network 0: fit all points with the same "
-                "centers, width and input_indices"
-            )
-    stack = RBFImageJacobian(
-        first.centers,
-        float(first.width),
-        weight=torch.cat([network.weight.detach() for network in networks]),
-        input_indices=first.input_indices,
-        reference=first.reference,
-        normalized=first.normalized,
-    )
-    known = [network.covariance for network in networks if network.covariance is not None]
-    if len(known) == len(networks):
-        stack.covariance = max(known, key=lambda covariance: float(covariance.trace()))
-    return stack
-
-
-def _same_neurons(a: RBFImageJacobian, b: RBFImageJacobian) -> bool:
-    references = [network.reference for network in (a, b) if network.reference is not None]
-    return (
-        torch.equal(a.centers, b.centers)
-        and torch.equal(a.width, b.width)
-        and (a.input_indices, a.normalized) == (b.input_indices, b.normalized)
-        and (not references or (len(references) == 2 and torch.equal(*references)))
-    )

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian.motion_samples import ImageDemonstration
+from hrc_learn.jacobian.fitting import ImageDemonstration
 from hrc_learn.jacobian.network import RBFImageJacobian
 
 # Prior standard deviation of the logarithm of the focal length, about the image width: lenses
@@ -241,25 +241,6 @@ class MarkerCamera:
             rotation=_triple(_rotation_vector(back @ _matrix(np.array(self.rotation)))),
             shift=_triple(back @ (np.array(self.shift) - twist[3:])),
         )
-
-
-def fit_focal_length(
-    demonstrations: Sequence[ImageDemonstration],
-    network: RBFImageJacobian,
-    image_size: tuple[int, int],
-) -> float:
-    """Focal length of the camera that saw a marker of a moving tool [px].
-
-    It is fitted together with the pose of the camera and the position of the marker, without
-    lens distortion (see `MarkerCamera.fit`). Motions without information on it leave it near
-    the image width.
-
-    Args:
-        demonstrations: Demonstrations in which the tool moved, read one by one.
-        network: Image Jacobian fitted to them; gives the initial guess.
-        image_size: Width and height of the image [px].
-    """
-    return MarkerCamera.fit(demonstrations, network, image_size, lens=False).focal
 
 
 def _project(

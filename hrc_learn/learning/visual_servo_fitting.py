@@ -17,10 +17,10 @@ from hrc_learn.jacobian import (
     EvidenceRound,
     ImageDemonstration,
     ImageJacobianFitConfig,
+    MarkerCamera,
     RBFCenters,
     RBFImageJacobian,
     cross_validate,
-    fit_focal_length,
     maximize_evidence,
 )
 from hrc_learn.kinematics import panda
@@ -69,10 +69,11 @@ def fit_visual_servo(
     if learning is not None and len(demos) >= learning.hold_out:
         learned = maximize_evidence(camera, neurons, config, learning, on_round)
         neurons, config = learned.neurons, learned.config
-    network = RBFImageJacobian.fit_demonstrations(camera, neurons, config)
+    network = RBFImageJacobian.fit(camera, neurons, config)
     cells = cross_validate(camera, network, config).by_cell()
     ends = _ends(demos, network)
-    focal = fit_focal_length(camera, copy.deepcopy(network).double(), IMAGE_SIZE)
+    double = copy.deepcopy(network).double()
+    focal = MarkerCamera.fit(camera, double, IMAGE_SIZE, lens=False).focal
     return VisualServoSkill(
         jacobian=network,
         target=_visual_target(ends, focal) if ends else None,

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import KalmanConfig, KalmanEstimator, Measurement, RBFImageJacobian
-from hrc_learn.jacobian.learning_estimators import RecursiveState
+from hrc_learn.jacobian.estimators import KalmanState
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
 from hrc_learn.store import Radians, read_json, write_json
 
@@ -128,7 +128,7 @@ class MarkerAngle:
 class AngleState:
     """State of an `AngleServo`."""
 
-    estimator: RecursiveState
+    estimator: KalmanState
     """State of the estimator of the image Jacobian."""
     chosen: float | None = None
     """Chosen turn of the present motion [rad]; None: none so far."""
@@ -243,8 +243,8 @@ def _estimator(network: RBFImageJacobian) -> KalmanEstimator:
 
 
 def _updated(
-    estimator: KalmanEstimator, state: RecursiveState, pose: Pose, angle: Tensor, dt: float
-) -> RecursiveState:
+    estimator: KalmanEstimator, state: KalmanState, pose: Pose, angle: Tensor, dt: float
+) -> KalmanState:
     """State of the estimator after an image."""
     if bool(state.key.present):
         # The estimator learns from differences to the key frame, each less than half a turn.

@@ -27,7 +27,6 @@ from hrc_learn.jacobian import (
     FixedEstimator,
     KalmanEstimator,
     PaperEstimator,
-    RecursiveLeastSquaresEstimator,
 )
 from hrc_learn.kinematics import panda
 
@@ -37,7 +36,6 @@ ESTIMATORS = [
     FixedEstimator,
     PaperEstimator,
     CompositeEstimator,
-    RecursiveLeastSquaresEstimator,
     KalmanEstimator,
 ]
 

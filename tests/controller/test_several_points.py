@@ -7,7 +7,6 @@ import sampling
 import torch
 from closed_loop import Imperfections
 from grasp_trials import CORNERS, TrialConfig, run_trials
-from torch.utils import _pytree
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import VisionBlending
@@ -19,9 +18,7 @@ from hrc_learn.jacobian import (
     Measurement,
     PaperEstimator,
     RBFImageJacobian,
-    RecursiveLeastSquaresEstimator,
     paper_grid,
-    stack_networks,
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.pinhole_camera import PinholeCamera
@@ -70,7 +67,6 @@ def test_corners_are_points_like_any_other():
         PaperEstimator,
         BroydenEstimator,
         CompositeEstimator,
-        RecursiveLeastSquaresEstimator,
         KalmanEstimator,
     ],
 )
@@ -130,17 +126,3 @@ def test_corners_are_brought_to_their_targets():
         result = run_trials(KalmanEstimator, config)
     assert result.success.double().mean() >= 0.9
     assert not result.violations.any()
-
-
-def test_networks_of_single_points_are_stacked():
-    rng = sampling.generator(7)
-    guesses = [J0 + 100 * torch.randn(2, 6, generator=rng, dtype=DOUBLE) for _ in range(4)]
-    networks = [RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1) for J in guesses]
-    stack = stack_networks(networks)
-    tool = tools(3)
-    assert stack.rows == 8
-    torch.testing.assert_close(stack(tool), torch.cat(guesses).expand(3, 8, 6))
-    other = RBFImageJacobian.from_jacobian(J0, paper_grid(), 0.2)
-    with pytest.raises(ValueError, match="network 1 has other neurons"):
-        stack_networks([networks[0], other])
-    assert len(_pytree.tree_leaves(camera())) == 4

@@ -74,7 +74,7 @@ def reference(demonstrations):
 @pytest.fixture(scope="module")
 def camera(demonstrations):
     neurons = RBFCenters.around(demonstrations)
-    network = RBFImageJacobian.fit_demonstrations(demonstrations, neurons)
+    network = RBFImageJacobian.fit(demonstrations, neurons)
     return MarkerCamera.fit(demonstrations, network.double(), IMAGE)
 
 

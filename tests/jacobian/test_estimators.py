@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from paper_law import PrintedEstimator
-from pinhole import Pinhole, wander
+from pinhole import Pinhole, image_demonstrations, wander
 from sampling import generator
 from torch.testing import assert_close
 from unchecked import shapes_unchecked
@@ -21,22 +21,18 @@ from hrc_learn.jacobian import (
     FixedEstimator,
     KalmanConfig,
     KalmanEstimator,
-    LeastSquaresConfig,
     Measurement,
     PaperEstimator,
+    RBFCenters,
     RBFImageJacobian,
-    RecursiveLeastSquaresEstimator,
     paper_grid,
 )
-from hrc_learn.jacobian.estimator import MotionSample
-from hrc_learn.jacobian.learning_estimators import condition
 
 ALL = [
     FixedEstimator,
     PaperEstimator,
     BroydenEstimator,
     CompositeEstimator,
-    RecursiveLeastSquaresEstimator,
     KalmanEstimator,
 ]
 LEARNING = ALL[2:]
@@ -332,7 +328,6 @@ def test_composite_law_contains_the_papers():
     [
         BroydenEstimator(guess(), BroydenConfig(weight_bound=3000.0)),
         CompositeEstimator(guess(), CompositeConfig(weight_bound=3000.0, noise_floor=0.0)),
-        RecursiveLeastSquaresEstimator(guess(), LeastSquaresConfig(weight_bound=3000.0)),
         KalmanEstimator(guess(), KalmanConfig(weight_bound=3000.0)),
     ],
     ids=lambda estimator: type(estimator).__name__,
@@ -374,10 +369,10 @@ def test_kalman_filter_against_the_textbook():
     np.testing.assert_allclose(state.covariance[0].numpy(), P, rtol=1e-6, atol=1e-2)
 
 
-def test_recursive_least_squares_is_least_squares():
-    """Without forgetting the last state solves the ridge problem of all pairs at once."""
+def test_a_filter_without_drift_is_least_squares():
+    """The last state solves the ridge problem of all pairs at once."""
     network = guess()
-    estimator = RecursiveLeastSquaresEstimator(network, LeastSquaresConfig(forgetting=1.0))
+    estimator = KalmanEstimator(network, KalmanConfig(drift=0.0))
     path = wander(80, rng=generator(21))
     x = CAMERA.project(path)
     state = run(estimator, path[None], x[None])[-1]
@@ -388,44 +383,6 @@ def test_recursive_least_squares_is_least_squares():
     w0 = scaled_rows(network.weight)
     w = w0 + np.linalg.solve(precision, Phi.T @ (dX - Phi @ w0.T) / 0.5).T
     np.testing.assert_allclose(scaled_rows(state.weight[0]), w, rtol=1e-6, atol=1e-3)
-
-
-def test_forgetting_weighs_old_pairs_less():
-    """Against the weighted ridge problem: a pair k ago counts forgetting^k, so the prior."""
-    network, forgetting = guess(), 0.9
-    path = wander(12, rng=generator(22))
-    pairs = naive_pairs(path, CAMERA.project(path), network, 2e-4, 0.05)
-    prior = np.kron(np.eye(6), 1500.0**2 * np.ones((9, 9)) + 500.0**2 * np.eye(9))
-    weight, covariance = network.weight.detach(), torch.from_numpy(prior)
-    for _, dx, dr, theta in pairs:
-        pair = MotionSample(
-            twist=torch.from_numpy(dr / SCALE),
-            dr=torch.from_numpy(dr),
-            dx=torch.from_numpy(dx),
-            theta=torch.from_numpy(theta),
-            valid=torch.ones((), dtype=torch.bool),
-        )
-        weight, covariance = condition(
-            weight, covariance / forgetting, pair, torch.from_numpy(SCALE), 0.5
-        )
-
-    count = forgetting ** np.arange(len(pairs))[::-1]
-    Phi, dX = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])
-    precision = forgetting ** len(pairs) * np.linalg.inv(prior)
-    precision = precision + (Phi.T * count) @ Phi / 0.5
-    w0 = scaled_rows(network.weight)
-    w = w0 + np.linalg.solve(precision, (Phi.T * count) @ (dX - Phi @ w0.T) / 0.5).T
-    np.testing.assert_allclose(scaled_rows(weight), w, rtol=1e-6, atol=1e-3)
-
-
-def test_forgetting_does_not_wind_up():
-    """Without turning, nothing is learned of three columns; their covariance stays bounded."""
-    estimator = RecursiveLeastSquaresEstimator(guess(), LeastSquaresConfig(forgetting=0.9))
-    long = wander(600, 2, rng=generator(23), turn=0.0)
-    states = run(estimator, long, CAMERA.project(long))
-    limit = float(estimator.largest_trace) * (1 + 1e-9)
-    for state in states:
-        assert float(state.covariance.diagonal(dim1=-2, dim2=-1).sum(-1).max()) <= limit
 
 
 @pytest.mark.parametrize("Estimator", RECURSIVE)
@@ -488,7 +445,7 @@ def test_composite_law_leaves_weights_alone_where_their_neurons_are_silent():
 def test_kalman_filter_starts_from_the_fit():
     poses = wander(300, 4, rng=generator(26))
     x = CAMERA.project(poses)
-    network = RBFImageJacobian.fit(list(poses), list(x), centers=paper_grid(), width=0.1)
+    network = RBFImageJacobian.fit(image_demonstrations(poses, x), RBFCenters.paper())
     state = KalmanEstimator(network).initial_state(2)
     assert_close(state.covariance[1], network.covariance)
 

@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from pinhole import Pinhole, wander
+from pinhole import Pinhole, image_demonstrations, wander
 from sampling import generator
 from torch.testing import assert_close
 
@@ -13,13 +13,11 @@ from hrc_learn.jacobian import (
     RBFCenters,
     RBFImageJacobian,
     cross_validate,
-    image_demonstrations,
     maximize_evidence,
     paper_grid,
 )
-from hrc_learn.jacobian.fitting import weight_covariance
+from hrc_learn.jacobian.fitting import KeyFrameConfig, MotionSamples, weight_covariance
 from hrc_learn.jacobian.model_selection import NegativeLogEvidence
-from hrc_learn.jacobian.motion_samples import KeyFrameConfig, MotionSamples
 
 CAMERA = Pinhole.overhead(roll=0.7)
 
@@ -91,10 +89,8 @@ def test_learning_improves_on_ridge_and_finds_the_noise():
     excess = [state.held_out_error - 0.2 for state in learned.rounds]
     assert excess[learned.best] < 0.9 * excess[0]
     assert learned.config.pixel_noise == pytest.approx(0.1, rel=0.1)
-    ridge = RBFImageJacobian.fit_demonstrations(demonstrations, neurons, config)
-    better = RBFImageJacobian.fit_demonstrations(
-        demonstrations, learned.neurons, learned.config
-    )
+    ridge = RBFImageJacobian.fit(demonstrations, neurons, config)
+    better = RBFImageJacobian.fit(demonstrations, learned.neurons, learned.config)
     assert relative_error(better) < relative_error(ridge)
 
 
@@ -132,9 +128,7 @@ def test_neurons_around_stand_where_the_tool_was():
 def test_a_reference_survives_saving_and_half_turns(tmp_path):
     """Poses and their vectors agree though the hand points down, at a half turn."""
     demonstrations = record(2)
-    network = RBFImageJacobian.fit_demonstrations(
-        demonstrations, RBFCenters.around(demonstrations)
-    )
+    network = RBFImageJacobian.fit(demonstrations, RBFCenters.around(demonstrations))
     network.save(tmp_path / "model")
     loaded = RBFImageJacobian.load(tmp_path / "model")
     pose = demonstrations[0].pose[:5]
@@ -147,9 +141,7 @@ def test_a_reference_survives_saving_and_half_turns(tmp_path):
 def test_held_out_errors_by_place_add_up():
     demonstrations = record()
     config = ImageJacobianFitConfig(pixel_noise=0.1)
-    network = RBFImageJacobian.fit_demonstrations(
-        demonstrations, RBFCenters.around(demonstrations), config
-    )
+    network = RBFImageJacobian.fit(demonstrations, RBFCenters.around(demonstrations), config)
     report = network.report
     assert report is not None
     pairs = cross_validate(demonstrations, network, config)

@@ -10,9 +10,9 @@ import torch
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     ImageDemonstration,
+    MarkerCamera,
     RBFImageJacobian,
     depth_gradient,
-    fit_focal_length,
     paper_grid,
 )
 
@@ -82,13 +82,13 @@ def test_the_focal_length_is_found_from_motion(focal):
     _, (jacobian,) = seen(marker[None], rotation, shift, focal)
     # To begin with it is enough to know the Jacobian roughly.
     rough = np.hstack([1.1 * jacobian, np.zeros((2, 3))])
-    found = fit_focal_length(demos, constant_network(rough), IMAGE)
+    found = MarkerCamera.fit(demos, constant_network(rough), IMAGE, lens=False).focal
     assert found == pytest.approx(focal, rel=0.03)
     # Some frames of another marker do not lead it astray.
     wrong = demos[0].feature.clone()
     wrong[50:60] += 300.0
     demos[0] = replace(demos[0], feature=wrong)
-    found = fit_focal_length(demos, constant_network(rough), IMAGE)
+    found = MarkerCamera.fit(demos, constant_network(rough), IMAGE, lens=False).focal
     assert found == pytest.approx(focal, rel=0.05)
 
 
@@ -104,4 +104,5 @@ def test_motion_that_tells_nothing_leaves_the_width_of_the_image():
         pose=Pose(place, still), feature=feature, visible=torch.ones(50, dtype=torch.bool)
     )
     network = constant_network(np.hstack([jacobian, np.zeros((2, 3))]))
-    assert fit_focal_length([demo], network, IMAGE) == pytest.approx(IMAGE[0], rel=0.1)
+    found = MarkerCamera.fit([demo], network, IMAGE, lens=False).focal
+    assert found == pytest.approx(IMAGE[0], rel=0.1)

@@ -22,7 +22,6 @@ from hrc_learn.jacobian import (
     Measurement,
     PaperEstimator,
     RBFImageJacobian,
-    RecursiveLeastSquaresEstimator,
     paper_grid,
 )
 
@@ -31,7 +30,6 @@ ALL = [
     PaperEstimator,
     BroydenEstimator,
     CompositeEstimator,
-    RecursiveLeastSquaresEstimator,
     KalmanEstimator,
 ]
 CAMERA = Pinhole.overhead()

@@ -1,0 +1,632 @@
+"""Online estimators of the image Jacobian.
+
+`FixedEstimator` never changes the Jacobian, `PaperEstimator` follows the paper's law. The other
+estimators compare key frames: pairs of poses and images far enough apart to distinguish motion
+from noise, which `KeyFrameEstimator` selects online. Composite law and Broyden's update follow
+gradients. The Kalman filter keeps one Gaussian for both image rows, whose regressors are the
+same.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.utils._pytree import tree_map
+
+from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import is_number, matmul
+from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_covariance
+from hrc_learn.jacobian.network import RBFImageJacobian
+from hrc_learn.pytree import pytree
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """Measurement of one control step."""
+
+    pose: Pose
+    """Pose of the tool when the image was taken."""
+    feature: Float[Tensor, "*batch rows"]
+    """Image feature [px], u and v of one point or of several in turn; any value, also NaN,
+    where not `valid`."""
+    valid: Bool[Tensor, "*batch"]
+    """True if the feature is visible and from an image not used before."""
+    dt: float | Float[Tensor, ""]
+    """Time since the last step [s]."""
+    xi_x: Float[Tensor, "*batch rows"]
+    """Vision feedback of the controller."""
+    xi_r: Float[Tensor, "*batch 6"]
+    """Cartesian feedback of the controller."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class WeightState:
+    """State of an estimator that consists of the weights alone."""
+
+    weight: Float[Tensor, "*batch entries K"]
+    """W [px/m, px/rad], one matrix for each element of the batch."""
+
+
+class ImageJacobianEstimator(nn.Module, ABC):
+    """Adapts the weights of a network while the robot moves.
+
+    `update` is pure: it takes a state and returns a new one, so thousands of robots adapt in
+    one batch. The network supplies the neurons and the initial weights; it is not changed.
+    """
+
+    def __init__(self, network: RBFImageJacobian):
+        super().__init__()
+        self.network = network
+
+    @abstractmethod
+    def initial_state(self, *batch: int) -> Any:
+        """State before the first step, for a batch of robots.
+
+        Its tensors have the dtype and device of the network.
+        """
+
+    @abstractmethod
+    def update(self, state: Any, measurement: Measurement) -> Any:
+        """State after one control step."""
+
+    def restored(self, state: Any) -> Any:
+        """The state, reset where it is not finite."""
+        known = all_numbers(state.weight)
+        initial = self.network.weight.detach()
+        return replace(state, weight=torch.where(known, state.weight, initial))
+
+    def resumed(self, state: Any, pause: float) -> Any:
+        """State after a pause without images.
+
+        Frames before and after the pause must not be compared: the camera may have been moved
+        meanwhile.
+
+        Args:
+            state: State before the pause.
+            pause: Duration of the pause [s].
+        """
+        return state
+
+    def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
+        """State after learning from two frames chosen by the caller.
+
+        Neighbouring pairs of a motion share the noise of the frame between them, which a filter
+        does not model. One pair of means over many images, at rest at both ends, is more
+        informative than all pairs of the motion.
+
+        Args:
+            state: State before.
+            before: First frame, its feature corrected for perspective.
+            now: Second frame, at which the Jacobian is learned; its `dt` should be 0 if that
+                time has already passed in `update`.
+        """
+        return state
+
+    def jacobian(
+        self, state: Any, r: Pose | Float[Tensor, "*batch 6"]
+    ) -> Float[Tensor, "*batch rows 6"]:
+        """J_s_hat at a pose with the weights of a state.
+
+        Args:
+            state: State of this estimator.
+            r: Position [m] and rotation vector [rad], or a pose.
+        """
+        return evaluate(state.weight, self.network.basis(r))
+
+    def initial_weight(self, *batch: int) -> Float[Tensor, "*batch entries K"]:
+        """The network's weights, repeated for each element of a batch."""
+        weight = self.network.weight.detach()
+        return weight.expand(*batch, *weight.shape).clone()
+
+
+def all_numbers(matrix: Float[Tensor, "*batch rows columns"]) -> Bool[Tensor, "*batch 1 1"]:
+    """True where all entries are finite."""
+    return is_number(matrix).all(-1, keepdim=True).all(-2, keepdim=True)
+
+
+def evaluate(
+    weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
+) -> Float[Tensor, "*batch rows 6"]:
+    """J_s_hat from  vec(J_s_hat^T) = W theta."""
+    return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 6))
+
+
+class FixedEstimator(ImageJacobianEstimator):
+    """Keeps the network's weights: the baseline for all other estimators."""
+
+    def initial_state(self, *batch: int) -> WeightState:
+        """The network's weights."""
+        return WeightState(weight=self.initial_weight(*batch))
+
+    def update(self, state: WeightState, measurement: Measurement) -> WeightState:
+        """The same state."""
+        return state
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class KeyFrame:
+    """Frame with which the next one is compared."""
+
+    pose: Pose
+    """Pose of the tool."""
+    feature: Float[Tensor, "*batch rows"]
+    """Feature at that pose [px]."""
+    theta: Float[Tensor, "*batch K"]
+    """Neurons at the pose."""
+    present: Bool[Tensor, "*batch"]
+    """False until the feature is first seen."""
+
+    @staticmethod
+    def absent(network: RBFImageJacobian, *batch: int) -> KeyFrame:
+        """Key frame before the first image."""
+        like = network.centers
+        upright = like.new_tensor([1.0, 0, 0, 0]).expand(*batch, 4).clone()
+        return KeyFrame(
+            pose=Pose(like.new_zeros(*batch, 3), upright),
+            feature=like.new_zeros(*batch, network.rows),
+            theta=like.new_zeros(*batch, len(like)),
+            present=torch.zeros(batch, dtype=torch.bool, device=like.device),
+        )
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class KeyFrameState:
+    """Weights, and the frame with which the next one is compared."""
+
+    weight: Float[Tensor, "*batch entries K"]
+    """W [px/m, px/rad]."""
+    key: KeyFrame
+    """Last key frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningConfig(KeyFrameConfig):
+    """Settings of all estimators that learn from key frames."""
+
+    weight_bound: float = 2e4
+    """Largest entry of the weights [px/m], rotation scaled with `rotation_scale`."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class MotionSample:
+    """Motion from the key frame to the present one; zero without a valid pair."""
+
+    twist: Float[Tensor, "*batch 6"]
+    """Motion of the tool, linear [m] and angular [rad]."""
+    dr: Float[Tensor, "*batch 6"]
+    """Motion of the tool with rotation scaled to metres [m]."""
+    dx: Float[Tensor, "*batch rows"]
+    """Motion of the feature [px]."""
+    theta: Float[Tensor, "*batch K"]
+    """Neurons half-way, as the mean of both ends."""
+    valid: Bool[Tensor, "*batch"]
+    """True where there is a pair to learn from."""
+
+    def error(self, weight: Float[Tensor, "*batch entries K"]) -> Float[Tensor, "*batch rows"]:
+        """Prediction error dx - J_s_hat dr [px]."""
+        J = evaluate(weight, self.theta)
+        return self.dx - matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)
+
+
+class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
+    """Base of estimators that learn from pairs of key frames."""
+
+    config: Config
+
+    scale: Tensor
+    """Metres per unit of each component of a twist, (6,)."""
+
+    bound: Tensor
+    """Largest absolute value of each entry of the weights, (entries, 1)."""
+
+    def __init__(self, network: RBFImageJacobian, config: Config):
+        """Prepare the scales.
+
+        Args:
+            network: Neurons and initial weights.
+            config: Choice of key frames, and settings of the estimator.
+        """
+        super().__init__(network)
+        self.config = config
+        scale = component_scale(network.centers, config.rotation_scale)
+        bound = config.weight_bound * scale.repeat(network.rows).unsqueeze(-1)
+        self.register_buffer("scale", scale, persistent=False)
+        self.register_buffer("bound", bound, persistent=False)
+
+    def initial_state(self, *batch: int) -> Any:
+        """The network's weights and no key frame."""
+        weight, key = self.initial_weight(*batch), KeyFrame.absent(self.network, *batch)
+        return KeyFrameState(weight=weight, key=key)
+
+    def projected(
+        self, weight: Float[Tensor, "*batch entries K"]
+    ) -> Float[Tensor, "*batch entries K"]:
+        """Weights clamped to their bound.
+
+        The projection on a convex set never moves an estimate away from a truth inside it.
+        """
+        return weight.clamp(-self.bound, self.bound)
+
+    def restored(self, state: Any) -> Any:
+        """The state with weights and key frame reset where they are not finite."""
+        state = super().restored(state)
+        key, batch = state.key, state.weight.shape[:-2]
+        pose = key.pose
+        numbers = torch.cat([pose.position, pose.orientation, key.feature, key.theta], dim=-1)
+        known = is_number(numbers).all(-1)
+        absent = KeyFrame.absent(self.network, *batch)
+        key = tree_map(
+            lambda x, none: torch.where(
+                known if x.dim() == known.dim() else known[..., None], x, none
+            ),
+            key,
+            absent,
+        )
+        return replace(state, key=key)
+
+    def resumed(self, state: Any, pause: float) -> Any:
+        """The same weights, and no key frame."""
+        batch = state.weight.shape[:-2]
+        return replace(state, key=KeyFrame.absent(self.network, *batch))
+
+    def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
+        """State after one more pair; the key frame stays."""
+        first = KeyFrame(
+            pose=before.pose,
+            feature=before.feature,
+            theta=self.network.basis(now.pose),
+            present=before.valid,
+        )
+        learned = self.update(replace(state, key=first), now)
+        return replace(learned, key=state.key)
+
+    def advance(
+        self,
+        key: KeyFrame,
+        measurement: Measurement,
+        theta: Float[Tensor, "*batch K"],
+    ) -> tuple[KeyFrame, MotionSample]:
+        """Compare with the key frame, and move it here once the tool is `min_step` away.
+
+        Where the tool has moved further than `max_step`, for example while the feature was
+        lost, the key frame moves without a pair.
+
+        Args:
+            key: Last key frame.
+            measurement: Present measurement.
+            theta: Neurons at the pose of the measurement.
+        """
+        config = self.config
+        twist = key.pose.twist_to(measurement.pose)
+        distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
+        moved = measurement.valid & key.present & (distance >= config.least_step)
+        valid = moved & (distance <= config.max_step)
+        # An invalid pair may contain NaN; zeros leave every weight unchanged.
+        use = valid.unsqueeze(-1)
+        twist = torch.where(use, twist, 0.0)
+        pair = MotionSample(
+            twist=twist,
+            dr=twist * self.scale,
+            dx=torch.where(use, measurement.feature - key.feature, 0.0),
+            theta=(key.theta + theta) / 2,
+            valid=valid,
+        )
+        # The first frame seen becomes a key frame, and so does the end of every pair.
+        take = (moved | (measurement.valid & ~key.present)).unsqueeze(-1)
+        here = KeyFrame(
+            pose=Pose(
+                torch.where(take, measurement.pose.position, key.pose.position),
+                torch.where(take, measurement.pose.orientation, key.pose.orientation),
+            ),
+            feature=torch.where(take, measurement.feature, key.feature),
+            theta=torch.where(take, theta, key.theta),
+            present=key.present | measurement.valid,
+        )
+        return here, pair
+
+
+class PaperEstimator(ImageJacobianEstimator):
+    """The paper's law,  W_dot = -[L theta s^T xi_x']^T,  s = J_s_hat^T xi_x + xi_r  (update).
+
+    L is a multiple of the identity. The law reduces the energy |s|^2 that the command puts
+    into the task. It uses no measured image motion, so it cannot correct a wrong Jacobian. With
+    Table I's L = 0.25 I, weights of 1e3 px/m change by parts in 1e9.
+    """
+
+    def __init__(self, network: RBFImageJacobian, gain: float = 0.25):
+        """Prepare the law.
+
+        Args:
+            network: Neurons and initial weights.
+            gain: Diagonal of L.
+        """
+        super().__init__(network)
+        self.gain = gain
+
+    def initial_state(self, *batch: int) -> WeightState:
+        """The network's weights."""
+        return WeightState(weight=self.initial_weight(*batch))
+
+    def update(self, state: WeightState, measurement: Measurement) -> WeightState:
+        """Take one explicit Euler step of dt."""
+        theta = self.network.basis(measurement.pose)
+        rate = paper_rate(state.weight, theta, measurement, self.gain)
+        return WeightState(weight=state.weight + measurement.dt * rate)
+
+
+def paper_rate(
+    weight: Float[Tensor, "*batch entries K"],
+    theta: Float[Tensor, "*batch K"],
+    measurement: Measurement,
+    gain: float,
+) -> Float[Tensor, "*batch entries K"]:
+    """Rate W_dot of the paper's law.
+
+    xi_x'^T s is the outer product of xi_x and s, row by row, so d(J_s_hat)/dt =
+    -gain |theta|^2 xi_x s^T at the present pose.
+    """
+    xi_x = measurement.xi_x.unsqueeze(-1)
+    J = evaluate(weight, theta)
+    s = matmul(J.mT, xi_x).squeeze(-1) + measurement.xi_r
+    push = (xi_x * s.unsqueeze(-2)).flatten(-2)  # (*batch, 12)
+    return -gain * push.unsqueeze(-1) * theta.unsqueeze(-2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompositeConfig(LearningConfig):
+    """Gains of the composite law."""
+
+    task_gain: float = 0.25
+    """Gain of the paper's term, the diagonal of L."""
+    prediction_gain: float = 0.5
+    """Fraction of the prediction error removed by one pair, in [0, 2)."""
+    noise_floor: float = 2e-3
+    """Motion at which half of that fraction is removed [m]; smaller motions are mostly
+    noise."""
+
+
+class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
+    """Composite adaptation: task error and prediction error (Slotine and Li 1989).
+
+    Between key frames the prediction error is e = dx - J_s_hat dr. Each pair moves the
+    weights along the gradient of |e|^2, normalised by the size of the regressor:
+
+        W <- W + gamma e (x) dr theta^T / (|theta|^2 (|dr|^2 + floor^2))
+
+    so |e| shrinks by the factor 1 - gamma |dr|^2 / (|dr|^2 + floor^2), never grows for
+    0 < gamma < 2, and pairs with little motion, mostly noise, count little. The entries of the
+    weights are bounded.
+    """
+
+    def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
+        super().__init__(network, config or CompositeConfig())
+
+    def update(self, state: KeyFrameState, measurement: Measurement) -> KeyFrameState:
+        """One step of dt of the paper's term, and the correction by a new pair."""
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta)
+        rate = paper_rate(state.weight, theta, measurement, self.config.task_gain)
+        change = measurement.dt * rate + self._correction(state.weight, pair)
+        weight = state.weight + change
+        return KeyFrameState(weight=self.projected(weight), key=key)
+
+    def _correction(self, weight: Tensor, pair: MotionSample) -> Tensor:
+        """Normalised gradient step on the prediction error; zero without a new pair."""
+        config = self.config
+        motion = pair.dr.square().sum(-1) + config.noise_floor**2
+        # Normalised neurons never fade. Others do between and beyond the centres: dividing by
+        # their small activity there would change weights far too much that act elsewhere.
+        least = 0.0 if self.network.normalized else 1.0
+        activity = pair.theta.square().sum(-1).clamp_min(least)
+        size = (motion * activity).clamp_min(torch.finfo(motion.dtype).tiny)
+        step = config.prediction_gain * pair.error(weight) / size.unsqueeze(-1)
+        entries = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
+        return entries.flatten(-2).unsqueeze(-1) * pair.theta.unsqueeze(-2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BroydenConfig(LearningConfig):
+    """Step of Broyden's update."""
+
+    min_step: float = 2e-3
+    """Least motion between key frames [m]; large, because the update has no noise model."""
+    gain: float = 0.5
+    """Fraction of the prediction error removed by one pair, in (0, 1]."""
+
+
+def check_normalised(network: RBFImageJacobian, law: str) -> None:
+    """Raise ValueError unless equal weights of all neurons give a constant Jacobian."""
+    if not network.normalized:
+        raise ValueError(
+            f"{law} a constant Jacobian, which only normalised neurons can represent: build "
+            "the network with normalized=True."
+        )
+
+
+class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
+    """Broyden's update,  J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997).
+
+    It applies everywhere at once: equal changes of all normalised neurons add a constant.
+    """
+
+    def __init__(self, network: RBFImageJacobian, config: BroydenConfig | None = None):
+        """Prepare the update.
+
+        Raises:
+            ValueError: The network's neurons are not normalised.
+        """
+        super().__init__(network, config or BroydenConfig())
+        check_normalised(network, "Broyden's update adds")
+
+    def update(self, state: KeyFrameState, measurement: Measurement) -> KeyFrameState:
+        """Update with a new pair, if there is one."""
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta)
+        # dr is zero without a pair; the floor avoids 0 / 0.
+        size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
+        step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
+        change = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
+        weight = state.weight + change.flatten(-2).unsqueeze(-1)
+        return KeyFrameState(weight=self.projected(weight), key=key)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KalmanConfig(LearningConfig):
+    """Prior, noise and drift."""
+
+    pixel_noise: float = 0.5
+    """Standard deviation of the measured feature [px]; enters twice into each pair."""
+    bias_std: float = 1500.0
+    """Prior standard deviation of the mean Jacobian [px/m]."""
+    weight_std: float = 500.0
+    """Prior standard deviation of each neuron's deviation from the mean [px/m]."""
+    drift: float = 100.0
+    """Random walk of the mean Jacobian [px/m/sqrt(s)]."""
+    watched_drift: float | None = None
+    """Random walk while images arrive, when a motion of the camera would be noticed; `drift`
+    then applies to pauses alone. None: `drift`."""
+
+    def pair_noise(
+        self, weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
+    ) -> float | Float[Tensor, "*batch 1 1"]:
+        """Variance of each coordinate of dx - J_s_hat dr [px^2].
+
+        Both ends of a pair are measured with noise in the image and in the pose, and the
+        Jacobian turns the latter into pixels: the effective variance of an errors-in-variables
+        model.
+
+        Args:
+            weight: Weights of the network [px/m, px/rad].
+            theta: Neurons of the pair.
+        """
+        pixels = 2 * self.pixel_noise**2
+        if self.pose_noise == 0:
+            return pixels
+        rows = evaluate(weight, theta)
+        # Pose noise in radians is scaled to metres.
+        metres = rows / component_scale(rows, self.rotation_scale)
+        # The larger image row, as both have one covariance.
+        square = metres.square().sum(-1).amax(-1)
+        return (pixels + 2 * self.pose_noise**2 * square)[..., None, None]
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class KalmanState(KeyFrameState):
+    """Mean and covariance of the weights, and the last key frame."""
+
+    covariance: Float[Tensor, "*batch P P"]
+    """Covariance of either image row, in (component, neuron) order [(px/m)^2]."""
+
+
+class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
+    """Random walk on a bias Jacobian plus the weights, observed through dx = J_s dr.
+
+    With normalised neurons a bias is an equal change of all weights, so it needs no state of
+    its own, only its covariance. Both image rows have the same regressors and one covariance.
+    """
+
+    first_covariance: Tensor
+    """Initial covariance, (P, P)."""
+    walk: Tensor
+    """Covariance of the random walk per second, (P, P)."""
+
+    def __init__(self, network: RBFImageJacobian, config: KalmanConfig | None = None):
+        """Prepare the filter.
+
+        Args:
+            network: Neurons and initial weights. The covariance of an offline fit is the
+                initial one of the filter.
+            config: Prior, noise and drift.
+
+        Raises:
+            ValueError: The network's neurons are not normalised.
+        """
+        super().__init__(network, config or KalmanConfig())
+        check_normalised(network, "the filter's drift is")
+        # The posterior of an offline fit, or the prior.
+        covariance = network.covariance
+        if covariance is None:
+            bias, weight = self.config.bias_std, self.config.weight_std
+            neurons = weight_covariance(network.centers, bias, weight)
+            covariance = torch.block_diag(*[neurons] * 6)
+        covariance = (covariance + covariance.mT) / 2  # symmetric to the last bit
+        self.register_buffer("first_covariance", covariance, persistent=False)
+        # An equal drift of all neurons, independent between the six components.
+        K = len(network.centers)
+        walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
+        self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)
+        drift, watched = self.config.drift, self.config.watched_drift
+        self.watched = 1.0 if watched is None else (watched / drift) ** 2
+
+    def initial_state(self, *batch: int) -> KalmanState:
+        """The network's weights, its posterior or the prior, and no key frame."""
+        shape = self.first_covariance.shape
+        return KalmanState(
+            weight=self.initial_weight(*batch),
+            covariance=self.first_covariance.expand(*batch, *shape).clone(),
+            key=KeyFrame.absent(self.network, *batch),
+        )
+
+    def restored(self, state: KalmanState) -> KalmanState:
+        """The state reset where invalid, with the initial covariance for initial weights."""
+        known = all_numbers(state.weight) & all_numbers(state.covariance)
+        covariance = torch.where(known, state.covariance, self.first_covariance)
+        return replace(super().restored(state), covariance=covariance)
+
+    def resumed(self, state: KalmanState, pause: float) -> KalmanState:
+        """No key frame, and the drift of the pause."""
+        state = super().resumed(state, pause)
+        return replace(state, covariance=state.covariance + pause * self.walk)
+
+    def update(self, state: KalmanState, measurement: Measurement) -> KalmanState:
+        """Drift for dt, then one pair if there is a new one."""
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta)
+        weight, covariance = condition(
+            state.weight,
+            state.covariance + measurement.dt * self.watched * self.walk,
+            pair,
+            self.scale,
+            self.config.pair_noise(state.weight, pair.theta),
+        )
+        return KalmanState(weight=self.projected(weight), covariance=covariance, key=key)
+
+
+def condition(
+    weight: Float[Tensor, "*batch entries K"],
+    covariance: Float[Tensor, "*batch P P"],
+    pair: MotionSample,
+    scale: Float[Tensor, "6"],
+    noise: float | Float[Tensor, "*batch 1 1"],
+) -> tuple[Float[Tensor, "*batch entries K"], Float[Tensor, "*batch P P"]]:
+    """Mean and covariance conditioned on one more pair; unchanged without one.
+
+    With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
+
+    Args:
+        weight: Mean before.
+        covariance: Covariance before.
+        pair: Observed motion.
+        scale: Metres per unit of each component of a twist.
+        noise: Variance of each coordinate of dx - J_s_hat dr [px^2].
+    """
+    phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
+    P_phi = matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
+    spread = (P_phi * phi).sum(-1, keepdim=True) + noise
+    change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
+    change = change.unflatten(-1, (6, -1)) * scale.unsqueeze(-1)  # (*batch, 2, 6, K)
+    # The outer product of a vector with itself is exactly symmetric. That of the gain and P_phi
+    # is not, and forgetting amplifies the difference until the covariance is indefinite.
+    root = P_phi / spread.sqrt()
+    return weight + change.flatten(-3, -2), covariance - root.mT * root
