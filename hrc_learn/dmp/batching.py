@@ -1,32 +1,15 @@
 """Batches of primitives: selection, stacking and concatenation."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from hrc_learn.dmp.fitting.samples import FitReport
-
-
-def select[M: nn.Module](primitive: M, index: Any) -> M:
-    """Part of a batch of primitives, `primitive[index]`, with memory of its own.
-
-    Gradients flow through weights that are a buffer; a parameter is copied.
-
-    Raises:
-        IndexError: The index is out of range.
-    """
-
-    def chosen(path: str, x: Tensor) -> Tensor:
-        x = x.detach() if isinstance(x, nn.Parameter) else x
-        shared = _name(path) == "timestamps" and x.ndim == 1
-        return x.clone() if shared else x[index].clone()
-
-    return _changed(primitive, chosen)
+from hrc_learn.dmp.motion_primitive import MotionPrimitive
 
 
-def stack[M: nn.Module](primitives: Sequence[M]) -> M:
+def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
     """Batch of primitives of one kind, basis and spring, along a new first axis.
 
     If timestamps differ, each primitive keeps its own, with the last one repeated as padding.
@@ -40,21 +23,18 @@ def stack[M: nn.Module](primitives: Sequence[M]) -> M:
     first, *others = (_description(primitive) for primitive in primitives)
     for i, other in enumerate(others, start=1):
         _check_equal(first, other, f"primitive {i}")
-    tensors = [dict(_tensors(primitive)) for primitive in primitives]
-
-    def stacked(path: str, x: Tensor) -> Tensor | None:
-        found = [each.get(path) for each in tensors]
-        present = [
-            x.detach() if isinstance(x, nn.Parameter) else x for x in found if x is not None
-        ]
-        if len(present) < len(primitives):
-            return None
-        return _padded(present) if _name(path) == "timestamps" else torch.stack(present)
-
-    return _changed(primitives[0], stacked)
+    tensors = [primitive.tensors() for primitive in primitives]
+    common = set.intersection(*(set(each) for each in tensors))
+    columns = {name: [each[name] for each in tensors] for name in tensors[0] if name in common}
+    return primitives[0].with_tensors(
+        {
+            name: _padded(rows) if name == "timestamps" else torch.stack(rows)
+            for name, rows in columns.items()
+        }
+    )
 
 
-def concatenate[M: nn.Module](batches: Iterable[M], samples: int) -> M:
+def concatenate[P: MotionPrimitive](batches: Iterable[P], samples: int) -> P:
     """Batches of primitives of one kind, joined along their first axis.
 
     They are read one by one and released after copying. Because demonstrations may have
@@ -67,33 +47,22 @@ def concatenate[M: nn.Module](batches: Iterable[M], samples: int) -> M:
     Raises:
         ValueError: There is no batch, or they differ; the message says in what.
     """
-    first, described, count = None, {}, 0
-    parts: dict[str, list[Tensor]] = {}
+    first, described = None, {}
+    parts: list[dict[str, Tensor]] = []
     for batch in batches:
-        weights: Any = batch.motion.weights  # pyright: ignore[reportAttributeAccessIssue]
-        own = _description(batch) | {"shape of the weights": weights.shape[1:]}
+        own = _description(batch)
+        own["shape of the weights"] = own["shape of the weights"][1:]
         if first is None:
             # A copy, so that the memory behind the batch is released.
-            first, described = select(batch, slice(0, 1)), own
-        _check_equal(described, own, f"batch {count}")
-        count += 1
-        for path, x in _tensors(batch):
-            if _name(path) != "timestamps":
-                parts.setdefault(path, []).append(x.detach().clone())
+            first, described = batch[:1], own
+        _check_equal(described, own, f"batch {len(parts)}")
+        parts.append({name: x.detach().clone() for name, x in batch.tensors().items()})
     if first is None:
         raise ValueError("there are no primitives to concatenate")
-
-    def joined(path: str, x: Tensor) -> Tensor | None:
-        if _name(path) == "timestamps":
-            return torch.linspace(0, 1, samples, dtype=x.dtype, device=x.device)
-        found = parts[path]
-        return torch.cat(found) if len(found) == count else None
-
-    return _changed(first, joined)
-
-
-def _name(path: str) -> str:
-    return path.rpartition(".")[2]
+    common = set.intersection(*(set(part) for part in parts)) - {"timestamps"}
+    joined = {name: torch.cat([part[name] for part in parts]) for name in common}
+    joined["timestamps"] = torch.linspace(0, 1, samples).to(first.motion.timestamps)
+    return first.with_tensors(joined)
 
 
 def _check_equal(first: dict[str, Any], other: dict[str, Any], label: str) -> None:
@@ -116,47 +85,9 @@ def _padded(rows: list[Tensor]) -> Tensor:
     return torch.stack(torch.broadcast_tensors(*rows))
 
 
-def _description(primitive: Any) -> dict[str, Any]:
+def _description(primitive: MotionPrimitive) -> dict[str, Any]:
     return {
         "kind": type(primitive).__name__,
         **primitive.motion.config(),
-        **primitive._own_config(),
         "shape of the weights": tuple(primitive.motion.weights.shape),
     }
-
-
-def _own_tensors(module: nn.Module) -> Iterator[tuple[str, Tensor]]:
-    yield from module._parameters.items()  # pyright: ignore[reportReturnType]
-    yield from module._buffers.items()  # pyright: ignore[reportReturnType]
-    # In some kinds the report is a property that returns that of another module.
-    if isinstance(report := vars(module).get("fit_report"), FitReport):
-        yield from ((f"fit_report.{name}", x) for name, x in report.tensors().items())
-
-
-def _tensors(module: nn.Module, prefix: str = "") -> Iterator[tuple[str, Tensor]]:
-    for path, part in module.named_modules(prefix=prefix):
-        for name, x in _own_tensors(part):
-            yield f"{path}.{name}" if path else name, x
-
-
-def _changed[M: nn.Module](
-    module: M, change: Callable[[str, Tensor], Tensor | None], prefix: str = ""
-) -> M:
-    """Module with changed tensors; all other attributes are those of the original."""
-    new = type(module).__new__(type(module))
-    new.__dict__.update(vars(module))
-    tensors = {name: change(prefix + name, x) for name, x in _own_tensors(module)}
-    report = {k.partition(".")[2]: x for k, x in tensors.items() if k.startswith("fit_report.")}
-    if report:
-        known = {k: x for k, x in report.items() if x is not None}
-        complete = {"rmse", "peak", "span"} <= known.keys()
-        new.__dict__["fit_report"] = FitReport(**known) if complete else None
-    new._buffers = {name: tensors[name] for name in module._buffers}
-    new._parameters = {
-        name: nn.Parameter(x) for name in module._parameters if (x := tensors[name]) is not None
-    }
-    new._modules = {
-        name: None if part is None else _changed(part, change, f"{prefix}{name}.")
-        for name, part in module._modules.items()
-    }
-    return new

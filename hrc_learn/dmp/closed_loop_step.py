@@ -15,8 +15,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import broadcast_shapes, fits_numpy, readable
-from hrc_learn.dmp._system.response import Response
-from hrc_learn.dmp._system.spring import SpringDamper, approach_state
+from hrc_learn.dmp.dynamics import SpringDamper, approach_state
+from hrc_learn.dmp.response import Response
 
 RESONANCE = 1e-3
 """Smallest distance of a goal filter from a mode of the spring, relative to the stiffness. The

@@ -1,47 +1,19 @@
 """Primitives as a function of a task parameter, by ridge regression."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
 from pathlib import Path
-from types import NoneType
 from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, to_tensor
-from hrc_learn.dmp.fitting.motion_fit import FitOptions
-from hrc_learn.dmp.fitting.samples import FitReport, check_samples
-from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, checked_vector, to_tensor
+from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.probabilistic_dmp import mean_primitive
+from hrc_learn.dmp.samples import FitReport, check_samples
 from hrc_learn.model_files import SavedModel, write_model
-
-type FeatureMap = Callable[[Tensor], Tensor]
-"""Map from contexts (*batch, C) to features (*batch, F), without a constant."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PolynomialFeatures:
-    """Products of up to `degree` coordinates of the context; 1: the context itself."""
-
-    degree: int = 1
-
-    def __post_init__(self):
-        if self.degree < 1:
-            raise ValueError(f"degree must be at least 1, got {self.degree}")
-
-    def __call__(self, context: Float[Tensor, "*batch C"]) -> Float[Tensor, "*batch F"]:
-        """Features of contexts (*batch, C)."""
-        columns = context.unbind(-1)
-        products = [
-            torch.stack(factors).prod(0)
-            for degree in range(1, self.degree + 1)
-            for factors in combinations_with_replacement(columns, degree)
-        ]
-        return torch.stack(products, dim=-1)
-
 
 CONSTANT = 1e-12
 """Standard deviation relative to the size below which a feature counts as constant: what is
@@ -117,7 +89,7 @@ OWN_TENSORS = ("coefficients", "feature_mean", "feature_scale", "held_out_durati
 class ContextualDMP(nn.Module):
     """Joint primitives as a function of a task parameter, the context c.
 
-    x(c) = a + B (phi(c) - mean) / scale,   x = (weights, y_0', y_0, g, log tau)
+    x(c) = a + B (c - mean) / scale,   x = (weights, y_0', y_0, g, log tau)
 
     a and B by ridge regression from one demonstration per context (after Forte et al. 2012,
     "On-line motion synthesis and adaptation using a trajectory database", and Ude et al.
@@ -143,21 +115,19 @@ class ContextualDMP(nn.Module):
         feature_scale: Float[Tensor, "F"],
         held_out: FitReport,
         held_out_duration: Float[Tensor, "n"],
-        features: FeatureMap,
     ):
         """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
             mean: Single primitive with the common basis, gains and names.
             coefficients: a and B transposed; K = D (N + 3) + 1.
-            feature_mean: Mean features of the demonstrations.
-            feature_scale: Scale of the features.
+            feature_mean: Mean context of the demonstrations.
+            feature_scale: Scale of the contexts.
             held_out: Residuals of leave-one-out predictions.
             held_out_duration: Ratios of durations to leave-one-out predictions.
-            features: Feature map phi.
 
         Raises:
-            ValueError: Coefficients that do not fit the primitive or the features.
+            ValueError: Coefficients that do not fit the primitive or the contexts.
         """
         super().__init__()
         D, N = mean.weights.shape
@@ -172,7 +142,6 @@ class ContextualDMP(nn.Module):
         self.register_buffer("feature_scale", feature_scale)
         self.register_buffer("held_out_duration", held_out_duration)
         self.held_out = held_out
-        self.features = features
 
     @classmethod  # pyright: ignore[reportArgumentType]
     def fit(
@@ -183,7 +152,6 @@ class ContextualDMP(nn.Module):
         n_basis: int = 50,
         mask: Mask | None = None,
         *,
-        features: FeatureMap | None = None,
         regularization: float = 1e-6,
         joint_names: Sequence[str] | None = None,
         units: str = "rad",
@@ -197,8 +165,7 @@ class ContextualDMP(nn.Module):
             context: (n, C), or (n,) for C = 1.
             n_basis: N.
             mask: (n, T), false at samples to ignore.
-            features: Feature map phi; by default the context itself.
-            regularization: Ridge over standardised features, positive. The default hardly
+            regularization: Ridge over standardised contexts, positive. The default hardly
                 smooths; compare `held_out` for noisy demonstrations.
             joint_names: D names, stored with the primitive.
             units: Units of the coordinates.
@@ -212,10 +179,8 @@ class ContextualDMP(nn.Module):
         if each.weights.ndim != 3:
             raise ValueError(f"position must be (n, T, D), got {_shape(position)}")
         samples = check_samples(time, position, mask=mask)
-        features = features or PolynomialFeatures()
-        phi = features(_contexts(context, each)).double()
         x = _coordinates(each)
-        ridge = fit_ridge(phi, x, regularization)
+        ridge = fit_ridge(_contexts(context, each), x, regularization)
         predicted = _primitive(each, x - ridge.held_out)
         with torch.no_grad():
             held_out = samples.compare(predicted.rollout().position)
@@ -227,7 +192,6 @@ class ContextualDMP(nn.Module):
             feature_scale=ridge.scale.to(dtype),
             held_out=held_out,
             held_out_duration=ridge.held_out[:, -1].exp().to(dtype),
-            features=features,
         )
 
     def at(self, context: Vectors) -> JointDMP:
@@ -236,36 +200,20 @@ class ContextualDMP(nn.Module):
         The weights of the result are a buffer, because the coefficients are the parameters.
         """
         like = self.coefficients
-        phi = self.features(to_tensor(context, dtype=like.dtype, device=like.device))
-        F = len(self.feature_mean)
-        if phi.ndim == 0 or phi.shape[-1] != F:
-            raise ValueError(
-                f"context of shape {_shape(context)} gives features {tuple(phi.shape)}, "
-                f"fitted were (..., {F})"
-            )
-        standard = (phi - self.feature_mean) / self.feature_scale
+        c = checked_vector("context", context, self.feature_mean)
+        standard = (c - self.feature_mean) / self.feature_scale
         return _primitive(self.mean, like[0] + standard @ like[1:])
 
     def save(self, folder: str | Path) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save.
-
-        A feature map other than `PolynomialFeatures` is code and is not saved: pass the same
-        one to `load`.
-        """
-        phi = self.features
-        features = {"degree": phi.degree} if isinstance(phi, PolynomialFeatures) else None
-        config = self.mean.config() | {"features": features}
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
         own = {name: getattr(self, name) for name in OWN_TENSORS}
         report = {f"held_out.{k}": v for k, v in self.held_out.tensors().items()}
-        write_model(folder, type(self).__name__, config, self.mean.tensors() | own | report)
+        tensors = self.mean.tensors() | own | report
+        write_model(folder, type(self).__name__, self.mean.config(), tensors)
 
     @classmethod
-    def load(cls, folder: str | Path, features: FeatureMap | None = None) -> "ContextualDMP":
+    def load(cls, folder: str | Path) -> "ContextualDMP":
         """Read a primitive that `save` wrote.
-
-        Args:
-            folder: Folder of the saved primitive.
-            features: Feature map of the fit, unless it was a polynomial.
 
         Raises:
             FileNotFoundError: The folder holds no saved primitive.
@@ -274,14 +222,9 @@ class ContextualDMP(nn.Module):
         saved = SavedModel(folder, cls.__name__)
         own = {name: saved.tensor(name) for name in OWN_TENSORS}
         report = {k: saved.tensor(f"held_out.{k}") for k in ("rmse", "peak", "span")}
-        features = _saved_features(saved, features)
+        mean = JointDMP.restore(saved)
         try:
-            return cls(
-                mean=JointDMP.restore(saved),
-                features=features,
-                held_out=FitReport(**report),
-                **own,
-            )
+            return cls(mean=mean, held_out=FitReport(**report), **own)
         except ValueError as error:
             raise saved.invalid(error) from None
 
@@ -307,25 +250,9 @@ def _contexts(context: Vectors, primitives: JointDMP) -> Float[Tensor, "n C"]:
             f"context has shape {_shape(context)}: expected one row for each of "
             f"{len(weights)} demonstrations"
         )
-    if not tensor.isfinite().all():
-        raise ValueError(f"context of demonstration {_first_bad(tensor)} is not finite")
+    if len(bad := (~tensor.isfinite()).nonzero()):
+        raise ValueError(f"context of demonstration {int(bad[0, 0])} is not finite")
     return tensor
-
-
-def _first_bad(rows: Tensor) -> int:
-    return int((~rows.isfinite()).nonzero()[0, 0])
-
-
-def _saved_features(saved: SavedModel, given: FeatureMap | None) -> FeatureMap:
-    fields = saved.get("features", dict, NoneType)
-    if given is not None:
-        return given
-    if fields is None:
-        raise saved.invalid_field("features", "fitted with a custom map: pass it to load")
-    try:
-        return PolynomialFeatures(**fields)
-    except (TypeError, ValueError) as error:
-        raise saved.invalid_field("features", error) from None
 
 
 def _shape(values: Points | Vectors) -> tuple[int, ...]:

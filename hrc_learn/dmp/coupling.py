@@ -1,8 +1,8 @@
 """Coupling terms: effects of the robot, its surroundings and a second arm on a motion.
 
 `step` takes their results as `phase_stopping` or as `coupling`. Obstacles are given by points
-on their surfaces, the nearest of each, so that the terms need no shapes: see
-`nearest_on_sphere` and `nearest_on_box`.
+on their surfaces, the nearest of each, so that the terms need no shapes; see
+`nearest_on_sphere`.
 
 Forces and the distance to a second arm act on the velocity (Gams et al. 2014, "Coupling
 movement primitives: interaction with the environment and bimanual tasks"). The spring opposes a
@@ -12,16 +12,16 @@ push on the acceleration; a term C added to the velocity moves the primitive as 
 
 C = tau gain error, with an error of force or of distance. A goal that contradicts the wanted
 force still pulls: at rest, feedback alone leaves 1 / (1 + K gain) of the error, K = k tau /
-beta on a contact of stiffness k, 2 tau / beta between two arms. `learn_feed_forward` removes
-the rest over repetitions. A coupling is constant over each step, which is of first order in its
-length.
+beta on a contact of stiffness k, 2 tau / beta between two arms. The feedback of one repetition
+as feed-forward of the next reduces it by the same factor again. A coupling is constant over
+each step, which is of first order in its length.
 """
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp.dynamics import SpringDamper
 
 TOUCH = 1e-3
 """Distance [m] below which repulsion stays constant, because it has no bound at contact."""
@@ -120,15 +120,6 @@ def nearest_on_sphere(
     return centre + offset * inwards
 
 
-def nearest_on_box(
-    position: Float[Tensor, "*#batch 3"],
-    centre: Float[Tensor, "*#batch 3"],
-    half_size: Float[Tensor, "*#batch 3"],
-) -> Float[Tensor, "*batch 3"]:
-    """Nearest point of a solid axis-aligned box [m]; inside, `position` itself."""
-    return torch.minimum(torch.maximum(position, centre - half_size), centre + half_size)
-
-
 def velocity_coupling(
     velocity: Float[Tensor, "*#batch D"],
     acceleration: Float[Tensor, "*#batch D"],
@@ -173,59 +164,3 @@ def offset_error(
         wanted: Offset to keep.
     """
     return wanted - (other - position), velocity - other_velocity
-
-
-def distance_error(
-    position: Float[Tensor, "*#batch D"],
-    velocity: Float[Tensor, "*#batch D"],
-    other: Float[Tensor, "*#batch D"],
-    other_velocity: Float[Tensor, "*#batch D"],
-    wanted: Float[Tensor, "*#batch"] | float,
-) -> tuple[Float[Tensor, "*batch D"], Float[Tensor, "*batch D"]]:
-    """Wanted minus actual distance along the line from one arm to the other, and its rate.
-
-    Unlike `offset_error` it lets the pair turn. If both are at one point, the error is zero.
-
-    Args:
-        position: Position of the first arm [m].
-        velocity: Velocity of the first arm [m/s].
-        other: Position of the second arm [m], which plus the error moves.
-        other_velocity: Velocity of the second arm [m/s].
-        wanted: Distance to keep [m].
-    """
-    offset, rate = other - position, other_velocity - velocity
-    distance = offset.norm(dim=-1, keepdim=True)
-    limit = wanted[..., None] if isinstance(wanted, Tensor) else wanted
-    stretch = limit / distance.clamp_min(torch.finfo(distance.dtype).tiny) - 1
-    stretch = torch.where(distance > 0, stretch, 0.0)
-    # error = (wanted / d - 1) offset; d' = offset . rate / d
-    along = (offset * rate).sum(-1, keepdim=True)
-    bend = torch.where(distance > 0, (stretch + 1) * along, 0.0)
-    square = torch.where(distance > 0, distance.square(), 1.0)
-    return stretch * offset, stretch * rate - bend / square * offset
-
-
-def learn_feed_forward(
-    learned: Float[Tensor, "*batch T D"],
-    error: Float[Tensor, "*batch T D"],
-    *,
-    gain: float,
-    rate: float = 1.0,
-    retention: float = 0.99,
-) -> Float[Tensor, "*batch T D"]:
-    """Feed-forward velocity for the next repetition, from the error of this one [m/s].
-
-    V_i = learned_i + gain e_i,   learned_(i+1) = Q (learned_i + L gain e_i)
-
-    (iterative learning control with the current iteration in the loop). With L = Q = 1, the
-    feedback of one repetition is the feed-forward of the next, and at rest each repetition
-    reduces the error by the same factor as feedback alone.
-
-    Args:
-        learned: Feed-forward velocity at the T steps of this repetition; zeros at first [m/s].
-        error: Error measured at these steps.
-        gain: Feedback gain, [m/s] per unit of the error.
-        rate: L.
-        retention: Q, up to 1; smaller values are more robust and leave more error.
-    """
-    return retention * (learned + rate * gain * error)

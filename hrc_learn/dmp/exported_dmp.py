@@ -119,7 +119,7 @@ class StepModule(nn.Module):
     def forward(self, state: Tensors, dt: Tensor, inputs: Tensors) -> Tensors:
         before, goals = _restored_state(self.dmp, state), _goals(inputs)
         options = {name: inputs[name] for name in ("phase_stopping", "coupling")}
-        if self.dmp.adapter.error_columns is not None:
+        if self.dmp.error_columns is not None:
             goal = goals.pop("goal")
             before = _where_new(self.dmp.retarget(before, goal), before)
         after = self.dmp.step(before, dt, goal_filter=self.goal_filter, **goals, **options)
@@ -148,12 +148,12 @@ def _restored_state(dmp: MotionPrimitive, tensors: Tensors) -> Any:
     """State from its tensors; the inverse of `state_tensors`."""
     columns = DMPState(**{name: tensors[name] for name in STATE})
     frames = [tensors[name] for name in FRAMES if name in tensors]
-    return dmp.adapter.state(columns, frames[0] if frames else None)
+    return dmp.state_of(columns, frames[0] if frames else None)
 
 
 def resting_inputs(dmp: Any, state: Mapping[str, Tensor]) -> Tensors:
     """Inputs of the program that change nothing: the current goal, and no coupling."""
-    target, errors = state["target"], dmp.adapter.error_columns
+    target, errors = state["target"], dmp.error_columns
     rest = {
         "phase_stopping": torch.zeros_like(state["pace"]),
         "coupling": torch.zeros_like(target),

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from hrc_learn.dmp.fitting.samples import demo_label
+from hrc_learn.dmp.samples import demo_label
 
 MINIMUM_DISPLACEMENT = 1e-3
 """Smallest |g - y_0| to divide by, relative to the range: weights would be a thousand times the

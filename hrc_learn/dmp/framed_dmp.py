@@ -18,12 +18,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import Mask, Points, Times
-from hrc_learn.dmp.fitting.motion_fit import FitOptions
-from hrc_learn.dmp.fitting.samples import check_samples, padded
-from hrc_learn.dmp.fitting.solvers import REGULARIZATION, fit_samples
-from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
 from hrc_learn.dmp.motion_primitive import REFIT_SAMPLES
 from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, mean_primitive
+from hrc_learn.dmp.samples import check_samples, padded
+from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples
 from hrc_learn.geometry import Pose, quaternion
 
 PERSISTENCE = 0.3

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import Points, Times, positive, to_tensor
-from hrc_learn.dmp.fitting.samples import padded
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP
+from hrc_learn.dmp.samples import padded
 
 DURATIONS = 31
 """Durations compared for each kind, over three standard deviations to either side: a fifth of

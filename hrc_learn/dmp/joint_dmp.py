@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,23 +15,28 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
-    broadcast_shapes,
     positive,
-    to_tensor,
 )
-from hrc_learn.dmp._system.trajectory import Trajectory
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.motion_fit import FitOptions, fit_motion
-from hrc_learn.dmp.fitting.samples import check_samples, padded
-from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
+from hrc_learn.dmp.dynamics import Basis, GaussianBasis, SpringDamper
+from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling, find_scaling
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive, check_names
 from hrc_learn.dmp.motion_primitive import (
     ColumnPoints,
-    CoordinateAdapter,
     MotionPrimitive,
     Retargeted,
+    via_columns,
 )
-from hrc_learn.geometry import Pose
+from hrc_learn.dmp.response import Response, response_of
+from hrc_learn.dmp.samples import (
+    Samples,
+    check_samples,
+    padded,
+    smoothed,
+    warn_of_few_samples,
+)
+from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.model_files import SavedModel
 
 LIMIT_SAMPLES = 2001
@@ -39,50 +44,88 @@ LIMIT_SAMPLES = 2001
 less than 1e-3."""
 TOLERANCE = 1.05
 """Ratio to the smallest held-out error that still counts as equal to it."""
+DEFAULT_COUNT = 50
+"""Default number of basis functions: they follow recordings of arms to 5e-5 of the range, and
+fewer would not make a motion without noise smoother."""
 
 
-class JointCoordinates(CoordinateAdapter[Vectors, Trajectory, DMPState]):
-    """Identity: joints are columns, without a frame."""
+class FitOptions(TypedDict, total=False):
+    """Options that `fit` of every kind of primitive accepts."""
 
-    def boundary(
-        self, motion: LinearPrimitive, given: Boundary, duration: Tensor
-    ) -> tuple[Boundary, None]:
-        """The given boundary."""
-        return given, None
-
-    def trajectory(self, columns: Trajectory, frame: None) -> Trajectory:
-        """The motion of the columns."""
-        return columns
-
-    def state(self, columns: DMPState, frame: None) -> DMPState:
-        """The state of the columns."""
-        return columns
-
-    def columns(self, state: DMPState) -> tuple[DMPState, None]:
-        """The state itself."""
-        return state, None
-
-    def retarget(
-        self, motion: LinearPrimitive, columns: DMPState, frame: None, goal: Vectors | None
-    ) -> Retargeted:
-        """The given goal."""
-        return Retargeted(columns, None, goal)
-
-    def via_points(
-        self,
-        motion: LinearPrimitive,
-        now: ColumnPoints,
-        value: Points | None,
-        velocity: Points | None,
-    ) -> ColumnPoints:
-        """The given via points."""
-        return via_columns(now, value, velocity)
+    method: str
+    """`"trajectory"` (default), least squares on the positions, the closest reproduction;
+    `"ridge"`, regression on the force; `"lwr"`, the paper's method."""
+    approach: float | int
+    """Fraction of the motion, 0 to 1, over which it moves smoothly to a new start and goal;
+    0 (default): at once, as in the paper."""
+    basis: Basis | None
+    """Basis of the forcing term; `n_basis` Gaussians by default."""
+    spring: SpringDamper | None
+    """Gains; alpha = 25, critically damped, by default."""
+    regularization: float
+    """Ridge, relative to the largest singular value; 1e-7 by default."""
+    smooth: bool | None
+    """True to remove noise from the samples first, as much as they give evidence of; see
+    `samples.py`. None (default): unless the number of basis functions is given."""
 
 
-JOINTS = JointCoordinates()
+class _Fit(NamedTuple):
+    response: Response
+    samples: Samples
+    """Fitted samples: without noise, if it was removed."""
+    noise: Tensor | None
+    """Standard deviation of the noise, (B, D); None without smoothing."""
+    weights: Float[Tensor, "B D N"]
+    """Weights of the unscaled forcing term."""
+    rate: Float[Tensor, "B D"]
+    """Start velocity dy/ds."""
 
 
-class JointDMP(MotionPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive):
+def _fit(
+    recorded: Samples,
+    n_basis: int | None,
+    *,
+    method: str = "trajectory",
+    approach: float | int = 0.0,
+    basis: Basis | None = None,
+    spring: SpringDamper | None = None,
+    regularization: float = REGULARIZATION,
+    smooth: bool | None = None,
+) -> _Fit:
+    """Fit weights and start velocity, in float64; arguments as in `FitOptions`."""
+    chosen = n_basis is not None or basis is not None
+    if basis is None:
+        basis = GaussianBasis(count=DEFAULT_COUNT if n_basis is None else n_basis)
+    if chosen:
+        warn_of_few_samples(recorded, basis.count)
+    response = response_of(spring or SpringDamper(), basis, float(approach))
+    samples, noise = recorded, None
+    if smooth or (smooth is None and not chosen):
+        samples, noise = smoothed(recorded)
+    return _Fit(
+        response, samples, noise, *fit_samples(method, response, samples, regularization)
+    )
+
+
+def _unscaled(
+    fit: _Fit, recorded: Samples, scaling: Scaling, names: Sequence[str] | None
+) -> Float[Tensor, "B D N"]:
+    """Weights for the given scaling.
+
+    Raises:
+        ValueError: A motion for which the scaling is singular.
+    """
+    if scaling.name == "none":
+        return fit.weights
+    amplitude = fit.samples.amplitude.double()
+    # Noise, or its removal, may separate a start and a goal that agree: both are checked.
+    for samples in (recorded, fit.samples):
+        shown = Demonstrated(samples.first.double(), samples.last.double(), amplitude)
+        scaling.check(shown, samples.batch, names)
+    return scaling.unscale(fit.weights.mT, shown).mT
+
+
+class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
     """Discrete movement primitive of D coordinates under one phase.
 
     A `LinearPrimitive` whose columns are the coordinates: values are (*batch, D) in the units
@@ -93,11 +136,6 @@ class JointDMP(MotionPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive):
     def motion(self) -> "JointDMP":  # pyright: ignore[reportIncompatibleVariableOverride]
         """The primitive itself, because joints are columns."""
         return self
-
-    @property
-    def adapter(self) -> JointCoordinates:
-        """Identity."""
-        return JOINTS
 
     @classmethod
     def fit(
@@ -139,11 +177,25 @@ class JointDMP(MotionPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive):
         time, mask, (position, velocity) = padded(time, mask, position, velocity)
         recorded = check_samples(time, position, velocity, mask)
         check_names(joint_names, recorded.position.shape[1])
-        fit = fit_motion(recorded, n_basis, **options)
-        arguments = fit.arguments(scaling, joint_names)
-        dmp = cls(**arguments, joint_names=joint_names, units=units)
+        fit = _fit(recorded, n_basis, **options)
+        samples = fit.samples
+        dmp = cls(
+            weights=samples.batched(_unscaled(fit, recorded, scaling, joint_names)),
+            start=samples.batched(samples.first),
+            goal=samples.batched(samples.last),
+            start_velocity=samples.batched(fit.rate / samples.duration[:, None]),
+            duration=samples.batched(samples.duration),
+            amplitude=samples.batched(samples.amplitude),
+            timestamps=samples.timestamps,
+            basis=fit.response.basis,
+            spring=fit.response.spring,
+            scaling=scaling,
+            approach=fit.response.approach,
+            joint_names=joint_names,
+            units=units,
+        )
         with torch.no_grad():
-            dmp.fit_report = fit.report(dmp.rollout())
+            dmp.fit_report = recorded.compare(dmp.rollout().position, fit.noise)
         return dmp
 
     def admissible_duration(
@@ -182,42 +234,30 @@ class JointDMP(MotionPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive):
         """The given motion."""
         return motion
 
+    def state_of(self, columns: DMPState, frame: None) -> DMPState:
+        """The state of the columns."""
+        return columns
+
+    def _columns(self, state: DMPState) -> tuple[DMPState, None]:
+        return state, None
+
+    def _boundary(self, given: Boundary, duration: Tensor) -> tuple[Boundary, None]:
+        return given, None
+
+    def _trajectory(self, columns: Trajectory, frame: None) -> Trajectory:
+        return columns
+
+    def _retarget(self, columns: DMPState, frame: None, goal: Vectors | None) -> Retargeted:
+        return Retargeted(columns, None, goal)
+
+    def _via(
+        self, now: ColumnPoints, value: Points | None, velocity: Points | None
+    ) -> ColumnPoints:
+        return via_columns(now, value, velocity)
+
     @classmethod
     def _restored[S: "JointDMP"](cls: type[S], saved: SavedModel) -> S:
         return cls.restore(saved)
-
-
-def via_columns(
-    now: ColumnPoints, value: Points | None, velocity: Points | None
-) -> ColumnPoints:
-    """Via points of values that are columns themselves."""
-    position = via_values(value, now.position)
-    return ColumnPoints(position, via_values(velocity, now.velocity, "velocity"))
-
-
-def via_values(
-    value: Any, like: Tensor, name: str = "value", columns: int | None = None
-) -> Float[Tensor, "*batch n D"]:
-    """Via values as a float64 tensor; NaN if None was given.
-
-    Args:
-        value: Values from the caller.
-        like: Tensor with the expected shape.
-        name: Name of the value in error messages.
-        columns: Number of columns D, if not that of `like`.
-
-    Raises:
-        ValueError: Another shape, or a `Pose`.
-    """
-    if isinstance(value, Pose):
-        raise ValueError(f"{name} of joints or an orientation must be an array, got a Pose")
-    shape = (*like.shape[:-1], like.shape[-1] if columns is None else columns)
-    if value is None:
-        return torch.full(shape, torch.nan).to(like)
-    tensor = to_tensor(value, torch.float64, like.device)
-    if tensor.ndim < 2 or tensor.shape[-2:] != shape[-2:]:
-        raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
-    return tensor.expand(broadcast_shapes(tensor.shape, shape))
 
 
 @dataclass(frozen=True, kw_only=True)

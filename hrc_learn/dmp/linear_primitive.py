@@ -1,12 +1,13 @@
 """The linear implementation behind all kinds of primitive.
 
-Joints, orientation errors and positions are columns that add up; a coordinate adapter makes
-columns of the values of a kind (see `motion_primitive.py`). Everything here is about columns.
+Joints, orientation errors and positions are columns that add up; each kind makes columns of its
+values (see `motion_primitive.py`). Everything here is about columns.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields
+from types import NoneType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,15 +27,17 @@ from hrc_learn.dmp._arguments import (
     positive,
     to_tensor,
 )
-from hrc_learn.dmp._system.bases import Basis
-from hrc_learn.dmp._system.response import Response, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp._system.trajectory import Trajectory
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.samples import FitReport, check_precision
+from hrc_learn.dmp.dynamics import Basis, SpringDamper, basis_config, restored_basis
 from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_scaling
-from hrc_learn.dmp.saved_primitive import TENSORS, basis_config, linear_arguments
+from hrc_learn.dmp.response import Response, response_of
+from hrc_learn.dmp.samples import FitReport, check_precision
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.model_files import SavedModel
+
+TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "timestamps")
+REPORT = "fit_report."
+"""Prefix of the tensors of the fit report."""
 
 
 class Boundary(NamedTuple):
@@ -204,21 +207,43 @@ class LinearPrimitive(nn.Module):
         duration = self.duration if duration is None else duration
         amplitude = self.amplitude if amplitude is None else amplitude
         duration = duration.to(x).expand(batch).clone()
-        return type(self)(
-            weights=x[..., :-3].clone(),
-            start_velocity=x[..., -3] / duration[..., None],
-            start=x[..., -2].clone(),
-            goal=x[..., -1].clone(),
-            duration=duration,
-            amplitude=amplitude.to(x).expand(*batch, -1).clone(),
-            timestamps=(self.timestamps if timestamps is None else timestamps).clone(),
-            basis=self.basis,
-            spring=self.spring,
-            scaling=self.forcing_scale,
-            approach=self.response.approach,
-            joint_names=self.joint_names,
-            units=self.units,
+        return self.with_tensors(
+            {
+                "weights": x[..., :-3].clone(),
+                "start_velocity": x[..., -3] / duration[..., None],
+                "start": x[..., -2].clone(),
+                "goal": x[..., -1].clone(),
+                "duration": duration,
+                "amplitude": amplitude.to(x).expand(*batch, -1).clone(),
+                "timestamps": (self.timestamps if timestamps is None else timestamps).clone(),
+            }
         )
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of the primitive, fit report included, by the names used in files.
+
+        Gradients flow to weights that are a buffer.
+        """
+        own = {name: getattr(self, name) for name in TENSORS}
+        if isinstance(self.weights, nn.Parameter):
+            own["weights"] = self.weights.detach()
+        report = {} if self.fit_report is None else self.fit_report.tensors()
+        return own | {f"{REPORT}{name}": x for name, x in report.items()}
+
+    def with_tensors[S: "LinearPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
+        """Primitive with other tensors, named as in `tensors`, and the same parts and names."""
+        return type(self)(**self.arguments(tensors))
+
+    def arguments(self, tensors: Mapping[str, Tensor] | None = None) -> dict[str, Any]:
+        """Arguments that make this primitive again, or one with other tensors."""
+        return _tensor_arguments(self.tensors() if tensors is None else tensors) | {
+            "basis": self.basis,
+            "spring": self.spring,
+            "scaling": self.forcing_scale,
+            "approach": self.response.approach,
+            "joint_names": self.joint_names,
+            "units": self.units,
+        }
 
     def rollout_columns(
         self,
@@ -428,11 +453,6 @@ class LinearPrimitive(nn.Module):
             "basis": basis_config(self.basis),
         }
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Tensors of a saved primitive, by the names used in the file."""
-        report = {} if self.fit_report is None else self.fit_report.tensors()
-        return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
-
     @classmethod
     def restore[S: "LinearPrimitive"](cls: type[S], saved: SavedModel) -> S:
         """Linear primitive inside a saved one.
@@ -440,9 +460,35 @@ class LinearPrimitive(nn.Module):
         Raises:
             ValueError: A wrong field; the message names the file and the field.
         """
-        arguments = linear_arguments(saved)
+        names = [*TENSORS, *(name for name in saved.tensors if name.startswith(REPORT))]
+        arguments = _tensor_arguments({name: saved.tensor(name) for name in names})
+        shape = arguments["weights"].shape
+        for name in TENSORS[1:-1]:
+            found, fits = (
+                arguments[name].shape,
+                shape[:-2] if name == "duration" else shape[:-1],
+            )
+            if len(shape) < 2 or found != fits:
+                raise saved.invalid(
+                    f"{name} has shape {tuple(found)}, which does not fit weights "
+                    f"{tuple(shape)}"
+                )
+        columns = saved.config.get("scaled_columns")
+        if columns is not None:
+            columns = saved.get("scaled_columns", int)
+        parts = {
+            "spring": _part(saved, "spring", dict, lambda fields: SpringDamper(**fields)),
+            "basis": _part(saved, "basis", dict, restored_basis),
+            "scaling": _part(saved, "scaling", str, lambda name: find_scaling(name, columns)),
+        }
         try:
-            return cls(**arguments)
+            return cls(
+                **arguments,
+                **parts,
+                approach=float(saved.get("approach", float, int)),
+                joint_names=saved.get("joint_names", list, NoneType),
+                units=saved.get("units", dict).get("coordinates", ""),
+            )
         except ValueError as error:
             raise saved.invalid(error) from None
 
@@ -491,3 +537,28 @@ def check_names(joint_names: Sequence[str] | None, D: int) -> None:
     """Raise ValueError unless there are D names, or none."""
     if joint_names is not None and len(joint_names) != D:
         raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
+
+
+def _tensor_arguments(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Arguments of a linear primitive among its tensors."""
+    report = {n.removeprefix(REPORT): x for n, x in tensors.items() if n.startswith(REPORT)}
+    known = {field.name for field in fields(FitReport)} & report.keys()
+    found: dict[str, Any] = {name: tensors[name] for name in TENSORS}
+    if {"rmse", "peak", "span"} <= known:
+        found["fit_report"] = FitReport(**{name: report[name] for name in known})
+    return found
+
+
+def _part(saved: SavedModel, field: str, kind: type, make: Callable[[Any], Any]) -> Any:
+    """Part made of a field of the file.
+
+    Raises:
+        ValueError: A missing or wrong field; the message names it.
+    """
+    value = saved.get(field, kind)
+    try:
+        return make(value)
+    except KeyError as error:
+        raise saved.invalid_field(field, f"{error} is missing") from None
+    except (TypeError, ValueError) as error:
+        raise saved.invalid_field(field, error) from None

@@ -75,7 +75,7 @@ class MixtureDMP[P: MotionPrimitive]:
                 of contexts.
         """
         whole = ProbabilisticDMP.fit(primitives, slack)
-        motion = with_common_reference(primitives).linear_motion()
+        motion = with_common_reference(primitives).motion
         x = motion.coordinates().detach().double().flatten(0, -3)
         n = len(x)
         if n_modes is not None and not 1 <= n_modes <= n:
@@ -88,7 +88,7 @@ class MixtureDMP[P: MotionPrimitive]:
         off = ((x[:, None] - means) * r.sqrt()[..., None, None]).flatten(2).flatten(0, 1)
         spread = off.mT / max(n - r.shape[1], 1) ** 0.5
         spread = torch.cat([spread, whole.spread[:, n:]], dim=1)
-        middle = whole.primitive.linear_motion()
+        middle = whole.primitive.motion
         modes = [
             replace(
                 whole,
@@ -165,7 +165,7 @@ class MixtureDMP[P: MotionPrimitive]:
         spread = torch.stack([mode.spread for mode in self.modes])[drawn]
         z = torch.randn(n, spread.shape[-1], 1, generator=generator, dtype=torch.float64)
         means = torch.stack([mode.mean for mode in self.modes])[drawn]
-        motions = [mode.primitive.linear_motion() for mode in self.modes]
+        motions = [mode.primitive.motion for mode in self.modes]
         duration = torch.stack([motion.duration for motion in motions])[drawn]
         x = means + (spread @ z.to(spread)).view(means.shape)
         return self.modes[0].primitive.with_motion(motions[0].with_coordinates(x, duration))

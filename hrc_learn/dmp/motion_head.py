@@ -28,12 +28,11 @@ from hrc_learn.dmp._arguments import (
     seconds,
     to_tensor,
 )
-from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
-from hrc_learn.dmp._system.ragged_times import spring_rows
-from hrc_learn.dmp._system.response import Response, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp._system.trajectory import Trajectory, output
+from hrc_learn.dmp.dynamics import GaussianBasis, SpringDamper, balanced_units
 from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.ragged_times import spring_rows
+from hrc_learn.dmp.response import Response, response_of
+from hrc_learn.dmp.trajectory import Trajectory, output
 
 SAMPLES_PER_FUNCTION = 20
 """Samples per basis function at which the modes of a motion are computed."""
@@ -71,16 +70,12 @@ class MotionHead(nn.Module):
         amplitude: Vectors | float = 1.0,
         goal_scale: Vectors | float | None = None,
         goal_centre: Vectors | None = None,
-        smoothness: float = 1.0,
-        approach: float = 1.0,
-        basis: Basis | None = None,
-        spring: SpringDamper | None = None,
     ):
         """Compute the modes.
 
         Args:
             columns: D.
-            n_basis: N, unless `basis` is given.
+            n_basis: N.
             duration: Duration [s], or a range in which a parameter selects it, geometrically.
             delay: Longest delay before a motion [s]; 0: no parameter for it.
             amplitude: Root mean square deviation over a motion for unit normal weights, in the
@@ -88,20 +83,11 @@ class MotionHead(nn.Module):
             goal_scale: Standard deviation of the goal for a unit normal parameter; `amplitude`
                 by default.
             goal_centre: Centre of the goals, (D,); None: the start of each motion.
-            smoothness: Exponent of the singular values of the modes. 1: finer modes are as
-                small as white forcing makes them. 0: all have one size, so that a regression
-                learns them at one rate and a search becomes rough.
-            approach: Fraction of the motion over which it moves smoothly to the goal.
-            basis: Basis of the forcing term, not periodic.
-            spring: Gains.
 
         Raises:
-            ValueError: Numbers with the wrong sign or count, or a periodic basis.
+            ValueError: Numbers with the wrong sign or count.
         """
         super().__init__()
-        basis = basis or GaussianBasis(count=n_basis)
-        if basis.periodic:
-            raise ValueError("a rhythm has no goal: a head needs a basis that is not periodic")
         low, high = duration if isinstance(duration, tuple) else (duration, duration)
         if not (0 < low <= high < math.inf and 0 <= delay < math.inf):
             raise ValueError(
@@ -110,7 +96,7 @@ class MotionHead(nn.Module):
             )
         self.columns = columns
         self.shortest, self.longest, self.latest = low, high, delay
-        self.response = response_of(spring or SpringDamper(), basis, float(approach))
+        self.response = response_of(SpringDamper(), GaussianBasis(count=n_basis), 1.0)
         self.register_buffer("amplitude", _each_column("amplitude", amplitude, columns))
         goal_scale = self.amplitude if goal_scale is None else goal_scale
         self.register_buffer("goal_scale", _each_column("goal_scale", goal_scale, columns))
@@ -120,7 +106,7 @@ class MotionHead(nn.Module):
             else checked_vector("goal_centre", goal_centre, self.amplitude)
         )
         self.register_buffer("goal_centre", centre)
-        modes = _modes(self.response, smoothness).to(self.amplitude)
+        modes = _modes(self.response).to(self.amplitude)
         self.register_buffer("modes", modes, persistent=False)
 
     def extra_repr(self) -> str:
@@ -559,15 +545,16 @@ def _each_column(name: str, value: Any, columns: int) -> Float[Tensor, "D"]:
     return values.expand(columns).clone()
 
 
-def _modes(response: Response, smoothness: float) -> Float[Tensor, "N N"]:
-    """Weights of orthogonal motions, smoothest first, with a mean square of one in total."""
+def _modes(response: Response) -> Float[Tensor, "N N"]:
+    """Weights of orthogonal motions, smoothest first, with a mean square of one in total.
+
+    Finer modes are as small as white forcing makes them.
+    """
     N = response.basis.count
     s = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N + 1, dtype=torch.float64)
     H = response.evaluate(s)[:, 0]
     unit = balanced_units(response.basis, H, 0)
     _, sigma, Vh = torch.linalg.svd(H[:, :N] * unit, full_matrices=False)
-    size = (sigma / sigma[0]) ** smoothness
-    size = size * (len(s) / size.square().sum()).sqrt()
-    modes = unit[:, None] * Vh.mT * (size / sigma)
+    modes = unit[:, None] * Vh.mT * (len(s) / sigma.square().sum()).sqrt()
     # The sign of a mode is arbitrary: take the one with a positive mean.
     return modes * torch.where((H[:, :N] @ modes).sum(0) < 0, -1.0, 1.0)

@@ -1,12 +1,12 @@
 """The interface of all movement primitives, and their one implementation.
 
-Every kind of primitive is a coordinate adapter around a linear primitive. The linear primitive
-moves columns; the adapter maps the values of a kind to columns and back: joints are columns
-themselves, an orientation becomes its error to a reference, a pose is position, orientation
-error and body, and a moving goal is the frame in which joints are seen.
+A linear primitive moves columns. A kind of primitive maps its values to columns and back:
+joints are columns themselves, an orientation becomes its error to a reference, a pose is
+position, orientation error and body, and a moving goal is the frame in which joints are seen.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any, ClassVar, NamedTuple
@@ -20,17 +20,19 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
+    broadcast_shapes,
     regular_times,
     seconds,
     to_tensor,
 )
-from hrc_learn.dmp.batching import select
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.samples import FitReport, check_samples
-from hrc_learn.dmp.fitting.solvers import REGULARIZATION, fit_samples
 from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.samples import FitReport, check_samples
+from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.dmp.via_points import ViaPoints, through_via_points
+from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel, write_model
 
 REFIT_SAMPLES = 20
@@ -54,109 +56,6 @@ class Retargeted(NamedTuple):
     """New goal in columns; None keeps that of `columns`."""
 
 
-class CoordinateAdapter[Value, Path, State](ABC):
-    """Map from values to columns and back.
-
-    `Value` is the type of starts and goals, `Path` that of a rollout, `State` that of the
-    closed loop. The frame is what columns are relative to and may differ between motions: the
-    reference of an orientation error, the velocity of a moving goal; None where there is none.
-    The argument `motion` is always the linear primitive that the columns belong to.
-    """
-
-    linear: ClassVar[bool] = True
-    """True if the columns move as a linear primitive does."""
-    error_columns: ClassVar[slice | None] = None
-    """Columns with the error of an orientation, if any."""
-    options: ClassVar[frozenset[str]] = frozenset()
-    """Arguments of this kind beyond start, goal and start velocity."""
-
-    @abstractmethod
-    def boundary(
-        self, motion: LinearPrimitive, given: Boundary, duration: Tensor, **options: Any
-    ) -> tuple[Boundary, Any]:
-        """Boundary of a motion in columns, and its frame.
-
-        Args:
-            motion: Supplies what is None.
-            given: Start, goal and start velocity from the caller.
-            duration: [s].
-            options: Arguments of this kind.
-        """
-
-    @abstractmethod
-    def trajectory(self, columns: Any, frame: Any) -> Path:
-        """Result of a rollout."""
-
-    @abstractmethod
-    def state(self, columns: DMPState, frame: Any) -> State:
-        """State in closed loop."""
-
-    @abstractmethod
-    def columns(self, state: State) -> tuple[DMPState, Any]:
-        """Columns and frame of a state; the inverse of `state`."""
-
-    @abstractmethod
-    def retarget(
-        self,
-        motion: LinearPrimitive,
-        columns: DMPState,
-        frame: Any,
-        goal: Value | None,
-        **options: Any,
-    ) -> Retargeted:
-        """Columns and frame with a new goal, for the same value and velocity.
-
-        Args:
-            motion: Linear primitive of the columns.
-            columns: Current state.
-            frame: Current frame.
-            goal: New goal; None if only `options` are new.
-            options: Goals of this kind.
-        """
-
-    @abstractmethod
-    def via_points(
-        self,
-        motion: LinearPrimitive,
-        now: ColumnPoints,
-        value: Any,
-        velocity: Any,
-        **options: Any,
-    ) -> ColumnPoints:
-        """Via points as columns in the frame of the primitive.
-
-        Args:
-            motion: Linear primitive of the columns.
-            now: Columns of the unchanged motion at these times.
-            value: Values from the caller; None or NaN leaves them free.
-            velocity: Velocities from the caller, per second; None or NaN leaves them free.
-            options: Values of this kind.
-        """
-
-    def external_acceleration(
-        self, motion: LinearPrimitive, columns: DMPState, frame: Any, coupling: Any
-    ) -> Any:
-        """Second derivatives of the columns [1/s^2] for a coupling term."""
-        return coupling
-
-    def rollout(
-        self,
-        motion: LinearPrimitive,
-        boundary: Boundary,
-        duration: Tensor,
-        time: Times | None,
-        forcing_gain: Scalars | None,
-    ) -> Any:
-        """Motion of the columns."""
-        return motion.rollout_columns(boundary, duration, time, forcing_gain)
-
-    def step(
-        self, motion: LinearPrimitive, columns: DMPState, dt: Scalars, **inputs: Any
-    ) -> DMPState:
-        """State of the columns after `dt` [s]; inputs as in `LinearPrimitive.step_columns`."""
-        return motion.step_columns(columns, dt, **inputs)
-
-
 class MotionPrimitive[Value, Path, State](nn.Module, ABC):
     """Learned motion that start, goal, duration and via points reshape.
 
@@ -168,11 +67,13 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
     """Linear primitive of the columns."""
     duration: Any
     """Duration of the demonstration [s], (*batch)."""
+    error_columns: ClassVar[slice | None] = None
+    """Columns with the error of an orientation, if any."""
+    options: ClassVar[frozenset[str]] = frozenset()
+    """Arguments of this kind beyond start, goal and start velocity."""
 
-    @property
-    @abstractmethod
-    def adapter(self) -> CoordinateAdapter[Value, Path, State]:
-        """Map from values to columns."""
+    # The frame is what columns are relative to and may differ between motions: the reference
+    # of an orientation error, the velocity of a moving goal; None where there is none.
 
     @abstractmethod
     def with_motion[S: "MotionPrimitive"](self: S, motion: Any, frame: Any = None) -> S:
@@ -183,18 +84,73 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             frame: Frame of the columns; None keeps that of this primitive.
         """
 
+    @abstractmethod
+    def state_of(self, columns: DMPState, frame: Any) -> State:
+        """State in closed loop from its columns and their frame."""
+
+    @abstractmethod
+    def _columns(self, state: State) -> tuple[DMPState, Any]:
+        """Columns and frame of a state; the inverse of `state_of`."""
+
+    @abstractmethod
+    def _boundary(
+        self, given: Boundary, duration: Tensor, **options: Any
+    ) -> tuple[Boundary, Any]:
+        """Boundary of a motion in columns, and its frame.
+
+        Args:
+            given: Start, goal and start velocity from the caller, None for those of the
+                demonstration.
+            duration: [s].
+            options: Arguments of this kind.
+        """
+
+    @abstractmethod
+    def _trajectory(self, columns: Trajectory, frame: Any) -> Path:
+        """Result of a rollout."""
+
+    @abstractmethod
+    def _retarget(
+        self, columns: DMPState, frame: Any, goal: Value | None, **options: Any
+    ) -> Retargeted:
+        """Columns and frame with a new goal, for the same value and velocity.
+
+        Args:
+            columns: Current state.
+            frame: Current frame.
+            goal: New goal; None if only `options` are new.
+            options: Goals of this kind.
+        """
+
+    @abstractmethod
+    def _via(
+        self, now: ColumnPoints, value: Any, velocity: Any, **options: Any
+    ) -> ColumnPoints:
+        """Via points as columns in the frame of the primitive; see `via_points`.
+
+        Args:
+            now: Columns of the unchanged motion at these times.
+            value: Values from the caller; None or NaN leaves them free.
+            velocity: Velocities from the caller, per second; None or NaN leaves them free.
+            options: Values of this kind.
+        """
+
+    def _acceleration(self, columns: DMPState, frame: Any, coupling: Any) -> Any:
+        """Second derivatives of the columns [1/s^2] for a coupling term."""
+        return coupling
+
     @classmethod
     @abstractmethod
     def _restored[S: "MotionPrimitive"](cls: type[S], saved: SavedModel) -> S:
         """Primitive from a saved model."""
 
-    def _own_config(self) -> dict[str, Any]:
-        """Contents of a saved primitive besides those of its motion, as JSON values."""
-        return {}
+    @abstractmethod
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of the primitive, fit report included, by the names used in files."""
 
-    def _own_tensors(self) -> dict[str, Tensor]:
-        """Tensors of a saved primitive besides those of its motion, by name."""
-        return {}
+    @abstractmethod
+    def with_tensors[S: "MotionPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
+        """Primitive with other tensors, named as in `tensors`, and the same parts and names."""
 
     def __len__(self) -> int:
         """Number of primitives along the first batch axis.
@@ -211,10 +167,17 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         return True
 
     def __getitem__[S: "MotionPrimitive"](self: S, index: Any) -> S:
-        """Part of a batch, indexed like the first axes of a tensor, with memory of its own."""
+        """Part of a batch, indexed like the first axes of a tensor, with memory of its own.
+
+        Gradients flow through weights that are a buffer; a parameter is copied.
+        """
         if not self.duration.ndim:
             raise TypeError("a single primitive cannot be indexed: it is not a batch")
-        return select(self, index)
+        shared = {"timestamps"} if self.motion.timestamps.ndim == 1 else set()
+        tensors = self.tensors().items()
+        return self.with_tensors(
+            {name: (x if name in shared else x[index]).clone() for name, x in tensors}
+        )
 
     def rollout(
         self,
@@ -254,18 +217,20 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             goal_body: Body at the goal, (*batch, K); poses only.
             end_velocity: Velocity at the end [1/s], (*batch, D); moving goals only.
         """
-        motion, adapter = self.motion, self.adapter
-        given = Boundary(start, goal, start_velocity)
         options = {"start_body": start_body, "goal_body": goal_body}
-        columns, tau, frame = self._boundary(
-            given, duration, speed, **options, end_velocity=end_velocity
+        boundary, tau, frame = self._resolved(
+            Boundary(start, goal, start_velocity),
+            duration,
+            speed,
+            **options,
+            end_velocity=end_velocity,
         )
         if dt is not None:
             if time is not None:
                 raise ValueError("give times or an interval dt, not both")
             time = regular_times(dt, tau)
-        motion_columns = adapter.rollout(motion, columns, tau, time, forcing_gain)
-        return adapter.trajectory(motion_columns, frame)
+        columns = self.motion.rollout_columns(boundary, tau, time, forcing_gain)
+        return self._trajectory(columns, frame)
 
     def initial_state(
         self,
@@ -280,16 +245,19 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         end_velocity: Vectors | None = None,
     ) -> State:
         """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        given = Boundary(start, goal, start_velocity)
         options = {"start_body": start_body, "goal_body": goal_body}
-        boundary, tau, frame = self._boundary(
-            given, duration, speed, **options, end_velocity=end_velocity
+        boundary, tau, frame = self._resolved(
+            Boundary(start, goal, start_velocity),
+            duration,
+            speed,
+            **options,
+            end_velocity=end_velocity,
         )
         columns = self.motion.initial_columns(boundary, tau)
         if frame is not None:
             # A copy for each element: an export takes one tensor in two places for one input.
             frame = frame.expand(*columns.position.shape[:-1], frame.shape[-1]).clone()
-        return self.adapter.state(columns, frame)
+        return self.state_of(columns, frame)
 
     def step(
         self,
@@ -322,21 +290,19 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             forcing_gain: Factor on the forcing term, (*batch).
             goal_body: New goal of the body, (*batch, K); poses only.
         """
-        adapter = self.adapter
         columns, frame, target = self._retargeted(state, goal, goal_body)
-        columns = adapter.step(
-            self.motion,
+        columns = self.motion.step_columns(
             columns,
             dt,
             goal=target,
             goal_filter=goal_filter,
-            external_acceleration=adapter.external_acceleration(
-                self.motion, columns, frame, coupling
+            external_acceleration=(
+                None if coupling is None else self._acceleration(columns, frame, coupling)
             ),
             phase_stopping=phase_stopping,
             forcing_gain=forcing_gain,
         )
-        return adapter.state(columns, frame)
+        return self.state_of(columns, frame)
 
     def retarget(
         self, state: State, goal: Value | None = None, *, goal_body: Vectors | None = None
@@ -354,7 +320,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         if target is not None:
             target = to_tensor(target, columns.target.dtype, columns.target.device)
             columns = replace(columns, target=target.expand_as(columns.target))
-        return self.adapter.state(columns, frame)
+        return self.state_of(columns, frame)
 
     def condition[S: "MotionPrimitive"](
         self: S,
@@ -386,7 +352,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
                 basis.
         """
         via = self.via_points(time, value, velocity, body=body, body_velocity=body_velocity)
-        return self.with_motion(through_via_points(self.linear_motion(), via, within))
+        return self.with_motion(through_via_points(self.motion, via, within))
 
     def via_points(
         self,
@@ -415,13 +381,13 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         Raises:
             ValueError: Negative times, or shapes that do not fit.
         """
-        motion, adapter = self.linear_motion(), self.adapter
+        motion = self.motion
         time = seconds(time, motion.start.device)
-        options = _given(adapter, body=body, body_velocity=body_velocity)
+        options = self._given(body=body, body_velocity=body_velocity)
         duration = motion.duration.double()[..., None]
         now = motion.rollout_columns(Boundary(), motion.duration, time.detach())
         now = ColumnPoints(*(x.detach().double() for x in (now.position, now.velocity)))
-        via = adapter.via_points(motion, now, value, velocity, **options)
+        via = self._via(now, value, velocity, **options)
         rate = via.velocity * duration[..., None]
         return ViaPoints(s=time / duration, position=via.position, rate=rate)
 
@@ -441,13 +407,13 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         Raises:
             ValueError: The scaling depends on the boundary, so the weights would differ.
         """
-        motion = self.linear_motion()
+        motion = self.motion
         if motion.forcing_scale.depends_on_boundary:
             raise ValueError(
                 f"scaling {motion.scaling!r} depends on start and goal: fit with 'none'"
             )
         given = Boundary(start, goal, start_velocity)
-        boundary, tau, frame = self._boundary(
+        boundary, tau, frame = self._resolved(
             given, duration, speed, start_body=start_body, goal_body=goal_body
         )
         moved = motion.initial_columns(boundary, tau)
@@ -465,7 +431,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         Raises:
             ValueError: A rhythm, which has no end to start from.
         """
-        motion = self.linear_motion()
+        motion = self.motion
         if motion.basis.periodic:
             raise ValueError("a rhythm cannot be reversed: it has no end to start from")
         s = torch.linspace(0, 1, REFIT_SAMPLES * motion.basis.count + 1, dtype=torch.float64)
@@ -484,24 +450,9 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         timestamps = 1 - motion.timestamps.flip(-1)
         return self.with_motion(motion.with_coordinates(x, timestamps=timestamps))
 
-    def linear_motion(self) -> LinearPrimitive:
-        """Linear primitive of the columns.
-
-        Raises:
-            ValueError: The columns do not move linearly, as in the formulation of Ude et al.
-        """
-        if not self.adapter.linear:
-            raise ValueError(
-                f"formulation {getattr(self, 'formulation', '?')!r} is not linear: fit with "
-                f"'log' instead"
-            )
-        return self.motion
-
     def save(self, folder: str | FilePath) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        config = self.motion.config() | self._own_config()
-        tensors = self._own_tensors() | self.motion.tensors()
-        write_model(folder, type(self).__name__, config, tensors)
+        write_model(folder, type(self).__name__, self.motion.config(), self.tensors())
 
     @classmethod
     def load[S: "MotionPrimitive"](cls: type[S], folder: str | FilePath) -> S:
@@ -513,27 +464,38 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         """
         return cls._restored(SavedModel(folder, cls.__name__))
 
-    def _boundary(
+    def _resolved(
         self, given: Boundary, duration: Scalars | None, speed: Scalars | None, **options: Any
     ) -> tuple[Boundary, Tensor, Any]:
         """Boundary of a motion in columns, its duration [s], and its frame."""
         tau = self.motion.resolve_duration(duration, speed)
-        options = _given(self.adapter, **options)
-        columns, frame = self.adapter.boundary(self.motion, given, tau, **options)
+        columns, frame = self._boundary(given, tau, **self._given(**options))
         return columns, tau, frame
 
     def _retargeted(
         self, state: State, goal: Value | None, goal_body: Vectors | None
     ) -> Retargeted:
-        columns, frame = self.adapter.columns(state)
+        columns, frame = self._columns(state)
         if goal is None and goal_body is None:
             return Retargeted(columns, frame)
-        options = _given(self.adapter, goal_body=goal_body)
-        return self.adapter.retarget(self.motion, columns, frame, goal, **options)
+        return self._retarget(columns, frame, goal, **self._given(goal_body=goal_body))
+
+    def _given(self, **options: Any) -> dict[str, Any]:
+        """Arguments that are not None.
+
+        Raises:
+            ValueError: The kind of primitive does not have one of them.
+        """
+        options = {name: value for name, value in options.items() if value is not None}
+        if unknown := options.keys() - self.options:
+            raise ValueError(f"this kind of primitive has no {', '.join(sorted(unknown))}")
+        return options
 
 
 class WrappedPrimitive[Value, Path, State](MotionPrimitive[Value, Path, State]):
     """Primitive with a linear one as a module of its own."""
+
+    motion: LinearPrimitive
 
     @property
     def duration(self) -> Float[Tensor, "*batch"]:
@@ -545,14 +507,43 @@ class WrappedPrimitive[Value, Path, State](MotionPrimitive[Value, Path, State]):
         """Residuals of the columns."""
         return self.motion.fit_report
 
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of the columns."""
+        return self.motion.tensors()
 
-def _given(adapter: CoordinateAdapter, **options: Any) -> dict[str, Any]:
-    """Arguments that are not None.
+    def with_tensors[S: "WrappedPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
+        """Primitive with other tensors of the columns."""
+        return self.with_motion(self.motion.with_tensors(tensors))
+
+
+def via_columns(
+    now: ColumnPoints, value: Points | None, velocity: Points | None
+) -> ColumnPoints:
+    """Via points of values that are columns themselves."""
+    position = via_values(value, now.position)
+    return ColumnPoints(position, via_values(velocity, now.velocity, "velocity"))
+
+
+def via_values(
+    value: Any, like: Tensor, name: str = "value", columns: int | None = None
+) -> Float[Tensor, "*batch n D"]:
+    """Via values as a float64 tensor; NaN if None was given.
+
+    Args:
+        value: Values from the caller.
+        like: Tensor with the expected shape.
+        name: Name of the value in error messages.
+        columns: Number of columns D, if not that of `like`.
 
     Raises:
-        ValueError: The kind of primitive does not have one of them.
+        ValueError: Another shape, or a `Pose`.
     """
-    options = {name: value for name, value in options.items() if value is not None}
-    if unknown := options.keys() - adapter.options:
-        raise ValueError(f"this kind of primitive has no {', '.join(sorted(unknown))}")
-    return options
+    if isinstance(value, Pose):
+        raise ValueError(f"{name} of joints or an orientation must be an array, got a Pose")
+    shape = (*like.shape[:-1], like.shape[-1] if columns is None else columns)
+    if value is None:
+        return torch.full(shape, torch.nan).to(like)
+    tensor = to_tensor(value, torch.float64, like.device)
+    if tensor.ndim < 2 or tensor.shape[-2:] != shape[-2:]:
+        raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
+    return tensor.expand(broadcast_shapes(tensor.shape, shape))

@@ -16,17 +16,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, to_tensor
-from hrc_learn.dmp._system.trajectory import ArrayOutputs, Trajectory, output
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.motion_fit import FitOptions
-from hrc_learn.dmp.joint_dmp import JointDMP, via_columns
-from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
+from hrc_learn.dmp.linear_primitive import Boundary
 from hrc_learn.dmp.motion_primitive import (
     ColumnPoints,
-    CoordinateAdapter,
     Retargeted,
     WrappedPrimitive,
+    via_columns,
 )
+from hrc_learn.dmp.trajectory import ArrayOutputs, Trajectory, output
 from hrc_learn.model_files import SavedModel
 
 
@@ -89,69 +88,6 @@ torch.export.register_dataclass(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingGoalState]):
-    """Joints relative to the moving goal; the frame is the goal's velocity [1/s]."""
-
-    options: ClassVar[frozenset[str]] = frozenset({"end_velocity"})
-
-    def boundary(
-        self,
-        motion: LinearPrimitive,
-        given: Boundary,
-        duration: Tensor,
-        end_velocity: Vectors | None = None,
-    ) -> tuple[Boundary, Tensor]:
-        """Start and rate relative to the goal whose motion leads to `end_velocity`."""
-
-        def value_or(value: Vectors | None, default: Tensor) -> Tensor:
-            if value is None:
-                return default
-            return to_tensor(value, default.dtype, default.device)
-
-        demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
-        start, goal = value_or(given.start, motion.start), value_or(given.goal, motion.goal)
-        rate = value_or(given.start_velocity, demonstrated)
-        end = duration[..., None]
-        at_rest = motion.rollout_columns(Boundary(start, goal, rate), duration, end)
-        at_rest = at_rest.velocity[..., 0, :]
-        # A unit of v shifts the start by v and its rate by -v. Columns -2 and -3 of the
-        # response are the start and its rate; the goal's own velocity is one.
-        at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
-        gain = 1 + at_end[-2] - at_end[-3]
-        # The end velocity is linear in v, so the difference gives v directly.
-        v = (value_or(end_velocity, at_rest) - at_rest) / gain.to(at_rest)
-        return Boundary(start + v * end, goal, rate - v), v
-
-    def trajectory(self, columns: Trajectory, frame: Tensor) -> MovingTrajectory:
-        """Motion relative to the goal plus that of the goal."""
-        return MovingTrajectory(columns, frame)
-
-    def state(self, columns: DMPState, frame: Tensor) -> MovingGoalState:
-        """State relative to the goal, and the goal's velocity."""
-        return MovingGoalState(motion=columns, goal_velocity=frame)
-
-    def columns(self, state: MovingGoalState) -> tuple[DMPState, Tensor]:
-        """State relative to the goal, and the goal's velocity."""
-        return state.motion, state.goal_velocity
-
-    def retarget(
-        self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, goal: Vectors | None
-    ) -> Retargeted:
-        """The goal at the end of the motion; its velocity stays."""
-        return Retargeted(columns, frame, goal)
-
-    def via_points(
-        self,
-        motion: LinearPrimitive,
-        now: ColumnPoints,
-        value: Points | None,
-        velocity: Points | None,
-    ) -> ColumnPoints:
-        """The given via points, because the goal rests for the demonstrated end velocity."""
-        return via_columns(now, value, velocity)
-
-
 class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]):
     """Joint primitive that passes its goal with a given velocity.
 
@@ -161,6 +97,7 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     """
 
     motion: JointDMP
+    options: ClassVar[frozenset[str]] = frozenset({"end_velocity"})
 
     def __init__(self, motion: JointDMP):
         """Wrap a joint primitive.
@@ -195,11 +132,6 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         return cls(motion)
 
     @property
-    def adapter(self) -> MovingGoalCoordinates:
-        """Joints relative to the goal."""
-        return MovingGoalCoordinates()
-
-    @property
     def start(self) -> Float[Tensor, "*batch D"]:
         """Start of the demonstration."""
         return self.motion.start
@@ -214,6 +146,53 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     ) -> S:
         """Primitive with another motion, whose own end velocity is the demonstrated one."""
         return type(self)(motion)
+
+    def state_of(self, columns: DMPState, frame: Tensor) -> MovingGoalState:
+        """State relative to the goal, and the goal's velocity."""
+        return MovingGoalState(motion=columns, goal_velocity=frame)
+
+    def _columns(self, state: MovingGoalState) -> tuple[DMPState, Tensor]:
+        return state.motion, state.goal_velocity
+
+    def _boundary(
+        self,
+        given: Boundary,
+        duration: Tensor,
+        end_velocity: Vectors | None = None,
+    ) -> tuple[Boundary, Tensor]:
+        """Start and rate relative to the goal whose motion leads to `end_velocity`."""
+        motion = self.motion
+
+        def value_or(value: Vectors | None, default: Tensor) -> Tensor:
+            if value is None:
+                return default
+            return to_tensor(value, default.dtype, default.device)
+
+        demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
+        start, goal = value_or(given.start, motion.start), value_or(given.goal, motion.goal)
+        rate = value_or(given.start_velocity, demonstrated)
+        end = duration[..., None]
+        at_rest = motion.rollout_columns(Boundary(start, goal, rate), duration, end)
+        at_rest = at_rest.velocity[..., 0, :]
+        # A unit of v shifts the start by v and its rate by -v. Columns -2 and -3 of the
+        # response are the start and its rate; the goal's own velocity is one.
+        at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
+        gain = 1 + at_end[-2] - at_end[-3]
+        # The end velocity is linear in v, so the difference gives v directly.
+        v = (value_or(end_velocity, at_rest) - at_rest) / gain.to(at_rest)
+        return Boundary(start + v * end, goal, rate - v), v
+
+    def _trajectory(self, columns: Trajectory, frame: Tensor) -> MovingTrajectory:
+        return MovingTrajectory(columns, frame)
+
+    def _retarget(self, columns: DMPState, frame: Tensor, goal: Vectors | None) -> Retargeted:
+        return Retargeted(columns, frame, goal)
+
+    def _via(
+        self, now: ColumnPoints, value: Points | None, velocity: Points | None
+    ) -> ColumnPoints:
+        # The goal rests for the demonstrated end velocity.
+        return via_columns(now, value, velocity)
 
     @classmethod
     def _restored[S: "MovingGoalDMP"](cls: type[S], saved: SavedModel) -> S:

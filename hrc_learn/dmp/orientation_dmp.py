@@ -1,10 +1,11 @@
-"""Movement primitive of an orientation, whose linear columns are its error to a reference.
+"""Movement primitives of an orientation, whose linear columns are its error to a reference.
 
 e'' = alpha (beta (0 - e) - e') + f, exact at all angles (Koutras and Doulgeri 2019). The
-reference is the goal by default; see `orientation_error.py` for the error and
-`ude_formulation.py` for the other formulation.
+reference is the goal by default; see `orientation_error.py` for the error.
 """
 
+from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Unpack
 
@@ -12,19 +13,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp import orientation_error
-from hrc_learn.dmp._arguments import Mask, Points, Quaternions, Times, to_tensor
-from hrc_learn.dmp._system.trajectory import ArrayOutputs, output
+from hrc_learn.dmp import orientation_error, ude_formulation
+from hrc_learn.dmp._arguments import (
+    Mask,
+    Points,
+    Quaternions,
+    Times,
+    Vectors,
+    broadcast_shapes,
+    to_tensor,
+)
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.motion_fit import FitOptions
-from hrc_learn.dmp.fitting.samples import Samples, check_samples, padded
-from hrc_learn.dmp.joint_dmp import JointDMP, via_values
-from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
+from hrc_learn.dmp.linear_primitive import Boundary
 from hrc_learn.dmp.motion_primitive import (
     ColumnPoints,
-    CoordinateAdapter,
     Retargeted,
     WrappedPrimitive,
+    via_values,
 )
 from hrc_learn.dmp.orientation_error import (
     error_boundary,
@@ -33,6 +39,9 @@ from hrc_learn.dmp.orientation_error import (
     to_orientation,
     unit_quaternion,
 )
+from hrc_learn.dmp.samples import check_samples, padded
+from hrc_learn.dmp.trajectory import ArrayOutputs, Trajectory, output
+from hrc_learn.dmp.ude_formulation import UdePrimitive
 from hrc_learn.geometry import quaternion
 from hrc_learn.model_files import SavedModel
 
@@ -42,16 +51,17 @@ class OrientationTrajectory(ArrayOutputs):
 
     outputs = ("time", "orientation", "angular_velocity", "angular_acceleration")
 
-    def __init__(self, errors: Any, reference: Float[Tensor, "*batch 4"], first: int = 0):
-        """Read the error from columns `first` to `first` + 3 of `errors`."""
-        self._errors = errors
+    error_columns: ClassVar[slice] = slice(0, 3)
+
+    def __init__(self, motion: Trajectory, reference: Float[Tensor, "*batch 4"]):
+        """Describe the motion of columns with an error to the reference."""
+        self._motion = motion
         self._reference = reference
-        self._columns = slice(first, first + 3)
 
     @property
     def time(self) -> Float[Tensor, "*batch T"]:
         """Time since the start of the motion [s]."""
-        return self._errors.time
+        return self._motion.time
 
     @output
     def orientation(self) -> Float[Tensor, "*batch T 4"]:
@@ -66,36 +76,40 @@ class OrientationTrajectory(ArrayOutputs):
     @output
     def angular_acceleration(self) -> Float[Tensor, "*batch T 3"]:
         """Angular acceleration in the base frame [rad/s^2]."""
-        second = self._errors.acceleration[..., self._columns]
+        second = self._motion.acceleration[..., self.error_columns]
         return orientation_error.angular_acceleration(self._error, self._rate, second)
 
     @property
     def _error(self) -> Tensor:
-        return self._errors.position[..., self._columns]
+        return self._motion.position[..., self.error_columns]
 
     @property
     def _rate(self) -> Tensor:
-        return self._errors.velocity[..., self._columns]
+        return self._motion.velocity[..., self.error_columns]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OrientationState:
     """State of an orientation primitive in closed loop."""
 
+    error_columns: ClassVar[slice] = slice(0, 3)
     motion: DMPState
-    """State of the error to the reference."""
+    """State of the columns, the error to the reference among them."""
     reference: Float[Tensor, "*batch 4"]
     """Reference of the error; the goal by default."""
 
     @property
     def orientation(self) -> Float[Tensor, "*batch 4"]:
         """Unit quaternion (w, x, y, z)."""
-        return orientation_error.to_orientation(self.motion.position, self.reference)
+        return to_orientation(self.motion.position[..., self.error_columns], self.reference)
 
     @property
     def angular_velocity(self) -> Float[Tensor, "*batch 3"]:
         """Angular velocity in the base frame [rad/s]."""
-        return orientation_error.angular_velocity(self.motion.position, self.motion.velocity)
+        columns = self.error_columns
+        return orientation_error.angular_velocity(
+            self.motion.position[..., columns], self.motion.velocity[..., columns]
+        )
 
 
 torch.export.register_dataclass(
@@ -103,153 +117,218 @@ torch.export.register_dataclass(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class OrientationCoordinates(
-    CoordinateAdapter[Quaternions, OrientationTrajectory, OrientationState]
+class OrientedPrimitive[Value, Path, State: OrientationState](
+    WrappedPrimitive[Value, Path, State]
 ):
-    """Three columns of error; the frame is its reference."""
+    """Primitive whose columns are a position, the error of an orientation, and a body.
 
-    goal: Tensor
+    Position and body may have no columns. The frame is the reference of the error.
+    """
+
+    goal_orientation: Tensor
     """Unit quaternion at the end of the demonstration, (*batch, 4)."""
-    error_columns: ClassVar[slice] = slice(0, 3)
-
-    @staticmethod
-    def refit(motion: LinearPrimitive, errors: Samples) -> None:
-        """Adapt fitted weights to a formulation that is not linear; this one is."""
-
-    def reference(self, motion: LinearPrimitive) -> Float[Tensor, "*batch 4"]:
-        """Reference of the demonstrated error."""
-        return reference_of(motion.goal, self.goal)
-
-    def boundary(
-        self, motion: LinearPrimitive, given: Boundary, duration: Tensor
-    ) -> tuple[Boundary, Tensor]:
-        """Error at the start and its rate; a goal moves the reference, not the columns."""
-        rate = motion.start_velocity * (motion.duration / duration)[..., None]
-        error, rate, reference = error_boundary(
-            motion.start, rate, motion.goal, self.goal, *given
-        )
-        return Boundary(error, None, rate), reference
-
-    def trajectory(self, columns: Any, frame: Tensor) -> OrientationTrajectory:
-        """Orientations of the errors."""
-        return OrientationTrajectory(columns, frame)
-
-    def state(self, columns: DMPState, frame: Tensor) -> OrientationState:
-        """Error and reference."""
-        return OrientationState(motion=columns, reference=frame)
-
-    def columns(self, state: OrientationState) -> tuple[DMPState, Tensor]:
-        """Error and reference."""
-        return state.motion, state.reference
-
-    def retarget(
-        self,
-        motion: LinearPrimitive,
-        columns: DMPState,
-        frame: Tensor,
-        goal: Quaternions | None,
-    ) -> Retargeted:
-        """Error to a new reference, for the same motion of the orientation."""
-        if goal is None:
-            return Retargeted(columns, frame)
-        new = reference_of(motion.goal, unit_quaternion(goal, frame)).expand_as(frame)
-        return Retargeted(self._to_reference(motion, columns, frame, new), new)
-
-    def external_acceleration(
-        self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, coupling: Any
-    ) -> Tensor | None:
-        """Second derivative of e, linear in the angular acceleration in the base frame."""
-        if coupling is None:
-            return None
-        coupling = to_tensor(coupling, frame.dtype, frame.device)
-        return orientation_error.error_rate(columns.position, coupling)
-
-    def via_points(
-        self,
-        motion: LinearPrimitive,
-        now: ColumnPoints,
-        value: Quaternions | None,
-        velocity: Points | None,
-    ) -> ColumnPoints:
-        """Errors on the branch nearest to that of the motion, and their rates."""
-        return via_errors(self.reference(motion), now.position, value, velocity)
-
-    def _to_reference(
-        self, motion: LinearPrimitive, columns: DMPState, old: Tensor, new: Tensor
-    ) -> DMPState:
-        """Error to another reference; with a goal filter, the acceleration is continuous."""
-        error, rate, second = orientation_error.retarget(
-            columns.position, columns.rate, motion.second_derivative(columns), old, new
-        )
-        columns = replace(columns, position=error, rate=rate)
-        return replace(columns, goal=motion.equilibrium_goal(columns, second))
-
-
-def via_errors(reference: Tensor, error: Tensor, value: Any, velocity: Any) -> ColumnPoints:
-    """Via points of an orientation as errors and their rates [rad/s]; NaN where free.
-
-    Args:
-        reference: Reference of the errors, (*batch, 4).
-        error: Errors of the unchanged motion, (*batch, n, 3).
-        value: Unit quaternions, (*batch, n, 4), or None.
-        velocity: Angular velocities [rad/s], (*batch, n, 3), or None.
-    """
-    q = via_values(value, error, columns=4)
-    free = q.isnan().any(-1, keepdim=True)
-    reference = reference.detach().double()[..., None, :].expand_as(q)
-    # NaN is replaced before any function, because it would make gradients NaN.
-    q = quaternion.normalize(torch.where(free, reference, q))
-    via = orientation_error.nearest_turn(orientation_error.to_error(q, reference), error)
-    omega = via_values(velocity, error, "velocity")
-    unknown = omega.isnan().any(-1, keepdim=True)
-    rate = orientation_error.error_rate(torch.where(free, error, via), omega.nan_to_num())
-    return ColumnPoints(via.masked_fill(free, torch.nan), rate.masked_fill(unknown, torch.nan))
-
-
-FORMULATIONS: dict[str, type[OrientationCoordinates]] = {"log": OrientationCoordinates}
-"""Formulations by name; `ude_formulation.py` adds its own."""
-
-
-class UnknownFormulationError(ValueError):
-    """There is no formulation with this name."""
-
-
-class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, OrientationState]):
-    """Movement primitive of an orientation.
-
-    The error e to a reference, the goal by default, is the state of a linear primitive that is
-    exact at all angles, or of the formulation of Ude et al. 2014; see `formulation`. Both signs
-    of a quaternion give the same motion. Values are unit quaternions (w, x, y, z), (*batch, 4);
-    velocities and couplings are angular, in the base frame, (*batch, 3). A new start or goal is
-    reached in the sense of rotation of the demonstration. The fit report has residuals of the
-    components of the error [rad], which bound those of the angle.
-    """
-
-    goal: Tensor
     motion: JointDMP
-    formulation: str
-    """`"log"` or `"ude"`: the state on which forcing term and spring act."""
+    error_columns: ClassVar[slice]
+    state_type: ClassVar[type]
+    trajectory_type: ClassVar[type]
 
-    def __init__(
-        self, motion: JointDMP, goal: Float[Tensor, "*batch 4"], formulation: str = "log"
-    ):
+    def __init__(self, motion: JointDMP, goal_orientation: Float[Tensor, "*batch 4"]):
         """Assemble a primitive; `fit` is the usual way to make one.
 
         Args:
-            motion: Motion of the error [rad], D = 3. If its own goal is not zero, the reference
-                of the error is exp(that) * goal, as for primitives with different goals.
-            goal: Unit quaternion (w, x, y, z) at the end.
-            formulation: `"log"` or `"ude"`.
-
-        Raises:
-            ValueError: Unknown formulation.
+            motion: Motion of the columns. If its own goal of the error is not zero, the
+                reference is exp(that) * goal, as for primitives with different goals.
+            goal_orientation: Unit quaternion (w, x, y, z) at the end.
         """
         super().__init__()
-        _check_formulation(formulation)
-        self.formulation = formulation
         self.motion = motion
-        self.register_buffer("goal", goal)
+        self.register_buffer("goal_orientation", goal_orientation)
+
+    @abstractmethod
+    def _parts(self, name: str, value: Any) -> tuple[Tensor | None, Any]:
+        """Position and orientation of a value, None where there is none.
+
+        Raises:
+            ValueError: A value of another kind.
+        """
+
+    @property
+    def reference(self) -> Float[Tensor, "*batch 4"]:
+        """Reference of the orientation error."""
+        return reference_of(self.motion.goal[..., self.error_columns], self.goal_orientation)
+
+    def with_motion[S: "OrientedPrimitive"](
+        self: S, motion: JointDMP, frame: Tensor | None = None
+    ) -> S:
+        """Primitive with another motion of the columns, to this reference or another."""
+        reference = self.reference if frame is None else frame
+        return type(self)(
+            motion, to_orientation(motion.goal[..., self.error_columns], reference)
+        )
+
+    def state_of(self, columns: DMPState, frame: Tensor) -> State:
+        """State of the columns and their reference."""
+        return self.state_type(motion=columns, reference=frame)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Tensors of the columns, and the goal."""
+        return self.motion.tensors() | {"goal_orientation": self.goal_orientation}
+
+    def with_tensors[S: "OrientedPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
+        """Primitive with other tensors, named as in `tensors`."""
+        return type(self)(self.motion.with_tensors(tensors), tensors["goal_orientation"])
+
+    def _columns(self, state: State) -> tuple[DMPState, Tensor]:
+        return state.motion, state.reference
+
+    def _trajectory(self, columns: Trajectory, frame: Tensor) -> Path:
+        return self.trajectory_type(columns, frame)
+
+    @property
+    def _others(self) -> tuple[slice, slice]:
+        """Columns of the position and of the body."""
+        return slice(0, self.error_columns.start), slice(self.error_columns.stop, None)
+
+    def _boundary(
+        self,
+        given: Boundary,
+        duration: Tensor,
+        start_body: Vectors | None = None,
+        goal_body: Vectors | None = None,
+    ) -> tuple[Boundary, Tensor]:
+        motion, E, (P, B) = self.motion, self.error_columns, self._others
+        if all(x is None for x in (*given, start_body, goal_body)):
+            return given, self.reference
+        start, rotation = self._parts("start", given.start)
+        goal, goal_rotation = self._parts("goal", given.goal)
+        like, demonstrated = motion.start, motion.start_velocity
+        demonstrated = demonstrated * (motion.duration / duration)[..., None]
+        twist = given.start_velocity
+        if twist is not None:
+            twist = to_tensor(twist, like.dtype, like.device)
+        error, rate, reference = error_boundary(
+            like[..., E],
+            demonstrated[..., E],
+            motion.goal[..., E],
+            self.goal_orientation,
+            rotation,
+            goal_rotation,
+            None if twist is None else twist[..., P.stop :],
+        )
+        start_columns = _join(
+            like[..., P] if start is None else start,
+            error,
+            like[..., B] if start_body is None else start_body,
+            like,
+        )
+        goal_columns = _join(
+            motion.goal[..., P] if goal is None else goal,
+            motion.goal[..., E],
+            motion.goal[..., B] if goal_body is None else goal_body,
+            like,
+        )
+        if twist is None:
+            # The scaling may rotate and scale the start velocity.
+            per_s = motion.start_rate(start_columns, goal_columns)
+            linear = (per_s / duration[..., None])[..., P]
+        else:
+            linear = twist[..., P]
+        # A twist does not include the body, which starts as demonstrated.
+        velocity = _join(linear, rate, demonstrated[..., B], like)
+        return Boundary(start_columns, goal_columns, velocity), reference
+
+    def _retarget(
+        self,
+        columns: DMPState,
+        frame: Tensor,
+        goal: Value | None,
+        goal_body: Vectors | None = None,
+    ) -> Retargeted:
+        target, (P, B) = columns.target, self._others
+        if goal is not None:
+            position, rotation = self._parts("goal", goal)
+            rotation = unit_quaternion(rotation, frame)
+            new = reference_of(self.motion.goal[..., self.error_columns], rotation)
+            new = new.expand_as(frame)
+            columns = self._to_reference(columns, frame, new)
+            if position is not None:
+                target = _with_columns(target, P, position)
+            frame = new
+        if goal_body is not None:
+            target = _with_columns(target, B, goal_body)
+        return Retargeted(columns, frame, target)
+
+    def _to_reference(self, columns: DMPState, old: Tensor, new: Tensor) -> DMPState:
+        """Columns with the error to another reference, for the same motion of the orientation.
+
+        With a goal filter, the acceleration is continuous.
+        """
+        motion, E = self.motion, self.error_columns
+        values = columns.position, columns.rate, motion.second_derivative(columns)
+        turned = orientation_error.retarget(*(x[..., E] for x in values), old, new)
+        position, rate, second = (
+            _with_columns(x, E, part) for x, part in zip(values, turned, strict=True)
+        )
+        columns = replace(columns, position=position, rate=rate)
+        return replace(columns, goal=motion.equilibrium_goal(columns, second))
+
+    def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
+        """Second derivatives of the columns for a linear acceleration, an angular one, or both.
+
+        That of the error is linear in the angular acceleration in the base frame.
+        """
+        values, E, (P, _) = columns.position, self.error_columns, self._others
+        coupling = to_tensor(coupling, values.dtype, values.device)
+        push = torch.zeros_like(values)
+        if P.stop:
+            push = _with_columns(push, P, coupling[..., P])
+        if coupling.shape[-1] > P.stop:
+            rate = orientation_error.error_rate(values[..., E], coupling[..., P.stop :])
+            push = _with_columns(push, E, rate)
+        return push
+
+    def _via(
+        self,
+        now: ColumnPoints,
+        value: Value | None,
+        velocity: Points | None,
+        body: Points | None = None,
+        body_velocity: Points | None = None,
+    ) -> ColumnPoints:
+        position, E, (P, B) = now.position, self.error_columns, self._others
+        place, rotation = self._parts("value", value)
+        twist = via_values(velocity, now.velocity, "velocity", columns=E.stop)
+        error, rate = _via_errors(
+            self.reference, position[..., E], rotation, twist[..., P.stop :]
+        )
+        parts = via_values(place, position[..., P]), error
+        rates = twist[..., P], rate
+        return ColumnPoints(
+            torch.cat([*parts, via_values(body, position[..., B], "body")], -1),
+            torch.cat(
+                [*rates, via_values(body_velocity, now.velocity[..., B], "body_velocity")], -1
+            ),
+        )
+
+    @classmethod
+    def _restored[S: "OrientedPrimitive"](cls: type[S], saved: SavedModel) -> S:
+        return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
+
+
+class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, OrientationState]):
+    """Movement primitive of an orientation.
+
+    The error e to a reference, the goal by default, is the state of a linear primitive that is
+    exact at all angles, or of the formulation of Ude et al. 2014. Both signs of a quaternion
+    give the same motion. Values are unit quaternions (w, x, y, z), (*batch, 4); velocities and
+    couplings are angular, in the base frame, (*batch, 3). A new start or goal is reached in the
+    sense of rotation of the demonstration. The fit report has residuals of the components of
+    the error [rad], which bound those of the angle.
+    """
+
+    error_columns: ClassVar[slice] = slice(0, 3)
+    state_type: ClassVar[type] = OrientationState
+    trajectory_type: ClassVar[type] = OrientationTrajectory
 
     @classmethod
     def fit(
@@ -270,27 +349,24 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
                 must be less than half a turn apart.
             n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
             mask: (*B, T), false at samples to ignore.
-            formulation: `"log"`, exact, or `"ude"`, integrated, for turns below 360 degrees.
+            formulation: `"log"`, or `"ude"` for the state of Ude et al. 2014.
             options: Options of the fit; see `FitOptions`.
 
         Raises:
             ValueError: Bad samples (the message names them), or an unknown formulation.
         """
-        _check_formulation(formulation)
+        kind = _formulated(formulation)
         time, mask, (orientation,) = padded(time, mask, orientation)
         error, goal = fitted_error(time, orientation, mask)
         motion = JointDMP.fit(time, error, n_basis, mask=mask, **options)
-        if not FORMULATIONS[formulation].linear:
-            if options.get("robust"):
-                # The robust fit replaces samples that may be outliers.
-                error = motion.rollout().position.detach()
-            FORMULATIONS[formulation].refit(motion, check_samples(time, error, mask=mask))
-        return cls(motion, goal, formulation)
+        if kind is UdePrimitive:
+            motion = kind.refitted(motion, check_samples(time, error, mask=mask))
+        return cls(motion, goal)
 
     @property
-    def adapter(self) -> OrientationCoordinates:
-        """Errors to a reference."""
-        return FORMULATIONS[self.formulation](self.goal)
+    def formulation(self) -> str:
+        """State on which forcing term and spring act: `"log"` or `"ude"`."""
+        return "ude" if isinstance(self.motion, UdePrimitive) else "log"
 
     @property
     def start(self) -> Float[Tensor, "*batch 4"]:
@@ -298,34 +374,75 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
         return to_orientation(self.motion.start, self.reference)
 
     @property
-    def reference(self) -> Float[Tensor, "*batch 4"]:
-        """Reference of the error."""
-        return reference_of(self.motion.goal, self.goal)
+    def goal(self) -> Float[Tensor, "*batch 4"]:
+        """Orientation at the end of the demonstration."""
+        return self.goal_orientation
 
-    def with_motion[S: "OrientationDMP"](
-        self: S, motion: JointDMP, frame: Tensor | None = None
-    ) -> S:
-        """Primitive with another motion of the error, to this reference or another."""
-        reference = self.reference if frame is None else frame
-        return type(self)(motion, to_orientation(motion.goal, reference), self.formulation)
+    def _parts(self, name: str, value: Any) -> tuple[None, Any]:
+        return None, value
 
-    def _own_config(self) -> dict[str, Any]:
-        return {"formulation": self.formulation}
+    def _to_reference(self, columns: DMPState, old: Tensor, new: Tensor) -> DMPState:
+        if isinstance(self.motion, UdePrimitive):
+            return ude_formulation.to_reference(columns, old, new)
+        return super()._to_reference(columns, old, new)
 
-    def _own_tensors(self) -> dict[str, Tensor]:
-        return {"goal_orientation": self.goal}
+    def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
+        if isinstance(self.motion, UdePrimitive):
+            # v is minus the angular velocity.
+            return -to_tensor(coupling, frame.dtype, frame.device)
+        return super()._acceleration(columns, frame, coupling)
 
     @classmethod
     def _restored[S: "OrientationDMP"](cls: type[S], saved: SavedModel) -> S:
-        # Older files have no formulation, because there was only one.
-        name = saved.get("formulation", str) if "formulation" in saved.config else "log"
         try:
-            return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"), name)
-        except UnknownFormulationError as error:
+            kind = _formulated(saved.config.get("formulation", "log"))
+        except ValueError as error:
             raise saved.invalid_field("formulation", error) from None
+        return cls(kind.restore(saved), saved.tensor("goal_orientation"))
 
 
-def _check_formulation(name: str) -> None:
-    if name not in FORMULATIONS:
-        known = ", ".join(FORMULATIONS)
-        raise UnknownFormulationError(f"unknown formulation {name!r}; choose from {known}")
+def _formulated(name: Any) -> type[JointDMP]:
+    """Class of the motion of the error in a formulation."""
+    formulations = {"log": JointDMP, "ude": UdePrimitive}
+    if name not in formulations:
+        known = ", ".join(formulations)
+        raise ValueError(f"unknown formulation {name!r}; choose from {known}")
+    return formulations[name]
+
+
+def _via_errors(reference: Tensor, error: Tensor, value: Any, velocity: Any) -> ColumnPoints:
+    """Via points of an orientation as errors and their rates [rad/s]; NaN where free.
+
+    Args:
+        reference: Reference of the errors, (*batch, 4).
+        error: Errors of the unchanged motion, (*batch, n, 3).
+        value: Unit quaternions, (*batch, n, 4), or None.
+        velocity: Angular velocities [rad/s], (*batch, n, 3), or None.
+    """
+    q = via_values(value, error, columns=4)
+    free = q.isnan().any(-1, keepdim=True)
+    reference = reference.detach().double()[..., None, :].expand_as(q)
+    # NaN is replaced before any function, because it would make gradients NaN.
+    q = quaternion.normalize(torch.where(free, reference, q))
+    via = orientation_error.nearest_turn(orientation_error.to_error(q, reference), error)
+    omega = via_values(velocity, error, "velocity")
+    unknown = omega.isnan().any(-1, keepdim=True)
+    rate = orientation_error.error_rate(torch.where(free, error, via), omega.nan_to_num())
+    return ColumnPoints(via.masked_fill(free, torch.nan), rate.masked_fill(unknown, torch.nan))
+
+
+def _join(
+    position: Tensor, error: Tensor, body: Vectors, like: Tensor
+) -> Float[Tensor, "*batch columns"]:
+    """Columns of a linear primitive, broadcast and concatenated."""
+    columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
+    batch = broadcast_shapes(*(column.shape[:-1] for column in columns))
+    return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
+
+
+def _with_columns(values: Tensor, columns: slice, new: Vectors) -> Float[Tensor, "*batch D"]:
+    """Values with some columns replaced; differentiable in both."""
+    new = to_tensor(new, values.dtype, values.device)
+    stop = values.shape[-1] if columns.stop is None else columns.stop
+    new = new.expand(*values.shape[:-1], stop - columns.start)
+    return torch.cat([values[..., : columns.start], new, values[..., stop:]], dim=-1)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, broadcast_tensors
 
 from hrc_learn.dmp._arguments import Mask, Quaternions, Times, Vectors, readable, to_tensor
-from hrc_learn.dmp.fitting.samples import check_samples, demo_label
+from hrc_learn.dmp.samples import check_samples, demo_label
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 

@@ -43,7 +43,7 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
     Raises:
         ValueError: The scaling is `"rotation"`, with weights in a frame per demonstration.
     """
-    motion, columns = _mean_motion(primitives.motion), primitives.adapter.error_columns
+    motion, columns = _mean_motion(primitives.motion), primitives.error_columns
     if columns is None:
         return primitives.with_motion(motion)
     goal: Any = primitives.goal
@@ -57,12 +57,12 @@ def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
     Orientations with different goals become errors to the mean of their references. The map is
     not linear, so the errors are fitted again.
     """
-    columns = primitives.adapter.error_columns
+    columns = primitives.error_columns
     if columns is None:
         return primitives
     own: Any = primitives.reference
     middle = intrinsic_mean(own.reshape(-1, 4))
-    motion = primitives.linear_motion()
+    motion = primitives.motion
     if (to_error(own, middle).abs() < SAME_ORIENTATION).all():
         return primitives
     if motion.basis.periodic:
@@ -138,13 +138,13 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Raises:
             ValueError: Fewer than two primitives, or a scaling, which is not linear.
         """
-        motion = primitives.linear_motion()
+        motion = primitives.motion
         batch = motion.weights.shape[:-2]
         if batch.numel() < 2 or not batch:
             raise ValueError("a distribution needs a batch of at least 2 primitives")
         _linear_coordinates(motion)
         primitives = with_common_reference(primitives)
-        motion = primitives.linear_motion()
+        motion = primitives.motion
         x = _linear_coordinates(motion).flatten(0, -3)
         mean, middle = x.mean(0), mean_primitive(primitives).motion
         reference = getattr(primitives, "reference", None)
@@ -169,7 +169,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
             slack: Standard deviation of the forcing term, equal at all times, in units of the
                 force that holds a coordinate at a distance of its range from the goal.
         """
-        motion = primitive.linear_motion()
+        motion = primitive.motion
         certain = _linear_coordinates(motion)
         if certain.ndim != 2:
             raise ValueError(f"needs one primitive, got a batch {tuple(certain.shape[:-2])}")
@@ -193,7 +193,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         Columns are joints, position, error to the primitive's reference, or body. For
         orientations, use `mean_primitive().rollout`.
         """
-        motion = self.primitive.linear_motion()
+        motion = self.primitive.motion
         time = seconds(time, motion.start.device)
         if time.ndim != 1:
             raise ValueError(f"time must be (n,), got {tuple(time.shape)}")
@@ -228,7 +228,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
                 orientation), or of each velocity per second; one number, (D,) or (n, D).
         """
         via = self._via(time, value, velocity, body, body_velocity)
-        motion = self.primitive.linear_motion()
+        motion = self.primitive.motion
         H, tau = motion.response.evaluate(via.s), motion.duration.double()
         mean, root = self._observe(torch.cat([H[:, 0], H[:, 1] / tau]))
         wanted = torch.cat([via.position, via.rate / tau]).reshape(-1)
@@ -262,7 +262,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         values that were not observed.
         """
         via = self._via(time, value, None, body, None)
-        motion = self.primitive.linear_motion()
+        motion = self.primitive.motion
         mean, root = self._observe(motion.response.evaluate(via.s)[:, 0])
         seen = ~via.position.isnan().reshape(-1)
         diagonal = torch.full_like(mean[seen], noise**2)
@@ -293,7 +293,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         return (rows @ self.mean.mT).reshape(-1), root.flatten(0, 1)
 
     def _with_coordinates(self, x: Float[Tensor, "*batch D M"]) -> P:
-        motion = self.primitive.linear_motion()
+        motion = self.primitive.motion
         return self.primitive.with_motion(motion.with_coordinates(x))
 
 

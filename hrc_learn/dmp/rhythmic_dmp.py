@@ -7,15 +7,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import Mask, Points, Quaternions, Times
-from hrc_learn.dmp._system.bases import PeriodicBasis
-from hrc_learn.dmp._system.response import Response, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp.fitting.samples import check_samples
-from hrc_learn.dmp.fitting.solvers import REGULARIZATION, ridge_inverse
+from hrc_learn.dmp.dynamics import PeriodicBasis, SpringDamper
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import centred_error, to_orientation
 from hrc_learn.dmp.pose_dmp import ERROR, PoseDMP, pose_columns
+from hrc_learn.dmp.response import Response, response_of
+from hrc_learn.dmp.samples import check_samples
+from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
 
 SEARCH_RANGE = 0.1
 """Relative range around the autocorrelation's estimate in which a period is searched."""
@@ -38,8 +37,6 @@ def fit_rhythmic(
     *,
     joint_names: Sequence[str] | None = None,
     units: str = "rad",
-    spring: SpringDamper | None = None,
-    regularization: float = REGULARIZATION,
 ) -> JointDMP:
     """Fit a rhythm to each demonstration of at least one cycle.
 
@@ -55,14 +52,12 @@ def fit_rhythmic(
         mask: (*B, T), false at samples to ignore.
         joint_names: D names, stored with the primitive.
         units: Units of the coordinates.
-        spring: Gains; by default alpha = 25 per period, critically damped.
-        regularization: Ridge, relative to the largest singular value.
 
     Raises:
         ValueError: Bad samples (the message names them), or less than one period of them.
     """
     samples = check_samples(time, position, mask=mask)
-    spring, basis = spring or SpringDamper(), PeriodicBasis(count=n_basis)
+    spring, basis = SpringDamper(), PeriodicBasis(count=n_basis)
     response = response_of(spring, basis)
     parts = []
     for s, duration, y, valid in zip(
@@ -74,19 +69,16 @@ def fit_rhythmic(
             raise ValueError(
                 f"a rhythm needs a whole period of {tau:.3f} s, got {duration.item():.3f} s"
             )
-        parts.append((tau, *_solve(response, elapsed / tau, y, regularization)))
+        parts.append((tau, *_solve(response, elapsed / tau, y, REGULARIZATION)))
     tau, weights, rate, start, centre = (torch.stack(part) for part in zip(*parts, strict=True))
 
-    def batched(tensor: Tensor) -> Tensor:
-        return tensor.to(samples.position.dtype).reshape(samples.batch + tensor.shape[1:])
-
     dmp = JointDMP(
-        weights=batched(weights),
-        start=batched(start),
-        goal=batched(centre),
-        start_velocity=batched(rate / tau[:, None]),
-        duration=batched(tau),
-        amplitude=batched(samples.amplitude),
+        weights=samples.batched(weights),
+        start=samples.batched(start),
+        goal=samples.batched(centre),
+        start_velocity=samples.batched(rate / tau[:, None]),
+        duration=samples.batched(tau),
+        amplitude=samples.batched(samples.amplitude),
         timestamps=(samples.s * (samples.duration / tau)[:, None]).reshape(*samples.batch, -1),
         basis=basis,
         spring=spring,
@@ -177,9 +169,6 @@ def fit_rhythmic_orientation(
     n_basis: int = 25,
     period: float | None = None,
     mask: Mask | None = None,
-    *,
-    spring: SpringDamper | None = None,
-    regularization: float = REGULARIZATION,
 ) -> OrientationDMP:
     """Fit a rhythm of an orientation to each demonstration of at least one cycle.
 
@@ -193,17 +182,13 @@ def fit_rhythmic_orientation(
         n_basis: Number of basis functions per period.
         period: [s]; by default estimated from the motion.
         mask: (*B, T), false at samples to ignore.
-        spring: Gains; by default alpha = 25 per period, critically damped.
-        regularization: Ridge, relative to the largest singular value.
 
     Raises:
         ValueError: Bad samples (the message names them), less than one period of them, or a
             motion that passes half a turn from its mean.
     """
     error, reference = centred_error(time, orientation, mask)
-    motion = fit_rhythmic(
-        time, error, n_basis, period, mask, spring=spring, regularization=regularization
-    )
+    motion = fit_rhythmic(time, error, n_basis, period, mask)
     return OrientationDMP(motion, to_orientation(motion.goal, reference))
 
 
@@ -215,9 +200,6 @@ def fit_rhythmic_pose(
     body: Points | None = None,
     period: float | None = None,
     mask: Mask | None = None,
-    *,
-    spring: SpringDamper | None = None,
-    regularization: float = REGULARIZATION,
 ) -> PoseDMP:
     """Fit a rhythm of a pose; arguments as for `PoseDMP.fit` and `fit_rhythmic`.
 
@@ -225,15 +207,6 @@ def fit_rhythmic_pose(
     """
     error, reference = centred_error(time, orientation, mask)
     columns = pose_columns(time, position, error, body, mask)
-    motion = fit_rhythmic(
-        time,
-        columns,
-        n_basis,
-        period,
-        mask,
-        units="m, rad, body",
-        spring=spring,
-        regularization=regularization,
-    )
+    motion = fit_rhythmic(time, columns, n_basis, period, mask, units="m, rad, body")
     goal = to_orientation(motion.goal[..., ERROR], reference.to(columns))
     return PoseDMP(motion, goal)

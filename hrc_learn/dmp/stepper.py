@@ -247,7 +247,7 @@ class Stepper:
         if isinstance(goal, Pose):
             columns[POSITION] = np.asarray(goal.position)
             goal = np.asarray(goal.orientation)
-        errors = self._dmp.adapter.error_columns
+        errors = self._dmp.error_columns
         new = _reference_of(self._shown.goal[errors], goal)
         y = state.y.copy()
         y[:, errors] = _retarget(y[0, errors], y[1, errors], state.reference, new)

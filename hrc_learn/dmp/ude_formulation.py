@@ -14,9 +14,9 @@ systems"): a step is stable at any length and exact about one axis. The logarith
 continuously.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -30,12 +30,12 @@ from hrc_learn.dmp._arguments import (
     normalised_time,
     to_tensor,
 )
-from hrc_learn.dmp._system.trajectory import Trajectory, output
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.samples import Samples
-from hrc_learn.dmp.fitting.solvers import REGULARIZATION, ridge_inverse
-from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
-from hrc_learn.dmp.orientation_dmp import FORMULATIONS, OrientationCoordinates
+from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.linear_primitive import Boundary
+from hrc_learn.dmp.samples import Samples
+from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
+from hrc_learn.dmp.trajectory import Trajectory, output
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 MAXIMUM_STEP = 1 / 200
@@ -44,28 +44,28 @@ SAMPLES_PER_FUNCTION = 10
 """Times per basis function at which the force of a demonstration is evaluated."""
 
 
-@dataclass(frozen=True, eq=False)
-class UdeCoordinates(OrientationCoordinates):
+class UdePrimitive(JointDMP):
     """Error columns in which (e, v) moves linearly except for the drift of the axis."""
 
-    linear: ClassVar[bool] = False
+    @classmethod
+    def refitted(cls, linear: JointDMP, errors: Samples) -> "UdePrimitive":
+        """Primitive with the force that this state needs to follow the path of a linear one.
 
-    @staticmethod
-    def refit(motion: LinearPrimitive, errors: Samples) -> None:
-        """Add to fitted weights the force that this state needs to follow the same path.
+        Args:
+            linear: Fitted to the errors.
+            errors: Samples for the fit report.
 
         Raises:
             ValueError: The demonstration passes a whole turn from its goal, where e' has no
                 bound.
         """
+        motion = UdePrimitive.of(linear)
         count = SAMPLES_PER_FUNCTION * motion.basis.count
         s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
-        start_rate = motion.start_velocity * motion.duration[..., None]
         with torch.no_grad():
-            boundary = Boundary(start_velocity=start_rate)
-            linear = motion.rollout_columns(boundary, _unit_duration(motion), s)
+            shown = linear.rollout_columns(Boundary(), _unit_duration(motion), s)
             e, rate, second = (
-                x.double() for x in (linear.position, linear.velocity, linear.acceleration)
+                x.double() for x in (shown.position, shown.velocity, shown.acceleration)
             )
             if (e.norm(dim=-1) >= 2 * torch.pi).any():
                 raise ValueError(
@@ -76,72 +76,80 @@ class UdeCoordinates(OrientationCoordinates):
             force = slope - second + motion.spring.alpha * (v - rate)
             change = (ridge_inverse(motion.basis.forcing(s), REGULARIZATION) @ force).mT
             motion.weights += change.to(motion.weights)
-            ends = motion.start, motion.duration, motion.start_velocity
-            reproduction = UdeMotion(motion, motion.timestamps, *ends, None).position
-        motion.fit_report = errors.compare(reproduction)
+            motion.fit_report = errors.compare(motion.rollout().position)
+        return motion
 
-    def rollout(
+    @classmethod
+    def of(cls, linear: JointDMP) -> "UdePrimitive":
+        """Primitive with the weights of a linear one."""
+        return cls(**linear.arguments())
+
+    def config(self) -> dict[str, Any]:
+        """Contents of a saved primitive besides its tensors, as JSON values."""
+        return super().config() | {"formulation": "ude"}
+
+    def coordinates(self) -> Tensor:
+        """Refuse: the motion is not a linear map of coordinates.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError("formulation 'ude' is not linear: fit with 'log' instead")
+
+    def with_coordinates(self, *_: Any, **__: Any) -> Any:
+        """Refuse, as `coordinates` does."""
+        return self.coordinates()
+
+    def rollout_columns(
         self,
-        motion: LinearPrimitive,
         boundary: Boundary,
         duration: Tensor,
-        time: Times | None,
-        forcing_gain: Scalars | None,
+        time: Times | None = None,
+        forcing_gain: Scalars | None = None,
     ) -> "UdeMotion":
         """Motion of the error, of order 4 in `MAXIMUM_STEP`."""
-        s = motion.timestamps if time is None else normalised_time(time, duration)
-        start, rate = boundary.start, boundary.start_velocity
-        return UdeMotion(motion, s, start, duration, rate, forcing_gain)
+        s = self.timestamps if time is None else normalised_time(time, duration)
+        start, _, per_s = self.resolve_boundary(boundary, duration)
+        return UdeMotion(self, s, start, duration, per_s, forcing_gain)
 
-    def step(
-        self, motion: LinearPrimitive, columns: DMPState, dt: Scalars, **inputs: Any
-    ) -> DMPState:
+    def step_columns(self, state: DMPState, dt: Scalars, **inputs: Any) -> DMPState:
         """State of the error after `dt` [s], of order 4 in it."""
-        v = drift_free_rate(columns.position, columns.rate)
-        begin = replace(columns, rate=v)
+        v = drift_free_rate(state.position, state.rate)
+        begin = replace(state, rate=v)
         half = to_tensor(dt, v.dtype, v.device) / 2
-        middle = motion.step_columns(begin, half, **inputs)
-        end = motion.step_columns(middle, half, **inputs)
+        middle = super().step_columns(begin, half, **inputs)
+        end = super().step_columns(middle, half, **inputs)
         linear = [torch.stack([x.position, x.rate], dim=-2) for x in (begin, middle, end)]
-        h = end.s - columns.s
-        change = deviation(torch.zeros_like(linear[0]), h, motion, linear)
+        change = deviation(torch.zeros_like(linear[0]), end.s - state.s, self, linear)
         e, v = (linear[2] + change).unbind(-2)
         return replace(end, position=e, rate=v + axis_drift(e, v))
 
-    def external_acceleration(
-        self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, coupling: Any
-    ) -> Tensor | None:
-        """Minus the angular acceleration, because v is minus the angular velocity."""
-        if coupling is None:
-            return None
-        return -to_tensor(coupling, frame.dtype, frame.device)
 
-    def _to_reference(
-        self, motion: LinearPrimitive, columns: DMPState, old: Tensor, new: Tensor
-    ) -> DMPState:
-        q = orientation_error.to_orientation(columns.position, old)
-        error = orientation_error.to_error(q, new)
-        error = orientation_error.nearest_turn(error, columns.position)
-        v = drift_free_rate(columns.position, columns.rate)
-        # The spring force alpha beta (e - goal) is unchanged if both move alike.
-        return replace(
-            columns,
-            position=error,
-            rate=v + axis_drift(error, v),
-            goal=columns.goal + error - columns.position,
-        )
+def to_reference(state: DMPState, old: Tensor, new: Tensor) -> DMPState:
+    """State of the error to another reference, for the same motion of the orientation."""
+    q = orientation_error.to_orientation(state.position, old)
+    error = orientation_error.to_error(q, new)
+    error = orientation_error.nearest_turn(error, state.position)
+    v = drift_free_rate(state.position, state.rate)
+    # The spring force alpha beta (e - goal) is unchanged if both move alike.
+    return replace(
+        state,
+        position=error,
+        rate=v + axis_drift(error, v),
+        goal=state.goal + error - state.position,
+    )
 
 
-class UdeMotion:
+class UdeMotion(Trajectory):
     """Error over time: linear motion plus deviation, integrated once on a fixed grid."""
 
     def __init__(
         self,
-        motion: LinearPrimitive,
+        motion: UdePrimitive,
         s: Float[Tensor, "*#batch T"],
         start: Float[Tensor, "*#batch 3"],
         duration: Float[Tensor, "*#batch"],
-        rate: Float[Tensor, "*#batch 3"],
+        per_s: Float[Tensor, "*#batch 3"],
         forcing_gain: Scalars | None,
     ):
         """Describe a motion.
@@ -151,10 +159,10 @@ class UdeMotion:
             s: Normalised times.
             start: Error at the start [rad].
             duration: [s].
-            rate: Rate of the error at the start [rad/s].
+            per_s: Rate de/ds of the error at the start [rad].
             forcing_gain: Factor on the forcing term.
         """
-        start, per_s = torch.broadcast_tensors(start, rate * duration[..., None])
+        start, per_s = torch.broadcast_tensors(start, per_s)
         self._motion = motion
         self._forcing_gain = forcing_gain
         self._s = s
@@ -230,13 +238,14 @@ class UdeMotion:
             Boundary(self._start, None, self._first),
             _unit_duration(self._motion),
         )
-        return self._motion.rollout_columns(boundary, duration, s, self._forcing_gain)
+        linear = super(UdePrimitive, self._motion).rollout_columns
+        return linear(boundary, duration, s, self._forcing_gain)
 
 
 def deviation(
     z: Float[Tensor, "*#batch 2 3"],
     h: Float[Tensor, "*#batch"],
-    motion: LinearPrimitive,
+    motion: JointDMP,
     linear: list[Tensor] | tuple[Tensor, ...],
 ) -> Float[Tensor, "*batch 2 3"]:
     """Deviation z = (e, v) - linear after a step of `h`, with z' = A z + (n, 0).
@@ -265,10 +274,6 @@ def _slope(x: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch 2 3"]:
     return torch.stack([drift, torch.zeros_like(drift)], dim=-2)
 
 
-def _unit_duration(motion: LinearPrimitive) -> Tensor:
+def _unit_duration(motion: JointDMP) -> Tensor:
     """Duration of one, for which times are s and velocities derivatives by s."""
     return motion.resolve_duration(1.0, None)
-
-
-# Registered here, so that no module below has to know this one.
-FORMULATIONS["ude"] = UdeCoordinates

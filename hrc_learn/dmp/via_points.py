@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hrc_learn.dmp._system.response import Response
-from hrc_learn.dmp._system.spring import minimum_jerk_curve
+from hrc_learn.dmp.dynamics import minimum_jerk_curve
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
+from hrc_learn.dmp.response import Response
 
 SAMPLES_PER_FUNCTION = 8
 """Times per basis function at which curve and motion are compared: no basis function follows a

@@ -5,7 +5,7 @@ from dmp_oracle import solve
 from torch.autograd.functional import jvp
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, fit_rhythmic
-from hrc_learn.dmp._system.spring import minimum_jerk_curve as approach_curve
+from hrc_learn.dmp.dynamics import minimum_jerk_curve as approach_curve
 from hrc_learn.geometry import quaternion
 
 S = torch.linspace(0, 1, 1000, dtype=torch.float64)

@@ -1,5 +1,3 @@
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -7,7 +5,7 @@ from demo_motions import minimum_jerk
 from torch.autograd import gradcheck
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import ContextualDMP, JointDMP, PolynomialFeatures, fit_ridge
+from hrc_learn.dmp import ContextualDMP, JointDMP, fit_ridge
 
 S = torch.linspace(0, 1, 200, dtype=torch.float64)
 CONTEXTS = torch.tensor([[0.0, 0.2], [0.5, 1.0], [1.0, 0.1], [0.3, 0.7], [0.8, 0.6]]).double()
@@ -122,24 +120,6 @@ def test_a_context_that_never_changes_tells_nothing():
     assert dmp.at([0.0, 0.2, 0.5]).goal.allclose(expected)
 
 
-def test_a_pluggable_feature_map_follows_what_is_curved():
-    c = torch.linspace(-1, 1, 7, dtype=torch.float64)
-    position = minimum_jerk(S)[:, None] * (c**2)[:, None, None] + 0.5 * S[:, None]
-    new = torch.tensor([0.45], dtype=torch.float64)
-    goals = {}
-    for degree in (1, 2):
-        features = PolynomialFeatures(degree=degree)
-        dmp = ContextualDMP.fit(2 * S, position, c, n_basis=12, features=features)
-        goals[degree] = dmp.at(new).goal.item()
-    assert goals[2] == pytest.approx(0.45**2 + 0.5, abs=1e-5)
-    assert abs(goals[1] - goals[2]) > 0.1
-
-
-def test_polynomials_are_all_products_up_to_their_degree():
-    got = PolynomialFeatures(degree=3)(torch.tensor([2.0, 3.0]))
-    assert got.tolist() == [2, 3, 4, 6, 9, 8, 12, 18, 27]
-
-
 @pytest.mark.parametrize("batch", [(), (1,), (3, 2)])
 def test_a_batch_is_a_loop(batch):
     dmp = fitted()
@@ -189,11 +169,10 @@ def test_padded_demonstrations_of_unlike_lengths():
     torch.testing.assert_close(padded.held_out.rmse, plain.held_out.rmse, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("features", [None, torch.sin])
-def test_a_saved_one_is_the_same(features, tmp_path):
-    dmp = fitted(features=features, approach=0.5)
+def test_a_saved_one_is_the_same(tmp_path):
+    dmp = fitted(approach=0.5)
     dmp.save(tmp_path / "placing")
-    loaded = ContextualDMP.load(tmp_path / "placing", features)
+    loaded = ContextualDMP.load(tmp_path / "placing")
     new = [0.2, 0.9]
     # Not to the last bit: where tensors lie in memory decides how a product is summed.
     torch.testing.assert_close(
@@ -204,22 +183,6 @@ def test_a_saved_one_is_the_same(features, tmp_path):
     dmp.at(new).save(tmp_path / "one")
     one = JointDMP.load(tmp_path / "one").rollout().position
     torch.testing.assert_close(one, dmp.at(new).rollout().position, rtol=0, atol=0)
-
-
-def test_a_feature_map_that_was_not_saved_is_asked_for(tmp_path):
-    fitted(features=torch.sin).save(tmp_path / "placing")
-    with pytest.raises(ValueError, match=r"config\.json: field 'features'.*pass it to load"):
-        ContextualDMP.load(tmp_path / "placing")
-
-
-@pytest.mark.parametrize("fields", [{"degree": 0}, {"grade": 1}])
-def test_saved_features_that_cannot_be_are_named(fields, tmp_path):
-    fitted().save(tmp_path / "placing")
-    (tmp_path / "placing" / ".manifest.json").unlink()
-    path = tmp_path / "placing" / "config.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"features": fields}))
-    with pytest.raises(ValueError, match=r"config\.json: field 'features'"):
-        ContextualDMP.load(tmp_path / "placing")
 
 
 def test_what_cannot_be_is_refused():
@@ -236,7 +199,5 @@ def test_what_cannot_be_is_refused():
         ContextualDMP.fit(time[:1], position[:1], CONTEXTS[:1])
     with pytest.raises(ValueError, match="regularization must be positive"):
         fitted(regularization=0.0)
-    with pytest.raises(ValueError, match=r"gives features \(3,\), fitted were \(..., 2\)"):
+    with pytest.raises(ValueError, match=r"context must have shape \(..., 2\), got \(3,\)"):
         fitted().at([0.1, 0.2, 0.3])
-    with pytest.raises(ValueError, match="degree must be at least 1"):
-        PolynomialFeatures(degree=0)

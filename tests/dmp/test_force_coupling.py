@@ -5,16 +5,10 @@ from demo_motions import arm_motion, minimum_jerk
 from dmp_oracle import forcing
 from scipy.integrate import solve_ivp
 from torch.autograd import gradcheck
-from torch.autograd.functional import jvp
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.coupling import (
-    distance_error,
-    learn_feed_forward,
-    offset_error,
-    velocity_coupling,
-)
+from hrc_learn.dmp.coupling import offset_error, velocity_coupling
 
 TAU = 2.0
 S = torch.linspace(0, 1, 400, dtype=torch.float64)
@@ -124,7 +118,7 @@ def test_the_wanted_force_on_a_wall_is_reached_by_learning():
     for _ in range(6):
         force = press_on_a_wall(dmp, wanted, learned, dt)
         last.append((force[-1] - wanted[-1]).item())
-        learned = learn_feed_forward(learned, wanted - force, gain=GAIN, retention=1.0)
+        learned = learned + GAIN * (wanted - force)
     # At rest the pull of the goal, 20 N - 8 N, is fed back over K = stiffness tau / beta.
     shrink = 1 / (1 + GAIN * STIFFNESS * TAU / dmp.spring.beta)
     for i, miss in enumerate(last):
@@ -134,12 +128,6 @@ def test_the_wanted_force_on_a_wall_is_reached_by_learning():
     settled = force[n_steps // 2 :]
     assert (settled - 8.0).abs().max() < 0.05
     assert force.max() < 20.0
-
-
-def test_forgetting_leaves_the_share_it_should():
-    error, learned = torch.tensor([[3.0]]), torch.tensor([[0.5]])
-    got = learn_feed_forward(learned, error, gain=0.2, rate=0.5, retention=0.9)
-    assert got.item() == pytest.approx(0.9 * (0.5 + 0.5 * 0.2 * 3.0))
 
 
 # Two arms
@@ -162,12 +150,9 @@ def mirrored(error, rate):
     return ARM_GAIN * pair[0], ARM_GAIN * pair[1], 0.0
 
 
-def keep(error_of, wanted):
-    def couple(k, state):
-        (a, b), (va, vb) = state.position, state.velocity
-        return mirrored(*error_of(a, va, b, vb, wanted))
-
-    return couple
+def keep(k, state):
+    (a, b), (va, vb) = state.position, state.velocity
+    return mirrored(*offset_error(a, va, b, vb, OFFSET))
 
 
 OFFSET = torch.tensor([0.3, 0.4], dtype=torch.float64)
@@ -181,31 +166,12 @@ def offset_by_hand(s, x, x_dot):
     return ARM_GAIN * np.concatenate([-e, e]), ARM_GAIN * np.concatenate([-rate, rate])
 
 
-def distance_by_hand(s, x, x_dot):
-    a, b = x.reshape(2, 2)
-    va, vb = x_dot.reshape(2, 2)
-    d = np.hypot(*(b - a))
-    n = (b - a) / d
-    swing = ((vb - va) - n * (n @ (vb - va))) / d
-    e = (0.5 - d) * n
-    rate = -(n @ (vb - va)) * n + (0.5 - d) * swing
-    return ARM_GAIN * np.concatenate([-e, e]), ARM_GAIN * np.concatenate([-rate, rate])
-
-
-@pytest.mark.parametrize(
-    ("couple", "by_hand"),
-    [
-        (keep(offset_error, OFFSET), offset_by_hand),
-        (keep(distance_error, 0.5), distance_by_hand),
-    ],
-    ids=["offset", "distance"],
-)
-def test_linked_arms_solve_the_printed_equations_to_first_order(couple, by_hand):
+def test_linked_arms_solve_the_printed_equations_to_first_order():
     dmp = two_arms()
     goal = dmp.goal + SHIFT
-    expected = printed_form(dmp, goal.numpy(), 0.7, by_hand).reshape(2, 2)
+    expected = printed_form(dmp, goal.numpy(), 0.7, offset_by_hand).reshape(2, 2)
     errors = [
-        abs(run(dmp, goal, 0.7, n, couple).position.numpy() - expected).max()
+        abs(run(dmp, goal, 0.7, n, keep).position.numpy() - expected).max()
         for n in (100, 200, 400)
     ]
     assert errors[-1] < 2e-3
@@ -215,7 +181,7 @@ def test_linked_arms_solve_the_printed_equations_to_first_order(couple, by_hand)
 def test_arms_keep_their_offset_when_one_goal_moves():
     """What is left at rest: the shift over 1 + 2 gain tau / beta."""
     dmp = two_arms()
-    a, b = run(dmp, dmp.goal + SHIFT, 3.0, 500, keep(offset_error, OFFSET)).position
+    a, b = run(dmp, dmp.goal + SHIFT, 3.0, 500, keep).position
     left = SHIFT[1] / (1 + 2 * ARM_GAIN * TAU / dmp.spring.beta)
     torch.testing.assert_close(b - a - OFFSET, left, rtol=0, atol=1e-6)
     assert left.norm() < 0.1 * SHIFT.norm()
@@ -224,53 +190,14 @@ def test_arms_keep_their_offset_when_one_goal_moves():
     torch.testing.assert_close((a + b) / 2, middle, rtol=0, atol=1e-6)
 
 
-def test_arms_keep_their_distance_on_the_way_and_may_turn():
-    dmp = two_arms()
-    goal = dmp.goal + SHIFT
-    distances = {}
-    for name, wanted_gain in (("linked", 1.0), ("alone", 0.0)):
-        state, distances[name] = dmp.initial_state(goal=goal), []
-        with torch.no_grad(), shapes_unchecked():
-            for _ in range(300):
-                (a, b), (va, vb) = state.position, state.velocity
-                V, V_dot, _ = mirrored(*distance_error(a, va, b, vb, 0.5))
-                push = velocity_coupling(V, V_dot, spring=dmp.spring, duration=state.duration)
-                state = dmp.step(state, 0.01, coupling=wanted_gain * push)
-                distances[name].append((b - a).norm().item())
-    linked, alone = (abs(np.array(distances[n]) - 0.5).max() for n in ("linked", "alone"))
-    assert linked < 0.15 * alone
-    turned = state.position[1] - state.position[0]  # the arms alone
-    assert turned.norm() != pytest.approx(0.5, abs=0.01)
-
-
-@pytest.mark.parametrize("error_of", [offset_error, distance_error])
-def test_rates_are_the_derivatives_of_errors_by_time(error_of):
-    rng = torch.Generator().manual_seed(0)
-    a, va, b, vb = torch.randn(4, 5, 3, generator=rng, dtype=torch.float64)
-    wanted = torch.full((5,) if error_of is distance_error else (3,), 0.7).double()
-
-    def error(a, b):
-        return error_of(a, va, b, vb, wanted)[0]
-
-    torch.testing.assert_close(
-        error_of(a, va, b, vb, wanted)[1], jvp(error, (a, b), (va, vb))[1]
-    )
-
-
-def test_arms_at_one_point_have_no_line_to_be_moved_along():
-    point, v = torch.ones(3, requires_grad=True), torch.ones(3)
-    error, rate = distance_error(point, v, torch.ones(3), 2 * v, 0.5)
-    assert error.tolist() == rate.tolist() == [0.0] * 3
-    (error + rate).sum().backward()
-    assert point.grad is not None
-    assert point.grad.isfinite().all()
+OFFSET3 = torch.tensor([0.3, 0.4, 0.5], dtype=torch.float64)
 
 
 def test_terms_take_batches_and_pass_gradients():
     dmp = two_arms()
 
     def moved(position, V):
-        error, rate = distance_error(position, V, position.flip(0) + 0.1, V.flip(0), 0.5)
+        error, rate = offset_error(position, V, position.flip(0) + 0.1, V.flip(0), OFFSET3)
         return velocity_coupling(error, rate, spring=dmp.spring, duration=dmp.duration)
 
     rng = torch.Generator().manual_seed(0)

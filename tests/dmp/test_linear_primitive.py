@@ -12,8 +12,7 @@ from power_cuts import cut_off
 from safetensors.torch import load_file, save_file
 from torch.autograd import forward_ad
 
-from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper
-from hrc_learn.dmp._system import products, trajectory
+from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper, response, trajectory
 
 # Files
 
@@ -467,7 +466,7 @@ def test_every_way_to_multiply_gives_the_same_motions(monkeypatch, shape, most, 
     positions = position + torch.randn(*shape, 1, 7, dtype=torch.float64)
     dmp = JointDMP.fit(time, positions, 12)
     derived = dmp.rollout()
-    for module in (products, trajectory):
+    for module in (response, trajectory):
         monkeypatch.setattr(module, "numpy_limit", lambda: most)
     before = torch.get_num_threads()
     torch.set_num_threads(n_threads)
@@ -495,11 +494,11 @@ def test_every_way_to_multiply_gives_the_same_motions(monkeypatch, shape, most, 
 def test_numpy_multiplies_what_its_library_has_kernels_for(monkeypatch, libraries, most):
     found = [{"internal_api": api, "architecture": name} for api, name in libraries]
     monkeypatch.setattr("threadpoolctl.threadpool_info", lambda: found)
-    assert products.numpy_limit.__wrapped__() == most
+    assert response.numpy_limit.__wrapped__() == most
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (2, 3, 5), (2, 4, 5)])
 def test_parameters_are_multiplied_where_nothing_derives_them(shape):
     X, H = torch.nn.Parameter(torch.randn(*shape)), torch.randn(5, 6)
     with torch.no_grad():
-        torch.testing.assert_close(products.product(X, H), X.detach() @ H)
+        torch.testing.assert_close(response.product(X, H), X.detach() @ H)

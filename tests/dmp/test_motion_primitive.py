@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion, turning_motion
-from safetensors.torch import load_file, save_file
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
@@ -114,16 +113,6 @@ def test_a_program_without_a_stepper_does_what_the_primitive_does():
         state = dmp.step(state, dt, coupling=inputs["coupling"][0], phase_stopping=waiting)
         for name, value in state_tensors(state).items():
             torch.testing.assert_close(tensors[name], value, rtol=1e-9, atol=1e-9, msg=name)
-
-
-def test_files_with_the_older_name_of_timestamps_are_read(tmp_path):
-    dmp = JointDMP.fit(TIME, POSITION, 12)
-    dmp.save(tmp_path)
-    model = tmp_path / "model.safetensors"
-    tensors = load_file(model)
-    tensors["stamps"] = tensors.pop("timestamps")
-    save_file(tensors, model)
-    assert torch.equal(JointDMP.load(tmp_path).rollout().position, dmp.rollout().position)
 
 
 @pytest.mark.parametrize("kind", ["joint", "orientation", "moving goal"])

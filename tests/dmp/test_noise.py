@@ -46,7 +46,6 @@ def test_noise_is_left_out(fps, duration, noise, seed):
         fixed = JointDMP.fit(s * duration, samples, count)
         assert error < judged(fixed, fine, truth, duration)[1]
     assert chosen.fit_report.noise.numpy() == pytest.approx(noise, rel=0.35)
-    assert chosen.fit_report.peak_jerk.isfinite().all()
     assert chosen.fit_report.rmse.numpy() == pytest.approx(noise, rel=0.35)
 
 

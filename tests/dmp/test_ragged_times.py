@@ -16,12 +16,10 @@ from hrc_learn.dmp import (
     PeriodicBasis,
     SplineBasis,
     SpringDamper,
+    ragged_times,
     response_of,
 )
-from hrc_learn.dmp._system import ragged_times
-from hrc_learn.dmp._system.ragged_times import motion, power_by_power
-from hrc_learn.dmp.fitting import ragged_gram
-from hrc_learn.dmp.fitting.ragged_gram import ColumnPieces
+from hrc_learn.dmp.ragged_times import motion, power_by_power
 
 BASES = {
     "gaussian": (GaussianBasis(count=12), 0.0),
@@ -248,31 +246,3 @@ def test_samples_that_do_not_count_change_no_fit():
         alone = JointDMP.fit(time[i, kept], position[i, kept], 12, velocity[i, kept])
         torch.testing.assert_close(together[i].weights, alone.weights, rtol=1e-6, atol=1e-5)
         torch.testing.assert_close(together[i].start_velocity, alone.start_velocity)
-
-
-@pytest.mark.parametrize("most", [ragged_gram.MAXIMUM_TABLE, 0])
-def test_products_are_those_of_the_design(monkeypatch, most):
-    monkeypatch.setattr(ragged_gram, "MAXIMUM_TABLE", most)
-    rng = torch.Generator().manual_seed(0)
-    s = torch.rand(3, 60, generator=rng, dtype=torch.float64).sort(-1).values
-    s[:, 0], s[:, -1] = 0.0, 1.0
-    # All at one place, and pieces that hold nothing.
-    s[2, 1:-1] = 0.4
-    y = torch.randn(3, 2, 60, generator=rng, dtype=torch.float64)
-    mask = (torch.rand(3, 60, generator=rng) < 0.8).double()
-    # One that fades before the end is for samples after that as well.
-    early = GaussianBasis(count=12, phase=ExponentialPhase(decay=60.0))
-    for basis in (
-        GaussianBasis(count=12),
-        GaussianBasis(count=40),
-        SplineBasis(count=9),
-        early,
-    ):
-        response = response_of(SpringDamper(), basis, 0.0)
-        mixing = torch.randn(response.size, 7, generator=rng, dtype=torch.float64)
-        gram, right = ColumnPieces.of(response, mixing).products(s, y, mask)
-        H = response.evaluate(s)[..., 0, :] @ mixing
-        expected = H.mT @ (mask[..., None] * H)
-        torch.testing.assert_close(gram, expected, rtol=1e-8, atol=1e-8)
-        expected = H.mT @ (mask[..., None] * y.mT)
-        torch.testing.assert_close(right, expected, rtol=1e-8, atol=1e-8)

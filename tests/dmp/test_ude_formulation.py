@@ -11,6 +11,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import angular_velocity
+from hrc_learn.dmp.ude_formulation import UdePrimitive
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate
 
@@ -75,7 +76,7 @@ def test_a_turn_about_one_axis_is_exact_in_one_step():
     axis = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     q = quaternion.exp((3.0 * minimum_jerk(s))[:, None] * axis)
     log = OrientationDMP.fit(s, q)
-    ude = OrientationDMP(log.motion, log.goal, "ude")
+    ude = OrientationDMP(UdePrimitive.of(log.motion), log.goal)
     expected = log.rollout(time=[0.6]).orientation[0]
     got = ude.step(ude.initial_state(), 0.6).orientation
     assert (got - expected).abs().max() < 1e-9

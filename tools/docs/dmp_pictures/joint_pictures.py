@@ -9,7 +9,6 @@ from hrc_learn.dmp import (
     GaussianBasis,
     JointDMP,
     MovingGoalDMP,
-    PolynomialFeatures,
     ProbabilisticDMP,
     SplineBasis,
     fit_rhythmic,
@@ -174,9 +173,7 @@ def context(figure: Figure) -> None:
         lift = h * demonstrations.rise(1.4 * s) + 0.08 * torch.sin(torch.pi * s) ** 2
         return torch.stack([(0.4 * demonstrations.rise(s)).expand_as(lift), lift], -1)
 
-    dmp = ContextualDMP.fit(
-        time.expand(5, -1), reach(heights), heights, features=PolynomialFeatures(degree=2)
-    )
+    dmp = ContextualDMP.fit(time.expand(5, -1), reach(heights), heights)
     where, when = panels(figure, 2)
     when.plot([], [], label="demonstrated", **DEMO)
     for path in reach(heights):

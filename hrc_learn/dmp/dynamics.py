@@ -1,18 +1,27 @@
-"""Phases and basis functions of the forcing term.
+"""The dynamics of a primitive: spring-damper, phase, and basis functions of the forcing term.
 
-A phase is the canonical system of a movement primitive: the clock that fades its forcing term.
-Any frozen dataclass with the members of `Phase` can be passed to a basis; files can store the
-phases and bases of this module only.
+Left to the spring, a motion reacts to a new goal at once: the acceleration jumps at the start
+and the motion becomes several times faster. With a minimum-jerk approach the forcing term
+contains a part proportional to goal - start under which, with all weights zero, the motion is
+y_0 + (g - y_0) m(s). The weights then shape the remainder (the elementary trajectory of Zhou et
+al. 2019, "Learning via-movement primitives", as part of a second-order system).
 """
 
 import math
-from dataclasses import dataclass, field
-from typing import ClassVar, Protocol, runtime_checkable
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from types import ModuleType
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry import minimum_jerk
+
+CRITICAL = 1e-12
+"""Bound on |1 - 4 beta / alpha| below which the damping counts as critical. Closer to zero,
+sinh(r s) / r loses more than six digits to cancellation."""
 ROUNDING = 38.0
 """Exponent below which a factor is lost in float64 rounding: exp(-38) = 3e-17."""
 DOMAINS = ("time", "phase")
@@ -20,23 +29,119 @@ DEGREE = 3
 """Degree of the splines: the lowest whose forcing has a continuous second derivative."""
 
 
-@runtime_checkable
-class Phase(Protocol):
-    """Decaying factor of the forcing term as a function of normalised time; hashable."""
+def check_positive(name: str, value: float) -> None:
+    """Raise ValueError unless `value` is positive and finite."""
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be positive, got {value}")
+
+
+def check_count(count: int) -> None:
+    """Raise ValueError for a basis of fewer than two functions."""
+    if count < 2:
+        raise ValueError(f"a basis needs at least 2 functions, got {count}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringDamper:
+    """y'' = alpha (beta (g - y) - y'), solved exactly for any gains.
+
+    (paper eq. (eq_tf)); primes are derivatives by s = t / tau. With x = (y - g, y') this
+    is x' = A x, A = [[0, 1], [-alpha beta, -alpha]].
+    """
+
+    alpha: float = 25.0
+    """Damping gain alpha_q."""
+    beta: float = math.nan
+    """Spring gain beta_q; alpha / 4, critical damping, by default."""
+
+    def __post_init__(self):
+        if math.isnan(self.beta):
+            object.__setattr__(self, "beta", self.alpha / 4)
+        for name in ("alpha", "beta"):
+            gain = getattr(self, name)
+            if not (math.isfinite(gain) and gain > 0):
+                raise ValueError(f"{name} must be positive for stability, got {gain}")
 
     @property
-    def horizon(self) -> float:
-        """Normalised time after which the phase is lost in float64 rounding."""
-        ...
+    def stiffness(self) -> float:
+        """Product alpha beta."""
+        return self.alpha * self.beta
 
     @property
     def smooth_interval(self) -> float:
-        """Length over which the phase is a polynomial of low degree."""
-        ...
+        """Length over which the unforced motion is a polynomial of low degree."""
+        half = self.alpha / 2
+        fastest = half + math.sqrt(max(half**2 - self.stiffness, 0.0))
+        # The modulus of complex modes is the square root of the stiffness.
+        return 1 / max(fastest, math.sqrt(self.stiffness))
 
-    def __call__(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Phase z at normalised time `s`: positive, 1 at s = 0, non-increasing."""
-        ...
+    def acceleration(self, offset: Tensor, velocity: Tensor) -> Tensor:
+        """Second derivative y'' of the unforced system at the offset y - g."""
+        return -self.stiffness * offset - self.alpha * velocity
+
+    def propagator(self, s: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch 2 2"]:
+        """Transition matrix exp(A s): maps (y - g, y') at 0 to the same at `s`.
+
+        exp(A s) = C I + S (A + alpha / 2 I) by Cayley-Hamilton; see `modes` for C and S.
+        The matrix of a number is cached: do not change it in place.
+        """
+        if not isinstance(s, Tensor):
+            return _cached_propagator(self, s)
+        C, S = self.modes(s, torch)
+        lean = S * (self.alpha / 2)  # A + alpha / 2 I has +-alpha / 2 on its diagonal
+        entries = torch.stack([C + lean, S, -self.stiffness * S, C - lean], dim=-1)
+        return entries.view(*s.shape, 2, 2)
+
+    def modes(self, s: Any, xp: ModuleType) -> tuple[Any, Any]:
+        """exp(-alpha s / 2) times cosh(r s) and sinh(r s) / r, r^2 = alpha^2 / 4 - alpha beta.
+
+        Trigonometric for imaginary r, 1 and s for r = 0.
+
+        Args:
+            s: Normalised time, of a type that `xp` accepts.
+            xp: `torch` for tensors, `math` for numbers.
+        """
+        half = self.alpha / 2
+        discriminant = 1 - 4 * (self.beta / self.alpha)
+        rate = half * math.sqrt(abs(discriminant))
+        if abs(discriminant) < CRITICAL:
+            C = xp.exp(-half * s)
+            return C, s * C
+        if discriminant > 0:
+            # Both exponents are negative: unlike cosh, nothing overflows at large s.
+            slow, fast = xp.exp((rate - half) * s), xp.exp((-rate - half) * s)
+            return (slow + fast) / 2, (slow - fast) / (2 * rate)
+        envelope = xp.exp(-half * s)
+        return envelope * xp.cos(rate * s), envelope * xp.sin(rate * s) / rate
+
+
+# A control loop uses few step lengths, each of which needs one 2x2 matrix.
+@lru_cache(maxsize=64)
+def _cached_propagator(spring: SpringDamper, s: float) -> Float[Tensor, "2 2"]:
+    """`SpringDamper.propagator` of a number (float64)."""
+    C, S = spring.modes(s, math)
+    lean = S * spring.alpha / 2
+    # Tensors made in inference mode cannot take part in a backward pass later.
+    with torch.inference_mode(False):
+        return torch.tensor(
+            [[C + lean, S], [-spring.stiffness * S, C - lean]], dtype=torch.float64
+        )
+
+
+def minimum_jerk_curve(
+    s: Float[Tensor, "*batch"], fraction: float = 1.0
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Curve m(s) from 0 to 1 over the first `fraction` of a motion, and m' and m''."""
+    u = (s / fraction).clamp(0, 1)
+    m, slope = minimum_jerk(u)
+    curvature = 60 * u * (1 - u) * (1 - 2 * u)
+    return m, slope / fraction, curvature / fraction**2
+
+
+def approach_state(s: Float[Tensor, "*batch"], fraction: float) -> Float[Tensor, "*batch 2"]:
+    """State (m - 1, m') of the approach, relative to the goal, per unit of goal - start."""
+    m, slope, _ = minimum_jerk_curve(s, fraction)
+    return torch.stack([m - 1, slope], dim=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,87 +176,6 @@ class ExponentialPhase:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SigmoidPhase:
-    """Phase that stays near one during the motion and falls at its end.
-
-    z(s) = (1 + exp(-a m)) / (1 + exp(a (s - m)))
-
-    (after Kulvicius et al. 2012, "Joining movement sequences"; an exponential decay leaves
-    little forcing for the end of a motion). Early and late weights have similar effect.
-    """
-
-    steepness: float = 50.0
-    """a: the phase falls from 88 % to 12 % within 4 / a."""
-    middle: float = 1.0
-    """m: normalised time at which the phase has fallen to one half."""
-
-    def __post_init__(self):
-        check_positive("steepness", self.steepness)
-        check_positive("middle", self.middle)
-
-    def __call__(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Phase z at normalised time `s`."""
-        top = 1 + math.exp(-self.steepness * self.middle)
-        return top * torch.sigmoid(self.steepness * (self.middle - s))
-
-    @property
-    def horizon(self) -> float:
-        """Normalised time after which the forcing is lost in float64 rounding."""
-        # For large s the sigmoid falls as exp(-a (s - m)).
-        return self.middle + ROUNDING / self.steepness
-
-    @property
-    def smooth_interval(self) -> float:
-        """Length over which the phase is a polynomial of low degree."""
-        # The sigmoid is analytic within pi / a; 1.4 is the same fraction as for Gaussians.
-        return 1.4 / self.steepness
-
-
-@runtime_checkable
-class Basis(Protocol):
-    """Functions that the weights of a forcing term multiply; a frozen, hashable dataclass."""
-
-    periodic: ClassVar[bool]
-    """True if the forcing repeats with a period of one."""
-
-    @property
-    def count(self) -> int:
-        """N, the number of basis functions."""
-        ...
-
-    @property
-    def horizon(self) -> float:
-        """Normalised time after which the forcing is lost in rounding; the period, if any."""
-        ...
-
-    @property
-    def smooth_interval(self) -> float:
-        """Length over which the forcing, between knots, is a polynomial of low degree."""
-        ...
-
-    @property
-    def knot_spacing(self) -> float | None:
-        """Spacing of the points where the forcing is not smooth; None: smooth everywhere."""
-        ...
-
-    def centre_times(self) -> Float[Tensor, "N"]:
-        """Normalised times at which the basis functions peak (float64)."""
-        ...
-
-    def phase(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Fading factor of the forcing term at normalised time `s`."""
-        ...
-
-    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Basis functions at normalised time `s`, neither normalised nor faded."""
-        ...
-
-    def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Forcing term per unit of each weight at normalised time `s`."""
-        ...
-
-
-@dataclass(frozen=True, kw_only=True)
 class GaussianBasis:
     """Normalised Gaussians, faded by the phase z.
 
@@ -172,7 +196,7 @@ class GaussianBasis:
     """sigma_i relative to the distance between neighbouring centres."""
     domain: str = "time"
     """Variable of the Gaussians: `"time"` or `"phase"`."""
-    phase: Phase = field(default_factory=ExponentialPhase)
+    phase: ExponentialPhase = ExponentialPhase()
     """Canonical system, whose z fades the forcing term."""
     periodic: ClassVar[bool] = False
     knot_spacing = None
@@ -215,14 +239,11 @@ class GaussianBasis:
         """Gaussians psi_i at normalised time `s`, not normalised."""
         return self._exponents(s).exp()[..., : self.count]
 
-    def activation(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Normalised Gaussians psi_i / sum_j psi_j at normalised time `s`."""
-        # A softmax never divides by zero, however far s lies from every centre.
-        return torch.softmax(self._exponents(s), dim=-1)[..., : self.count]
-
     def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
         """Forcing term per unit of each weight at normalised time `s`."""
-        return self.activation(s) * self.phase(s)[..., None]
+        # A softmax never divides by zero, however far s lies from every centre.
+        activation = torch.softmax(self._exponents(s), dim=-1)[..., : self.count]
+        return activation * self.phase(s)[..., None]
 
     def _exponents(self, s: Tensor) -> Tensor:
         if self.domain == "time":
@@ -303,7 +324,7 @@ class SplineBasis:
 
     count: int = 50
     """N, the number of basis functions."""
-    phase: Phase = field(default_factory=ExponentialPhase)
+    phase: ExponentialPhase = ExponentialPhase()
     """Canonical system, whose z fades the forcing term."""
     periodic: ClassVar[bool] = False
 
@@ -347,16 +368,41 @@ def cubic_spline(x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return (outer**DEGREE - 4 * inner**DEGREE) / math.factorial(DEGREE)
 
 
-def check_positive(name: str, value: float) -> None:
-    """Raise ValueError unless `value` is positive and finite."""
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be positive, got {value}")
+type Basis = GaussianBasis | PeriodicBasis | SplineBasis
+"""Functions that the weights of a forcing term multiply; frozen and hashable.
+
+`horizon` is the normalised time after which the forcing is lost in rounding, or the period;
+`smooth_interval` the length over which the forcing, between knots, is a polynomial of low
+degree; `knot_spacing` the spacing of the points where it is not smooth, None if there are none.
+"""
+BASES: dict[str, type[Any]] = {
+    kind.__name__: kind for kind in (GaussianBasis, PeriodicBasis, SplineBasis)
+}
 
 
-def check_count(count: int) -> None:
-    """Raise ValueError for a basis of fewer than two functions."""
-    if count < 2:
-        raise ValueError(f"a basis needs at least 2 functions, got {count}")
+def basis_config(basis: Basis) -> dict[str, Any]:
+    """Description of a basis as JSON values, from which `restored_basis` makes it again."""
+    return {"type": type(basis).__name__, **asdict(basis)}
+
+
+def restored_basis(config: dict[str, Any]) -> Basis:
+    """Basis that `basis_config` described.
+
+    Raises:
+        ValueError: Unknown type, or values that it refuses.
+        TypeError: Fields that the type does not have.
+        KeyError: The type is missing.
+    """
+    fields = dict(config)
+    kind = fields.pop("type")
+    if kind not in BASES:
+        raise ValueError(f"unknown type {kind!r}; choose from {', '.join(BASES)}")
+    if "phase" in fields:
+        phase = dict(fields["phase"])
+        if (name := phase.pop("type", "ExponentialPhase")) != "ExponentialPhase":
+            raise ValueError(f"unknown phase {name!r}; there is ExponentialPhase only")
+        fields["phase"] = ExponentialPhase(**phase)
+    return BASES[kind](**fields)
 
 
 def balanced_units(

@@ -1,9 +1,17 @@
-"""Recorded samples of demonstrations, checked and batched, and residuals of a fit."""
+"""Recorded samples of demonstrations: checked, batched, and smoothed; residuals of a fit.
+
+Noise is removed by penalised splines (Eilers and Marx 1996, "Flexible smoothing with B-splines
+and penalties"): y = B c + noise, with a penalty on the third differences of c, which stand for
+the jerk. The strength of the penalty maximises the restricted likelihood of the samples (Wood
+2011) for Gaussian jerks, in each column separately. The same likelihood gives the standard
+deviation of the noise, whether it comes from encoders, a tracker or a trembling person.
+"""
 
 import math
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,17 +20,29 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import Mask, Points, Times, to_tensor
+from hrc_learn.dmp.dynamics import cubic_spline
 
 MINIMUM_SAMPLES = 3
 """Start, goal and one sample between them; two leave nothing to fit."""
 
+MAXIMUM_KNOTS = 120
+"""Intervals of the splines: finer than any reasonable number of basis functions."""
+STRENGTHS = 81
+"""Penalties compared, from 1e-10 to 1e6 relative to the samples: a fifth of a decade apart,
+which changes the error by less than a percent."""
+LIKELIHOOD_MARGIN = 1.0
+"""Twice the logarithm of a likelihood ratio that is not significant; two standard deviations
+would be four."""
+CLEAN = 2e-5
+"""Noise relative to the range below which samples stay as they are: the accuracy of a fit with
+fifty functions."""
+ORDER = 3
+"""Order of the penalised differences: a motion without jerk is a parabola."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitReport:
-    """Residuals of a reproduction, in the units of the demonstration.
-
-    A robust fit weights each residual by the trust in the sample.
-    """
+    """Residuals of a reproduction, in the units of the demonstration."""
 
     rmse: Float[Tensor, "*batch D"]
     """Root mean square error of each coordinate."""
@@ -30,14 +50,8 @@ class FitReport:
     """Largest absolute error of each coordinate."""
     span: Float[Tensor, "*batch D"]
     """Range of each coordinate in the demonstration."""
-    trust: Float[Tensor, "*batch T D"] | None = None
-    """Weight of each sample in a robust fit, 0 to 1."""
     noise: Float[Tensor, "*batch D"] | None = None
     """Estimated standard deviation of the noise removed by smoothing."""
-    peak_acceleration: Float[Tensor, "*batch D"] | None = None
-    """Largest absolute acceleration of the reproduction [1/s^2]; NRMSE ignores roughness."""
-    peak_jerk: Float[Tensor, "*batch D"] | None = None
-    """Largest absolute jerk of the reproduction [1/s^3]."""
 
     @property
     def nrmse(self) -> Float[Tensor, "*batch"]:
@@ -46,7 +60,7 @@ class FitReport:
 
     def select(self, columns: slice) -> "FitReport":
         """Report for a subset of the coordinates."""
-        return FitReport(**{k: values[..., columns] for k, values in self.tensors().items()})
+        return FitReport(**{k: x[..., columns] for k, x in self.tensors().items()})
 
     def tensors(self) -> dict[str, Tensor]:
         """Fields that are present, by name."""
@@ -82,6 +96,11 @@ class Samples:
         # Timestamps with different origins differ by rounding, below 1e-12 of the duration.
         return bool(((self.s - self.s[:1]).abs() < 1e-12).all())
 
+    @property
+    def timestamps(self) -> Float[Tensor, "*#batch T"]:
+        """Normalised times, one grid or one for each demonstration."""
+        return self.s[0] if self.shared_grid else self.s.view(*self.batch, -1)
+
     @cached_property
     def first(self) -> Float[Tensor, "B D"]:
         """Position at the first valid sample."""
@@ -112,20 +131,23 @@ class Samples:
     def compare(
         self,
         reproduction: Float[Tensor, "*batch T D"],
-        trust: Float[Tensor, "*batch T D"] | None = None,
+        noise: Float[Tensor, "B D"] | None = None,
     ) -> FitReport:
-        """Residuals of a reproduction at the valid samples; `trust` is stored with them."""
+        """Residuals of a reproduction at the valid samples; `noise` is stored with them."""
         made = reproduction.mT.reshape(self.position.shape)
         error = self._filled(made - self.position, 0.0)
         valid = error.shape[-1] if self.complete else self.mask.sum(-1, keepdim=True)
-        residuals = {
-            "rmse": error.norm(dim=-1) / valid**0.5,
-            "peak": error.abs().amax(-1),
-            "span": self.span,
-        }
-        batch = self.batch
-        residuals = {k: v.reshape(*batch, -1) if batch else v[0] for k, v in residuals.items()}
-        return FitReport(**residuals, trust=trust)
+        return FitReport(
+            rmse=self.batched(error.norm(dim=-1) / valid**0.5),
+            peak=self.batched(error.abs().amax(-1)),
+            span=self.batched(self.span),
+            noise=None if noise is None else self.batched(noise),
+        )
+
+    def batched(self, values: Float[Tensor, "B *rest"]) -> Float[Tensor, "*batch_and_rest"]:
+        """Values in the batch shape and dtype of the demonstrations."""
+        values = values.to(self.position.dtype)
+        return values.reshape(self.batch + values.shape[1:]) if self.batch else values[0]
 
     def _at(self, index: Tensor) -> Tensor:
         return torch.take_along_dim(self.position, index[:, None, None], dim=-1)[..., 0]
@@ -330,3 +352,96 @@ def _normalised(
         )
     duration = last - first
     return elapsed.cummax(-1).values / duration, duration[..., 0]
+
+
+def smoothed(samples: Samples) -> tuple[Samples, Float[Tensor, "B D"]]:
+    """Samples without their noise, and its standard deviation in each column.
+
+    Columns with less noise than `CLEAN`, and columns that never move, stay unchanged.
+    """
+    position = samples.position.double()
+    smooth, noise = position.clone(), torch.zeros_like(position[..., 0])
+    if samples.shared_grid:
+        flat = position.flatten(0, 1)
+        smooth, noise = (
+            x.view(*position.shape[:2], *x.shape[1:]) for x in _smooth(samples.s[0], flat)
+        )
+    else:
+        for i, valid in enumerate(samples.mask):
+            smooth[i, :, valid], noise[i] = _smooth(samples.s[i, valid], position[i, :, valid])
+    noisy = (noise > CLEAN * samples.span)[..., None]
+    smooth = torch.where(noisy, smooth, position)
+    return replace(samples, position=smooth.to(samples.position)), noise
+
+
+def _smooth(s: Float[Tensor, "T"], y: Float[Tensor, "C T"]) -> tuple[Tensor, Tensor]:
+    return _spline(s.cpu().numpy().tobytes(), s.device).smooth(y)
+
+
+def warn_of_few_samples(samples: Samples, n_basis: int) -> None:
+    """Warn if there are at most as many samples as functions, which leaves gaps arbitrary."""
+    if samples.complete and samples.s.shape[-1] > n_basis:
+        return  # without counting, which a short fit would notice
+    counts = samples.mask.sum(-1)
+    if (counts <= n_basis).any():
+        i = int((counts <= n_basis).nonzero()[0])
+        warnings.warn(
+            f"{demo_label(i, samples.batch)}{n_basis} basis functions are fitted to "
+            f"{int(counts[i])} samples, which do not determine them: the motion between "
+            "samples is arbitrary. Use fewer functions, or remove noise (smooth=True).",
+            stacklevel=4,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Spline:
+    """Splines on a time grid, in coordinates that diagonalise both samples and penalty."""
+
+    U: Float[Tensor, "T K"]
+    """Maps samples to coordinates, and coordinates to the motion."""
+    data: Float[Tensor, "K"]
+    """Precision of each coordinate from the samples, 0 to 1; the penalty adds the rest."""
+    strengths: Float[Tensor, "L"]
+    """Penalties to choose from."""
+
+    def smooth(self, y: Float[Tensor, "C T"]) -> tuple[Float[Tensor, "C T"], Tensor]:
+        """Most likely motion and the standard deviation of the noise, for each column."""
+        T = y.shape[-1]
+        middle = y.mean(-1, keepdim=True)
+        y = y - middle
+        c = y @ self.U
+        e, r = self.data, 1 - self.data
+        # The prior precision of coordinate k is lambda r_k, that of the samples e_k.
+        total = e + self.strengths[:, None] * r
+        free = r < 1e-9
+        n = T - int(free.sum())
+        # Penalty plus squared distance to the samples, at their minimum.
+        misfit = y.square().sum(-1)[:, None] - c.square() @ (1 / total).mT
+        misfit = misfit.clamp(min=torch.finfo(y.dtype).tiny)
+        prior = torch.where(free, 1.0, self.strengths[:, None] * r)
+        known = torch.where(free, 1.0, total)
+        score = n * misfit.log() + (known.log() - prior.log()).sum(-1)
+        # The strongest penalty that is not significantly less likely than the best.
+        likely = score <= score.amin(-1, keepdim=True) + LIKELIHOOD_MARGIN
+        best = (likely * torch.arange(1, STRENGTHS + 1, device=y.device)).argmax(-1)
+        fitted = (c / total[best]) @ self.U.mT
+        noise = (misfit.gather(-1, best[:, None])[:, 0] / n).sqrt()
+        return fitted + middle, noise
+
+
+# Demonstrations on one grid share a spline.
+@lru_cache(maxsize=16)
+def _spline(timestamps: bytes, device: torch.device) -> _Spline:
+    s = torch.frombuffer(bytearray(timestamps), dtype=torch.float64).to(device)
+    knots = max(4, min(MAXIMUM_KNOTS, len(s) // 2))
+    B = cubic_spline(s[:, None] * knots - torch.arange(-1, knots + 2).to(s))
+    K = B.shape[1]
+    D = torch.diff(torch.eye(K, dtype=s.dtype, device=s.device), n=ORDER, dim=0)
+    # In units in which penalty and samples have equal weight overall.
+    data, penalty = B.mT @ B, D.mT @ D
+    penalty = penalty * (data.trace() / penalty.trace())
+    # The small diagonal keeps splines without samples, which have a penalty only, invertible.
+    L = torch.linalg.cholesky(data + penalty + 1e-13 * torch.eye(K).to(s))
+    W = torch.linalg.solve_triangular(L, B.mT, upper=False)
+    e, V = torch.linalg.eigh(W @ W.mT)
+    return _Spline(W.mT @ V, e.clamp(0, 1), torch.logspace(-10, 6, STRENGTHS).to(s))

@@ -18,12 +18,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hrc_learn.dmp._system.products import (
+from hrc_learn.dmp.response import (
+    Response,
+    chebyshev_points,
     empty_in_large_pages,
     product,
     without_subnormals,
 )
-from hrc_learn.dmp._system.response import Response, chebyshev_points
 
 NEGLIGIBLE = 4
 """Error allowed when the degree of polynomials is reduced, in machine epsilons relative to the

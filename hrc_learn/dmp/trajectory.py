@@ -10,9 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import broadcast_shapes, readable
-from hrc_learn.dmp._system.products import numpy_limit, product
-from hrc_learn.dmp._system.ragged_times import motion
-from hrc_learn.dmp._system.response import Response
+from hrc_learn.dmp.ragged_times import motion
+from hrc_learn.dmp.response import Response, numpy_limit, product
 
 
 class PlottableTensor(Tensor):

@@ -17,12 +17,11 @@ from torch import Tensor
 
 from hrc_learn import distributed
 from hrc_learn.dmp._arguments import Points, Times
-from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
-from hrc_learn.dmp._system.response import Response, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp.fitting.samples import Samples, check_samples
-from hrc_learn.dmp.fitting.solvers import REGULARIZATION, ridge_inverse
+from hrc_learn.dmp.dynamics import GaussianBasis, SpringDamper, balanced_units
 from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.response import Response, response_of
+from hrc_learn.dmp.samples import Samples, check_samples
+from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
 
 TIMESTAMPS = 1000
 """Samples of the default rollout, because the demonstrations have no common grid."""
@@ -66,15 +65,14 @@ class LeastSquares:
         """Square root of A'A, with the singular values and column norms of A."""
         return self.factor[: self.unknowns, : self.unknowns]
 
-    def solve(self, regularization: float, unit: Float[Tensor, "n"]) -> Float[Tensor, "n k"]:
-        """Minimise |A X - B|^2 + (r sigma)^2 |X / unit|^2.
+    def solve(self, unit: Float[Tensor, "n"]) -> Float[Tensor, "n k"]:
+        """Minimise |A X - B|^2 + (r sigma)^2 |X / unit|^2, r the default ridge of a fit.
 
         Args:
-            regularization: r, relative to sigma, the largest singular value of A times unit.
-            unit: Unit of each unknown.
+            unit: Unit of each unknown; sigma is the largest singular value of A times unit.
         """
         n = self.unknowns
-        inverse = ridge_inverse(self.design * unit, regularization)
+        inverse = ridge_inverse(self.design * unit, REGULARIZATION)
         return unit[:, None] * (inverse @ self.factor[:n, n:])
 
     def residual(self, X: Float[Tensor, "n k"]) -> Float[Tensor, "k"]:
@@ -106,10 +104,6 @@ def fit_shared(
     demonstrations: Sequence[tuple[Times, Points]],
     n_basis: int = 50,
     *,
-    basis: Basis | None = None,
-    spring: SpringDamper | None = None,
-    approach: float = 0.0,
-    regularization: float = REGULARIZATION,
     joint_names: Sequence[str] | None = None,
     units: str = "rad",
 ) -> SharedFit:
@@ -123,11 +117,7 @@ def fit_shared(
     Args:
         demonstrations: Timestamps (T,) [s] and positions (T, D) of each. They are read one by
             one, so a sequence that loads them on demand is enough.
-        n_basis: N, unless `basis` is given.
-        basis: Basis of the forcing term.
-        spring: Gains.
-        approach: Fraction of the motion over which it moves to a new goal.
-        regularization: Ridge, relative to the largest singular value.
+        n_basis: N.
         joint_names: D names, stored with the primitive.
         units: Units of the coordinates.
 
@@ -136,14 +126,12 @@ def fit_shared(
     """
     if not len(demonstrations):
         raise ValueError("there are no demonstrations to learn from")
-    response = response_of(
-        spring or SpringDamper(), basis or GaussianBasis(count=n_basis), approach
-    )
+    response = response_of(SpringDamper(), GaussianBasis(count=n_basis))
     problem, sums = _accumulate(demonstrations, response)
     mean = sums / len(demonstrations)
     # The start velocity is one more unknown after the weights.
     unit = balanced_units(response.basis, problem.design, others=1)
-    X = problem.solve(regularization, unit)
+    X = problem.solve(unit)
     start, goal, amplitude, duration = mean[0], mean[1], mean[2], mean[3, 0]
     primitive = JointDMP(
         weights=X[:-1].mT.contiguous(),
@@ -155,7 +143,6 @@ def fit_shared(
         timestamps=torch.linspace(0, 1, TIMESTAMPS, dtype=torch.float64),
         basis=response.basis,
         spring=response.spring,
-        approach=approach,
         joint_names=joint_names,
         units=units,
     )

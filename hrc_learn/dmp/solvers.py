@@ -1,22 +1,31 @@
 """Least-squares solvers: from samples to weights and start velocity.
 
-Demonstrations with the same normalised times are fitted by one matrix product.
+Demonstrations with the same normalised times are fitted by one matrix product, those with
+times of their own by batched normal equations.
 """
 
 from functools import lru_cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.dmp._system.bases import balanced_units
-from hrc_learn.dmp._system.response import Response
-from hrc_learn.dmp.fitting.ragged_gram import fit_ragged
-from hrc_learn.dmp.fitting.samples import Samples
+from hrc_learn.dmp.dynamics import balanced_units
+from hrc_learn.dmp.ragged_times import chunks, motion
+from hrc_learn.dmp.response import Response
+from hrc_learn.dmp.samples import Samples
 
 REGULARIZATION = 1e-7
 """Default ridge of a fit: far above rounding, far below what a sensor resolves."""
 METHODS = ("trajectory", "ridge", "lwr")
+SAMPLES_PER_FUNCTION = 20
+"""Samples per basis function of the even grid on which columns are orthonormal."""
+WELL_POSED = 1e-3
+"""Bound on the ratio of the smallest to the largest diagonal entry of a Cholesky factor; at
+1e-8, half of the digits of float64 are lost."""
+NORM_ITERATIONS = 4
+"""Iterations for the largest singular value. The next one is a third of it, so the error falls
+to a percent within two iterations."""
 type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
 """Weights and start velocity dy/ds."""
 
@@ -45,8 +54,8 @@ def fit_samples(
     weights = position.new_empty(*position.shape[:2], response.basis.count)
     start_rate = position.new_empty(position.shape[:2])
     remaining = torch.ones(len(position), dtype=torch.bool)
-    if method == "trajectory" and not (response.approach or response.basis.periodic):
-        weights, start_rate, remaining = fit_ragged(
+    if method == "trajectory" and not response.basis.periodic:
+        weights, start_rate, remaining = _fit_ragged(
             response, samples, position, rate, regularization
         )
     for i in remaining.nonzero()[:, 0].tolist():
@@ -57,6 +66,80 @@ def fit_samples(
             method, response, s, position[i, :, valid], one_rate, regularization
         )
     return weights, start_rate
+
+
+def _fit_ragged(
+    response: Response,
+    samples: Samples,
+    position: Float[Tensor, "B D T"],
+    rate: Float[Tensor, "B D T"] | None,
+    regularization: float,
+) -> tuple[Float[Tensor, "B D N"], Float[Tensor, "B D"], Bool[Tensor, "B"]]:
+    """Least squares on the trajectory for all demonstrations at once, on ragged times.
+
+    The normal equations are written in columns that are orthonormal on an even grid: if the
+    samples determine all functions, squaring them loses no digits.
+
+    Returns:
+        Weights, start velocity dy/ds, and a flag for each demonstration that leaves functions
+        undetermined; its other results must not be used.
+    """
+    N, fit_rate = response.basis.count, rate is None
+    n = N + fit_rate
+    s, M, D = samples.s, response.size, position.shape[1]
+    mixing, sigma, directions = _orthonormal_columns(response, n, s.device)
+    products = s.new_empty(len(s), M + D, M + D)
+    for part in chunks(s):
+        # One motion for each column, at the times of all demonstrations.
+        columns = motion(response, s[part].reshape(1, -1), mixing.mT[None], 0)
+        columns = columns.view(*s[part].shape, M)
+        if not samples.complete:
+            columns *= samples.mask[part][..., None]
+        columns = torch.cat([columns, position[part].mT], dim=-1)
+        products[part] = columns.mT @ columns
+    gram, right = products[:, :M, :M], products[:, :M, M:]
+    known = [samples.first.double(), samples.last.double()]
+    if rate is not None:
+        first = samples.mask.long().argmax(-1)[:, None, None]
+        known.insert(0, torch.take_along_dim(rate, first, -1)[..., 0])
+    right = right[:, :n] - gram[:, :n, n:] @ torch.stack(known, 1)
+    A = gram[:, :n, :n]
+    # The ridge is relative to the largest singular value of the balanced weights, found by
+    # power iteration from that of the even grid.
+    v, norm = directions[:1].expand(len(A), -1), A.new_zeros(len(A), 1)
+    for _ in range(NORM_ITERATIONS):
+        v = (A @ (v @ directions.mT * sigma)[..., None])[..., 0] * sigma @ directions
+        norm = v.norm(dim=-1, keepdim=True)
+        v = v / norm
+    A = A + torch.diag_embed(regularization**2 * norm / sigma**2)
+    factor, failed = torch.linalg.cholesky_ex(A)
+    diagonal = factor.diagonal(dim1=-2, dim2=-1)
+    undetermined = (failed > 0) | ~(diagonal.amin(-1) > WELL_POSED * diagonal.amax(-1))
+    unknown = (mixing[:n, :n] @ torch.cholesky_solve(right, factor)).mT
+    if rate is None:
+        return unknown[..., :-1], unknown[..., -1], undetermined
+    return unknown, known[0], undetermined
+
+
+@lru_cache(maxsize=16)
+def _orthonormal_columns(
+    response: Response, n: int, device: torch.device
+) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"], Float[Tensor, "n n"]]:
+    """Replacement of the first n columns by ones that are orthonormal on an even grid.
+
+    Returns:
+        Coordinates of each column, those after n unchanged; singular values of the balanced
+        design matrix; and its right singular vectors in rows.
+    """
+    N = response.basis.count
+    count = SAMPLES_PER_FUNCTION * N + 1
+    even = torch.linspace(0, 1, count, dtype=torch.float64, device=device)
+    H = response.evaluate(even)[:, 0]
+    unit = balanced_units(response.basis, H, n - N)
+    _, sigma, Vh = torch.linalg.svd(H[:, :n] * unit, full_matrices=False)
+    mixing = torch.eye(H.shape[1]).to(H)
+    mixing[:n, :n] = unit[:, None] * Vh.mT / sigma
+    return mixing, sigma, Vh
 
 
 def _fit(

@@ -1,1 +1,0 @@
-"""From sampled demonstrations to the weights of a primitive."""
