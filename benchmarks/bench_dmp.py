@@ -54,7 +54,7 @@ TARGETS: dict[str, tuple[float, int]] = {
     "own_durations_4096_per_s": (20_000, +1),
     "own_durations_4096_of_shared": (0.5, +1),
     "duration_gradient_over_forward": (3, -1),
-    "fit_own_stamps_256_ms": (100, -1),
+    "fit_own_stamps_256_ms": (200, -1),
     "joint_gradient_error": (1e-6, -1),
     "orientation_gradient_error": (1e-6, -1),
     "orientation_deg": (1e-3, -1),

@@ -58,9 +58,7 @@ class SpringDamper:
         if math.isnan(self.beta):
             object.__setattr__(self, "beta", self.alpha / 4)
         for name in ("alpha", "beta"):
-            gain = getattr(self, name)
-            if not (math.isfinite(gain) and gain > 0):
-                raise ValueError(f"{name} must be positive for stability, got {gain}")
+            check_positive(name, getattr(self, name))
 
     @property
     def stiffness(self) -> float:
@@ -293,10 +291,6 @@ class PeriodicBasis:
     def centre_times(self) -> Float[Tensor, "N"]:
         """Normalised times c_i at which the basis functions peak (float64)."""
         return torch.arange(self.count, dtype=torch.float64) / self.count
-
-    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
-        """Bells psi_i at normalised time `s`, not normalised."""
-        return self._exponents(s).exp()
 
     def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
         """Forcing term per unit of each weight at normalised time `s`."""

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import torch
 from jaxtyping import Bool, Float
@@ -69,18 +69,6 @@ class FitOptions(TypedDict, total=False):
     `samples.py`. None (default): unless the number of basis functions is given."""
 
 
-class _Fit(NamedTuple):
-    response: Response
-    samples: Samples
-    """Fitted samples: without noise, if it was removed."""
-    noise: Tensor | None
-    """Standard deviation of the noise, (B, D); None without smoothing."""
-    weights: Float[Tensor, "B D N"]
-    """Weights of the unscaled forcing term."""
-    rate: Float[Tensor, "B D"]
-    """Start velocity dy/ds."""
-
-
 def _fit(
     recorded: Samples,
     n_basis: int | None,
@@ -91,8 +79,14 @@ def _fit(
     spring: SpringDamper | None = None,
     regularization: float = REGULARIZATION,
     smooth: bool | None = None,
-) -> _Fit:
-    """Fit weights and start velocity, in float64; arguments as in `FitOptions`."""
+) -> tuple[Response, Samples, Tensor | None, Tensor, Tensor]:
+    """Fit in float64; arguments as in `FitOptions`.
+
+    Returns:
+        Response of spring and basis; the fitted samples, without noise if it was removed; its
+        standard deviation (B, D), or None; weights (B, D, N) of the unscaled forcing term; and
+        start velocities dy/ds (B, D).
+    """
     chosen = n_basis is not None or basis is not None
     if basis is None:
         basis = GaussianBasis(count=DEFAULT_COUNT if n_basis is None else n_basis)
@@ -102,13 +96,16 @@ def _fit(
     samples, noise = recorded, None
     if smooth or (smooth is None and not chosen):
         samples, noise = smoothed(recorded)
-    return _Fit(
-        response, samples, noise, *fit_samples(method, response, samples, regularization)
-    )
+    fitted = fit_samples(method, response, samples, regularization)
+    return response, samples, noise, *fitted
 
 
 def _unscaled(
-    fit: _Fit, recorded: Samples, scaling: Scaling, names: Sequence[str] | None
+    weights: Float[Tensor, "B D N"],
+    samples: Samples,
+    recorded: Samples,
+    scaling: Scaling,
+    names: Sequence[str] | None,
 ) -> Float[Tensor, "B D N"]:
     """Weights for the given scaling.
 
@@ -116,13 +113,13 @@ def _unscaled(
         ValueError: A motion for which the scaling is singular.
     """
     if scaling.name == "none":
-        return fit.weights
-    amplitude = fit.samples.amplitude.double()
+        return weights
+    amplitude = samples.amplitude.double()
     # Noise, or its removal, may separate a start and a goal that agree: both are checked.
-    for samples in (recorded, fit.samples):
-        shown = Demonstrated(samples.first.double(), samples.last.double(), amplitude)
-        scaling.check(shown, samples.batch, names)
-    return scaling.unscale(fit.weights.mT, shown).mT
+    for each in (recorded, samples):
+        shown = Demonstrated(each.first.double(), each.last.double(), amplitude)
+        scaling.check(shown, each.batch, names)
+    return scaling.unscale(weights.mT, shown).mT
 
 
 class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
@@ -177,25 +174,25 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
         time, mask, (position, velocity) = padded(time, mask, position, velocity)
         recorded = check_samples(time, position, velocity, mask)
         check_names(joint_names, recorded.position.shape[1])
-        fit = _fit(recorded, n_basis, **options)
-        samples = fit.samples
+        response, samples, noise, weights, rate = _fit(recorded, n_basis, **options)
+        weights = _unscaled(weights, samples, recorded, scaling, joint_names)
         dmp = cls(
-            weights=samples.batched(_unscaled(fit, recorded, scaling, joint_names)),
+            weights=samples.batched(weights),
             start=samples.batched(samples.first),
             goal=samples.batched(samples.last),
-            start_velocity=samples.batched(fit.rate / samples.duration[:, None]),
+            start_velocity=samples.batched(rate / samples.duration[:, None]),
             duration=samples.batched(samples.duration),
             amplitude=samples.batched(samples.amplitude),
             timestamps=samples.timestamps,
-            basis=fit.response.basis,
-            spring=fit.response.spring,
+            basis=response.basis,
+            spring=response.spring,
             scaling=scaling,
-            approach=fit.response.approach,
+            approach=response.approach,
             joint_names=joint_names,
             units=units,
         )
         with torch.no_grad():
-            dmp.fit_report = recorded.compare(dmp.rollout().position, fit.noise)
+            dmp.fit_report = recorded.compare(dmp.rollout().position, noise)
         return dmp
 
     def admissible_duration(

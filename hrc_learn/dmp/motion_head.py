@@ -468,17 +468,6 @@ class MotionDistribution:
         change = (self.scale_tril @ noise.to(like.device))[..., 0]
         return like + torch.nn.functional.pad(change, (0, self.head.n_timing))
 
-    def parameter_log_prob(
-        self, parameters: Float[Tensor, "*other P"]
-    ) -> Float[Tensor, "*other"]:
-        """Log density of linear parameters, as needed for a policy gradient."""
-        L = self.head.n_linear
-        off = (parameters - self.parameters)[..., :L, None]
-        factor = self.scale_tril.expand(*off.shape[:-2], L, L)
-        z = torch.linalg.solve_triangular(factor, off, upper=False)[..., 0]
-        size = L * math.log(2 * math.pi) + z.square().sum(-1)
-        return -size / 2 - _log_diagonal(self.scale_tril)
-
     def log_prob(self, time: Times, position: Points, noise: float) -> Float[Tensor, "*batch"]:
         """Log density of the positions of one motion observed with noise.
 

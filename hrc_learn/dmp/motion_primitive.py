@@ -6,10 +6,10 @@ position, orientation error and body, and a moving goal is the frame in which jo
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypedDict, Unpack
 
 import torch
 from jaxtyping import Float
@@ -45,6 +45,26 @@ class ColumnPoints(NamedTuple):
     position: Tensor
     velocity: Tensor
     """Velocity, per second."""
+
+
+class EndOptions(TypedDict, total=False):
+    """Ends that some kinds of primitive have."""
+
+    start_body: Vectors | None
+    """Body at the start, (*batch, K); poses only."""
+    goal_body: Vectors | None
+    """Body at the goal, (*batch, K); poses only."""
+    end_velocity: Vectors | None
+    """Velocity at the end [1/s], (*batch, D); moving goals only."""
+
+
+class ViaOptions(TypedDict, total=False):
+    """Via points that some kinds of primitive have; NaN leaves a value free."""
+
+    body: Points | None
+    """Body of a pose, (*batch, n, K)."""
+    body_velocity: Points | None
+    """Velocity of the body of a pose, (*batch, n, K)."""
 
 
 class Retargeted(NamedTuple):
@@ -190,9 +210,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         speed: Scalars | None = None,
         dt: float | int | None = None,
         forcing_gain: Scalars | None = None,
-        start_body: Vectors | None = None,
-        goal_body: Vectors | None = None,
-        end_velocity: Vectors | None = None,
+        **options: Unpack[EndOptions],
     ) -> Path:
         """Compute the whole motion from start to goal; by default, the demonstrated one.
 
@@ -213,18 +231,10 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             dt: Sampling interval [s], instead of times: from zero to the end of the longest
                 motion, or the first sample past it.
             forcing_gain: Factor on the forcing term, (*batch): the amplitude of a rhythm.
-            start_body: Body at the start, (*batch, K); poses only.
-            goal_body: Body at the goal, (*batch, K); poses only.
-            end_velocity: Velocity at the end [1/s], (*batch, D); moving goals only.
+            options: Ends of this kind of primitive.
         """
-        options = {"start_body": start_body, "goal_body": goal_body}
-        boundary, tau, frame = self._resolved(
-            Boundary(start, goal, start_velocity),
-            duration,
-            speed,
-            **options,
-            end_velocity=end_velocity,
-        )
+        given = Boundary(start, goal, start_velocity)
+        boundary, tau, frame = self._resolved(given, duration, speed, **options)
         if dt is not None:
             if time is not None:
                 raise ValueError("give times or an interval dt, not both")
@@ -240,19 +250,11 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         start_velocity: Any = None,
         *,
         speed: Scalars | None = None,
-        start_body: Vectors | None = None,
-        goal_body: Vectors | None = None,
-        end_velocity: Vectors | None = None,
+        **options: Unpack[EndOptions],
     ) -> State:
         """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        options = {"start_body": start_body, "goal_body": goal_body}
-        boundary, tau, frame = self._resolved(
-            Boundary(start, goal, start_velocity),
-            duration,
-            speed,
-            **options,
-            end_velocity=end_velocity,
-        )
+        given = Boundary(start, goal, start_velocity)
+        boundary, tau, frame = self._resolved(given, duration, speed, **options)
         columns = self.motion.initial_columns(boundary, tau)
         if frame is not None:
             # A copy for each element: an export takes one tensor in two places for one input.
@@ -328,9 +330,8 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         value: Any = None,
         velocity: Points | None = None,
         *,
-        body: Points | None = None,
-        body_velocity: Points | None = None,
         within: tuple[float | int, float | int] | None = None,
+        **options: Unpack[ViaOptions],
     ) -> S:
         """Primitive that passes exactly through via points.
 
@@ -343,15 +344,14 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             time: Times of the via points [s], (*batch, n).
             value: Values as for `via_points`, like all that follow; NaN leaves them free.
             velocity: Velocities. None or NaN keeps that of the motion if a value is given.
-            body: Body of a pose.
-            body_velocity: Velocity of the body of a pose.
             within: Times [s] between which the motion may change; None: from start to end.
+            options: Via points of this kind of primitive.
 
         Raises:
             ValueError: Via points at one time or outside of the window, or too many for the
                 basis.
         """
-        via = self.via_points(time, value, velocity, body=body, body_velocity=body_velocity)
+        via = self.via_points(time, value, velocity, **options)
         return self.with_motion(through_via_points(self.motion, via, within))
 
     def via_points(
@@ -359,9 +359,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
         time: Times,
         value: Any = None,
         velocity: Points | None = None,
-        *,
-        body: Points | None = None,
-        body_velocity: Points | None = None,
+        **options: Unpack[ViaOptions],
     ) -> ViaPoints:
         """Via points as columns (float64).
 
@@ -375,19 +373,17 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
                 (*batch, n). NaN leaves a coordinate free; in a quaternion, the orientation.
             velocity: Of joints (*batch, n, D); angular [rad/s], (*batch, n, 3); or a twist
                 (*batch, n, 6). NaN leaves it free.
-            body: Body of a pose, (*batch, n, K).
-            body_velocity: Velocity of the body of a pose, (*batch, n, K).
+            options: Via points of this kind of primitive.
 
         Raises:
             ValueError: Negative times, or shapes that do not fit.
         """
         motion = self.motion
         time = seconds(time, motion.start.device)
-        options = self._given(body=body, body_velocity=body_velocity)
         duration = motion.duration.double()[..., None]
         now = motion.rollout_columns(Boundary(), motion.duration, time.detach())
         now = ColumnPoints(*(x.detach().double() for x in (now.position, now.velocity)))
-        via = self._via(now, value, velocity, **options)
+        via = self._via(now, value, velocity, **self._given(**options))
         rate = via.velocity * duration[..., None]
         return ViaPoints(s=time / duration, position=via.position, rate=rate)
 
@@ -547,3 +543,87 @@ def via_values(
     if tensor.ndim < 2 or tensor.shape[-2:] != shape[-2:]:
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
     return tensor.expand(broadcast_shapes(tensor.shape, shape))
+
+
+def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
+    """Batch of primitives of one kind, basis and spring, along a new first axis.
+
+    If timestamps differ, each primitive keeps its own, with the last one repeated as padding.
+    The result has a fit report if all primitives have one.
+
+    Raises:
+        ValueError: The list is empty, or the primitives differ; the message says in what.
+    """
+    if not primitives:
+        raise ValueError("there are no primitives to stack")
+    first, *others = (_description(primitive) for primitive in primitives)
+    for i, other in enumerate(others, start=1):
+        _check_equal(first, other, f"primitive {i}")
+    tensors = [primitive.tensors() for primitive in primitives]
+    common = set.intersection(*(set(each) for each in tensors))
+    columns = {name: [each[name] for each in tensors] for name in tensors[0] if name in common}
+    return primitives[0].with_tensors(
+        {
+            name: _padded(rows) if name == "timestamps" else torch.stack(rows)
+            for name, rows in columns.items()
+        }
+    )
+
+
+def concatenate[P: MotionPrimitive](batches: Iterable[P], samples: int) -> P:
+    """Batches of primitives of one kind, joined along their first axis.
+
+    They are read one by one and released after copying. Because demonstrations may have
+    different timestamps, those of the result, for its default rollout, are evenly spaced.
+
+    Args:
+        batches: Batches that agree in the axes after the first.
+        samples: Number of timestamps of the result.
+
+    Raises:
+        ValueError: There is no batch, or they differ; the message says in what.
+    """
+    first, described = None, {}
+    parts: list[dict[str, Tensor]] = []
+    for batch in batches:
+        own = _description(batch)
+        own["shape of the weights"] = own["shape of the weights"][1:]
+        if first is None:
+            # A copy, so that the memory behind the batch is released.
+            first, described = batch[:1], own
+        _check_equal(described, own, f"batch {len(parts)}")
+        parts.append({name: x.detach().clone() for name, x in batch.tensors().items()})
+    if first is None:
+        raise ValueError("there are no primitives to concatenate")
+    common = set.intersection(*(set(part) for part in parts)) - {"timestamps"}
+    joined = {name: torch.cat([part[name] for part in parts]) for name in common}
+    joined["timestamps"] = torch.linspace(0, 1, samples).to(first.motion.timestamps)
+    return first.with_tensors(joined)
+
+
+def _check_equal(first: dict[str, Any], other: dict[str, Any], label: str) -> None:
+    for name, value in first.items():
+        if other[name] != value:
+            raise ValueError(
+                f"primitives of one batch must be alike, but {name} of {label} is "
+                f"{other[name]}, of the first {value}"
+            )
+
+
+def _padded(rows: list[Tensor]) -> Tensor:
+    """One grid of timestamps if all are equal, else one row each."""
+    if all(x.shape == rows[0].shape and torch.equal(x, rows[0]) for x in rows):
+        return rows[0].clone()
+    T = max(x.shape[-1] for x in rows)
+    rows = [
+        torch.cat([x, x[..., -1:].expand(*x.shape[:-1], T - x.shape[-1])], -1) for x in rows
+    ]
+    return torch.stack(torch.broadcast_tensors(*rows))
+
+
+def _description(primitive: MotionPrimitive) -> dict[str, Any]:
+    return {
+        "kind": type(primitive).__name__,
+        **primitive.motion.config(),
+        "shape of the weights": tuple(primitive.motion.weights.shape),
+    }

@@ -71,19 +71,23 @@ class StepperState(NamedTuple):
 class OrientationStepperState(StepperState):
     """State of an orientation primitive in a `Stepper`."""
 
+    errors = slice(0, 3)
+
     @property
     def orientation(self) -> Quaternion:
         """Unit quaternion (w, x, y, z)."""
-        return _to_orientation(self.y[0], self.reference)
+        return _to_orientation(self.y[0, self.errors], self.reference)
 
     @property
     def angular_velocity(self) -> Vector3:
         """Angular velocity in the base frame [rad/s]."""
-        return _angular_velocity(self.y[0], self.rate)
+        return _angular_velocity(self.y[0, self.errors], self.rate[self.errors])
 
 
-class PoseStepperState(StepperState):
+class PoseStepperState(OrientationStepperState):
     """State of a pose primitive in a `Stepper`."""
+
+    errors = ERROR
 
     @property
     def position(self) -> Vector3:
@@ -96,11 +100,6 @@ class PoseStepperState(StepperState):
         return self.rate[POSITION]
 
     @property
-    def orientation(self) -> Quaternion:
-        """Unit quaternion (w, x, y, z)."""
-        return _to_orientation(self.y[0, ERROR], self.reference)
-
-    @property
     def body(self) -> Float64[np.ndarray, "K"]:
         """Body coordinates."""
         return self.y[0, BODY]
@@ -108,8 +107,7 @@ class PoseStepperState(StepperState):
     @property
     def twist(self) -> Float64[np.ndarray, "6"]:
         """Twist (linear [m/s], angular [rad/s]) in the base frame."""
-        angular = _angular_velocity(self.y[0, ERROR], self.rate[ERROR])
-        return np.concatenate([self.velocity, angular])
+        return np.concatenate([self.velocity, self.angular_velocity])
 
 
 STATES: dict[type, type[StepperState]] = {
@@ -331,11 +329,6 @@ def _to_orientation(error: Vector3, goal: Quaternion | None) -> Quaternion:
     return _multiply(_exp(-error), goal)
 
 
-def _to_error(q: Quaternion, goal: Quaternion) -> Vector3:
-    """Shortest error of an orientation to the goal [rad]."""
-    return _log(_multiply(goal, q * [1.0, -1.0, -1.0, -1.0]))
-
-
 def _reference_of(error: Vector3, orientation: Quaternion) -> Quaternion:
     """Reference to which an orientation, of any norm, has this error."""
     return _multiply(_exp(error), orientation / np.sqrt(orientation @ orientation))
@@ -387,14 +380,14 @@ def _skew(v: Vector3) -> Float64[np.ndarray, "3 3"]:
 def _retarget(
     error: Vector3, rate: Vector3, old_goal: Quaternion | None, goal: Quaternion
 ) -> tuple[Vector3, Vector3]:
-    """Error to a new goal and its rate, for the same orientation and angular velocity."""
-    new = _nearest_turn(_to_error(_to_orientation(error, old_goal), goal), error)
-    return new, _error_rate(new, _angular_velocity(error, rate))
+    """Error to a new goal and its rate, for the same orientation and angular velocity.
 
-
-def _nearest_turn(error: Vector3, reference: Vector3) -> Vector3:
-    """The same rotation as `error`, with the whole turns that bring it closest to another."""
-    axis = error if np.sqrt(error @ error) > NO_AXIS else reference
+    Of all errors of that orientation it is the one nearest to the old error.
+    """
+    q = _to_orientation(error, old_goal)
+    new = _log(_multiply(goal, q * [1.0, -1.0, -1.0, -1.0]))
+    axis = new if np.sqrt(new @ new) > NO_AXIS else error
     axis = axis / max(np.sqrt(axis @ axis), NO_AXIS)
-    turns = np.round((reference - error) @ axis / (2 * np.pi))
-    return error + 2 * np.pi * turns * axis
+    turns = np.round((error - new) @ axis / (2 * np.pi))
+    new = new + 2 * np.pi * turns * axis
+    return new, _error_rate(new, _angular_velocity(error, rate))

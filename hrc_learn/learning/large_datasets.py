@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.dmp import SharedFit, fit_shared, mean_primitive
-from hrc_learn.dmp.batching import concatenate
+from hrc_learn.dmp.motion_primitive import concatenate
 from hrc_learn.learning.channels import (
     CHANNELS,
     LazyMap,

@@ -5,7 +5,7 @@ import torch
 from demo_motions import arm_motion
 
 from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.batching import concatenate
+from hrc_learn.dmp.motion_primitive import concatenate
 
 
 def primitives(seeds, frames, n_basis=12):
