@@ -37,8 +37,6 @@ from hrc_learn.kinematics import (
     LinkCapsule,
     TaskSpace,
     UnreachableError,
-    arm,
-    clear_posture,
     gripper_down,
 )
 from hrc_learn.kinematics.inverse import solutions_from
@@ -218,10 +216,47 @@ class TrialArm:
 _PANDA_REACH = 0.95  # [m], as `Arm.reach` of it
 
 
+def clear_posture(
+    postures: Float[Tensor, "postures n"],
+    start: Float[Tensor, "*batch n"],
+    clearance: Callable[[Tensor], Tensor],
+    *,
+    least: float = 0.03,
+    samples: int = 25,
+) -> Float[Tensor, "*batch n"]:
+    """The first posture whose straight path in joint space keeps clear of contacts.
+
+    A joint-space approach follows that path. Where none is clear, the posture whose path comes
+    least near to a contact.
+
+    Args:
+        postures: Candidates [rad], the best first.
+        start: Present joint positions [rad].
+        clearance: Distance from all contacts [m] at joint positions (*points, n).
+        least: Distance to keep [m]; nearer to the start what the start has is enough.
+        samples: Points looked at along the path.
+    """
+    flat = start.reshape(-1, start.shape[-1])
+    best = postures[:1].expand_as(flat).clone()
+    found = torch.full_like(flat[:, 0], -torch.inf)
+    wanted = torch.minimum(clearance(flat), found.new_tensor(least))
+    # Without the start itself, where the arm is anyway.
+    fraction = torch.linspace(0, 1, samples, dtype=flat.dtype, device=flat.device)[1:, None]
+    for posture in postures:
+        missing = (found < wanted).nonzero().flatten()
+        if len(missing) == 0:
+            break
+        path = torch.lerp(flat[missing, None], posture, fraction)
+        distance = clearance(path).amin(-1)
+        better = distance > found[missing]
+        best[missing[better]], found[missing[better]] = posture, distance[better]
+    return best.reshape(start.shape)
+
+
 @cache
 def trial_arm(choice: ArmChoice) -> TrialArm:
     """An arm, ready for trials."""
-    return TrialArm(arm(choice.name, base=choice.base or None, tip=choice.tip or None))
+    return TrialArm(choice.arm())
 
 
 # At the joints' speeds the arm moves less than 5 cm in between [s].

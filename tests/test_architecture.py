@@ -113,6 +113,7 @@ LIBRARIES: dict[str, set[str]] = {
 """Libraries that modules of a package may import as soon as they are imported."""
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
+    "geometry": {"trimesh", "collada"},
     "kinematics": {"frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
     "dmp": {"threadpoolctl"},
@@ -137,6 +138,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
 
 DISTRIBUTIONS = {
     "forcedimension_core": "forcedimension-core",
+    "collada": "pycollada",
     "cv2": "opencv-python-headless",
     "rerun": "rerun-sdk",
     "franky_sim": "franky-sim",

@@ -22,11 +22,6 @@ class WithRobot(Measured):
     tip: str = ""
     """Flange link in such a file, or BASE:TIP. Default: from the root to the only end."""
 
-    def links(self) -> tuple[str, str]:
-        """Names of the base and the flange link, "" for the default."""
-        base, _, tip = self.tip.rpartition(":")
-        return base, tip
-
 
 @dataclass(frozen=True, kw_only=True)
 class WithDriver(WithRobot):

@@ -186,7 +186,7 @@ def _model(folder: Path | None) -> Path:
 
 
 def _choice(args: WithRobot) -> ArmChoice:
-    return ArmChoice(args.robot, *args.links())
+    return ArmChoice(args.robot, tip=args.tip)
 
 
 def _possible_pulls(args: Run) -> Pulls:

@@ -60,7 +60,7 @@ def page(args: ServePage) -> None:
     guiding = settings.session.guiding
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    robot, console = ArmChoice(args.robot, *args.links()).work_arm(), Console()
+    robot, console = ArmChoice(args.robot, tip=args.tip).work_arm(), Console()
     workplace = Workplace.of(robot)
     writer = DatasetWriter(
         args.out,

@@ -132,7 +132,7 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
 
 
 def _work_cell(args: Record, seed: int) -> tuple[Workplace, World, np.random.Generator]:
-    workplace = Workplace.of(ArmChoice(args.robot, *args.links()).work_arm())
+    workplace = Workplace.of(ArmChoice(args.robot, tip=args.tip).work_arm())
     return workplace, World(workplace.scene), np.random.default_rng(seed)
 
 
@@ -147,7 +147,6 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
 
     if args.out.exists():
         raise FileExistsError(f"{args.out} exists: give another --out")
-    base, tip = args.links()
 
     @dataclass(frozen=True, kw_only=True)
     class Settings:
@@ -155,8 +154,7 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
 
     default = MujocoArmRobotConfig(
         arm=args.robot,
-        base=base,
-        tip=tip,
+        tip=args.tip,
         scenario=args.task,
         shelf=args.shelf,
         fps=20.0,

@@ -69,7 +69,7 @@ def serve(args: Serve) -> None:
         )
     torch.set_num_threads(1)
     dt = 1 / args.rate
-    camera, robot = _camera(), ArmChoice(args.robot, *args.links()).work_arm()
+    camera, robot = _camera(), ArmChoice(args.robot, tip=args.tip).work_arm()
     access = _access(args, dt, robot)
     controller, observation = _controller(robot.chain, camera, dt, access.safety)
     began = time.perf_counter()

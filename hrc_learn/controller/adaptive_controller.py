@@ -47,8 +47,7 @@ from hrc_learn.controller.safety_filter import (
 )
 from hrc_learn.controller.way_making import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.arrays import ArrayLike
-from hrc_learn.geometry.numerics import is_number
+from hrc_learn.geometry.numerics import ArrayLike, is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain, TaskSpace, task_basis, task_rank
 from hrc_learn.kinematics.inverse import TASK_ROWS

@@ -21,8 +21,7 @@ from hrc_learn.controller.constraint_layer import (
     constrained_velocity,
 )
 from hrc_learn.controller.limit_barrier import LimitBarrier
-from hrc_learn.geometry.arrays import ArrayLike, as_tensor
-from hrc_learn.geometry.numerics import is_number
+from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number
 from hrc_learn.kinematics import JointLimits, MotionLimits
 from hrc_learn.pytree import pytree
 

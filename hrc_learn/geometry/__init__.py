@@ -1,13 +1,12 @@
 """Rotations, poses and shapes; every delicate numeric of the package is in `numerics`."""
 
 from hrc_learn.geometry import quaternion as quaternion
-from hrc_learn.geometry.mesh_files import MeshPart as MeshPart
-from hrc_learn.geometry.mesh_files import mesh_points as mesh_points
-from hrc_learn.geometry.mesh_files import read_mesh as read_mesh
 from hrc_learn.geometry.numerics import minimum_jerk as minimum_jerk
 from hrc_learn.geometry.pose import Pose as Pose
 from hrc_learn.geometry.shapes import Body as Body
 from hrc_learn.geometry.shapes import Box as Box
 from hrc_learn.geometry.shapes import Capsule as Capsule
 from hrc_learn.geometry.shapes import MeshFile as MeshFile
-from hrc_learn.geometry.shapes import arm_bodies as arm_bodies
+from hrc_learn.geometry.shapes import MeshPart as MeshPart
+from hrc_learn.geometry.shapes import mesh_points as mesh_points
+from hrc_learn.geometry.shapes import read_mesh as read_mesh

@@ -1,19 +1,46 @@
 """The delicate numerics of the package: singular functions, small matrices, fixed tensors.
 
+Arrays as users have them become tensors here as well.
+
 Functions with a removable singularity take the *squared* length: a Euclidean norm has no second
 derivative at zero, its square has all of them. On either side of a threshold a Taylor series or
 the closed form is chosen by `where`, and the form that is not chosen is evaluated at a harmless
 argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
+
+type ArrayLike = Real[Tensor, "..."] | Real[np.ndarray, "..."] | Sequence | float
+"""A tensor, a NumPy array, or a nested list of numbers."""
 
 # Below it the series are exact to rounding in float64 (next term < 1e-16) while the closed
 # forms lose second derivatives to cancellation, which grows as 1 / threshold^2.
 _SINC_THRESHOLD = 1e-2
 _ARCTAN_THRESHOLD = 1e-3
+
+
+def as_tensor(values: ArrayLike, like: Tensor | None = None) -> Tensor:
+    """Turn an array into a floating-point tensor; tensors of floats pass unchanged.
+
+    Args:
+        values: Tensor, NumPy array, or nested list. Integers and lists become float64.
+        like: Tensor whose dtype and device the result takes; None keeps those of `values`.
+
+    Returns:
+        Tensor of the same shape.
+    """
+    if not isinstance(values, Tensor):
+        values = torch.as_tensor(np.asarray(values))
+    if not values.is_floating_point():
+        values = values.double()
+    return values if like is None else values.to(like)
 
 
 def cos_and_sinc(square: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.arrays import ArrayLike, as_tensor
+from hrc_learn.geometry.numerics import ArrayLike, as_tensor
 
 
 @dataclass(frozen=True)

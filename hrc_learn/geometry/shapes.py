@@ -1,19 +1,27 @@
-"""Shapes to draw and to keep clear of, and the rigid bodies that carry them.
+"""Shapes to draw and to keep clear of, the rigid bodies that carry them, and mesh files.
 
-A body is a trajectory of poses with boxes, capsules or a mesh file attached to it.
+A body is a trajectory of poses with boxes, capsules or mesh files attached to it. trimesh reads
+the files; of these only triangles, their places in the scene and one plain colour for each
+material are used.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 Colour = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
 
 PLAIN: Colour = (0.86, 0.87, 0.89, 1.0)
 """Colour of a robot link without a colour of its own."""
+
+_SUFFIXES = (".dae", ".stl", ".obj")
+_CREASE = np.deg2rad(40.0)
+"""Angle between two faces from which on the edge between them is drawn sharp [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,43 +79,117 @@ class Body:
     """Drawn in place of capsules and nameless boxes."""
 
 
-def arm_bodies(
-    position: Float[np.ndarray, "time links 3"],
-    orientation: Float[np.ndarray, "time links 4"],
-    *,
-    radius: float = 0.045,
-    colour: Colour = PLAIN,
-) -> tuple[Body, ...]:
-    """A stick arm for robots without a drawn model: a capsule from each frame to the next.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MeshPart:
+    """Triangles of one colour."""
 
-    The base stands at the origin.
+    vertices: Float[np.ndarray, "vertices 3"]
+    """[m]"""
+    normals: Float[np.ndarray, "vertices 3"]
+    """Unit normals; where an edge is sharp, each side has vertices of its own."""
+    faces: Int[np.ndarray, "faces 3"]
+    """Corners of each triangle, counter-clockwise as seen from outside."""
+    colour: Colour | None = None
+    """None: the file gives none."""
+
+    def placed(self, mesh: MeshFile) -> "MeshPart":
+        """The same where a body carries it, in the body's frame and never without a colour."""
+        w, *axis = mesh.orientation
+        scale, v = np.array(mesh.scale), np.array(axis)
+
+        def turned(vectors: np.ndarray) -> np.ndarray:
+            return vectors + 2.0 * np.cross(v, np.cross(v, vectors) + w * vectors)
+
+        normals = turned(self.normals / scale)
+        return MeshPart(
+            vertices=turned(self.vertices * scale) + mesh.position,
+            normals=normals / np.linalg.norm(normals, axis=-1, keepdims=True),
+            # A mirrored part would be seen from inside.
+            faces=self.faces[:, ::-1] if scale.prod() < 0 else self.faces,
+            colour=self.colour or mesh.colour or PLAIN,
+        )
+
+
+@cache
+def read_mesh(path: Path) -> tuple[MeshPart, ...]:
+    """Read the shape in a file; it is kept, so the file is read once.
 
     Args:
-        position: Origins of the joint frames, from the base to the tool [m].
-        orientation: Unit quaternions of the bodies (w, x, y, z).
-        radius: Radius of the capsules [m].
-        colour: Colour of the capsules.
+        path: A .dae (COLLADA), .stl (binary or text) or .obj (Wavefront) file.
+
+    Returns:
+        Its parts, one for each material, in the frame and unit that the file is meant in:
+        metres. COLLADA says its unit; the others have none and are taken as they are.
+        COLLADA's `up_axis` is ignored, as all readers of URDF do.
+
+    Raises:
+        ValueError: The file is of another kind, broken, or holds no triangle.
+        ModuleNotFoundError: trimesh is not installed.
     """
-    origin = np.zeros_like(position[:, :1])
-    upright = np.zeros_like(orientation[:, :1])
-    upright[..., 0] = 1.0
-    position = np.concatenate([origin, position], axis=1)
-    orientation = np.concatenate([upright, orientation], axis=1)
-    bodies = []
-    for i in range(position.shape[1] - 1):
-        # Joint i + 1 sits on link i, so its place in frame i is the same at every time.
-        w, axis = orientation[0, i, 0], orientation[0, i, 1:]
-        offset = position[0, i + 1] - position[0, i]
-        turned = np.cross(axis, offset)
-        end = offset + 2.0 * (np.cross(axis, turned) - w * turned)  # by the conjugate
-        x, y, z = end.tolist()
-        capsule = Capsule(start=(0.0, 0.0, 0.0), end=(x, y, z), radius=radius, colour=colour)
-        bodies.append(
-            Body(
-                name=f"link{i}",
-                position=position[:, i],
-                orientation=orientation[:, i],
-                capsules=(capsule,),
+    from trimesh.graph import smooth_shade
+
+    parts = []
+    for mesh, colour in _meshes(path):
+        # A micrometre apart is one place: files in text are rounded there.
+        mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=6)
+        mesh.update_faces(mesh.nondegenerate_faces())
+        mesh = smooth_shade(mesh, angle=_CREASE, facet_minarea=None)
+        vertices, normals, faces = mesh.vertices, mesh.vertex_normals, mesh.faces
+        parts.append(
+            MeshPart(
+                vertices=np.array(vertices, dtype=np.float64),
+                normals=np.array(normals, dtype=np.float64),
+                faces=np.array(faces),
+                colour=colour,
             )
         )
-    return tuple(bodies)
+    return tuple(parts)
+
+
+def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
+    """Corners of the triangles in a file that `read_mesh` reads, each once [m].
+
+    Raises:
+        ValueError: The file is of another kind, broken, or holds no triangle.
+        ModuleNotFoundError: trimesh is not installed.
+    """
+    corners = [mesh.vertices[mesh.faces].reshape(-1, 3) for mesh, _ in _meshes(path)]
+    return np.unique(np.concatenate(corners), axis=0)
+
+
+def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
+    """Meshes in a file, in metres, at their places in its scene, with their colours."""
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValueError(
+            f"{path}: cannot read {path.suffix} meshes, only {', '.join(_SUFFIXES)}."
+        )
+    try:
+        import collada  # noqa: F401  # which trimesh reads COLLADA with
+        import trimesh
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f"{path}: meshes are read with {error.name}: pip install 'hrc-learn[meshes]'",
+            name=error.name,
+        ) from error
+
+    try:
+        scene = trimesh.load_scene(path, process=False)
+    except Exception as error:  # its readers raise errors of all kinds at broken files
+        raise ValueError(f"{path} is no complete mesh file: {error}") from error
+    unit = str(scene.units or "").partition(" * ")[0]
+    scale = float(unit) if unit[:1].isdigit() else 1.0
+    found = []
+    for mesh in scene.dump():
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            found.append((mesh.apply_scale(scale), _colour(mesh.visual)))
+    if not found:
+        raise ValueError(f"{path} holds no triangle: is it complete?")
+    return found
+
+
+def _colour(visual: Any) -> Colour | None:
+    material = getattr(visual, "material", None)
+    if material is None:
+        return None
+    red, green, blue = (material.main_color[:3] / 255).tolist()
+    return (red, green, blue, 1.0)

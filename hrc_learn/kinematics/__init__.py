@@ -32,7 +32,6 @@ from hrc_learn.kinematics.limits import MotionLimits as MotionLimits
 from hrc_learn.kinematics.redundancy import SINGULAR_BELOW as SINGULAR_BELOW
 from hrc_learn.kinematics.redundancy import arm_angle as arm_angle
 from hrc_learn.kinematics.redundancy import arm_angle_and_motion as arm_angle_and_motion
-from hrc_learn.kinematics.redundancy import clear_posture as clear_posture
 from hrc_learn.kinematics.redundancy import null_space_projector as null_space_projector
 from hrc_learn.kinematics.redundancy import pseudo_inverse as pseudo_inverse
 from hrc_learn.kinematics.redundancy import singularity_damping as singularity_damping

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import MeshFile, Pose, quaternion
-from hrc_learn.geometry.arrays import ArrayLike, as_tensor
+from hrc_learn.geometry.numerics import ArrayLike, as_tensor
 from hrc_learn.kinematics.capsule_fit import fit_body
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule

@@ -16,8 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.arrays import ArrayLike, as_tensor
-from hrc_learn.geometry.numerics import Constant
+from hrc_learn.geometry.numerics import ArrayLike, Constant, as_tensor
 from hrc_learn.kinematics.limits import JointLimits
 
 type JointKind = Literal["revolute", "continuous", "prismatic"]

@@ -18,14 +18,19 @@ Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at mo
 
 from __future__ import annotations
 
+from collections import defaultdict
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from math import cos, pi, sin
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Body, Capsule, MeshFile, Pose
 from hrc_learn.kinematics.arm import TCP_OFFSET, Arm, ArmShape, hand_capsules
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import LinkCapsule
@@ -298,3 +303,84 @@ panda = _franka("panda", PANDA_LIMITS, (False,))
 
 fr3 = _franka("fr3", FR3_LIMITS, (False, True))
 """The Research 3 with its hand; the Cartesian limits are 3 m/s and 2.5 rad/s."""
+
+
+# Drawing
+
+_MESHES = "cmeel.prefix/share/example-robot-data/robots/panda_description/meshes/visual"
+_PARTS = {
+    **{f"link{i}": {"file": f"link{i}"} for i in range(8)},
+    "hand": {"file": "hand"},
+    "tool": {"file": "hand", "position": (0.0, 0.0, -TCP_OFFSET)},
+    "finger_left": {"file": "finger"},
+    "finger_right": {"file": "finger", "orientation": (0.0, 0.0, 0.0, 1.0)},
+}
+
+
+def panda_meshes(body: str) -> tuple[MeshFile, ...]:
+    """Meshes of a link, the hand or a finger of the Panda; empty without the extra `meshes`.
+
+    Args:
+        body: link0 to link7, hand, finger_left or finger_right; tool is the hand in the frame
+            of the tool centre point. There are none of any other body.
+    """
+    folder = _mesh_folder()
+    if folder is None or body not in _PARTS:
+        return ()
+    place: dict[str, Any] = dict(_PARTS[body])
+    return (MeshFile(path=folder / f"{place.pop('file')}.dae", **place),)
+
+
+@cache
+def _mesh_folder() -> Path | None:
+    try:
+        folder = Path(str(distribution("example-robot-data").locate_file(_MESHES)))
+    except PackageNotFoundError:
+        return None
+    return folder if folder.is_dir() else None
+
+
+def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
+    """Meshes of a link, the gripper or a finger of an arm; empty if unknown.
+
+    Franka's arms share their meshes, and all arms of the work cell carry the same gripper.
+
+    Args:
+        robot: The arm.
+        body: link0, link1, ..., hand, finger_left or finger_right.
+    """
+    if robot.is_franka or body in ("hand", "finger_left", "finger_right"):
+        return panda_meshes(body)
+    return tuple(robot.meshes.get(body, ()))
+
+
+def panda_bodies(joint_position: Float[np.ndarray, "time 7"]) -> tuple[Body, ...]:
+    """Base, links and hand as the capsules that stand for them in planning.
+
+    Args:
+        joint_position: [rad].
+    """
+    poses = panda.link_poses(torch.from_numpy(joint_position))
+    position, orientation = poses.position.numpy(), poses.orientation.numpy()
+    # The base, which moves with no joint, comes first.
+    position = np.concatenate([np.zeros_like(position[:, :1]), position], axis=1)
+    upright = np.zeros_like(orientation[:, :1])
+    upright[..., 0] = 1.0
+    orientation = np.concatenate([upright, orientation], axis=1)
+    shapes = defaultdict(list)
+    for capsule in panda.whole.capsules:
+        shapes[capsule.link].append(
+            Capsule(start=capsule.start, end=capsule.end, radius=capsule.radius)
+        )
+    last = position.shape[1] - 1
+    names = {link: "tool" if link == last else f"link{link}" for link in shapes}
+    return tuple(
+        Body(
+            name=names[link],
+            position=position[:, link],
+            orientation=orientation[:, link],
+            capsules=tuple(capsules),
+            meshes=panda_meshes(names[link]),
+        )
+        for link, capsules in shapes.items()
+    )

@@ -7,8 +7,6 @@ line from shoulder to wrist (Kreutz-Delgado et al. 1992). Unlike the position of
 changes steadily as the elbow circles, and keeps its meaning when the end effector moves on.
 """
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -157,40 +155,3 @@ def best_postures(
         if all(torch.linalg.vector_norm(posture - other) > _ALIKE for other in chosen):
             chosen.append(posture)
     return torch.stack(chosen)
-
-
-def clear_posture(
-    postures: Float[Tensor, "postures n"],
-    start: Float[Tensor, "*batch n"],
-    clearance: Callable[[Tensor], Tensor],
-    *,
-    least: float = 0.03,
-    samples: int = 25,
-) -> Float[Tensor, "*batch n"]:
-    """The first posture whose straight path in joint space keeps clear of contacts.
-
-    A joint-space approach follows that path. Where none is clear, the posture whose path comes
-    least near to a contact.
-
-    Args:
-        postures: Candidates [rad], the best first.
-        start: Present joint positions [rad].
-        clearance: Distance from all contacts [m] at joint positions (*points, n).
-        least: Distance to keep [m]; nearer to the start what the start has is enough.
-        samples: Points looked at along the path.
-    """
-    flat = start.reshape(-1, start.shape[-1])
-    best = postures[:1].expand_as(flat).clone()
-    found = torch.full_like(flat[:, 0], -torch.inf)
-    wanted = torch.minimum(clearance(flat), found.new_tensor(least))
-    # Without the start itself, where the arm is anyway.
-    fraction = torch.linspace(0, 1, samples, dtype=flat.dtype, device=flat.device)[1:, None]
-    for posture in postures:
-        missing = (found < wanted).nonzero().flatten()
-        if len(missing) == 0:
-            break
-        path = torch.lerp(flat[missing, None], posture, fraction)
-        distance = clearance(path).amin(-1)
-        better = distance > found[missing]
-        best[missing[better]], found[missing[better]] = posture, distance[better]
-    return best.reshape(start.shape)

@@ -10,7 +10,7 @@ from torch import Tensor
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.jacobian import EvidenceResult, RBFCenters
 from hrc_learn.kinematics import panda
-from hrc_learn.kinematics.arm_shapes import panda_bodies
+from hrc_learn.kinematics.franka import panda_bodies
 from hrc_learn.learning.primitive_fitting import FittedPrimitives
 from hrc_learn.learning.visual_servo_fitting import Demonstrations, feature_trajectories
 from hrc_learn.log import JointRanges

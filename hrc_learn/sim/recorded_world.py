@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile, read_mesh
-from hrc_learn.kinematics.arm_shapes import arm_meshes
+from hrc_learn.kinematics.franka import arm_meshes
 from hrc_learn.log import RunRecording
 from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM, add_surroundings
 from hrc_learn.sim.step_checks import body_geoms

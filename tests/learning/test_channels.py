@@ -4,7 +4,7 @@ import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda
-from hrc_learn.kinematics.arm_shapes import panda_bodies
+from hrc_learn.kinematics.franka import panda_bodies
 from hrc_learn.learning.channels import Motions
 from hrc_learn.learning.fit_recordings import demonstrations_recording
 

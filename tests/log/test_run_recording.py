@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from sample_runs import STEPS, camera_recording, sample_run
 
-from hrc_learn.geometry import arm_bodies
+from hrc_learn.geometry import Body
 from hrc_learn.log import CameraRecording
 
 SHORT = np.zeros(STEPS - 1)
@@ -28,7 +28,7 @@ def test_a_series_of_another_length_is_named(change):
 
 
 def test_a_body_of_another_length_is_named():
-    (body,) = arm_bodies(np.zeros((5, 1, 3)), np.tile([1.0, 0, 0, 0], (5, 1, 1)))
+    body = Body(name="link0", position=np.zeros((5, 3)), orientation=np.zeros((5, 4)))
     with pytest.raises(ValueError, match=r"link0\.position has 5"):
         sample_run(bodies=(body,))
 
