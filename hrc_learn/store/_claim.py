@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import TextIO
 
 from hrc_learn.store._disk import (
+    SUFFIX,
     carry_over,
     delete,
     delete_entries,
     entries,
     holder,
     is_at,
+    naming,
     sign,
     sync_file,
     sync_folder,
@@ -25,8 +27,6 @@ from hrc_learn.store._disk import (
 from hrc_learn.store._ownership import Kind, owned_entries, write_manifest
 from hrc_learn.store._reading import json_text, read_json
 
-SUFFIX = ".writing"
-"""Suffix of a workspace."""
 _LOCK, _NEW, _OLD, _OWNED = "lock", "new", "old", "owned.json"
 # Time between two attempts at a lock [s]: short compared with any work under a lock.
 _POLL = 0.05
@@ -71,12 +71,15 @@ class Claim:
         self._sync = not any(_is_workspace(parent.name) for parent in self.target.parents)
         self._old = self.workspace / _OLD
         self._owned = self.workspace / _OWNED
-        self._lock = self._acquire(wait)
-        try:
-            self.mended = self.clear()
-        except BaseException:
-            self._lock.close()
-            raise
+        with naming(self.target):
+            self._lock = self._acquire(wait)
+            try:
+                sign(self._lock)
+                self.mended = self.clear()
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    self.release()
+                raise
 
     def __enter__(self) -> "Claim":
         return self
@@ -246,7 +249,6 @@ class Claim:
                         )
                     time.sleep(_POLL)
                 elif is_at(file, path):
-                    sign(file)
                     return file
             except BaseException:
                 file.close()

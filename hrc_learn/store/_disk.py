@@ -19,6 +19,8 @@ _NO_LOCKS = {
 }
 
 
+SUFFIX = ".writing"
+"""Suffix of a workspace."""
 DISK_ERRORS = {
     getattr(errno, name)
     for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "EIO")
@@ -101,14 +103,15 @@ def entries(folder: Path) -> set[str]:
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Context that names a path in errors of the disk that name none.
+    """Context that names a path in errors of the disk that name none, or a temporary place.
 
     A full disk, for example, shows when a buffered file is closed, and that error has no name.
     """
     try:
         yield
     except OSError as error:
-        if error.errno in DISK_ERRORS and error.filename is None:
+        named = error.filename is not None and SUFFIX not in str(error.filename)
+        if error.errno in DISK_ERRORS and not named:
             raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
         raise
 

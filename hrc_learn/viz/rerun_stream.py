@@ -36,12 +36,15 @@ def rrd_file(
         blueprint: Layout; None: the writer of the stream sends it.
     """
     stream = rr.RecordingStream("hrc_learn")
+    # Not by `stream.save`: on a full disk it loses data, and its `flush` never returns.
+    content = stream.binary_stream()
     with new_file(Path(path)) as part:
         try:
-            stream.save(part, default_blueprint=blueprint)
+            if blueprint is not None:
+                stream.send_blueprint(blueprint, make_active=False)
             begin(stream, title)
             yield stream
-            stream.flush()
+            part.write_bytes(content.read() or b"")
         finally:
             stream.disconnect()
 
