@@ -35,10 +35,17 @@ from hrc_learn.deploy import (
     export_step,
 )
 from hrc_learn.hardware.arm_process import DriverError
-from hrc_learn.hardware.franka_gripper import FrankaHand, GripperProcess
-from hrc_learn.hardware.franka_loop import CYCLE, Robot, serve
-from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
-from hrc_learn.hardware.franka_settings import CollisionConfig, Load
+from hrc_learn.hardware.franka_loop import CYCLE, Robot, import_pylibfranka, serve
+from hrc_learn.hardware.franka_memory import (
+    JOINTS,
+    CollisionConfig,
+    Load,
+    Orders,
+    Phase,
+    Report,
+    Shared,
+)
+from hrc_learn.hardware.gripper import GripperProcess
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
@@ -121,10 +128,6 @@ class LoopTiming:
     """Cycles of motion that were answered."""
     lost: int
     """Cycles of motion of which no state was read in time."""
-    success_rate: float
-    """Fraction of the last 100 answers that the control box received in time, by its own count;
-    zero at rest.
-    """
     cost: Float[np.ndarray, " bins"]
     """Number of answers by the time they took, from reading the state to sending the answer."""
 
@@ -132,17 +135,6 @@ class LoopTiming:
     def answered_fraction(self) -> float:
         """Fraction of all cycles answered in time; 1 before the first."""
         return self.answered / max(1, self.answered + self.lost) if self.answered else 1.0
-
-    def percentile(self, percent: float) -> float:
-        """Time that this many of the answers took at most, to a microsecond [s].
-
-        NaN before the first.
-        """
-        total = self.cost.sum()
-        if total == 0:
-            return math.nan
-        reached = np.cumsum(self.cost) >= percent / 100 * total
-        return 1e-6 * (float(np.argmax(reached)) + 1.0)
 
 
 @final
@@ -231,7 +223,6 @@ class FrankaArm:
         return LoopTiming(
             answered=report.cycles,
             lost=report.lost,
-            success_rate=report.success_rate,
             cost=self._shared.costs.copy(),
         )
 
@@ -389,6 +380,36 @@ class FrankaArm:
         self._process.join()
         if self._gripper is not None:
             self._gripper.close()
+
+
+@final
+class FrankaHand:
+    """The gripper of a Franka arm, by pylibfranka."""
+
+    def __init__(self, ip: str, *, speed: float, force: float):
+        """Connect.
+
+        Args:
+            ip: Address of the control box.
+            speed: Of the fingers [m/s].
+            force: To squeeze with [N].
+
+        Raises:
+            ImportError: The driver is not installed.
+        """
+        self._gripper = import_pylibfranka().Gripper(ip)
+        self._speed, self._force = speed, force
+
+    def read_width(self) -> float:
+        return float(self._gripper.read_once().width)
+
+    def move(self, width: float) -> bool:
+        return self._gripper.move(width, self._speed)
+
+    def squeeze(self) -> bool:
+        # Whatever is between the fingers is a grasp; nothing is one of width zero.
+        self._gripper.grasp(0.0, self._speed, self._force, 0.1, 0.1)
+        return True
 
 
 def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner]:

@@ -30,8 +30,16 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.deploy import StepRunner
-from hrc_learn.hardware.franka_memory import COST_BINS, JOINTS, Orders, Phase, Report, Shared
-from hrc_learn.hardware.franka_settings import CollisionConfig, Load
+from hrc_learn.hardware.franka_memory import (
+    COST_BINS,
+    JOINTS,
+    CollisionConfig,
+    Load,
+    Orders,
+    Phase,
+    Report,
+    Shared,
+)
 
 CYCLE = 1e-3
 """Period of Franka's control interface [s]."""
@@ -358,7 +366,6 @@ class ControlLoop:
         report.joint_position = np.array(state.q)
         report.joint_velocity = np.array(state.dq)
         report.external_torque = np.array(state.tau_ext_hat_filtered)
-        report.success_rate = state.control_command_success_rate
 
     def _publish(self, phase: Phase) -> None:
         self._report.phase = phase

@@ -1,7 +1,7 @@
-"""Memory that the loop of a Franka arm shares with the process that commands it.
+"""Settings of a Franka arm's control box, and the memory of its loop.
 
-Orders go one way, reports the other, each as the newest line of numbers in a mailbox: neither
-side ever waits for the other.
+The loop shares the memory with the process that commands it. Orders go one way, reports the
+other, each as the newest line of numbers in a mailbox: neither side ever waits for the other.
 """
 
 from __future__ import annotations
@@ -25,6 +25,55 @@ ones.
 _TRIES = 100
 """Readings of a mailbox before its writer is taken for dead in the middle of a line: a line is
 written within a microsecond or two."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """A load on the flange, in addition to the end effector that the arm is configured for."""
+
+    mass: float = 0.0
+    """[kg]"""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre of mass, in the flange's frame [m]."""
+    inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
+    """About that centre, along the flange's axes [kg m^2]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.mass < float("inf"):
+            raise ValueError(f"mass of a load must not be negative, but is {self.mass} kg.")
+        if not np.isfinite(self.centre).all():
+            raise ValueError(f"centre of a load must be finite, but is {self.centre} m.")
+        tensor = np.array(self.inertia)
+        if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"inertia of a load must be a symmetric matrix, 3 by 3, but is {self.inertia}."
+            )
+        if np.linalg.eigvalsh(tensor).min() < 0:
+            raise ValueError(
+                f"inertia of a load must not be negative about any axis, but is {self.inertia}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollisionConfig:
+    """Estimated external load from which on the arm stops by a reflex.
+
+    The default is that of the maker's own example of joint velocities (libfranka,
+    examples/generate_joint_velocity_motion.cpp), for contacts and collisions alike.
+    """
+
+    torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    """On each joint [N m]."""
+    force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+    """Threshold at the end effector: forces along x, y, z [N], torques about them [N m]."""
+
+    def __post_init__(self) -> None:
+        for name, number in (("torque", 7), ("force", 6)):
+            values = getattr(self, name)
+            if len(values) != number or not all(0 < v < float("inf") for v in values):
+                raise ValueError(
+                    f"{name} of a collision must be {number} positive numbers, but is {values}."
+                )
 
 
 class Phase(IntEnum):
@@ -126,9 +175,6 @@ class Report:
     """Answered in motion."""
     lost: int = 0
     """Cycles whose state could not be answered in time."""
-    success_rate: float = 0.0
-    """Fraction of the last 100 answers that the control box received in time, by its own count.
-    """
     resting: bool = True
     """True if the velocity sent last is zero."""
     joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
@@ -138,13 +184,13 @@ class Report:
     external_torque: Float[np.ndarray, "7"] = field(default_factory=_zeros)
     """[N m]"""
 
-    SIZE = 9 + 3 * JOINTS
+    SIZE = 8 + 3 * JOINTS
 
     def line(self) -> Float[np.ndarray, " size"]:
         """The numbers."""
         head = [
             self.phase, self.stamp, self.time, self.recoveries, self.faults, self.cycles,
-            self.lost, self.success_rate, self.resting,
+            self.lost, self.resting,
         ]  # fmt: skip
         return np.array(
             [*head, *self.joint_position, *self.joint_velocity, *self.external_torque],
@@ -154,7 +200,7 @@ class Report:
     @classmethod
     def of(cls, line: Float[np.ndarray, " size"]) -> Report:
         """Read the report from a line."""
-        q, dq, torque = line[9:].reshape(3, JOINTS)
+        q, dq, torque = line[8:].reshape(3, JOINTS)
         return cls(
             phase=Phase(int(line[0])),
             stamp=float(line[1]),
@@ -163,8 +209,7 @@ class Report:
             faults=int(line[4]),
             cycles=int(line[5]),
             lost=int(line[6]),
-            success_rate=float(line[7]),
-            resting=bool(line[8]),
+            resting=bool(line[7]),
             joint_position=q,
             joint_velocity=dq,
             external_torque=torque,

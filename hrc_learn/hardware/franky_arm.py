@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.franka_settings import CollisionConfig, Load
+from hrc_learn.hardware.franka_memory import CollisionConfig, Load
 from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
 

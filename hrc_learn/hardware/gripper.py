@@ -1,25 +1,35 @@
-"""A real gripper on threads of its own: no loop ever waits for its fingers."""
+"""Grippers on threads or in a process, so that no loop waits for their fingers."""
 
 from __future__ import annotations
 
 import atexit
+import multiprocessing
+import os
+import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
+from multiprocessing.sharedctypes import RawArray
 from typing import Protocol, final, runtime_checkable
 
+import numpy as np
+
+from hrc_learn.hardware.franka_memory import TEXT, Mailbox
+
 _NARROW = 0.005
-"""Openings below this are a wish to squeeze, and such a difference is none [m]: a tenth of what
-an object that two fingers take is wide."""
+"""Openings below this are a request to squeeze, and smaller changes are no new request [m]: a
+tenth of the width of an object that two fingers take."""
 _BETWEEN_READINGS = 0.02
 """Period of the width readings [s]: skills read it every 10 ms and act on millimetres, for
 which fingers at 0.1 m/s take 20 ms.
 """
 _BEFORE_NEXT_TRY = 1.0
 """After the connection failed [s]: a control box takes some seconds to start again."""
-
 _ENDING = 2.0
 """Longest wait for each thread to end [s]: twice what libfranka waits for a reading."""
+_STARTUP = 60.0
+"""Longest time for connecting in a new process [s]."""
 
 
 class GripperError(RuntimeError):
@@ -47,7 +57,7 @@ class GripperDriver(Protocol):
 
 
 def report_failure(failure: GripperError) -> None:
-    """Tell on stderr what the gripper failed at."""
+    """Print a failure of the gripper on stderr."""
     print(f"gripper: {failure}", file=sys.stderr)
 
 
@@ -221,3 +231,125 @@ class GripperThread:
             self._news.notify_all()
         if not known and not self._closed:
             self._report(failure)
+
+
+@final
+class GripperProcess:
+    """A gripper whose calls are made in another process, one at a time.
+
+    For drivers that hold the interpreter during a call, as pylibfranka does. While a call runs,
+    the newest request waits, and the width last read stands.
+    """
+
+    def __init__(self, open_gripper: Callable[[], GripperDriver]):
+        """Start the process and connect.
+
+        Args:
+            open_gripper: Connects, in the process; it is pickled.
+
+        Raises:
+            RuntimeError: The gripper cannot be reached; it says why.
+        """
+        self._wish, self._status = Mailbox(2), Mailbox(3)
+        self._wish.write(np.array([0.0, np.nan]))
+        self._status.write(np.array([np.nan, 0.0, 0.0]))
+        self._text = RawArray("c", TEXT)
+        self._wishes, self._seen, self._width = 0, 0.0, np.nan
+        context = multiprocessing.get_context("spawn")
+        self._process = context.Process(
+            target=_serve_gripper,
+            args=(self._wish, self._status, self._text, open_gripper, os.getpid()),
+            name="gripper",
+            daemon=True,
+        )
+        self._process.start()
+        end = time.monotonic() + _STARTUP
+        while np.isnan(self.width):
+            if not self._process.is_alive() or time.monotonic() > end:
+                self.close()
+                text = self._message or f"no answer for {_STARTUP:g} s."
+                raise RuntimeError(f"the gripper cannot be reached: {text}")
+            time.sleep(0.01)
+
+    @property
+    def width(self) -> float:
+        """Opening, as last read; NaN before the first reading [m]."""
+        line = self._status.read()
+        return np.nan if line is None else float(line[0])
+
+    @property
+    def busy(self) -> bool:
+        """True while the newest request is not yet done."""
+        line = self._status.read()
+        return line is not None and bool(line[2] < self._wishes)
+
+    def move(self, width: float) -> None:
+        """Open to a width, or squeeze what is between the fingers [m]; returns at once.
+
+        Sent once for each new width.
+
+        Raises:
+            ValueError: The width is not a number.
+            RuntimeError: The call before has failed, or the process has ended; the message
+                says why. The next is tried anew.
+        """
+        if not np.isfinite(width):
+            raise ValueError(f"width must be finite, but is {width}.")
+        if not self._process.is_alive():
+            raise RuntimeError(f"the process of the gripper has ended. {self._message}")
+        line = self._status.read()
+        if line is not None and line[1] > self._seen:
+            self._seen, self._width = line[1], np.nan
+            raise RuntimeError(f"the gripper has failed: {self._message}")
+        if abs(width - self._width) < _NARROW:
+            return
+        self._width = width
+        self._wishes += 1
+        self._wish.write(np.array([float(self._wishes), width]))
+
+    def close(self) -> None:
+        """End the process, whatever call it is in."""
+        if self._process.is_alive():
+            self._process.kill()
+        self._process.join()
+
+    @property
+    def _message(self) -> str:
+        return self._text.value.decode("utf-8", "replace")
+
+
+def _serve_gripper(
+    wish: Mailbox,
+    status: Mailbox,
+    text: object,
+    open_gripper: Callable[[], GripperDriver],
+    parent: int,
+) -> None:
+    """Serve the gripper in its process until the parent has gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def note(error: Exception) -> None:
+        message = f"{type(error).__name__}: {error}"
+        text.value = message.encode()[: TEXT - 1]  # pyright: ignore[reportAttributeAccessIssue]
+
+    try:
+        gripper = open_gripper()
+    except Exception as error:
+        note(error)
+        return
+    width, failures, done = np.nan, 0, 0.0
+    while os.getppid() == parent:
+        begin = time.monotonic()
+        try:
+            line = wish.read()
+            if line is not None and line[0] > done:
+                done = line[0]
+                squeezes = line[1] < _NARROW
+                if not (gripper.squeeze() if squeezes else gripper.move(float(line[1]))):
+                    raise GripperError(f"it has not reached {line[1]:g} m.")
+            width = gripper.read_width()
+        except Exception as error:
+            note(error)
+            failures += 1
+        status.write(np.array([width, failures, done]))
+        time.sleep(max(0.0, begin + _BETWEEN_READINGS - time.monotonic()))

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -85,13 +85,19 @@ class CaptureCamera(TimedCamera):
             CameraError: It cannot be opened, or sends no image of this size.
             ValueError: The delay is negative, or the timeout is not positive.
         """
-        check_times(delay, timeout)
+        if not delay >= 0:
+            raise ValueError(f"delay must not be negative, but is {delay} s.")
+        if not timeout > 0:
+            raise ValueError(f"timeout must be positive, but is {timeout} s.")
         name = str(source)
         self._name, self._size, self._delay = f"camera {name}", size, delay
         self._timeout, self._age = timeout, 0.0
         self._capture = _opened(int(name) if name.isdecimal() else name, self._name, timeout)
         if size is not None:
-            _ask_for_size(self._capture, size)
+            import cv2
+
+            self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
         self._arrived = threading.Condition()
         # Time at which it was taken as far as is known [s], and the image, BGR.
         self._newest: tuple[float, np.ndarray] | None = None
@@ -124,7 +130,7 @@ class CaptureCamera(TimedCamera):
         if since > self._timeout:
             raise CameraError(failure or _silent(self._name, since, self._timeout))
         self._age = since + self._delay
-        return as_rgb(newest[1], self._name, self._size)
+        return _as_rgb(newest[1], self._name, self._size)
 
     def close(self) -> None:
         """Give the camera back."""
@@ -155,7 +161,7 @@ class CaptureCamera(TimedCamera):
                 raise CameraError(self._failure or _silent(self._name, longest, self._timeout))
 
     def _keep_newest(self) -> None:
-        """Read images until closed (body of the thread)."""
+        """Read images until closed, in the thread."""
         while not self._closing:
             if not self._capture.grab():
                 self._fail(
@@ -204,7 +210,6 @@ class VideoFile(TimedCamera):
         path: str | Path,
         *,
         size: tuple[int, int] | None = None,
-        pace: Literal["own", "read"] = "own",
         clock: Callable[[], float] = time.monotonic,
     ):
         """Open it.
@@ -212,7 +217,6 @@ class VideoFile(TimedCamera):
         Args:
             path: Of the file.
             size: Width and height that its images should have [px]; None: any.
-            pace: Whether it is played at its own rate, or each reading is the next image.
             clock: Tells the time [s].
 
         Raises:
@@ -221,7 +225,7 @@ class VideoFile(TimedCamera):
         """
         if not Path(path).is_file():
             raise FileNotFoundError(f"no video file {path}: give a path, a number or a URL.")
-        self._name, self._size, self._pace = f"video {path}", size, pace
+        self._name, self._size = f"video {path}", size
         self._clock, self._begun, self._age = clock, float("nan"), 0.0
         self._capture = _opened(str(path), self._name, _FIRST_IMAGE)
         self._number, self._ahead = 0, float("inf")
@@ -231,9 +235,7 @@ class VideoFile(TimedCamera):
 
     @property
     def age(self) -> float:
-        """Time by which the newest image was overdue when it was read [s]; 0 if images are read
-        one by one.
-        """
+        """Time by which the newest image was overdue when it was read [s]."""
         return self._age
 
     @property
@@ -248,9 +250,6 @@ class VideoFile(TimedCamera):
             VideoEndedError: The file has ended.
             CameraError: The image is not one that can be used.
         """
-        if self._pace == "read":
-            self._step()
-            return self._rgb()
         now = self._clock()
         if self._image is None:
             self._begun = now - self._ahead
@@ -291,15 +290,7 @@ class VideoFile(TimedCamera):
 
     def _rgb(self) -> RGB:
         assert self._image is not None  # a step has been made
-        return as_rgb(self._image, self._name, self._size)
-
-
-def check_times(delay: float, timeout: float) -> None:
-    """Raises a ValueError for a delay that is negative, or a timeout that is not positive."""
-    if not delay >= 0:
-        raise ValueError(f"delay must not be negative, but is {delay} s.")
-    if not timeout > 0:
-        raise ValueError(f"timeout must be positive, but is {timeout} s.")
+        return _as_rgb(self._image, self._name, self._size)
 
 
 def _opened(source: int | str, name: str, timeout: float) -> Any:
@@ -341,13 +332,6 @@ def _opened(source: int | str, name: str, timeout: float) -> Any:
     return capture
 
 
-def _ask_for_size(capture: Any, size: tuple[int, int]) -> None:
-    import cv2
-
-    capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
-
-
 def _silent(name: str, passed: float, timeout: float) -> str:
     return (
         f"{name} has sent no image for {passed:.1f} s (timeout: {timeout:g} s): check its "
@@ -355,10 +339,8 @@ def _silent(name: str, passed: float, timeout: float) -> str:
     )
 
 
-def as_rgb(
-    image: np.ndarray, name: str, size: tuple[int, int] | None, *, bgr: bool = True
-) -> RGB:
-    """An image, RGB.
+def _as_rgb(image: np.ndarray, name: str, size: tuple[int, int] | None) -> RGB:
+    """RGB image of a BGR one.
 
     Raises:
         CameraError: It is no colour image of 8 bits, or not of the size.
@@ -374,4 +356,4 @@ def as_rgb(
             f"{name} sends images of {width} x {height} pixels instead of {size[0]} x "
             f"{size[1]}: ask for a size that it has."
         )
-    return np.ascontiguousarray(image[..., ::-1]) if bgr else image
+    return np.ascontiguousarray(image[..., ::-1])

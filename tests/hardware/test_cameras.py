@@ -11,7 +11,6 @@ import pytest
 from hrc_learn.hardware import (
     CameraError,
     CaptureCamera,
-    LeRobotCamera,
     VideoEndedError,
     VideoFile,
     open_camera,
@@ -76,10 +75,9 @@ def test_images_that_nobody_read_are_passed_over(video):
     assert camera.number == 8
 
 
-@pytest.mark.parametrize("pace", ["own", "read"])
-def test_the_end_of_a_file_is_told(video, pace):
+def test_the_end_of_a_file_is_told(video):
     clock = Clock()
-    camera = VideoFile(video, pace=pace, clock=clock)
+    camera = VideoFile(video, clock=clock)
     numbers = []
 
     def play():
@@ -90,8 +88,6 @@ def test_the_end_of_a_file_is_told(video, pace):
     with pytest.raises(VideoEndedError, match=r"twelve\.mkv has ended after 12 images"):
         play()
     assert sorted({*numbers}) == [*range(12)]
-    if pace == "read":
-        assert numbers == [*range(12)]
 
 
 def test_a_file_that_is_none_is_refused(tmp_path, video):
@@ -231,52 +227,3 @@ def test_the_stamp_of_a_driver_counts_if_it_is_one(position, taken):
 def test_times_that_make_no_sense_are_refused(keyword, stream):
     with pytest.raises(ValueError, match=next(iter(keyword))):
         open_camera(stream.url, **keyword)
-
-
-def lerobots(source, **options):
-    opencv = pytest.importorskip("lerobot.cameras.opencv")
-    return opencv.OpenCVCamera(
-        opencv.OpenCVCameraConfig(index_or_path=source, warmup_s=0, **options)
-    )
-
-
-@pytest.mark.parametrize("mode", ["rgb", "bgr"])
-def test_a_camera_of_lerobots_is_one(stream, mode):
-    camera = lerobots(stream.url, color_mode=mode)
-    ours = LeRobotCamera(camera, delay=0.1, timeout=5.0)
-    try:
-        assert camera.is_connected
-        assert until(lambda: camera.latest_frame is not None)
-        seen = set()
-        assert until(lambda: seen.add(number_of(ours.read())) or len(seen) >= 3)
-        assert ours.age >= 0.1
-    finally:
-        ours.close()
-    assert not camera.is_connected
-    with pytest.raises(CameraError, match="OpenCVCamera"):
-        ours.read()
-
-
-def test_a_camera_of_lerobots_that_is_not_there_is_named():
-    with pytest.raises(CameraError, match=r"OpenCVCamera.*lerobot-find-cameras"):
-        LeRobotCamera(lerobots("/dev/video97"))
-
-
-class Depth:
-    """What LeRobot's depth cameras give."""
-
-    is_connected, color_mode = True, "rgb"
-
-    def connect(self, warmup=True):
-        raise AssertionError("it is connected")
-
-    def disconnect(self):
-        raise AssertionError("it was connected by somebody else")
-
-    def read_latest(self, max_age_ms):
-        return np.zeros((48, 64), np.uint16)
-
-
-def test_images_without_colour_are_refused():
-    with pytest.raises(CameraError, match=r"\(48, 64\).*uint16.*colour streams"):
-        LeRobotCamera(Depth()).read()
