@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from page_in_browser import chromium, wait_until
 
+from hrc_learn.teleoperation.headset import BUILD, CLIENT
 from hrc_learn.teleoperation.page import Page
-from hrc_learn.teleoperation.page.headset import BUILD, CLIENT
 
 EMULATOR = CLIENT / "node_modules" / "iwer" / "build" / "iwer.min.js"
 

@@ -23,7 +23,7 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.lerobot.arm_values import DOWN, GRIPPER, HAND, ActionSpace, ArmValues
 from hrc_learn.lerobot.person import Person, PersonConfig
 from hrc_learn.protocols import Arm, ArmState
-from hrc_learn.teleoperation.recording_quality import RecordingQuality, pressed
+from hrc_learn.teleoperation.demonstration_recorder import RecordingQuality, pressed
 
 if TYPE_CHECKING:
     from hrc_learn.sim import World

@@ -11,7 +11,7 @@ import select
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
@@ -27,6 +27,9 @@ from hrc_learn.teleoperation.hand_guiding import (
     pull_to_nullspace_input,
     steering_twist,
 )
+
+OPEN = 0.08
+"""Width of the open gripper [m]."""
 
 
 class CombinedInput(Human):
@@ -184,73 +187,35 @@ class Controller(Protocol):
     def rumble(self, low_frequency: float, high_frequency: float, duration: int) -> bool: ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class RumbleConfig:
-    """Rumble of a gamepad. The slow motor reports contact and nearby people, the quick one an
-    input that the arm does not follow. Both pulse, because pulses are easier to notice than
-    motors that run continuously.
-    """
-
-    every: float = 0.25
-    """Time from one pulse to the next [s]."""
-    pulse: float = 0.12
-    """Length of a pulse [s]."""
-    least: float = 0.1
-    """Strength below which there is no pulse, of 1: motors hardly turn."""
-    contact: tuple[float, float] = (20.0, 60.0)
-    """Contact force from which on there are pulses, and that of the strongest [N]. Friction of
-    the simulated joints feels like 17 N; a scripted person pulls with 60 N at most."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.pulse <= self.every:
-            raise ValueError(
-                "pulse must be positive and no longer than every, but they are "
-                f"{self.pulse} and {self.every} s."
-            )
-        if not 0 <= self.contact[0] < self.contact[1]:
-            raise ValueError(f"contact must be two rising forces, but is {self.contact}.")
+# Rumble: the slow motor reports contact and nearby people, the quick one an input that the arm
+# does not follow. Pulses are easier to notice than motors that run continuously.
+PULSE_EVERY, _PULSE = 0.25, 0.12  # [s]
+_LEAST_RUMBLE = 0.1  # of 1: motors hardly turn below
+_CONTACT = (20.0, 60.0)
+"""Contact force from which on there are pulses, and that of the strongest [N]. Friction of the
+simulated joints feels like 17 N; a scripted person pulls with 60 N at most."""
 
 
-def rumble_strength(feedback: Feedback, config: RumbleConfig) -> tuple[float, float]:
+def rumble_strength(feedback: Feedback) -> tuple[float, float]:
     """Strengths of the slow and of the quick motor of a gamepad, 0 to 1.
 
     Args:
         feedback: Feedback of the arm.
-        config: Thresholds and strengths.
     """
-    met, (least, most) = 0.0, config.contact
+    met, (least, most) = 0.0, _CONTACT
     if feedback.contact_force is not None:
         met = (float(np.linalg.norm(feedback.contact_force)) - least) / (most - least)
     slow = min(max(met, 1.0 - feedback.pace, 0.0), 1.0)
     return slow, 1.0 - feedback.followed
 
 
-@dataclass(frozen=True, kw_only=True)
-class GamepadConfig:
-    """Response of the sticks."""
-
-    dead_zone: float = 0.12
-    """Fraction of its range in which a stick has no effect: worn sticks do not return to 0."""
-    curve: float = 2.0
-    """Power of the deflection: above 1 it is finer near the middle."""
-    forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
-    """Fastest motion of the end effector, and how it turns."""
-    opening: float = 0.08
-    """Width of the open gripper [m]."""
-    rumble: RumbleConfig = field(default_factory=RumbleConfig)
-    """Rumble settings."""
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.dead_zone < 1 and self.curve > 0):
-            raise ValueError(
-                "dead_zone must be in [0, 1) and curve positive, but are "
-                f"{self.dead_zone} and {self.curve}."
-            )
+_DEAD_ZONE = 0.12
+"""Fraction of its range in which a stick has no effect: worn sticks do not return to 0."""
+_CURVE = 2.0
+"""Power of the deflection: above 1 it is finer near the middle."""
 
 
-def deflection(
-    stick: Float[np.ndarray, " axes"], dead_zone: float, curve: float
-) -> Float[np.ndarray, " axes"]:
+def deflection(stick: Float[np.ndarray, " axes"]) -> Float[np.ndarray, " axes"]:
     """A stick's effect, 0 to 1 in length, in the direction of the stick.
 
     Zero in the dead zone, and from its edge on without a jump: the zone is a ball, as one for
@@ -258,14 +223,12 @@ def deflection(
 
     Args:
         stick: Deflection of the stick, each axis -1 to 1.
-        dead_zone: Fraction of its range without effect.
-        curve: Power of what remains.
     """
     length = float(np.linalg.norm(stick))
-    if length <= dead_zone:
+    if length <= _DEAD_ZONE:
         return np.zeros_like(stick)
-    beyond = min((length - dead_zone) / (1 - dead_zone), 1.0)
-    return stick / length * beyond**curve
+    beyond = min((length - _DEAD_ZONE) / (1 - _DEAD_ZONE), 1.0)
+    return stick / length * beyond**_CURVE
 
 
 class Gamepad(Human):
@@ -281,7 +244,6 @@ class Gamepad(Human):
         chain: SerialChain,
         controller: Controller,
         update: Callable[[], None] = lambda: None,
-        config: GamepadConfig | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
         """Take an open controller; `Gamepad.open` finds one.
@@ -290,12 +252,10 @@ class Gamepad(Human):
             chain: The arm that is guided.
             controller: The gamepad.
             update: Lets the library read the device.
-            config: Response of the sticks, and rumble.
             clock: Monotonic clock [s].
         """
         self._chain, self._controller, self._update = chain, controller, update
         self._clock, self._next_pulse = clock, float("-inf")
-        self._config = config or GamepadConfig()
         self._held: set[int] = set()
         self._gripper: float | None = None
 
@@ -336,7 +296,7 @@ class Gamepad(Human):
             self._held = set()
             return HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
         pressed = self._pressed()
-        for button, width in ((_LEFT_SHOULDER, self._config.opening), (_RIGHT_SHOULDER, 0.0)):
+        for button, width in ((_LEFT_SHOULDER, OPEN), (_RIGHT_SHOULDER, 0.0)):
             if button in pressed:
                 self._gripper = width
         return HumanInput(
@@ -348,23 +308,23 @@ class Gamepad(Human):
 
     def tell(self, feedback: Feedback) -> None:
         """Rumble, a pulse every now and then; a gamepad without motors stays still."""
-        config, now = self._config.rumble, self._clock()
+        now = self._clock()
         if now < self._next_pulse:
             return
-        slow, quick = rumble_strength(feedback, config)
-        if max(slow, quick) >= config.least and self._controller.attached():
-            self._controller.rumble(slow, quick, round(1000 * config.pulse))
-            self._next_pulse = now + config.every
+        slow, quick = rumble_strength(feedback)
+        if max(slow, quick) >= _LEAST_RUMBLE and self._controller.attached():
+            self._controller.rumble(slow, quick, round(1000 * _PULSE))
+            self._next_pulse = now + PULSE_EVERY
 
     def _twist(self, state: ArmState) -> Float[np.ndarray, "6"]:
-        config = self._config
         x, y, z = (
             self._controller.get_axis(axis) / _FULL for axis in (_LEFT_X, _LEFT_Y, _RIGHT_Y)
         )
         # A stick that points forward or up reads negative; the base's y axis points left.
         stick = np.array([-y, -x, -z])
-        direction = deflection(stick, config.dead_zone, config.curve)
-        return steering_twist(self._chain, state.joint_position, direction, config.forces)
+        return steering_twist(
+            self._chain, state.joint_position, deflection(stick), InteractionForceConfig()
+        )
 
     def _pressed(self) -> set[int]:
         """Buttons that have gone down since the last reading."""
@@ -431,7 +391,7 @@ KEYS: MappingProxyType[str, Request] = MappingProxyType(
 )
 """Request sent by each key; `DIRECTIONS` has the keys that move the end effector."""
 
-_GRIPPER = {"[": 0.08, "]": 0.0}
+_GRIPPER = {"[": OPEN, "]": 0.0}
 
 
 class TerminalKeyboard(Human):

@@ -240,12 +240,6 @@ class HandGuidingConfig:
     """Control step [s]."""
     damping: float = 3.0
     """c_d [N m s/rad]."""
-    attraction: float = 0.12
-    """Largest speed towards a region or a target [m/s]."""
-    approach_rate: float = 1.5
-    """Decay rate of the distance to a target [1/s]."""
-    return_speed: float = 0.3
-    """Largest speed of a joint that moves to a posture [rad/s]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Settings of the safety filter, which knows the limits of the arm's driver."""
 
@@ -255,6 +249,12 @@ class HandGuidingConfig:
                 raise ValueError(f"{name} must be positive, but is {value}.")
 
 
+ATTRACTION = 0.12
+"""Largest speed towards a region or a target [m/s]."""
+_APPROACH_RATE = 1.5
+"""Decay rate of the distance to a target or a posture [1/s]."""
+RETURN_SPEED = 0.3
+"""Largest speed of a joint that moves to a posture [rad/s]."""
 _ARRIVED = 1e-3
 """Distance at which a joint has reached its target [rad]: ten times the noise of an encoder."""
 
@@ -379,9 +379,9 @@ class HandGuidedArm:
         if float(ahead.abs().max()) < _ARRIVED:
             self._posture = None
         # All joints slow down together, which keeps the line straight.
-        fastest = self.config.approach_rate * float(ahead.abs().max())
-        scale = min(1.0, self.config.return_speed / max(fastest, TINY))
-        return scale * self.config.approach_rate * ahead
+        fastest = _APPROACH_RATE * float(ahead.abs().max())
+        scale = min(1.0, RETURN_SPEED / max(fastest, TINY))
+        return scale * _APPROACH_RATE * ahead
 
     def _attraction(
         self, human_input: HumanInput, position: Float[torch.Tensor, "3"]
@@ -396,6 +396,6 @@ class HandGuidedArm:
             velocity = -box.feedback(position)[1]  # zero inside
         if human_input.target is not None:
             towards = position.new_tensor(human_input.target) - position
-            velocity = velocity + self.config.approach_rate * towards
+            velocity = velocity + _APPROACH_RATE * towards
         # Shortened as a whole: the direction is kept.
-        return velocity / max(1.0, float(velocity.norm()) / self.config.attraction)
+        return velocity / max(1.0, float(velocity.norm()) / ATTRACTION)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from threading import Event, Thread
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -40,36 +39,22 @@ class ForceDevice(Protocol):
     def close(self, ID: int = -1) -> int: ...
 
 
-@dataclass(frozen=True, kw_only=True)
-class HapticDeviceConfig:
-    """Scaling of motions and forces of the device."""
-
-    scale: float = 2.5
-    """Motion of the end effector for that of the hand: an Omega's workspace is 0.16 m wide."""
-    stiffness: float = 120.0
-    """Stiffness of the spring that pulls the device to where the arm has followed it [N/m]."""
-    damping: float = 4.0
-    """Against motion of the hand while the clutch is closed [N s/m]."""
-    contact: float = 0.1
-    """Fraction of the contact force at the end effector that the device renders."""
-    max_force: float = 6.0
-    """Largest force on the hand [N]; an Omega can hold 12."""
-    rate: float = 1000.0
-    """Times a second that the force is renewed [1/s]."""
-    stale: float = 0.1
-    """Time without word from the control loop after which no force is left [s]."""
-    clutch: int = 0
-    """Button that closes the clutch while it is held."""
-    forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
-    """Fastest motion of the end effector, and how it turns."""
-
-    def __post_init__(self) -> None:
-        for name in ("scale", "max_force", "rate", "stale"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
-        for name in ("stiffness", "damping", "contact"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative: {getattr(self, name)}.")
+_SCALE = 2.5
+"""Motion of the end effector for that of the hand: an Omega's workspace is 0.16 m wide."""
+_STIFFNESS = 120.0
+"""Stiffness of the spring that pulls the device to where the arm has followed it [N/m]."""
+_DAMPING = 4.0
+"""Damping of the hand's motion while the clutch is closed [N s/m]."""
+_CONTACT = 0.1
+"""Fraction of the contact force at the end effector that the device renders."""
+_MAX_FORCE = 6.0
+"""Largest force on the hand [N]; an Omega can hold 12."""
+_PERIOD = 0.001
+"""Time between two forces [s]."""
+_STALE = 0.1
+"""Time without feedback from the control loop after which the force vanishes [s]."""
+_CLUTCH = 0
+"""Button that closes the clutch while it is held."""
 
 
 class _Pull(NamedTuple):
@@ -88,7 +73,7 @@ class HapticDevice(Human):
     force.
 
     When the clutch closes, the pointer is at the end effector. It then moves with the device,
-    scaled by `scale`, and the end effector follows it like a gizmo. The person feels what the
+    scaled by 2.5, and the end effector follows it like a gizmo. The person feels what the
     arm does not follow:
 
         f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force
@@ -107,7 +92,6 @@ class HapticDevice(Human):
         self,
         chain: SerialChain,
         device: ForceDevice,
-        config: HapticDeviceConfig | None = None,
         *,
         number: int = -1,
         clock: Callable[[], float] = time.monotonic,
@@ -117,12 +101,11 @@ class HapticDevice(Human):
         Args:
             chain: Kinematics of the guided arm.
             device: Interface of Force Dimension's library.
-            config: Scaling of motions and forces.
             number: Number of the device; -1: the one opened last.
             clock: Monotonic clock [s].
         """
         self._chain, self._device, self._number = chain, device, number
-        self._config, self._clock = config or HapticDeviceConfig(), clock
+        self._forces, self._clock = InteractionForceConfig(), clock
         # Positions of hand and tool at which the clutch was closed.
         self._clutched: tuple[np.ndarray, np.ndarray] | None = None
         self._tool = np.zeros(3)
@@ -131,12 +114,11 @@ class HapticDevice(Human):
         self._thread = Thread(target=self._push_back, name="haptic device", daemon=True)
 
     @classmethod
-    def open(cls, chain: SerialChain, config: HapticDeviceConfig | None = None) -> HapticDevice:
+    def open(cls, chain: SerialChain) -> HapticDevice:
         """Open the first device by forcedimension-core, which the extra `haptic` brings.
 
         Args:
             chain: Kinematics of the guided arm.
-            config: Scaling of motions and forces.
 
         Raises:
             ValueError: There is no device, or the maker's SDK is not installed.
@@ -151,7 +133,7 @@ class HapticDevice(Human):
         number = connect()
         if number < 0:
             raise ValueError(f"no haptic device: {dhd.errorGetLastStr()}.")
-        return cls(chain, dhd, config, number=number)
+        return cls(chain, dhd, number=number)
 
     def __enter__(self) -> HapticDevice:
         self._device.enableForce(True, self._number)
@@ -168,18 +150,18 @@ class HapticDevice(Human):
     def read(self, state: ArmState) -> HumanInput:
         """Motion of the end effector as the hand is now."""
         still = HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
-        config, hand = self._config, self._vector(self._device.getPosition)
+        hand = self._vector(self._device.getPosition)
         tool = self._chain.forward(torch.from_numpy(state.joint_position))
         self._tool = tool.position.numpy()
-        if hand is None or self._device.getButton(config.clutch, self._number) != 1:
+        if hand is None or self._device.getButton(_CLUTCH, self._number) != 1:
             self._clutched = None
             return still
         if self._clutched is None:
             self._clutched = hand, self._tool
         began, start = self._clutched
-        pointer = start + config.scale * (hand - began)
-        velocity = config.forces.rate * (pointer - self._tool)
-        twist = guiding_twist(tool, velocity, coarse_orientation(tool.position), config.forces)
+        pointer = start + _SCALE * (hand - began)
+        velocity = self._forces.rate * (pointer - self._tool)
+        twist = guiding_twist(tool, velocity, coarse_orientation(tool.position), self._forces)
         return HumanInput(nullspace_input=still.nullspace_input, twist=twist)
 
     def tell(self, feedback: Feedback) -> None:
@@ -188,28 +170,27 @@ class HapticDevice(Human):
             self._pull = None
             return
         began, start = self._clutched
-        rest = began + (self._tool - start) / self._config.scale
+        rest = began + (self._tool - start) / _SCALE
         push = np.zeros(3)
         if feedback.contact_force is not None and not feedback.contact_expected:
-            push = self._config.contact * feedback.contact_force
-        self._pull = _Pull(rest, push, self._clock() + self._config.stale)
+            push = _CONTACT * feedback.contact_force
+        self._pull = _Pull(rest, push, self._clock() + _STALE)
 
     def force(self) -> Float[np.ndarray, "3"]:
         """Force on the hand now [N]; none where the clutch is open or the loop is silent."""
-        pull, config = self._pull, self._config
+        pull = self._pull
         hand = self._vector(self._device.getPosition)
         velocity = self._vector(self._device.getLinearVelocity)
         if pull is None or hand is None or velocity is None or self._clock() > pull.until:
             return np.zeros(3)
-        spring = config.stiffness * (pull.rest - hand) - config.damping * velocity
-        return capped(spring + pull.push, config.max_force)
+        spring = _STIFFNESS * (pull.rest - hand) - _DAMPING * velocity
+        return capped(spring + pull.push, _MAX_FORCE)
 
     def _vector(self, read: Callable[..., int]) -> Float[np.ndarray, "3"] | None:
         out = [0.0, 0.0, 0.0]
         return None if read(out, self._number) < 0 else np.array(out)
 
     def _push_back(self) -> None:
-        period = 1 / self._config.rate
         with contextlib.suppress(OSError):  # it has been unplugged
-            while not self._closing.wait(period):
+            while not self._closing.wait(_PERIOD):
                 self._device.setForce(self.force().tolist(), self._number)

@@ -26,8 +26,7 @@ from hrc_learn.teleoperation.gate.messages import (
     session_message,
     view_message,
 )
-from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.teleoperation.page.page import slow_words
+from hrc_learn.teleoperation.page import PageConfig, slow_words
 
 
 class Clock:

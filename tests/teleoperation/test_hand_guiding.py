@@ -15,6 +15,8 @@ from hrc_learn.teleoperation import (
     guiding_twist,
 )
 from hrc_learn.teleoperation.hand_guiding import (
+    ATTRACTION,
+    RETURN_SPEED,
     HandGuidedArm,
     HandGuidingConfig,
     bounded,
@@ -88,7 +90,7 @@ def test_a_region_draws_the_hand_in_no_faster_than_it_may():
     region = DrawnRegion(centre=(0.45, 0.25, 0.35), half_size=(0.08, 0.08, 0.08))
     arm, start = lead(1.0, region=region)
     distance = float((arm.hand().position - start.position).norm())
-    assert distance <= HandGuidingConfig().attraction * 1.0 + 1e-6
+    assert distance <= ATTRACTION * 1.0 + 1e-6
     arm, _ = lead(8.0, region=region)
     offset = np.abs(arm.hand().position.numpy() - region.centre)
     # The last of the way in decays: within a few millimetres of the wall.
@@ -142,7 +144,7 @@ def test_an_arm_that_is_sent_to_a_posture_goes_straight_there_and_rests():
     np.testing.assert_allclose(path - path[0], share[:, None] * offset, atol=1e-3)
     assert (np.diff(share) >= -1e-9).all()
     fastest = np.abs(np.diff(path, axis=0)).max() / 0.01
-    assert fastest == pytest.approx(HandGuidingConfig().return_speed, rel=0.02)
+    assert fastest == pytest.approx(RETURN_SPEED, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +222,7 @@ def test_who_asks_for_nothing_is_told_nothing():
     assert (told.pushed, told.followed, told.reasons) == (False, 1.0, ())
 
 
-@pytest.mark.parametrize("name", ["dt", "damping", "attraction", "approach_rate"])
+@pytest.mark.parametrize("name", ["dt", "damping"])
 def test_settings_that_make_no_sense_are_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be positive"):
         HandGuidingConfig(**{name: 0.0})

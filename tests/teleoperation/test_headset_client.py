@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from hrc_learn.geometry import Body, Box, Capsule
+from hrc_learn.teleoperation import headset
 from hrc_learn.teleoperation.gate.messages import Hands, MessageError, session_message
-from hrc_learn.teleoperation.page import PageConfig, headset
-from hrc_learn.teleoperation.page.headset import headset_contents, scene_glb
+from hrc_learn.teleoperation.headset import headset_contents, headset_data, scene_glb
+from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import hand_columns
 
 AT_REST = {"position": np.zeros((1, 3)), "orientation": np.array([[1.0, 0.0, 0.0, 0.0]])}
@@ -84,11 +85,11 @@ def test_the_file_holds_each_shape_in_the_frame_of_its_body():
 
 def test_the_client_is_told_what_can_be_held(tmp_path, monkeypatch):
     monkeypatch.setattr(headset, "CLIENT", tmp_path)
-    assert headset_contents([LINK], []) == {}  # it has not been built
+    assert headset_contents() == {}  # it has not been built
     (tmp_path / "built").mkdir()
     for name in ("index.html", "style.css", "built/client.js", "built/licences.txt"):
         (tmp_path / name).write_text(name, "utf-8")
-    contents = headset_contents([LINK, FINGER], [TABLE], task="show it")
+    contents = headset_contents() | headset_data([LINK, FINGER], [TABLE], task="show it")
     told = json.loads(contents["/xr/scene.json"].body)
     assert told["task"] == "show it"
     link, finger = told["bodies"]

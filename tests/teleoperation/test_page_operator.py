@@ -11,7 +11,7 @@ from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig, gizmo_nullspace_input
 from hrc_learn.teleoperation.page import PageHuman
-from hrc_learn.teleoperation.page.page_operator import (
+from hrc_learn.teleoperation.page_operator import (
     AddedTurn,
     HeldGizmo,
     HeldGizmos,

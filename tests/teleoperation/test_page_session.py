@@ -19,7 +19,7 @@ from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.page import Page, PageConfig
-from hrc_learn.teleoperation.page.page_operator import HeldGizmo
+from hrc_learn.teleoperation.page_operator import HeldGizmo
 from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,

@@ -6,7 +6,7 @@ import numpy as np
 
 from hrc_learn.protocols import Feedback, Reason
 from hrc_learn.teleoperation.page import PageStatus
-from hrc_learn.teleoperation.page.panel import (
+from hrc_learn.teleoperation.panel import (
     can_do,
     feedback_html,
     interventions_html,

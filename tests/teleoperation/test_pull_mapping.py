@@ -18,7 +18,6 @@ from hrc_learn.teleoperation import (
     ScriptedPerturbation,
     force_to_nullspace_input,
 )
-from hrc_learn.teleoperation.devices import GamepadConfig
 from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
 from hrc_learn.teleoperation.page import PageConfig
 
@@ -36,7 +35,7 @@ def field_default(cls, name):
 def test_every_part_has_the_same_default():
     assert default_of(force_to_nullspace_input, "mapping") == DEFAULT_MAPPING
     assert field_default(CollaborationExperiment, "mapping") == DEFAULT_MAPPING
-    for forces in (InteractionForceConfig(), PageConfig().forces, GamepadConfig().forces):
+    for forces in (InteractionForceConfig(), PageConfig().forces):
         assert forces.mapping == DEFAULT_MAPPING
 
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.teleoperation.page.region_editor import (
+from hrc_learn.teleoperation.region_editor import (
     meet_box,
     meet_plane,
     region_over,

@@ -5,9 +5,8 @@ them: links, knobs and the end effector's gizmo.
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +15,14 @@ from jaxtyping import Float
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.page.meshes import body_meshes, body_shape
-from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
+from hrc_learn.teleoperation.headset import (
+    END_EFFECTOR_PARTS,
+    PEDESTAL,
+    body_meshes,
+    body_shape,
+    held_joint,
+)
+from hrc_learn.teleoperation.page_operator import AddedTurn, HeldGizmo, HeldGizmos
 from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
 # viser is imported when a page is opened, and not before.
@@ -59,18 +64,9 @@ def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 
 
 _KNOBS = (2, 4, 6)
 """Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
-_END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
-"""Bodies that move with the end effector, including the last link: dragging them guides it."""
 _PERSON = rgba(PERSON)[:3]
 
 
-PEDESTAL = Box(
-    name="pedestal",
-    centre=(-0.03, 0.0, -0.36),
-    half_size=(0.12, 0.12, 0.36),
-    colour=(0.30, 0.30, 0.32, 1.0),
-)
-"""Pedestal of the arm."""
 _TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
 """Opacity of the virtual twin."""
 
@@ -80,18 +76,6 @@ class _DrawnBody(NamedTuple):
 
     frame: FrameHandle
     meshes: Sequence[MeshHandle]
-
-
-def held_joint(body: Body) -> int | Literal["nothing"] | None:
-    """Joint that moves a link, from 1; None for bodies of the end effector.
-
-    Args:
-        body: Body, identified by its name.
-    """
-    if body.name in _END_EFFECTOR_PARTS:
-        return None
-    link = re.fullmatch(r"link([1-9]\d*)", body.name)
-    return int(link[1]) if link else "nothing"
 
 
 class PageScene:
@@ -120,7 +104,7 @@ class PageScene:
         # Objects that are carried have no twin: what matters is what can be held.
         self._copies = [
             self._draw("/twin", body)
-            if body.name.startswith("link") or body.name in _END_EFFECTOR_PARTS
+            if body.name.startswith("link") or body.name in END_EFFECTOR_PARTS
             else None
             for body in bodies
         ]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Box, quaternion
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.page.page_scene import (
+from hrc_learn.teleoperation.page_scene import (
     SceneClickEvent,
     SceneRectSelectEvent,
     ViserServer,

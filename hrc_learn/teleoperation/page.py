@@ -22,7 +22,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
-from hrc_learn.teleoperation.devices import RumbleConfig, rumble_strength
+from hrc_learn.teleoperation.devices import OPEN, rumble_strength
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Control, Gate
 from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.control import Link
@@ -35,27 +35,24 @@ from hrc_learn.teleoperation.gate.messages import (
     TrackedHand,
 )
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, steering_twist
-from hrc_learn.teleoperation.page.headset import (
-    HeadsetHands,
-    headset_contents,
-    headset_data,
-    scene_state,
-)
-from hrc_learn.teleoperation.page.page_operator import (
+from hrc_learn.teleoperation.headset import headset_contents, headset_data, scene_state
+from hrc_learn.teleoperation.page_operator import (
     AddedTurn,
     GizmoCommand,
+    HeadsetHands,
     HeldGizmo,
     HeldGizmos,
-    PageHuman,
     gizmo_command,
 )
-from hrc_learn.teleoperation.page.page_scene import Gizmos, PageScene
-from hrc_learn.teleoperation.page.page_sockets import (
+from hrc_learn.teleoperation.page_operator import PageHuman as PageHuman
+from hrc_learn.teleoperation.page_scene import Gizmos, PageScene
+from hrc_learn.teleoperation.page_sockets import (
     PageSockets,
     guarded_viser,
     page_contents,
 )
-from hrc_learn.teleoperation.page.panel import OPEN, PageStatus, Panel, felt_words
+from hrc_learn.teleoperation.panel import PageStatus as PageStatus
+from hrc_learn.teleoperation.panel import Panel, felt_words
 from hrc_learn.viz.palette import followed_colour
 
 
@@ -100,7 +97,6 @@ class PageConfig(AddressConfig):
 
 # Between touched points: 1 cm off at 10 cm turns the arm by 6 degrees [m].
 _APART = 0.1
-_PULSES = RumbleConfig()  # a headset's controllers shake as a gamepad does
 _SLOW = 0.25  # round trip from which drags visibly lag [s]
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 _MOST_FAILURES = 25
@@ -442,7 +438,7 @@ class Page:
             "task": self.task,
             "pushed": feedback.pushed,
             "followed": round(feedback.followed, 3),
-            "pulse": rumble_strength(feedback, _PULSES),
+            "pulse": rumble_strength(feedback),  # controllers shake as a gamepad
             "reasons": [reason.text for reason in feedback.reasons],
             "felt": felt_words(feedback),
             "sent": self._asked,

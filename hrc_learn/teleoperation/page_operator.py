@@ -1,10 +1,10 @@
-"""People at the page as one `Human`: the gizmos that they hold, and their combined input."""
+"""People at the page as one `Human`: what they hold by mouse or hand, and their input."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Hashable
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass, replace
 from threading import Lock
 
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput, Request
+from hrc_learn.teleoperation.gate.messages import Grip, Hands, MessageError, TrackedHand
 from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
     bounded,
@@ -161,6 +162,92 @@ class AddedTurn:
             return None
         x, y, z = quaternion.log(turn).tolist()
         return x, y, z
+
+
+_HOLDER = "headset"
+_AT_REST = np.array([1.0, 0.0, 0.0, 0.0])  # unit quaternion (wxyz)
+
+
+class HeadsetHands:
+    """Turns what two hands hold into held gizmos, by the rules of the mouse.
+
+    A message names all that is held; what an earlier one named and this one does not is let go.
+    """
+
+    def __init__(
+        self,
+        held: HeldGizmos,
+        turn: AddedTurn,
+        links: Callable[[], Pose | None],
+        *,
+        guides: bool,
+    ):
+        """Start with empty hands.
+
+        Args:
+            held: Record of held gizmos.
+            turn: Rotation that a hand adds to the end effector's orientation.
+            links: Frames of the arm as they are now; None before the arm is known.
+            guides: True if the end effector can be held.
+        """
+        self._held, self._turn, self._links, self._guides = held, turn, links, guides
+        self._grips: dict[str, Grip] = {}
+        self._tracked: Mapping[str, TrackedHand] = {}
+        self._noted = False
+
+    @property
+    def tracked(self) -> Mapping[str, TrackedHand]:
+        """Tracked hands that are visible now, by name."""
+        return self._tracked
+
+    def hear(self, hands: Hands) -> None:
+        """Take a message over.
+
+        Raises:
+            MessageError: It holds a joint that the arm does not have.
+        """
+        self._tracked = {seen.hand: seen for seen in hands.tracked}
+        links = self._links()
+        if links is None:
+            return
+        now = {
+            grip.hand: grip for grip in hands.grips if self._guides or grip.joint is not None
+        }
+        if not self._noted:
+            self._grips, self._noted = now, True
+        for hand in self._grips.keys() - now.keys():
+            self._held.release(_HOLDER, hand)
+            self._turn.release((_HOLDER, hand))
+        for hand, grip in now.items():
+            before = self._grips.get(hand)
+            if before is None or (before.joint, before.start) != (grip.joint, grip.start):
+                self._take(grip, links)
+            else:
+                self._held.move(_HOLDER, hand, np.array(grip.pointer))
+            if grip.joint is None and grip.orientation is not None:
+                self._turn.move((_HOLDER, hand), np.array(grip.orientation))
+        self._grips = now
+
+    def forget(self) -> None:
+        """Forget the hands when control changes; held gizmos move nothing until they are taken
+        again.
+        """
+        self._noted, self._tracked = False, {}
+
+    def _take(self, grip: Grip, links: Pose) -> None:
+        start = torch.tensor(grip.start, dtype=torch.float64)
+        if grip.joint is None:
+            held_at = start - links[-1].position
+            if grip.orientation is not None:
+                self._turn.take((_HOLDER, grip.hand), _AT_REST)
+        elif grip.joint < len(links.position):
+            held_at = links[grip.joint - 1].inverse().apply(start)
+        else:
+            raise MessageError(f"the arm has no joint {grip.joint}")
+        gizmo = HeldGizmo(
+            joint=grip.joint, held_at=held_at.numpy(), pointer=np.array(grip.pointer)
+        )
+        self._held.take(_HOLDER, grip.hand, gizmo)
 
 
 class PageHuman(Human):

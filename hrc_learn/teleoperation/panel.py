@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Feedback, Request
-from hrc_learn.teleoperation.devices import DIRECTIONS, KeyboardState
+from hrc_learn.teleoperation.devices import DIRECTIONS, OPEN, KeyboardState
 from hrc_learn.teleoperation.gate.messages import Gripper, Message, Region, Target, Task
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
-from hrc_learn.teleoperation.page.page_operator import AddedTurn
-from hrc_learn.teleoperation.page.page_scene import ViserServer, in_loop
-from hrc_learn.teleoperation.page.region_editor import RegionEditor
+from hrc_learn.teleoperation.page_operator import AddedTurn
+from hrc_learn.teleoperation.page_scene import ViserServer, in_loop
+from hrc_learn.teleoperation.region_editor import RegionEditor
 from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed_colour
 
 
@@ -217,9 +217,6 @@ def _turn_words(turn: tuple[float, float, float] | None) -> str:
 
 LONGEST_TEXT = 200
 """Characters that a text typed on the page may have."""
-
-OPEN = 0.08
-"""Width of the open gripper [m]."""
 
 _ICONS: dict[str, Any] = {"start": "player-record", "stop": "player-stop"}
 _MAPPINGS = {"velocity (paper's)": "pinv", "spring": "transpose"}

@@ -1,0 +1,257 @@
+"""Scene of the page for browsers: meshes of bodies, and the files and state of the headset
+client.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hrc_learn.geometry import Body, Box, Capsule, Pose, read_mesh
+from hrc_learn.geometry.shapes import Colour
+from hrc_learn.protocols import DrawnRegion
+from hrc_learn.teleoperation.gate import Content
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh as Trimesh
+else:
+    Trimesh = Any
+
+END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
+"""Bodies that move with the end effector, including the last link: dragging them guides it."""
+
+
+PEDESTAL = Box(
+    name="pedestal",
+    centre=(-0.03, 0.0, -0.36),
+    half_size=(0.12, 0.12, 0.36),
+    colour=(0.30, 0.30, 0.32, 1.0),
+)
+"""Pedestal of the arm."""
+
+_TRIANGLES = 1500
+"""Most triangles for each colour of a body. The Panda then has 29,000 rather than 135,000, and
+a browser without a graphics processor draws it in half the time.
+"""
+_AGGRESSION = 5
+"""Aggression of fast-simplification, 0 to 10. At the triangles above, 99 % of the Panda's
+surfaces stay within 1 mm, sockets of cables within 8 mm; at 7, its default, within 3 mm.
+"""
+
+_OFF = 0.002
+"""Farthest that simplifying may move a side of the box around a mesh [m]. Of the UR5e and the
+Sawyer it would take away whole parts: such meshes stay as they are."""
+
+
+CLIENT = Path(__file__).parent / "xr_client"
+"""Sources of the client for headsets and phones; what is built of them lies in `built`."""
+BUILD = "make xr"
+"""Builds it."""
+
+
+def scene_state(
+    positions: Float[np.ndarray, "bodies 3"],
+    orientations: Float[np.ndarray, "bodies 4"],
+    links: Pose,
+    arrows: Float[np.ndarray, "arrows 2 3"],
+    colour: str,
+    followed: DrawnRegion | None,
+    drawn: DrawnRegion | None,
+    active: bool,
+    plan: Float[np.ndarray, "points 3"] | None = None,
+) -> dict[str, Any]:
+    """Poses and regions of the scene, for a client that renders it itself.
+
+    Args:
+        positions: Positions of the bodies [m].
+        orientations: Orientations of the bodies (wxyz).
+        links: Frames of the arm; the last is the tool's.
+        arrows: Arrows from the points held to the pointers [m].
+        colour: Colour of the arrows, which shows how far the arm follows.
+        followed: Region to which a controller takes the end effector.
+        drawn: Region that the person draws.
+        active: True if the drawn region attracts the end effector.
+        plan: Planned path of the end effector [m]; None: there is none.
+    """
+    return {
+        "bodies": np.concatenate([positions, orientations], axis=1).round(6).tolist(),
+        "links": links.position.numpy().round(6).tolist(),
+        "tool": links[-1].orientation.numpy().round(6).tolist(),
+        "arrows": arrows.round(6).tolist(),
+        "colour": colour,
+        "followed": None if followed is None else vars(followed),
+        "drawn": None if drawn is None else vars(drawn),
+        "active": active,
+        "plan": [] if plan is None else plan.round(4).tolist(),
+    }
+
+
+def held_joint(body: Body) -> int | Literal["nothing"] | None:
+    """Joint that moves a link, from 1; None for bodies of the end effector.
+
+    Args:
+        body: Body, identified by its name.
+    """
+    if body.name in END_EFFECTOR_PARTS:
+        return None
+    link = re.fullmatch(r"link([1-9]\d*)", body.name)
+    return int(link[1]) if link else "nothing"
+
+
+def headset_contents() -> dict[str, Content]:
+    """Public files of the headset client by path; empty if it has not been built."""
+    built = CLIENT / "built"
+    if not (built / "client.js").is_file():
+        return {}
+    files = {
+        "/xr": CLIENT / "index.html",
+        "/xr/style.css": CLIENT / "style.css",
+        "/xr/client.js": built / "client.js",
+        "/xr/licences.txt": built / "licences.txt",
+    }
+    return {path: Content.of(file.name, file.read_bytes()) for path, file in files.items()}
+
+
+def headset_data(
+    bodies: Sequence[Body], boxes: Sequence[Box], **more: Any
+) -> dict[str, Content]:
+    """Scene for the headset client by path, for clients with the secret.
+
+    Args:
+        bodies: Moving bodies.
+        boxes: Fixed boxes.
+        more: Further entries of the description, such as the page's features.
+    """
+    made = {
+        "scene.glb": scene_glb(bodies, [*boxes, PEDESTAL]),
+        "scene.json": json.dumps({"bodies": [*map(_held, bodies)], **more}).encode(),
+    }
+    return {f"/xr/{name}": Content.of(name, body) for name, body in made.items()}
+
+
+def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
+    """All shapes as one binary glTF file, each in the frame of its body.
+
+    Nodes are named `body<index>_<colour number>`, or `stands_<number>` for fixed ones.
+
+    Args:
+        bodies: Moving bodies; their poses are sent as they change.
+        boxes: Fixed boxes, in the base frame.
+    """
+    import trimesh
+    from trimesh.visual.material import PBRMaterial
+
+    scene = trimesh.Scene()
+
+    def add(name: str, mesh: Trimesh, colour: Colour) -> None:
+        material = PBRMaterial(
+            baseColorFactor=[round(255 * channel) for channel in colour],
+            metallicFactor=0.0,
+            roughnessFactor=0.75,
+            alphaMode="OPAQUE" if colour[3] >= 1 else "BLEND",
+        )
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+
+    for k, body in enumerate(bodies):
+        for c, (colour, mesh) in enumerate(body_meshes(body).items()):
+            add(f"body{k}_{c}", mesh, colour)
+    for colour in dict.fromkeys(box.colour for box in boxes):
+        parts = [box_mesh(box) for box in boxes if box.colour == colour]
+        add(f"stands_{len(scene.geometry)}", _joined(parts), colour)
+    return trimesh.exchange.gltf.export_glb(scene, include_normals=True)
+
+
+def _held(body: Body) -> dict[str, Any]:
+    """Name, joint and capsules of a body, for picking it."""
+    capsules = [[*c.start, *c.end, c.radius] for c in body.capsules]
+    # A box is held as the ball around it.
+    capsules += [
+        [*box.centre, *box.centre, float(np.linalg.norm(box.half_size))] for box in body.boxes
+    ]
+    return {"name": body.name, "joint": held_joint(body), "capsules": capsules}
+
+
+def capsule_mesh(capsule: Capsule, segments: int = 20) -> Trimesh:
+    """A cylinder with round ends, of so many segments around and along it."""
+    import trimesh
+
+    start, end = np.array(capsule.start), np.array(capsule.end)
+    length = float(np.linalg.norm(end - start))
+    mesh = trimesh.creation.capsule(
+        height=length, radius=capsule.radius, count=(segments, segments)
+    )
+    if length > 0:
+        mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], end - start))
+    mesh.apply_translation((start + end) / 2)
+    return mesh
+
+
+def box_mesh(box: Box) -> Trimesh:
+    """A box along the axes of its body; every face has corners of its own, for sharp edges."""
+    import trimesh
+
+    mesh = trimesh.creation.box(extents=2 * np.array(box.half_size))
+    mesh.unmerge_vertices()
+    mesh.apply_translation(box.centre)
+    return mesh
+
+
+def body_meshes(body: Body) -> dict[Colour, Trimesh]:
+    """All that a body looks like, one mesh for each colour: its own meshes, simplified, and the
+    boxes with a name, or else its capsules and boxes in the colour of the first.
+    """
+    if not body.meshes:
+        shapes = [*map(capsule_mesh, body.capsules), *map(box_mesh, body.boxes)]
+        return {(*body.capsules, *body.boxes)[0].colour: _joined(shapes)}
+    parts: dict[Colour, list[Trimesh]] = {}
+    for file in body.meshes:
+        for part in (part.placed(file) for part in read_mesh(file.path)):
+            assert part.colour is not None  # a placed part has one
+            parts.setdefault(part.colour, []).append(_mesh(part.vertices, part.faces))
+    for box in body.boxes:
+        if box.name:
+            parts.setdefault(box.colour, []).append(box_mesh(box))
+    return {colour: simplified(_joined(meshes)) for colour, meshes in parts.items()}
+
+
+def body_shape(body: Body) -> Trimesh:
+    """Shape of a body as one mesh, for drawing it in one colour."""
+    return simplified(_joined([*body_meshes(body).values()]))
+
+
+def simplified(mesh: Trimesh) -> Trimesh:
+    """The same surface, nearly, of as few triangles as a browser draws quickly.
+
+    A mesh that would lose whole parts comes back as it is.
+    """
+    if len(mesh.faces) <= _TRIANGLES:
+        return mesh
+    shape = mesh.copy()
+    shape.merge_vertices(merge_norm=True)  # or edges with two normals would tear
+    shape.update_faces(shape.nondegenerate_faces())
+    few = shape.simplify_quadric_decimation(face_count=_TRIANGLES, aggression=_AGGRESSION)
+    if np.abs(few.bounds - shape.bounds).max() > _OFF:
+        return mesh
+    return few
+
+
+def _mesh(
+    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Trimesh:
+    import trimesh
+
+    # Corners are not merged: edges that have corners of their own stay sharp.
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _joined(meshes: Sequence[Trimesh]) -> Trimesh:
+    import trimesh
+
+    return trimesh.util.concatenate(list(meshes))
