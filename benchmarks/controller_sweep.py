@@ -33,7 +33,7 @@ from hrc_learn import cli
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.store import new_file, new_folder, write_json
 from hrc_learn.viz import palette
-from hrc_learn.viz.figure_parts import STYLE, WIDTH
+from hrc_learn.viz.figures import STYLE, WIDTH
 
 CHUNK = 250
 """Trials in one batch: their tensors stay in the cache."""

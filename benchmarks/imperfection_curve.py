@@ -20,7 +20,7 @@ from hrc_learn.experiments.metric_table import Summary, wilson_interval
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.store import write_json
 from hrc_learn.viz import palette
-from hrc_learn.viz.figure_parts import STYLE, WIDTH
+from hrc_learn.viz.figures import STYLE, WIDTH
 
 SHOWN = {
     "placing": ("place_error_mm", "place_tilt_deg"),

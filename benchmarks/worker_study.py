@@ -49,7 +49,7 @@ from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_file, new_folder, write_json
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.viz import palette
-from hrc_learn.viz.figure_parts import STYLE, WIDTH
+from hrc_learn.viz.figures import STYLE, WIDTH
 
 Mode = Literal["none", "expert", "automatic", "both"]
 MODES: tuple[Mode, ...] = ("none", "expert", "automatic", "both")

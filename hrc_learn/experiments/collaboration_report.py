@@ -13,18 +13,20 @@ from matplotlib.figure import Figure
 from hrc_learn.experiments.collaboration_trial import CollaborationRun
 from hrc_learn.log import Event, RunRecording
 from hrc_learn.viz import palette
-from hrc_learn.viz.figure_parts import (
+from hrc_learn.viz.figures import (
     STYLE,
     WIDTH,
     active_intervals,
     draw_box,
     finite_span,
     frame_space,
+    image_jacobian_figure,
+    joints_figure,
     near,
     needed,
+    person_figure,
     space,
 )
-from hrc_learn.viz.figures import image_jacobian_figure, joints_figure, person_figure
 from hrc_learn.viz.report import Picture, Section
 
 Spans = Mapping[str, tuple[float, float]]

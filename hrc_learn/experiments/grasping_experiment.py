@@ -30,8 +30,17 @@ from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.teleoperation import DrawnInterval
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz import palette
-from hrc_learn.viz.figure_parts import STYLE, WIDTH, draw_box, frame_space, near, needed, space
-from hrc_learn.viz.figures import image_jacobian_figure, joints_figure
+from hrc_learn.viz.figures import (
+    STYLE,
+    WIDTH,
+    draw_box,
+    frame_space,
+    image_jacobian_figure,
+    joints_figure,
+    near,
+    needed,
+    space,
+)
 from hrc_learn.viz.report import Picture, Section
 
 

@@ -43,8 +43,17 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, PlanningSpace
 from hrc_learn.store import read_made_by
 from hrc_learn.viz import palette
-from hrc_learn.viz.figure_parts import STYLE, WIDTH, draw_box, frame_space, near, space
-from hrc_learn.viz.figures import JointCurves, demonstrated_joints, joint_grid_figure
+from hrc_learn.viz.figures import (
+    STYLE,
+    WIDTH,
+    JointCurves,
+    demonstrated_joints,
+    draw_box,
+    frame_space,
+    joint_grid_figure,
+    near,
+    space,
+)
 from hrc_learn.viz.report import Picture, Section
 
 _COLOURS = (palette.ORANGE, palette.BLUE, palette.PURPLE, palette.GREEN)

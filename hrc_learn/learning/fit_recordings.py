@@ -14,6 +14,7 @@ from hrc_learn.kinematics.franka import panda_bodies
 from hrc_learn.learning.primitive_fitting import FittedPrimitives
 from hrc_learn.learning.visual_servo_fitting import Demonstrations, feature_trajectories
 from hrc_learn.log import JointRanges
+from hrc_learn.log.recordings import Seen
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
@@ -23,7 +24,6 @@ from hrc_learn.viz import (
     LearningRecording,
 )
 from hrc_learn.viz.figures import fit_joints_figure, residual_figure, seen_figure
-from hrc_learn.viz.recordings import Seen
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, software_versions
 
 

@@ -106,12 +106,6 @@ class StepLog(LoggedSteps):
         log = StepLog()
         log.append(time=t, joint_position=q, feature=x, pushed=True)
         log["joint_position"]      # (T, 7)
-
-    The fastest way is a prepared row, whose fields are written in place where they arise:
-
-        row = log.prepare(joint_position=q, feature=x)
-        row["joint_position"][:] = q
-        log.append_row(row)
     """
 
     def __init__(self, block: int = 8192):
@@ -159,24 +153,6 @@ class StepLog(LoggedSteps):
             raise self._mismatch(values) from error
         if len(values) != len(self._columns):
             raise self._mismatch(values)
-        self._length += 1
-
-    def prepare(self, **examples: Value) -> np.ndarray:
-        """Row with example values, to be filled in place and passed to `append_row`."""
-        if self._dtype is None:
-            self._open(examples)
-        elif set(examples) != set(self.names):
-            raise self._mismatch(examples)
-        row = np.zeros((), dtype=self._dtype)
-        for name, value in examples.items():
-            row[name] = value
-        return row
-
-    def append_row(self, row: np.ndarray) -> None:
-        """Add a copy of a row made by `prepare`."""
-        if self._length - self._first == self._block:
-            self._extend()
-        self._blocks[-1][self._length - self._first] = row
         self._length += 1
 
     def event(self, time: float, text: str) -> None:

@@ -13,6 +13,14 @@ import rerun as rr
 import rerun.blueprint as rrb
 from jaxtyping import Float
 
+from hrc_learn.log.recordings import (
+    DemonstrationsRecording,
+    DemonstrationTrace,
+    ErrorMap,
+    FitRecording,
+    LearningRecording,
+    Seen,
+)
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import (
     Curves,
@@ -24,14 +32,6 @@ from hrc_learn.viz.panels import (
     several,
     single,
     slug,
-)
-from hrc_learn.viz.recordings import (
-    DemonstrationsRecording,
-    DemonstrationTrace,
-    ErrorMap,
-    FitRecording,
-    LearningRecording,
-    Seen,
 )
 from hrc_learn.viz.rerun_stream import (
     StaticShapes,

@@ -32,27 +32,6 @@ def test_whole_first_values_do_not_cut_later_ones():
     assert log["joint"][1].tolist() == [0.5, 1.5]
 
 
-def test_a_prepared_row_is_copied_at_every_step():
-    log = StepLog(block=4)
-    row = log.prepare(time=0.0, joint=np.zeros(7))
-    joint = row["joint"]
-    for k in range(10):
-        row["time"] = k
-        joint[:] = 2 * k
-        log.append_row(row)
-    assert log["time"].tolist() == list(range(10))
-    assert log["joint"][:, 6].tolist() == list(range(0, 20, 2))
-
-
-def test_prepared_and_plain_rows_share_columns():
-    log = filled(3)
-    row = log.prepare(pushed=True, time=9.0, joint=np.ones(7), J=np.ones((2, 6)))
-    log.append_row(row)
-    assert log["time"].tolist() == [0, 1 / 125, 2 / 125, 9.0]
-    with pytest.raises(ValueError, match="joint is missing"):
-        log.prepare(time=0.0, J=np.zeros((2, 6)), pushed=False)
-
-
 @pytest.mark.parametrize("steps", [1, 8, 17])
 def test_columns_can_be_added_to_what_was_logged(steps, tmp_path):
     log = filled(steps, block=8)

@@ -10,7 +10,7 @@ from sample_runs import NAMES, STEPS, sample_fit, sample_run
 
 from hrc_learn.geometry import Box
 from hrc_learn.viz import figures
-from hrc_learn.viz.figure_parts import active_intervals, draw_limits, near
+from hrc_learn.viz.figures import active_intervals, draw_limits, near
 
 RUN_FIGURES = [
     figures.joints_figure,

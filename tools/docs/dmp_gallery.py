@@ -14,7 +14,7 @@ from dmp_pictures.drawing import Picture
 from matplotlib.figure import Figure
 
 from hrc_learn import cli
-from hrc_learn.viz.figure_parts import STYLE, WIDTH
+from hrc_learn.viz.figures import STYLE, WIDTH
 
 DPI = 120
 PICTURES: dict[str, tuple[Picture, float]] = {

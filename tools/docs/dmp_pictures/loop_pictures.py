@@ -17,7 +17,7 @@ from hrc_learn.dmp.coupling import (
     velocity_coupling,
 )
 from hrc_learn.viz import palette
-from hrc_learn.viz.figure_parts import shade
+from hrc_learn.viz.figures import shade
 
 from . import demonstrations
 from .drawing import DEMO, ends, panels, plane

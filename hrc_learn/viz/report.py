@@ -1,7 +1,9 @@
-"""Reports as files: one self-contained HTML page, and the folder of a run.
+"""Reports of runs: the folder of a run, and one self-contained HTML page about one or several.
 
-The page has no external script, font or picture: it can be mailed, printed, and read offline.
-The folder is read again to compare runs.
+A program fills a `Report`; `write_report` writes `report.json`, pictures, `film.mp4` and
+`report.html` to the folder of the run. `read_report` reads them again, and `reports_page` shows
+several on one page. The page has no external script, font or picture: it can be mailed,
+printed, and read offline.
 """
 
 import base64
@@ -17,15 +19,16 @@ from typing import Literal
 from urllib.parse import quote
 
 from hrc_learn.store import new_file, read_json, write_json
-from hrc_learn.viz.report.content import (
-    Film,
-    Measurement,
-    Picture,
-    Report,
-    Section,
-    flatten,
-    leading,
-)
+from hrc_learn.viz.report_content import Film as Film
+from hrc_learn.viz.report_content import Measurement as Measurement
+from hrc_learn.viz.report_content import Picture as Picture
+from hrc_learn.viz.report_content import Report as Report
+from hrc_learn.viz.report_content import Section as Section
+from hrc_learn.viz.report_content import flatten as flatten
+from hrc_learn.viz.report_content import leading as leading
+from hrc_learn.viz.report_content import show_command as show_command
+from hrc_learn.viz.report_content import show_measurements as show_measurements
+from hrc_learn.viz.report_content import software_versions as software_versions
 
 
 def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = ()) -> str:
@@ -56,7 +59,7 @@ def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = 
         )
         overview = f'<table class="overview"><tbody>{overview}</tbody></table>'
         body = "\n".join([heading, overview, _side_by_side(reports), *articles])
-    style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
+    style = files(__package__).joinpath("report.css").read_text(encoding="utf-8")
     return _PAGE.format(title=escape(title), style=style, body=body)
 
 
@@ -278,7 +281,7 @@ class _ReportFile:
 def write_report(folder: str | os.PathLike[str], report: Report) -> None:
     """Write `report.json`, pictures, `film.mp4` and the self-contained `report.html`.
 
-    Pictures are `figures/*.png`, and `*.svg` linkeds where they are figures of few lines.
+    Pictures are `figures/*.png`, and `*.svg` beside figures of few lines.
 
     Args:
         folder: Folder of the run. Each file appears only when complete, `report.json` last.
