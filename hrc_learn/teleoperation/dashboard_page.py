@@ -81,7 +81,8 @@ def serve_recordings(files: Sequence[Path], port: int | None = None) -> Iterator
         files: Recordings (`.rrd`).
         port: Port of the page; None: the first free one from 8080 on.
     """
-    with _served(port, lambda: [file.read_bytes() for file in files]) as url:
+    parts = [file.read_bytes() for file in files]
+    with _served(port, lambda: parts) as url:
         yield url
 
 

@@ -71,6 +71,10 @@ class CombinedInput(Human):
             source.tell(feedback)
 
 
+_ELBOW = 4
+"""Joint whose origin a `LinkGuide` pulls, counted from 1."""
+
+
 class LinkGuide(Human):
     """Pulls a link in the null space with a device that otherwise guides the end effector.
 
@@ -82,28 +86,21 @@ class LinkGuide(Human):
         self,
         human: Human,
         chain: SerialChain,
-        joint: int = 4,
-        config: InteractionForceConfig | None = None,
     ):
         """Take a device.
 
         Args:
-            human: The device, with speeds of the same `config`.
+            human: The device.
             chain: The arm.
-            joint: Whose origin is pulled, counted from 1; the elbow by default.
-            config: Largest speed and force.
         """
-        self._human, self._chain, self._joint = human, chain, joint
-        self._config = config or InteractionForceConfig()
+        self._human, self._chain, self._config = human, chain, InteractionForceConfig()
 
     def read(self, state: ArmState) -> HumanInput:
         """The null-space input now."""
         asked, config = self._human.read(state), self._config
         # As a gizmo's displacement, whose largest force and speed are those of the device.
         force = capped(config.max_force / config.speed * asked.twist[:3], config.max_force)
-        d = pull_to_nullspace_input(
-            self._chain, state.joint_position, self._joint, force, config
-        )
+        d = pull_to_nullspace_input(self._chain, state.joint_position, _ELBOW, force, config)
         return replace(
             asked,
             nullspace_input=bounded(asked.effort(len(d)) + d, config.max_nullspace_input),

@@ -25,7 +25,6 @@ from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.teleoperation.devices import OPEN, rumble_strength
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Control, Gate
 from hrc_learn.teleoperation.gate.admission import RefusedError
-from hrc_learn.teleoperation.gate.control import Link
 from hrc_learn.teleoperation.gate.messages import (
     Ask,
     GuiUpdate,
@@ -97,7 +96,6 @@ class PageConfig(AddressConfig):
 
 # Between touched points: 1 cm off at 10 cm turns the arm by 6 degrees [m].
 _APART = 0.1
-_SLOW = 0.25  # round trip from which drags visibly lag [s]
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 _MOST_FAILURES = 25
 """Refreshes in a row that may fail before the page ends: one second of them. Each failure asks
@@ -426,7 +424,7 @@ class Page:
         if self._error is not None:
             words = "The page does not follow the arm any more: see the terminal."
         else:
-            words = slow_words(self.control.link, self._config)
+            words = slow_words(*self.control.slow, self._config)
         feedback, status = self.human.feedback, self._status
         return {
             "words": words,
@@ -445,29 +443,24 @@ class Page:
         }
 
 
-def slow_words(link: Link, config: PageConfig) -> str:
-    """Why a drag is followed late or not at all; empty if it is followed at once.
+def slow_words(silence: float, lag: float, config: PageConfig) -> str:
+    """Why a drag is not followed; empty if it is.
 
     Args:
-        link: The leader's connection.
+        silence: Time for which nothing was heard of the leader [s].
+        lag: Time for which its page did not react [s].
         config: Settings of the page.
     """
-    if link.lag > config.timeout / 2:
+    if lag > config.timeout / 2:
         return (
-            f"This browser was busy for {link.lag:.1f} s: beyond {config.timeout:.1f} s the "
+            f"This browser was busy for {lag:.1f} s: beyond {config.timeout:.1f} s the "
             "arm lets go. Make its window smaller, hide the virtual twin, or put ?fixedDpr=0.5 "
             "behind the page's address, which draws a quarter of the pixels."
         )
-    if link.silence > config.silence:
+    if silence > config.silence:
         return (
-            f"The link is slow: nothing was heard of this browser for {link.silence:.2f} s, "
-            f"and beyond {config.silence:.2f} s the arm waits. There and back takes up to "
-            f"{1e3 * link.delay:.0f} ms."
-        )
-    if link.delay > _SLOW:
-        return (
-            f"The link is slow: there and back takes {1e3 * link.delay:.0f} ms, and the arm "
-            "follows a drag that much later."
+            f"The link is slow: nothing was heard of this browser for {silence:.2f} s, "
+            f"and beyond {config.silence:.2f} s the arm waits."
         )
     return ""
 

@@ -33,7 +33,7 @@ from hrc_learn.viz.palette import GREEN, rgba
 
 # Of the fields drawn on the boards [m]: thin, but thick enough not to flicker with the board.
 _THICKNESS = 0.002
-# Control steps between two statuses of a job: ten times a second at 10 ms.
+# Control steps between two statuses on the page: ten times a second at 10 ms.
 _SHOW_EVERY = 10
 # Distance of postures checked for contacts along a path: 0.05 rad, 5 cm at 1 m reach.
 _LOOK = 0.05
@@ -115,12 +115,10 @@ class PageSessionConfig:
     """Bounds on the acceleration of the end effector."""
     record_every: int = 2
     """Control steps from one recorded frame to the next."""
-    show_every: int = 10
-    """Control steps from one status shown on the page to the next."""
 
     def __post_init__(self) -> None:
-        if self.record_every < 1 or self.show_every < 1:
-            raise ValueError("record_every and show_every must be at least 1.")
+        if self.record_every < 1:
+            raise ValueError(f"record_every must be at least 1, but is {self.record_every}.")
 
     @property
     def fps(self) -> float:
@@ -197,7 +195,7 @@ class PageSession:
         for request in step.human_input.requests:
             self._remark = ""
             self._handle(request)
-        if self._ticks % self._config.show_every == 0:
+        if self._ticks % _SHOW_EVERY == 0:
             self._page.show(self._status(step))
         self._ticks += 1
         return step

@@ -99,7 +99,7 @@ class PageSockets:
                 content: dict[str, Any] = {}
                 if now >= due:
                     due, view = now + _STATUS_EVERY, vars(self._control.view(visitor.client))
-                    content = {"status": {**self._status(), **view}, "clock": now}
+                    content = {"status": {**self._status(), **view}}
                     pause = _SCENE_EVERY[view["role"]] if wants_scene else _STATUS_EVERY
                 if wants_scene and (scene := self.scene) is not last:
                     last, content["scene"] = scene, scene
@@ -115,9 +115,8 @@ class PageSockets:
 
     def _hear(self, client: str, message: Message) -> None:
         match message:
-            case Beat(lag=lag, echo=echo):
-                delay = 0.0 if echo is None else max(time.monotonic() - echo, 0.0)
-                self._control.hear(client, lag, delay)
+            case Beat(lag=lag):
+                self._control.hear(client, lag)
             case Lead(wish="ask"):
                 self._control.ask(client)
             case Lead():

@@ -62,6 +62,14 @@ class Scenario(ABC):
         """True if the task is done."""
 
 
+_RELEASE = 1.5  # time for the fingers to open [s]
+_REACH = (0.10, 0.08, 0.0)  # largest distance of the object from the middle of the table [m]
+# Phases of a grasp: from above the table to the object, fingers, lift, rest [s].
+_APPROACH, _GRIP, _LIFT, _SETTLE = 4.0, 0.7, 2.0, 0.5
+_HEIGHT = 0.15  # to which the object is lifted [m]
+_TREMOR = 2e-4  # amplitude of the end effector's tremor while it grasps [m]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Placing(Scenario):
     """Put the object in the gripper on a shelf, and let go."""
@@ -71,8 +79,6 @@ class Placing(Scenario):
     demonstration: PlacingDemonstrationConfig = field(
         default_factory=PlacingDemonstrationConfig
     )
-    release: float = 1.5
-    """Time for the fingers to open [s]."""
 
     @property
     def task(self) -> str:
@@ -80,7 +86,7 @@ class Placing(Scenario):
 
     @property
     def duration(self) -> float:
-        return self._let_go + self.release
+        return self._let_go + _RELEASE
 
     @property
     def _let_go(self) -> float:
@@ -102,20 +108,6 @@ class Grasping(Scenario):
     """Take an object that lies at random on the table, and lift it."""
 
     workplace: Workplace = field(default_factory=Workplace)
-    reach: tuple[float, float, float] = (0.10, 0.08, 0.0)
-    """Largest distance of the object from the middle of the table [m]."""
-    approach: float = 4.0
-    """Duration of the approach, from above the middle of the table down to the object [s]."""
-    grip: float = 0.7
-    """Time for the fingers to close [s]."""
-    lift: float = 2.0
-    """Time to lift it [s]."""
-    height: float = 0.15
-    """Height to which the object is lifted [m]."""
-    settle: float = 0.5
-    """Rest at the end [s]."""
-    tremor: float = 2e-4
-    """Amplitude of the end effector's tremor [m]."""
 
     @property
     def task(self) -> str:
@@ -123,23 +115,23 @@ class Grasping(Scenario):
 
     @property
     def duration(self) -> float:
-        return self.approach + self.grip + self.lift + self.settle
+        return _APPROACH + _GRIP + _LIFT + _SETTLE
 
     def begin(self, world: World, rng: np.random.Generator) -> Human:
         item = self.workplace.scene.objects[0]
-        pose = self.workplace.random_object_pose(self.reach, rng)
+        pose = self.workplace.random_object_pose(_REACH, rng)
         # On the table as it is, of an object as tall as it is.
         pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
         hover = self.workplace.hover()
         joints = self.workplace.robot.inverse(hover, near=self.workplace.hover_joints())
         world.reset(joints.numpy(), {item.name: pose})
         grasp = pose[:3, 3]
-        above, lifted = (grasp + np.array([0.0, 0.0, h]) for h in (0.08, self.height))
-        closing = self.approach + self.grip
-        down = self._lead([hover.position.numpy(), above, grasp], self.approach, 0.0, rng)
-        up = self._lead([grasp, lifted], self.lift, closing, rng)
+        above, lifted = (grasp + np.array([0.0, 0.0, h]) for h in (0.08, _HEIGHT))
+        closing = _APPROACH + _GRIP
+        down = self._lead([hover.position.numpy(), above, grasp], _APPROACH, 0.0, rng)
+        up = self._lead([grasp, lifted], _LIFT, closing, rng)
         return SequencedInput(
-            [(0.0, down, OPEN), (self.approach, down, CLOSED), (closing, up, CLOSED)]
+            [(0.0, down, OPEN), (_APPROACH, down, CLOSED), (closing, up, CLOSED)]
         )
 
     def _lead(
@@ -148,14 +140,14 @@ class Grasping(Scenario):
         return ScriptedExpert(
             self.workplace.robot.chain,
             GuidedPath(np.vstack(points), duration, start),
-            tremor=Tremor(self.tremor, rng),
+            tremor=Tremor(_TREMOR, rng),
             orientation=lambda _position, _time: gripper_down(),
         )
 
     def succeeded(self, world: World) -> bool:
         item = self.workplace.scene.objects[0]
         bottom = world.object_pose(item.name)[2, 3] - max(item.half_size)
-        return world.holds(item.name) and bool(bottom > 0.5 * self.height)
+        return world.holds(item.name) and bool(bottom > 0.5 * _HEIGHT)
 
 
 class SequencedInput(Human):

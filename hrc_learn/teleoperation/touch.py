@@ -54,8 +54,6 @@ class TouchConfig:
     """Force at the hand from which on the task pauses [N]; half of it lets it go on."""
     released: float = 0.4
     """Time without a push at the end effector until the task resumes [s]."""
-    resumes: Literal["release", "push"] = "release"
-    """Event that resumes the task: release of the end effector, or a second push."""
     collision_rise: float = 30.0
     """Change of the force within `collision_time` that no hand makes [N]."""
     collision_time: float = 0.04
@@ -292,7 +290,7 @@ class Touch(Human):
         self._lately: list[tuple[float, np.ndarray]] = []
         self._fingers_moved = self._pushed = self._collided = self._let_go = -math.inf
         self._alone = 0.0
-        self._paused, self._expected, self._why = False, False, ""
+        self._expected, self._why = False, ""
 
     def tell(self, feedback: Feedback) -> None:
         """Learn whether the task feels its way."""
@@ -387,15 +385,9 @@ class Touch(Human):
 
     def _pauses(self, meets: bool) -> bool:
         """True while the task is paused."""
-        config, pushed = self._config, self.place == "hand" and not meets
-        again = pushed and self._time - self._pushed > config.released
-        if pushed:
+        if self.place == "hand" and not meets:
             self._pushed = self._time
-        if config.resumes == "push":
-            self._paused ^= again
-        else:
-            self._paused = self._time - self._pushed < config.released
-        return self._paused
+        return self._time - self._pushed < self._config.released
 
     def _watch_for_collision(
         self,

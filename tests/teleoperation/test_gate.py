@@ -19,7 +19,6 @@ from hrc_learn.teleoperation.gate.address import (
     tls_context,
 )
 from hrc_learn.teleoperation.gate.admission import Admission, Bucket, RefusedError
-from hrc_learn.teleoperation.gate.control import Link
 from hrc_learn.teleoperation.gate.messages import (
     Hands,
     MessageError,
@@ -76,22 +75,19 @@ def test_what_slowed_the_leader_down_is_told_for_a_while(control, clock):
     control.join("a")
     for _ in range(20):
         clock.time += 0.04
-        control.hear("a", delay=0.02)
-    assert slow_words(control.link, config) == ""
-    control.hear("a", delay=0.3)
-    assert "there and back takes 300 ms" in slow_words(control.link, config)
+        control.hear("a")
+    assert slow_words(*control.slow, config) == ""
     clock.time += 0.4
-    control.hear("a", delay=0.2)
-    assert "nothing was heard of this browser for 0.40 s" in slow_words(control.link, config)
-    assert "up to 300 ms" in slow_words(control.link, config)
+    control.hear("a")
+    assert "nothing was heard of this browser for 0.40 s" in slow_words(*control.slow, config)
     control.hear("a", lag=0.35)
-    assert "busy for 0.3" in slow_words(control.link, config)
+    assert "busy for 0.3" in slow_words(*control.slow, config)
     for _ in range(31):
         clock.time += 0.1
-        control.hear("a", delay=0.02)
-    assert slow_words(control.link, config) == ""
+        control.hear("a")
+    assert slow_words(*control.slow, config) == ""
     control.leave("a")
-    assert control.link == Link()
+    assert control.slow == (0.0, 0.0)
 
 
 def test_a_page_that_hangs_behind_a_worker_that_beats_is_gone(control):

@@ -227,18 +227,6 @@ def test_a_push_that_begins_like_one_at_the_elbow_turns_out_as_one_at_the_hand()
     assert elbow.max() < 0.01
 
 
-def test_a_push_may_pause_the_task_until_the_next_one():
-    pushes = [("hand", (0.0, 0.0, -20.0), start, 0.8) for start in (1.0, 3.0)]
-    _, cell, human = at_work(2, config=TouchConfig(resumes="push"), pushes=pushes[:1])
-    cell.hold_pose(2.5)
-    assert human.rows[-1][2]
-    assert human.rows[-1][1] == "nothing"
-    _, cell, human = at_work(2, config=TouchConfig(resumes="push"), pushes=pushes[1:])
-    cell.hold_pose(4.5)
-    assert human.rows[-1][2]
-    assert not human.rows[250][2]
-
-
 def test_a_collision_stops_the_arm_for_good():
     world, cell, _ = at_work(3, [("hand", (0.0, 70.0, 0.0), 1.0, 5.0, 0.02)])
     with pytest.raises(StoppedByPersonError, match=r"something has met the arm, with \d+ N"):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import RLock
@@ -27,20 +27,8 @@ class ControlView:
     """False for a client that may only watch."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Link:
-    """Connection quality of the controlling client over the last seconds."""
-
-    silence: float = 0.0
-    """Longest time without a sign of life [s]."""
-    delay: float = 0.0
-    """Longest round trip [s]."""
-    lag: float = 0.0
-    """Longest time that their page did not react [s]."""
-
-
 _REMEMBERED = 3.0
-"""Duration for which the cause of a slow browser is shown [s], enough to read a sentence."""
+"""Time for which the cause of a slow browser is shown [s], enough to read a sentence."""
 
 
 class Control:
@@ -81,7 +69,7 @@ class Control:
         self._clock = clock
         self._heard: dict[str, float] = {}
         self._lag: dict[str, float] = {}
-        self._links: dict[str, deque[tuple[float, Link]]] = {}
+        self._slow: dict[str, tuple[float, float, float]] = {}
         self._asking: dict[str, float] = {}
         self._able: set[str] = set()
         self._leader: str | None = None
@@ -92,7 +80,7 @@ class Control:
     def join(self, client: str, *, may_lead: bool = True) -> None:
         """Add a client. It gets control if no other client has it and it may lead."""
         with self._lock:
-            self._heard[client], self._links[client] = self._clock(), deque()
+            self._heard[client] = self._clock()
             if may_lead:
                 self._able.add(client)
                 if self._leader is None:
@@ -101,7 +89,7 @@ class Control:
     def leave(self, client: str) -> None:
         """Remove a client."""
         with self._lock:
-            for table in (self._heard, self._lag, self._links, self._asking):
+            for table in (self._heard, self._lag, self._slow, self._asking):
                 table.pop(client, None)
             self._able.discard(client)
             if client == self._leader:
@@ -110,24 +98,22 @@ class Control:
                 alone = next(iter(self._able)) if len(self._able) == 1 else None
                 self._give(min(self._asking, key=self._asking.__getitem__, default=alone))
 
-    def hear(self, client: str, lag: float = 0.0, delay: float = 0.0) -> None:
+    def hear(self, client: str, lag: float = 0.0) -> None:
         """Note a sign of life.
 
         Args:
-            client: Whose.
-            lag: Time since their page last responded [s]; its worker may run on when the page
+            client: Client that gives it.
+            lag: Time since its page last responded [s]; the worker may run on when the page
                 hangs.
-            delay: Round-trip time [s]; zero if it was not measured.
         """
         with self._lock:
             if client not in self._heard:
                 return
             now = self._clock()
-            silence, links = now - self._heard[client], self._links[client]
+            silence = now - self._heard[client]
             self._heard[client], self._lag[client] = now, lag
-            links.append((now, Link(silence=silence, delay=delay, lag=lag)))
-            while links[0][0] < now - _REMEMBERED:
-                links.popleft()
+            if silence > self._silence or lag > self._timeout / 2:
+                self._slow[client] = now, silence, lag
 
     def act(self, client: str, *, idle: bool = False) -> bool:
         """True if a client may act now.
@@ -192,18 +178,13 @@ class Control:
             return 0.0 if self._leader is None else self._lag.get(self._leader, 0.0)
 
     @property
-    def link(self) -> Link:
-        """The worst of the leader's connection in the last seconds."""
+    def slow(self) -> tuple[float, float]:
+        """Silence and lag of the controlling client that slowed it down lately [s]; zero if
+        nothing did.
+        """
         with self._lock:
-            since = self._clock() - _REMEMBERED
-            recent = [
-                link for time, link in self._links.get(self._leader or "", ()) if time > since
-            ]
-        return Link(
-            silence=max((link.silence for link in recent), default=0.0),
-            delay=max((link.delay for link in recent), default=0.0),
-            lag=max((link.lag for link in recent), default=0.0),
-        )
+            time, silence, lag = self._slow.get(self._leader or "", (-math.inf, 0.0, 0.0))
+            return (silence, lag) if self._clock() - time <= _REMEMBERED else (0.0, 0.0)
 
     @property
     def people(self) -> int:

@@ -49,8 +49,6 @@ class Beat(_Message, tag="beat"):
 
     lag: _Time
     """Time since the page last responded [s]."""
-    echo: _Time | None = None
-    """Last server time that the client received, returned at once to measure the round trip."""
 
 
 class Hello(_Message, tag="hello"):

@@ -8,18 +8,11 @@ self.onmessage = ({ data }) => {
   else if (data.send && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(data.send));
   else if (data.open) {
     socket = new WebSocket(data.open.url, data.open.protocols);
-    socket.onmessage = (event) => {
-      const message = JSON.parse(event.data);
-      if (message.clock !== undefined) beat(message.clock);
-      self.postMessage(message);
-    };
+    socket.onmessage = (event) => self.postMessage(JSON.parse(event.data));
     socket.onclose = (event) => self.postMessage({ type: "closed", words: event.reason });
   }
 };
-// With the clock of the server, it learns how long the way there and back takes.
-const beat = (echo) => {
+setInterval(() => {
   if (socket?.readyState !== WebSocket.OPEN) return;
-  const lag = Math.max(0, Date.now() - alive) / 1000;
-  socket.send(JSON.stringify(echo === undefined ? { type: "beat", lag } : { type: "beat", lag, echo }));
-};
-setInterval(() => beat(), BEAT);
+  socket.send(JSON.stringify({ type: "beat", lag: Math.max(0, Date.now() - alive) / 1000 }));
+}, BEAT);
