@@ -215,7 +215,7 @@ def _evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
 def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[str, float]:
     """Errors on two grids of poses."""
     # MuJoCo, which the evaluation of primitives does not need.
-    from hrc_learn.experiments.jacobian_evaluation import (
+    from hrc_learn.experiments.grasping_metrics import (
         compare_with_truth,
         held_out_grid,
     )

@@ -18,7 +18,12 @@ from hrc_learn.cli.arguments import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.arm_arguments import Demo, Record, Run, WithImperfections, WithRobot
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment, Pulls
 from hrc_learn.experiments.collaboration_trial import Disturbances
-from hrc_learn.experiments.experiment import Experiment, RunOptions, run_experiment
+from hrc_learn.experiments.experiment import (
+    Experiment,
+    LiveViewConfig,
+    RunOptions,
+    run_experiment,
+)
 from hrc_learn.experiments.grasping_experiment import GraspingExperiment
 from hrc_learn.experiments.placing_experiment import PlacingExperiment, dataset_of
 from hrc_learn.experiments.real_arm import (
@@ -29,7 +34,6 @@ from hrc_learn.experiments.real_arm import (
     placing_task,
     run_on_arm,
 )
-from hrc_learn.experiments.run_recorder import LiveViewConfig
 from hrc_learn.experiments.table_objects import workplace_for
 from hrc_learn.hardware import open_camera
 from hrc_learn.kinematics import ArmChoice, panda

@@ -7,19 +7,20 @@ An experiment is a frozen dataclass of its settings with the methods of `Experim
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
-from hrc_learn.experiments.run_film import film
-from hrc_learn.experiments.run_recorder import LiveViewConfig, live_view
-from hrc_learn.experiments.simulated_cell import UNOBSERVED, Observer, no_live_view
+from hrc_learn.experiments.run_recorder import film, record
+from hrc_learn.experiments.simulated_cell import UNOBSERVED, LiveView, Observer, no_live_view
 from hrc_learn.experiments.trials import Trial, TrialRun, repeat
 from hrc_learn.log import LoggedSteps, RunRecording
-from hrc_learn.sim import PhysicsError
+from hrc_learn.sim import MotionLog, PhysicsError, World
 from hrc_learn.skills.failures import TaskFailedError
+from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz.report import (
     FILM,
@@ -162,6 +163,16 @@ class Results:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LiveViewConfig:
+    """Port and rate of the live dashboard of a run."""
+
+    port: int = 9090
+    """Port of the page."""
+    period: float = 0.25
+    """Time between two updates [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """Options common to all experiments: repetition, outputs and live dashboard."""
 
@@ -291,6 +302,35 @@ def _observer(experiment: Experiment[Any], options: RunOptions, console: "Consol
             experiment.title, options.serving, lambda at: console.print(f"Dashboard at {at}")
         )
     return Observer(view=view, tell=console.print)
+
+
+def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]) -> LiveView:
+    """Serve the dashboard of a run on a page of its own.
+
+    The loop pays for its log only: another thread makes and sends recordings of the run so
+    far. A page that is open when the run ends keeps its content.
+
+    Args:
+        title: Title of the dashboard.
+        config: Port and rate.
+        on_open: Called with the address of the page.
+    """
+
+    @contextmanager
+    def watch(cell: WorkCell, world: World, motion: MotionLog) -> Iterator[None]:
+        # Rerun takes a second to import.
+        from hrc_learn.teleoperation.dashboard_page import serve_stream
+        from hrc_learn.viz.run_dashboard import live_dashboard
+
+        def snapshot() -> RunRecording | None:
+            return record(title, cell, world, motion) if len(motion) else None
+
+        with serve_stream(config.port) as server:
+            on_open(server.viewer)
+            with live_dashboard(server.stream, snapshot, period=config.period):
+                yield
+
+    return watch
 
 
 def _run_trials(study: Study, file: Path, options: RunOptions) -> list[Trial]:

@@ -1,9 +1,13 @@
-"""Recording of a simulated run, and its live dashboard."""
+"""Recording of a simulated run, and its film.
+
+The film is rendered from the recording, or drawn on machines that cannot render. Its length is
+bounded, and so is its cost.
+"""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import closing, contextmanager
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,23 +23,63 @@ from hrc_learn.experiments.run_measures import (
     true_tool,
     worker_distance,
 )
-from hrc_learn.experiments.simulated_cell import LiveView
 from hrc_learn.geometry import Box
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import CameraRecording, JointRanges, LoggedSteps, RunRecording
 from hrc_learn.protocols import HINDRANCES
-from hrc_learn.sim import MotionLog, World
-from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
+from hrc_learn.sim import (
+    Arrow,
+    MotionLog,
+    OffscreenRenderer,
+    RecordedWorld,
+    RenderingUnavailableError,
+    World,
+)
+from hrc_learn.skills.pick_and_place import HOME, INTERACT, RELEASE, TRANSFER
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.vision import CameraModel
+from hrc_learn.viz import palette
+from hrc_learn.viz.film import CameraInset, Line, Picture, annotated, draw_run, film_mp4
+from hrc_learn.viz.report import Film
 
 # Joint, counted from 1, whose frame is at the elbow of an arm with seven joints: the person
 # takes hold of the arm there (paper, Experiment 3).
 _PUSHED = 4
 # Null-space input below which nobody pushes [N m], and length of the arrow of a push [m].
 _NO_PUSH, _ARROW = 0.5, 0.45
+
+WIDTH, HEIGHT = 720, 450
+"""Size of the pictures [px]."""
+RATE = 15.0
+"""Pictures per second [1/s]."""
+LONGEST = 16.0
+"""Longest film [s]; a longer run is shown faster."""
+
+_EYE, _TOWARDS = (1.30, 1.25, 1.00), (0.06, 0.22, 0.30)  # [m]
+_FOCAL = 1.15  # focal length over height: 47 degrees from top to bottom
+
+_CAPTIONS = {
+    "detect": "looks for the object with an uncalibrated camera",
+    "servo": "servoes with that camera until the gripper is above the object",
+    INTERACT: "holds the gripper there while a person may pull the elbow aside",
+    "grasp": "descends and grasps",
+    "lift": "lifts the object",
+    HOME: "carries it home",
+    TRANSFER: "carries it to the shelf along the learned motion",
+    RELEASE: "releases it on the shelf",
+    "retreat": "retreats from the cabinet",
+    "done": "done",
+}
+"""Captions of the phases."""
+
+_CARRYING = (HOME, TRANSFER, RELEASE, "retreat")
+_ABOVE = 0.15  # height of the arrow above the forearm [m]
+_HAND = 0.04  # width of the forearm that pulls [m]
+_NEAR = 1.0  # largest distance of a worker that is shown [m]
+_TRAIL = 2.0  # duration for which the path of the tool stays in the picture [s]
+_POINTS = 60  # points of a drawn path
 
 
 def record(
@@ -189,40 +233,162 @@ def demonstrated_joints(
     return np.column_stack([np.interp(time, demonstration.time, joint) for joint in columns])
 
 
-@dataclass(frozen=True, kw_only=True)
-class LiveViewConfig:
-    """Port and rate of the live dashboard of a run."""
-
-    port: int = 9090
-    """Port of the page."""
-    period: float = 0.25
-    """Time between two updates [s]."""
-
-
-def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]) -> LiveView:
-    """Serve the dashboard of a run on a page of its own.
-
-    The loop pays for its log only: another thread makes and sends recordings of the run so
-    far. A page that is open when the run ends keeps its content.
+def film(recording: RunRecording, render: bool = True) -> Film:
+    """Film of a run.
 
     Args:
-        title: Title of the dashboard.
-        config: Port and rate.
-        on_open: Called with the address of the page.
+        recording: Recording of the run.
+        render: Render the pictures, if this machine can; otherwise draw them.
     """
+    return Film(film_mp4(frames(recording, render), RATE), recording.title)
 
-    @contextmanager
-    def watch(cell: WorkCell, world: World, motion: MotionLog) -> Iterator[None]:
-        # Rerun takes a second to import.
-        from hrc_learn.teleoperation.dashboard_page import serve_stream
-        from hrc_learn.viz.run_dashboard import live_dashboard
 
-        def snapshot() -> RunRecording | None:
-            return record(title, cell, world, motion) if len(motion) else None
+def frames(recording: RunRecording, render: bool = True) -> Iterator[Picture]:
+    """Pictures of the film.
 
-        with serve_stream(config.port) as server:
-            on_open(server.viewer)
-            with live_dashboard(server.stream, snapshot, period=config.period):
-                yield
+    Args:
+        recording: Recording of the run.
+        render: Render the pictures, if this machine can; otherwise draw them.
+    """
+    camera = CameraModel(
+        width=WIDTH,
+        height=HEIGHT,
+        focal=(_FOCAL * HEIGHT, _FOCAL * HEIGHT),
+        principal=((WIDTH - 1) / 2, (HEIGHT - 1) / 2),
+    ).look_at(np.array(_EYE), np.array(_TOWARDS))
+    begin, end = float(recording.time[0]), float(recording.time[-1])
+    shown = min(end - begin, LONGEST)
+    speed = (end - begin) / shown if shown else 1.0
+    inset = None
+    if recording.camera is not None and recording.camera.images:
+        inset = CameraInset(recording.camera, WIDTH)
+    with _painter(recording, camera, render) as paint:
+        for time in np.linspace(begin, end, max(2, round(shown * RATE))):
+            step = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
+            lines, labels = _drawn_in(recording, step)
+            yield annotated(
+                paint(step, lines),
+                caption(recording, float(time)),
+                f"{time - begin:.0f} s" + (f"   {speed:.1f} ×" if speed > 1.05 else ""),
+                labels,
+                None if inset is None else inset.at(step, float(time)),
+            )
 
-    return watch
+
+def caption(recording: RunRecording, time: float) -> str:
+    """Caption of the phase at a time [s]."""
+    begun = [event.text for event in recording.phases if event.time <= time]
+    if not begun:
+        return recording.title
+    text = _CAPTIONS.get(begun[-1], begun[-1])
+    return text[:1].upper() + text[1:]
+
+
+@contextmanager
+def _painter(
+    recording: RunRecording, camera: CameraModel, render: bool
+) -> Iterator[Callable[[int, list[Line]], Picture]]:
+    """Function that makes the picture of a step with lines in it."""
+    renderer, world = None, None
+    if render:
+        try:
+            world = RecordedWorld(recording)
+            renderer = OffscreenRenderer(world, WIDTH, HEIGHT)
+        except RenderingUnavailableError:
+            pass
+    if world is None or renderer is None:
+        yield lambda step, lines: draw_run(recording, step, camera, lines)
+        return
+    with closing(renderer):
+
+        def paint(step: int, lines: list[Line]) -> Picture:
+            world.show(step)
+            return renderer.render(camera, [_arrow(line) for line in lines])
+
+        yield paint
+
+
+def _arrow(line: Line) -> Arrow:
+    r, g, b, _ = palette.rgba(line.colour)
+    return Arrow(
+        start=line.start,
+        end=line.end,
+        colour=(r / 255, g / 255, b / 255, 1.0),
+        width=line.width,
+        head=line.head,
+    )
+
+
+def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str, str]]]:
+    """Lines in the picture of a step, and the legend of their colours."""
+    lines: list[Line] = []
+    labels: list[tuple[str, str]] = []
+    phase = next((e.text for e in reversed(run.phases) if e.time <= run.time[step]), "")
+    if run.plan_path is not None and phase in _CARRYING:
+        lines += _polyline(run.plan_path, palette.GREEN)
+        labels.append(("learned motion, planned", palette.GREEN))
+    elif run.region is not None:
+        lines += _edges(run.region, palette.YELLOW)
+        labels.append(("region of visual servoing", palette.YELLOW))
+    first = int(np.searchsorted(run.time, run.time[step] - _TRAIL))
+    lines += _polyline(run.position[first : step + 1], palette.BLUE)
+    labels.append(("path of the gripper", palette.BLUE))
+    if pull := _pull(run, step):
+        lines += pull
+        labels.append(("a person pulls the elbow", palette.PERSON))
+    if run.worker_nearest is not None and np.isfinite(run.worker_nearest[step]).all():
+        near, far = run.worker_nearest[step]
+        distance = float(np.linalg.norm(far - near))
+        if distance < _NEAR:
+            lines.append(
+                Line(start=_point(near), end=_point(far), colour=palette.PURPLE, width=0.01)
+            )
+            labels.append((f"distance to the worker: {distance:.2f} m", palette.PURPLE))
+    return lines, labels
+
+
+def _pull(run: RunRecording, step: int) -> list[Line]:
+    """Lines for the forearm that pulls the elbow, and for an arrow above it."""
+    if run.push is None or not np.isfinite(run.push[step]).all():
+        return []
+    at, tip = run.push[step]
+    above = np.array([0.0, 0.0, _ABOVE])
+    return [
+        Line(
+            start=_point(at + above),
+            end=_point(tip + above),
+            colour=palette.VERMILION,
+            width=0.02,
+            head=True,
+        ),
+        Line(start=_point(at), end=_point(tip), colour=palette.PERSON, width=_HAND),
+    ]
+
+
+def _polyline(points: Float[np.ndarray, "points 3"], colour: str) -> list[Line]:
+    kept = points[np.unique(np.linspace(0, len(points) - 1, _POINTS).round().astype(int))]
+    return [
+        Line(start=_point(a), end=_point(b), colour=colour)
+        for a, b in pairwise(kept)
+        if np.isfinite([a, b]).all()
+    ]
+
+
+def _edges(box: Box, colour: str) -> list[Line]:
+    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    lines = []
+    for a in corners:
+        for axis in range(3):
+            if a[axis] < 0:
+                b = a.copy()
+                b[axis] = 1
+                start, end = (np.array(box.centre) + c * box.half_size for c in (a, b))
+                lines.append(
+                    Line(start=_point(start), end=_point(end), colour=colour, width=0.004)
+                )
+    return lines
+
+
+def _point(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

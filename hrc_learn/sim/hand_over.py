@@ -138,7 +138,6 @@ def random_hand_over(
     *,
     bench: Box,
     thickness: float,
-    begin: tuple[float, float] = (1.0, 3.0),
 ) -> HandOver:
     """Draw a worker's walk to the far side of the bench, with an object for the robot.
 
@@ -147,7 +146,6 @@ def random_hand_over(
         rng: Random generator.
         bench: The table, whose far side (+y) is free.
         thickness: Half the height of the object [m].
-        begin: Earliest and latest time of entering [s].
 
     Raises:
         ValueError: The worker is too small to hold an object out over the bench.
@@ -155,7 +153,7 @@ def random_hand_over(
     pace = UNHURRIED.drawn(rng)
     script = BenchScript(worker, rng, bench, (0.15, 0.45), sway=0.1)
     place, target, lean = _held_out(worker, rng, script)
-    script.enter(rng.uniform(*begin), pace, RIGHT)
+    script.enter(rng.uniform(1.0, 3.0), pace, RIGHT)
     # Down on the bench, near its edge, to the worker's right.
     x, y = script.stand[0] + rng.uniform(-0.25, 0.0), script.edge - rng.uniform(0.10, 0.16)
     laid_at = script.own(np.array([x, y, script.top + thickness]) - HELD_OUT)

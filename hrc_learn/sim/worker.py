@@ -113,18 +113,12 @@ IMAGE_RATE = 30.0
 
 @dataclass(frozen=True, kw_only=True)
 class WorkerConfig:
-    """Whose body it is."""
+    """Size and place of a body."""
 
     stature: float = 1.75
     """Height of the standing body [m]."""
     floor: float = -0.72
     """Height of the floor, below the robot's base [m]."""
-
-    def __post_init__(self) -> None:
-        if not 1.2 <= self.stature <= 2.3:
-            raise ValueError(
-                f"stature must be that of an adult, 1.2 to 2.3 m, but is {self.stature}."
-            )
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> WorkerConfig:
@@ -380,8 +374,6 @@ class WorkerSensor:
         clock: Callable[[], float],
         sizes: Imperfections,
         rng: np.random.Generator,
-        *,
-        rate: float = IMAGE_RATE,
     ):
         """Begin to watch now.
 
@@ -390,15 +382,9 @@ class WorkerSensor:
             clock: Current time [s].
             sizes: Sizes of noise, delay and loss.
             rng: Source of noise and loss.
-            rate: Images a second.
-
-        Raises:
-            ValueError: If the rate is not positive.
         """
-        if not rate > 0:
-            raise ValueError(f"rate must be positive, but is {rate}.")
         self._visit, self._clock, self._sizes, self._rng = visit, clock, sizes, rng
-        self._rate, self._first, self._taken = rate, clock(), 0
+        self._first, self._taken = clock(), 0
         self._pending: deque[PersonObservation] = deque()
         self._before: deque[PersonObservation] = deque()
         self._newest: PersonObservation | None = None
@@ -407,7 +393,7 @@ class WorkerSensor:
         """The newest observation that has arrived by now."""
         # Clocks add up steps of rounded length: a nanosecond early still counts as in time.
         now = self._clock() + 1e-9
-        while (time := self._first + self._taken / self._rate) <= now:
+        while (time := self._first + self._taken / IMAGE_RATE) <= now:
             self._take(time)
         while self._pending and self._pending[0].time + self._sizes.person_delay <= now:
             self._newest = self._pending.popleft()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from sample_runs import sample_run
 
-from hrc_learn.experiments import run_film as film
-from hrc_learn.experiments.run_film import caption, frames
+from hrc_learn.experiments import run_recorder as film
+from hrc_learn.experiments.run_recorder import caption, frames
 from hrc_learn.log import Event
 from hrc_learn.viz import palette
 

@@ -7,7 +7,8 @@ import rerun as rr
 import torch
 from rrd_reading import Rrd
 
-from hrc_learn.experiments.run_recorder import LiveViewConfig, live_view, push_arrows
+from hrc_learn.experiments.experiment import LiveViewConfig, live_view
+from hrc_learn.experiments.run_recorder import push_arrows
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace

@@ -166,9 +166,3 @@ def test_statures_are_those_of_adults():
     assert drawn.max() > high - 0.01
     mean = np.mean([np.mean(STATURES["women"]), np.mean(STATURES["men"])])
     assert drawn.mean() == pytest.approx(mean, abs=0.005)
-
-
-@pytest.mark.parametrize("stature", [0.4, 17.5, float("nan")])
-def test_nobody_is_so_tall(stature):
-    with pytest.raises(ValueError, match="stature"):
-        WorkerConfig(stature=stature)

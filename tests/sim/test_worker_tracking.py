@@ -110,8 +110,3 @@ def test_what_is_seen_does_not_depend_on_how_often_one_looks():
         if one is not None:
             np.testing.assert_array_equal(one.ends, other.ends)
             np.testing.assert_array_equal(one.velocity, other.velocity)
-
-
-def test_a_tracker_takes_images():
-    with pytest.raises(ValueError, match="rate"):
-        WorkerSensor(VISIT, Clock(), Imperfections(), np.random.default_rng(0), rate=0.0)
