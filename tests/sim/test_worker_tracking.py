@@ -23,11 +23,9 @@ class Clock:
         return self.time
 
 
-def readings(times, rate=30.0, seed=0, **sizes):
+def readings(times, seed=0, **sizes):
     clock = Clock()
-    sensor = WorkerSensor(
-        VISIT, clock, Imperfections(**sizes), np.random.default_rng(seed), rate=rate
-    )
+    sensor = WorkerSensor(VISIT, clock, Imperfections(**sizes), np.random.default_rng(seed))
     assert isinstance(sensor, PersonTracker)
     read = []
     for clock.time in times:
@@ -39,7 +37,7 @@ TICKS = np.arange(0.0, 6.0, 0.01)
 
 
 def test_an_ideal_tracker_sees_him_where_he_is():
-    for time, seen in zip(TICKS[::10], readings(TICKS[::10], rate=50.0), strict=True):
+    for time, seen in zip(TICKS[::10], readings(TICKS[::10]), strict=True):
         assert seen.time == pytest.approx(time)
         truth = VISIT.capsules_at(time)
         np.testing.assert_allclose(seen.ends, truth.ends, atol=1e-9)
@@ -69,11 +67,11 @@ def test_noise_has_the_size_that_was_asked_for():
 
 def test_a_share_of_the_images_is_lost():
     def taken(**sizes):
-        return len({one.time for one in readings(TICKS, rate=60.0, **sizes)})
+        return len({one.time for one in readings(TICKS, **sizes)})
 
-    assert taken() == 360
-    # Of a binomial distribution, three deviations of 8.
-    assert taken(person_loss=0.2) == pytest.approx(288, abs=24)
+    assert taken() == 180
+    # Of a binomial distribution, three deviations of 5.4.
+    assert taken(person_loss=0.2) == pytest.approx(144, abs=17)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.4])
