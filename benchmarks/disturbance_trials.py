@@ -178,8 +178,8 @@ class StressConfig:
 class StressResult:
     """Results, one entry for each trial."""
 
-    beyond: Int[Tensor, "trials 4"]
-    """Steps beyond the limits of position, velocity, acceleration and jerk."""
+    beyond: Int[Tensor, "trials 5"]
+    """Steps beyond the limits of position, velocity, acceleration, jerk and tool speed."""
     unknown: Int[Tensor, "trials"]
     """Steps with a NaN in command or state."""
     interventions: Int[Tensor, "trials kinds"]
@@ -195,7 +195,7 @@ class StressResult:
 
 def ticks_beyond(beyond: Int[Tensor, "trials kinds"]) -> dict[str, float]:
     """Number of trials, and by kind of limit that of the ticks beyond it, by name."""
-    names = ("position", "velocity", "acceleration", "jerk")
+    names = ("position", "velocity", "acceleration", "jerk", "speed")
     totals = zip(names, beyond.sum(0).tolist(), strict=False)
     return {
         "rollouts": float(len(beyond)),
@@ -211,8 +211,9 @@ def run_stress_trials(config: StressConfig) -> StressResult:
     controller, camera = random_controller(count, rng)
     virtual = VirtualCamera(camera=camera, imperfections=config.imperfections(), generator=rng)
     state = controller.initial_state(q)
-    watch = LimitMonitor(limits, state.safety.velocity, config.dt)
-    beyond = torch.zeros(count, 4, dtype=torch.int64)
+    cap = controller.config.safety.tcp_speed
+    watch = LimitMonitor(limits, state.safety.velocity, config.dt, cap)
+    beyond = torch.zeros(count, 5, dtype=torch.int64)
     unknown = torch.zeros(count, dtype=torch.int64)
     joints = _JointReadings(config, rng)
     with torch.inference_mode():
@@ -231,7 +232,8 @@ def run_stress_trials(config: StressConfig) -> StressResult:
             )
             command, state = controller.step(state, observation)
             q = q + config.dt * command.joint_velocity
-            beyond += watch.violations(q, command.joint_velocity)
+            points = panda.jacobian(q)[:, None, :3]
+            beyond += watch.violations(q, command.joint_velocity, points)
             unknown += ~all_finite((q, command, state))
     return StressResult(beyond=beyond, unknown=unknown, interventions=state.safety.counts)
 

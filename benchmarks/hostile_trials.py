@@ -144,7 +144,7 @@ def _poison(
     hostile_goals, ready = (_of_each_arm(goals, count) for goals in (controller.goals, ready))
     state = controller.initial_state(q)
     watch = LimitMonitor(limits, state.safety.velocity, dt)
-    beyond = torch.zeros(count, 4, dtype=torch.int64)
+    beyond = torch.zeros(count, 5, dtype=torch.int64)
     furthest = torch.full((count,), -math.inf, dtype=torch.float64)
     unknown, poisoned = torch.zeros(2, count, dtype=torch.int64)
     hostile, hold = round(config.duration / dt), round(_HOLD / dt)

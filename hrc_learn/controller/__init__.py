@@ -31,12 +31,12 @@ from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMA
 from hrc_learn.controller.interface import Command as Command
 from hrc_learn.controller.interface import Goals as Goals
 from hrc_learn.controller.interface import Observation as Observation
-from hrc_learn.controller.safety_filter import INTERVENTIONS as INTERVENTIONS
-from hrc_learn.controller.safety_filter import ConstraintReport as ConstraintReport
-from hrc_learn.controller.safety_filter import SafetyConfig as SafetyConfig
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
-from hrc_learn.controller.safety_filter import SafetyReport as SafetyReport
-from hrc_learn.controller.safety_filter import SafetyState as SafetyState
+from hrc_learn.controller.safety_state import INTERVENTIONS as INTERVENTIONS
+from hrc_learn.controller.safety_state import ConstraintReport as ConstraintReport
+from hrc_learn.controller.safety_state import SafetyConfig as SafetyConfig
+from hrc_learn.controller.safety_state import SafetyReport as SafetyReport
+from hrc_learn.controller.safety_state import SafetyState as SafetyState
 from hrc_learn.controller.way_making import WayMakingConfig as WayMakingConfig
 from hrc_learn.watchdog import Watchdog as Watchdog
 from hrc_learn.watchdog import WatchdogError as WatchdogError

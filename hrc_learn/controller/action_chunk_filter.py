@@ -116,15 +116,17 @@ class ActionChunkFilter(nn.Module):
         self,
         position: Float[Tensor, "*batch D"],
         velocity: Float[Tensor, "*batch D"] | None = None,
+        acceleration: Float[Tensor, "*batch D"] | None = None,
     ) -> ActionChunkState:
-        """State at rest, or in steady motion, in the dtype of the limits."""
+        """State at rest, or in motion, in the dtype of the limits."""
         position = position.to(self.braking_acceleration)
         still = torch.zeros_like(position)
         velocity = still if velocity is None else still + velocity
+        acceleration = still if acceleration is None else still + acceleration
         return ActionChunkState(
             position=position,
             velocity=velocity,
-            acceleration=still,
+            acceleration=acceleration,
             reference=position,
             reference_velocity=velocity,
             reference_acceleration=still,

@@ -39,12 +39,8 @@ from hrc_learn.controller.resolved_rate import (
     scale_task,
     task_descent,
 )
-from hrc_learn.controller.safety_filter import (
-    SafetyConfig,
-    SafetyFilter,
-    SafetyReport,
-    SafetyState,
-)
+from hrc_learn.controller.safety_filter import SafetyFilter
+from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.controller.way_making import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import ArrayLike, is_number
@@ -261,13 +257,17 @@ class AdaptiveController(nn.Module):
             )
 
     def initial_state(
-        self, joint_position: ArrayLike, joint_velocity: ArrayLike | None = None
+        self,
+        joint_position: ArrayLike,
+        joint_velocity: ArrayLike | None = None,
+        joint_acceleration: ArrayLike | None = None,
     ) -> ControllerState:
-        """State at the start.
+        """State at the start, of an arm at rest or in motion.
 
         Args:
             joint_position: Measured joint positions (*batch, n) [rad].
-            joint_velocity: Steady joint velocities (*batch, n) [rad/s]; None: at rest.
+            joint_velocity: Measured joint velocities (*batch, n) [rad/s]; None: at rest.
+            joint_acceleration: Joint accelerations (*batch, n) [rad/s^2]; None: zero.
 
         Raises:
             ValueError: A vector does not have one value for each joint.
@@ -287,7 +287,9 @@ class AdaptiveController(nn.Module):
                 planned=still,
                 active=torch.zeros_like(still[..., 0], dtype=torch.bool),
             ),
-            safety=self.safety.initial_state(joint_position, joint_velocity),
+            safety=self.safety.initial_state(
+                joint_position, joint_velocity, joint_acceleration
+            ),
             estimator=self.estimator.initial_state(*joint_position.shape[:-1]),
         )
 
@@ -389,6 +391,7 @@ class AdaptiveController(nn.Module):
             motion.joint_velocity,
             observation.dt,
             jacobian=J,
+            joint_velocity=observation.joint_velocity,
             human_distance=observation.human_distance,
             stop=stop,
             stale=stale,

@@ -44,7 +44,7 @@ from hrc_learn.controller.null_space_motion import (
 )
 from hrc_learn.controller.path_law import PathLaw
 from hrc_learn.controller.pose_tracking import PoseTracking, twist_of
-from hrc_learn.controller.safety_filter import SafetyReport
+from hrc_learn.controller.safety_state import SafetyReport
 from hrc_learn.controller.task_pace import TaskPace, closes_in, fraction_of_motion, people_bind
 from hrc_learn.controller.way_making import way_making_velocity
 from hrc_learn.geometry.numerics import null_projection
@@ -82,19 +82,23 @@ class ArmLoop:
         self.safety = self._tracking.safety
 
     def initial_state(
-        self, joint_position: Float[Tensor, "*batch n"], time: float = 0.0
+        self,
+        joint_position: Float[Tensor, "*batch n"],
+        time: float = 0.0,
+        joint_velocity: Float[Tensor, "*batch n"] | None = None,
     ) -> ArmLoopState:
-        """State of arms at rest that follow no path.
+        """State of arms that follow no path.
 
         Args:
             joint_position: Joint positions [rad].
             time: Reading of the clock [s].
+            joint_velocity: Measured joint velocities [rad/s]; None: at rest.
         """
         still = torch.zeros_like(joint_position)
         clock = still[..., 0] + time
         never = torch.zeros_like(clock, dtype=torch.bool)
         return ArmLoopState(
-            safety=self.safety.initial_state(joint_position),
+            safety=self.safety.initial_state(joint_position, joint_velocity),
             pace=TaskPace.begin(clock, self.config.speed),
             null_velocity=still,
             return_velocity=still,
@@ -270,7 +274,8 @@ class ArmLoop:
         left = fraction_of_motion(command.twist, twist_of(J, command.joint_velocity))
         velocity = state.pace.speed_override.unsqueeze(-1) * command.joint_velocity
         pace = state.pace.limited(torch.where(slowed, left, 1.0), self.config.dt)
-        safety = self.safety.initial_state(q, velocity)
+        change = (velocity - state.safety.velocity) / self.config.dt
+        safety = self.safety.initial_state(q, velocity, change)
         state = replace(_without_path(state), safety=safety, pace=pace)
         report = ArmReport(command.safety)
         if reading.explain:

@@ -17,7 +17,7 @@ from hrc_learn.controller.direct_return import DirectReturn
 from hrc_learn.controller.interface import Command
 from hrc_learn.controller.joint_path import JointPaths
 from hrc_learn.controller.null_space_motion import YieldingConfig
-from hrc_learn.controller.safety_filter import SafetyConfig, SafetyReport, SafetyState
+from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.controller.way_making import WayMakingConfig
 from hrc_learn.geometry import Pose

@@ -12,12 +12,8 @@ from typing import final
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hrc_learn.controller.safety_filter import (
-    SafetyConfig,
-    SafetyFilter,
-    SafetyReport,
-    SafetyState,
-)
+from hrc_learn.controller.safety_filter import SafetyFilter
+from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree
 
@@ -82,9 +78,16 @@ class VelocityStep(nn.Module):
                 f"dt must be in (0, {self.safety.config.longest_step:g}] s, but is {dt:g}"
             )
 
-    def initial_state(self, joint_position: Float[Tensor, "*batch n"]) -> VelocityStepState:
-        """State of an arm at rest [rad]."""
-        return VelocityStepState(safety=self.safety.initial_state(joint_position))
+    def initial_state(
+        self,
+        joint_position: Float[Tensor, "*batch n"],
+        joint_velocity: Float[Tensor, "*batch n"] | None = None,
+        joint_acceleration: Float[Tensor, "*batch n"] | None = None,
+    ) -> VelocityStepState:
+        """State of an arm at rest, or in motion, see `SafetyFilter.initial_state`."""
+        return VelocityStepState(
+            safety=self.safety.initial_state(joint_position, joint_velocity, joint_acceleration)
+        )
 
     def step(
         self, state: VelocityStepState, observation: WantedVelocity

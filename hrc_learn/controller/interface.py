@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller.constraint_layer import Distances
-from hrc_learn.controller.safety_filter import SafetyReport
+from hrc_learn.controller.safety_state import SafetyReport
 from hrc_learn.kinematics import TaskSpace
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import (
@@ -183,6 +183,9 @@ class Observation:
     """True if the feature was found in the image."""
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
+    joint_velocity: Float[Tensor, "*batch n"] | None = None
+    """Measured joint velocities [rad/s]. In the first step after a start they take the place of
+    those of the start, where they differ. None: not measured."""
     target: Float[Tensor, "*#batch rows"] | None = None
     """Target in the image [px]; None: that of the goals. NaN (unknown) switches vision feedback
     off."""

@@ -7,46 +7,25 @@ playback of a learned motion, a joystick.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hrc_learn.controller.constraint_layer import (
-    ConstraintConfig,
-    Distances,
-    SeparationConfig,
-    constrained_velocity,
-)
+from hrc_learn.controller.constraint_layer import Distances, constrained_velocity
 from hrc_learn.controller.limit_barrier import LimitBarrier
+from hrc_learn.controller.safety_state import (
+    INTERVENTIONS,
+    ConstraintReport,
+    SafetyConfig,
+    SafetyReport,
+    SafetyState,
+)
+from hrc_learn.controller.speed_barrier import SpeedBarrier
 from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number
 from hrc_learn.kinematics import JointLimits, MotionLimits
-from hrc_learn.pytree import pytree
-
-
-@runtime_checkable
-class HasLimits(Protocol):
-    """An arm or a kinematic chain with joint limits."""
-
-    @property
-    def limits(self) -> JointLimits:
-        """Joint limits."""
-        ...
-
-
-INTERVENTIONS = (
-    "velocity",
-    "position",
-    "acceleration",
-    "jerk",
-    "tcp_speed",
-    "separation",
-    "invalid",
-    "stopped",
-)
-"""Kinds of interventions, in the order of the last axis of their flags and counts."""
 
 # Smallest relative excess, or change of a joint velocity [rad/s], reported as an intervention.
 # Smaller ones are rounding, also in float32: a command along a limit would be flagged at
@@ -61,110 +40,19 @@ _REST = 1e-15
 # Step assumed for braking before the first valid one [s]: that of the fastest arms, so the
 # gentlest.
 _SHORTEST_STEP = 1e-3
+# Fraction of the velocity limits by which a measured velocity may differ from the one of a
+# start: encoders at 1 kHz err by some hundredths of a radian per second.
+_START_ERROR = 0.03
 
 
-@dataclass(frozen=True, kw_only=True)
-class SafetyConfig:
-    """Margins and caps in addition to the joint limits."""
-
-    margin: float = 0.02
-    """Distance kept from every joint position limit [rad]."""
-    velocity_margin: float = 0.02
-    """Unused fraction of every joint velocity limit. The arm's own servo overshoots its command
-    by up to 1.2 % of the limit (in MuJoCo)."""
-    rate: float = 5.0
-    """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
-    jerk_limited: bool = True
-    """True if joint jerk is limited, which starts to matter below 4 ms a step."""
-    braking: float = 1.0
-    """Fraction of the acceleration and jerk limits that the arm's driver uses, in (0, 1].
-    franky plans with its `dynamics` factor, 0.3 by default in our adapter."""
-    delay: float = 0.0
-    """Longest time from a joint position reading to the motion that results from it [s]."""
-    jitter: float = 0.0
-    """Largest relative deviation of a step from its `dt`, in [0, 1). Zero where dt is the
-    measured time since the last step: then all limits hold exactly."""
-    tcp_speed: float = 1.0
-    """Highest speed of the tool centre point [m/s]; applied where a Jacobian is given."""
-    separation: SeparationConfig = field(default_factory=SeparationConfig)
-    """Protective distance from people. It lowers the tool-speed cap where `human_distance` is
-    given, and limits all links where `distances` to a person are given."""
-    constraints: ConstraintConfig | None = None
-    """Keeps limits and distances by one quadratic program, in which the null space yields to
-    the task; None: each joint brakes by itself before its limits, and no distance is kept."""
-
-    def __post_init__(self):
-        for name in ("rate", "tcp_speed"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
-        for name in ("margin", "delay"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, but is {getattr(self, name)}")
-        if not 0 < self.braking <= 1:
-            raise ValueError(f"braking must be in (0, 1], but is {self.braking}")
-        for name in ("velocity_margin", "jitter"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} must be in [0, 1), but is {getattr(self, name)}")
+@runtime_checkable
+class HasLimits(Protocol):
+    """An arm or a kinematic chain with joint limits."""
 
     @property
-    def longest_step(self) -> float:
-        """Longest step for which the limits are guaranteed [s]."""
-        return 1 / (self.rate * (1 + self.jitter))
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class SafetyState:
-    """State of the filter between two steps."""
-
-    velocity: Float[Tensor, "*batch n"]
-    """Velocity of the last step [rad/s]."""
-    acceleration: Float[Tensor, "*batch n"]
-    """Acceleration of the last step [rad/s^2]; zero where jerk is not limited."""
-    position: Float[Tensor, "*batch n"]
-    """Predicted joint positions [rad], used while the measurement is invalid."""
-    dt: Float[Tensor, "*batch"]
-    """Last valid step [s], used while the given one is invalid."""
-    counts: Int[Tensor, "*batch kinds"]
-    """Number of steps with each of `INTERVENTIONS`."""
-
-    def count(self, kind: str) -> Int[Tensor, "*batch"]:
-        """Number of steps with one kind of intervention."""
-        return self.counts[..., _index(kind)]
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class ConstraintReport:
-    """Effect of the quadratic program in one step (`ConstrainedVelocity`)."""
-
-    slowed: Float[Tensor, "*batch"]
-    """Fraction of the task velocity given up, 0 to 1."""
-    violation: Float[Tensor, "*batch"]
-    """Excess of the fastest closing speed over the allowed one [m/s]."""
-    solved: Bool[Tensor, "*batch"]
-    """False: the arm brakes, because the solver needed more steps."""
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class SafetyReport:
-    """Interventions of the filter in one step."""
-
-    flags: Bool[Tensor, "*batch kinds"]
-    """True for each of `INTERVENTIONS` that changed the command by more than rounding."""
-    constraints: ConstraintReport | None = None
-    """Effect of the constraints, where the filter has them."""
-
-    def acted(self, kind: str) -> Bool[Tensor, "*batch"]:
-        """True where one kind of intervention changed the command."""
-        return self.flags[..., _index(kind)]
-
-
-def _index(kind: str) -> int:
-    if kind not in INTERVENTIONS:
-        raise ValueError(f"no intervention {kind!r}; there are {', '.join(INTERVENTIONS)}")
-    return INTERVENTIONS.index(kind)
+    def limits(self) -> JointLimits:
+        """Joint limits."""
+        ...
 
 
 class _Inputs(NamedTuple):
@@ -175,18 +63,14 @@ class _Inputs(NamedTuple):
     command: Tensor
     """Wanted joint velocity [rad/s], zero where the arm has to brake."""
     jacobian: Tensor | None
+    points: Tensor | None
+    """Linear Jacobians of the capped points, that of the tool first (points, 3, n)."""
     bounds: tuple[Tensor, Tensor]
     """Lowest and highest velocity allowed by position and velocity limits [rad/s]."""
     dt: float | Tensor
     invalid: Tensor
     stopped: Tensor
-
-
-class _Motion(NamedTuple):
-    """Motion of one step."""
-
-    velocity: Tensor
-    acceleration: Tensor
+    wrong_start: Tensor
 
 
 @final
@@ -195,8 +79,7 @@ class SafetyFilter(nn.Module):
 
     A step is a chain of stages, each of which takes the velocity of the one before:
 
-        limit_velocity -> cap_tool_speed -> limit_acceleration -> keep_constraints
-        -> brake_to_cap
+        limit_velocity -> cap_speed -> limit_acceleration -> keep_constraints -> keep_speed
 
     The limits hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), if
     the arm follows its commands with an error below the margins. Otherwise the limits of
@@ -204,12 +87,16 @@ class SafetyFilter(nn.Module):
     limits, or within their margin, does not move further out. It may rest there, and returns
     when the command asks for it: a stop never causes a motion.
 
+    The cap on the speed of the tool, and of other points, holds by a barrier as well
+    (`SpeedBarrier`). Where no admissible motion keeps it, because the cap has fallen faster
+    than the arm can brake, or a start was faster, the arm brakes as hard as it can, and the
+    report says by how much and for how long the cap is exceeded.
+
     Any NaN or infinity, in an argument or in the state, brakes the arm to rest and is
     forgotten: neither a command nor a state is ever NaN or infinite.
 
-    Velocity, tool speed, acceleration and jerk are limited by scaling the whole vector, which
-    keeps its direction; only the barrier cuts single joints. Where such a cut makes the tool
-    faster than its cap, all joints brake as for a stop, as far as necessary. The acceleration
+    Velocity, speed, acceleration and jerk are limited by scaling the whole vector, which keeps
+    its direction; only the barrier of the joint limits cuts single joints. The acceleration
     fades in time for the velocity to arrive without overshoot, so stops and resumes are smooth.
     """
 
@@ -239,6 +126,7 @@ class SafetyFilter(nn.Module):
             jerk_limited=config.jerk_limited,
             rests_outside=True,
         )
+        self.speed_barrier = SpeedBarrier(self.barrier, config.tcp_speed)
 
     def joint_vector(self, values: ArrayLike, name: str) -> Float[Tensor, "*batch n"]:
         """Joint values as a tensor (*batch, n); tensors are returned as they are.
@@ -262,49 +150,52 @@ class SafetyFilter(nn.Module):
         return vector
 
     def initial_state(
-        self, joint_position: ArrayLike, joint_velocity: ArrayLike | None = None
+        self,
+        joint_position: ArrayLike,
+        joint_velocity: ArrayLike | None = None,
+        joint_acceleration: ArrayLike | None = None,
     ) -> SafetyState:
-        """State of an arm at rest, or moving steadily.
+        """State of an arm at rest, or in motion: pass what is measured.
 
         Args:
             joint_position: Measured joint positions (*batch, n) [rad].
-            joint_velocity: Steady joint velocities (*batch, n) [rad/s]; None: at rest.
+            joint_velocity: Measured joint velocities (*batch, n) [rad/s]; None: at rest.
+            joint_acceleration: Joint accelerations (*batch, n) [rad/s^2]; None: zero.
 
         Raises:
             ValueError: A vector does not have one value for each joint.
         """
         q = self.joint_vector(joint_position, "joint_position")
-        counts = q.new_zeros(*q.shape[:-1], len(INTERVENTIONS), dtype=torch.int64)
         still = torch.zeros_like(q)
-        if joint_velocity is None:
-            velocity = still.clone()
-        else:
-            velocity = still + self.joint_vector(joint_velocity, "joint_velocity")
+
+        def motion(values: ArrayLike | None, name: str) -> Tensor:
+            return still.clone() if values is None else still + self.joint_vector(values, name)
+
+        zero = torch.zeros_like(still[..., 0])
         return SafetyState(
-            velocity=velocity,
-            acceleration=still,
+            velocity=motion(joint_velocity, "joint_velocity"),
+            acceleration=motion(joint_acceleration, "joint_acceleration"),
             position=q,
-            dt=torch.full_like(still[..., 0], _SHORTEST_STEP),
-            counts=counts,
+            dt=torch.full_like(zero, _SHORTEST_STEP),
+            fresh=torch.ones_like(zero, dtype=torch.bool),
+            too_fast=zero,
+            counts=q.new_zeros(*q.shape[:-1], len(INTERVENTIONS), dtype=torch.int64),
         )
 
     def restored(self, state: SafetyState) -> SafetyState:
         """The state with invalid values replaced: at rest, in the middle of the joint range."""
         lower, upper = self.barrier.walls.unbind(-2)
+        zero = torch.zeros_like(state.velocity)
         fallback = (
-            (state.velocity, torch.zeros_like(state.velocity)),
-            (state.acceleration, torch.zeros_like(state.acceleration)),
+            (state.velocity, zero),
+            (state.acceleration, zero),
             (state.position, (upper - lower) / 2),
+            (state.too_fast, zero[..., 0]),
         )
-        v, a, q = (torch.where(is_number(x), x, instead) for x, instead in fallback)
+        v, a, q, time = (torch.where(is_number(x), x, instead) for x, instead in fallback)
         valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
-        return SafetyState(
-            velocity=v,
-            acceleration=a,
-            position=q,
-            dt=torch.where(valid, state.dt, _SHORTEST_STEP),
-            counts=state.counts,
-        )
+        dt = torch.where(valid, state.dt, _SHORTEST_STEP)
+        return replace(state, velocity=v, acceleration=a, position=q, dt=dt, too_fast=time)
 
     def velocity_bounds(
         self, joint_position: ArrayLike
@@ -320,6 +211,8 @@ class SafetyFilter(nn.Module):
         dt: float | Float[Tensor, ""],
         *,
         jacobian: Float[Tensor, "*batch rows n"] | None = None,
+        points: Float[Tensor, "*batch points 3 n"] | None = None,
+        joint_velocity: Float[Tensor, "*batch n"] | None = None,
         human_distance: Float[Tensor, "*batch"] | None = None,
         stop: Bool[Tensor, "*batch"] | None = None,
         stale: Bool[Tensor, "*batch"] | None = None,
@@ -338,6 +231,10 @@ class SafetyFilter(nn.Module):
                 tensor outside (0, longest_step]: brake to rest, with the last valid step.
             jacobian: Jacobian of the tool centre point, linear rows first; enables the cap on
                 its speed. Not finite: brake to rest.
+            points: Linear Jacobians of further points under the same cap, such as the elbow and
+                the far end of a load. Not finite: brake to rest.
+            joint_velocity: Measured joint velocities [rad/s]. Where they differ from those of a
+                start, in the first step after it, the filter goes on from them.
             human_distance: Distance of the tool from the nearest person [m], which slows and
                 stops it; NaN (unknown): stop. None: no person is monitored.
             stop: True where the arm has to brake to rest for another reason.
@@ -358,31 +255,26 @@ class SafetyFilter(nn.Module):
         self._check_arguments(jacobian, human_distance, distances)
         q = self.joint_vector(joint_position, "joint_position")
         u = self.joint_vector(joint_velocity_command, "joint_velocity_command")
-        given = self._validated(state, q, u, dt, jacobian, bounds, distances, stop, stale)
+        given = self._validated(
+            state, q, u, dt, jacobian, points, bounds, distances, stop, stale, joint_velocity
+        )
         target, fast, cut = self._limit_velocity(given)
-        target, cap, speeding, near = self._cap_tool_speed(given, target, human_distance)
+        target, cap, speeding, near = self._cap_speed(given, target, human_distance)
         # Constraints keep the bounds on the velocity themselves.
         own = given.bounds if self.config.constraints is None else None
-        motion, hard, jerky = self._limit_acceleration(given, target, own)
-        report = None
-        if given.jacobian is not None:
-            stopping = self._stopping(given)
-            if self.config.constraints is not None:
-                motion, report = self._keep_constraints(given, motion, distances, stopping)
-            motion = self._brake_to_cap(given, motion, cap, stopping)
-
+        v, hard, jerky = self._limit_acceleration(given, target, own)
+        report, excess = None, torch.zeros_like(given.state.dt)
+        if self.config.constraints is not None:
+            v, report = self._keep_constraints(given, v, distances)
+        if given.points is not None and (human_distance is not None or cap < math.inf):
+            v, braked = self._keep_speed(given, v, cap)
+            speeding = speeding | braked
+            speed = _speed(given.points, v)
+            excess = (speed - cap).clamp(min=0).squeeze(-1)
         # In the order of INTERVENTIONS.
-        flags = (fast, cut, hard, jerky, speeding, near, given.invalid, given.stopped)
-        flags = torch.cat(flags, dim=-1)
-        v = motion.velocity
-        state = SafetyState(
-            velocity=v,
-            acceleration=motion.acceleration,
-            position=given.joint_position + v * given.dt,
-            dt=given.state.dt,
-            counts=given.state.counts + flags,
-        )
-        return v, state, SafetyReport(flags=flags, constraints=report)
+        flags = (fast, cut, hard, jerky, speeding, near)
+        flags = torch.cat((*flags, given.invalid, given.stopped, given.wrong_start), dim=-1)
+        return v, *self._results(given, v, flags, excess, report)
 
     def _check_arguments(
         self,
@@ -405,6 +297,22 @@ class SafetyFilter(nn.Module):
                 "jacobian as well"
             )
 
+    def _measured_start(
+        self, state: SafetyState, measured: Tensor | None
+    ) -> tuple[SafetyState, Tensor]:
+        """The state after a start that agrees with the measured velocity, and the flag."""
+        if measured is None:
+            return state, torch.zeros_like(state.fresh).unsqueeze(-1)
+        most = self.barrier.velocity
+        error = (measured - state.velocity).abs() > _START_ERROR * most
+        known = is_number(measured).all(-1, keepdim=True)
+        wrong = state.fresh.unsqueeze(-1) & known & error.any(-1, keepdim=True)
+        return replace(
+            state,
+            velocity=torch.where(wrong, measured, state.velocity),
+            acceleration=state.acceleration.masked_fill(wrong, 0),
+        ), wrong
+
     def _validated(
         self,
         state: SafetyState,
@@ -412,16 +320,23 @@ class SafetyFilter(nn.Module):
         u: Tensor,
         dt: float | Tensor,
         jacobian: Tensor | None,
+        points: Tensor | None,
         bounds: tuple[Tensor, Tensor] | None,
         distances: Distances | None,
         stop: Tensor | None,
         stale: Tensor | None,
+        joint_velocity: Tensor | None,
     ) -> _Inputs:
         """Arguments of a step, with invalid values replaced and flagged."""
         state, dt, invalid = self._validated_state(state, dt)
+        state, wrong_start = self._measured_start(state, joint_velocity)
         numbers = [q, u]
         if jacobian is not None:
             numbers.append(jacobian.flatten(-2))
+            tool = jacobian[..., None, :3, :]
+            points = tool if points is None else torch.cat([tool, points], dim=-3)
+        if points is not None:
+            numbers.append(points.flatten(-3))
         invalid = invalid | ~is_number(torch.cat(numbers, dim=-1)).all(-1, keepdim=True)
         if distances is not None:
             invalid = invalid | ~distances.known().unsqueeze(-1)
@@ -435,15 +350,19 @@ class SafetyFilter(nn.Module):
         q = torch.where(invalid, state.position, q)
         if jacobian is not None:
             jacobian = jacobian.masked_fill(invalid.unsqueeze(-1), 0)
+        if points is not None:
+            points = points.masked_fill(invalid.unsqueeze(-1).unsqueeze(-1), 0)
         return _Inputs(
             state=state,
             joint_position=q,
             command=u.masked_fill(invalid | stopped, 0),
             jacobian=jacobian,
+            points=points,
             bounds=bounds or self.velocity_bounds(q),
             dt=dt,
             invalid=invalid,
             stopped=stopped,
+            wrong_start=wrong_start,
         )
 
     def _validated_state(
@@ -479,14 +398,14 @@ class SafetyFilter(nn.Module):
         # Constraints cut no single joint: the null space may give way to all of the task.
         return inside if self.config.constraints is None else u, _acts(excess), cut
 
-    def _cap_tool_speed(
+    def _cap_speed(
         self, given: _Inputs, u: Tensor, human_distance: Tensor | None
     ) -> tuple[Tensor, Tensor | float, Tensor, Tensor]:
         """The velocity slowed down, the cap, and the flags `tcp_speed` and `separation`."""
         never = torch.zeros_like(u[..., :1], dtype=torch.bool)
-        if given.jacobian is None:
+        if given.points is None:
             return u, math.inf, never, never
-        speed = torch.linalg.vector_norm(_linear(given.jacobian, u), dim=-1, keepdim=True)
+        speed = _speed(given.points, u)
         excess = speed / self.config.tcp_speed
         speeding = _acts(excess)
         if human_distance is None:
@@ -499,8 +418,8 @@ class SafetyFilter(nn.Module):
 
     def _limit_acceleration(
         self, given: _Inputs, target: Tensor, bounds: tuple[Tensor, Tensor] | None
-    ) -> tuple[_Motion, Tensor, Tensor]:
-        """The motion nearest to a target velocity within limits of acceleration and jerk.
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The velocity nearest to a target within limits of acceleration and jerk.
 
         With a jerk limit, the wanted acceleration is the largest fraction of change/dt, alike
         for all joints, with which they keep their acceleration limits and can still fade it out
@@ -512,34 +431,51 @@ class SafetyFilter(nn.Module):
             bounds: Limits of the velocity; None: the constraints keep them.
 
         Returns:
-            The motion, and the flags `acceleration` and `jerk`.
+            The velocity, and the flags `acceleration` and `jerk`.
         """
         barrier, state, dt = self.barrier, given.state, given.dt
+        acceleration, jerk = barrier.usable(dt)
+        change = (target - state.velocity) / dt
+        excess = _excess(change, acceleration)
         if not self.config.jerk_limited:
-            reach = barrier.acceleration * dt
-            change = target - state.velocity
-            excess_a = _excess(change, reach)
-            v = torch.addcdiv(state.velocity, change, excess_a.clamp(min=1))
+            v = torch.addcdiv(state.velocity, change * dt, excess.clamp(min=1))
             if bounds is not None:
                 # The acceleration limit comes last: the arm could not brake harder anyway.
-                v = v.clamp(*bounds).clamp(state.velocity - reach, state.velocity + reach)
-            acts = _acts(excess_a)
-            return _Motion(v, state.acceleration), acts, torch.zeros_like(acts)
-        reach = barrier.jerk * dt  # largest change of the acceleration in this step
-        change = (target - state.velocity) / dt
-        excess_a = _excess(change, barrier.acceleration)
+                v = v.clamp(*bounds)
+            reach = acceleration * dt
+            v = v.clamp(state.velocity - reach, state.velocity + reach)
+            return v, _acts(excess), torch.zeros_like(_acts(excess))
         # a = change/s with the root s of a dt + a^2/(2 j) = change dt, which fades out in time.
-        fading = (1 + torch.sqrt(1 + 2 * _excess(change, reach))) / 2
-        wanted = change / torch.maximum(excess_a, fading)
-        step = wanted - state.acceleration
-        excess_j = _excess(step, reach)
-        acceleration = torch.addcdiv(state.acceleration, step, excess_j.clamp(min=1))
+        fading = (1 + torch.sqrt(1 + 2 * _excess(change, jerk * dt))) / 2
+        v, excess_j = self._accelerated(given, change / torch.maximum(excess, fading), bounds)
+        return v, _acts(excess), _acts(excess_j)
+
+    def _accelerated(
+        self, given: _Inputs, wanted: Tensor, bounds: tuple[Tensor, Tensor] | None
+    ) -> tuple[Tensor, Tensor]:
+        """The velocity after a wanted acceleration, and by how much it exceeds the jerk."""
+        barrier, state, dt = self.barrier, given.state, given.dt
+        change = wanted - state.acceleration
+        excess = _excess(change, barrier.usable(dt)[1] * dt)
+        acceleration = torch.addcdiv(state.acceleration, change, excess.clamp(min=1))
         if bounds is not None:
             acceleration = barrier.nearest_acceleration(
                 acceleration, state.acceleration, state.velocity, bounds, dt
             )
-        motion = _Motion(state.velocity + acceleration * dt, acceleration)
-        return motion, _acts(excess_a), _acts(excess_j)
+        return state.velocity + acceleration * dt, excess
+
+    def _stopping(self, given: _Inputs) -> Tensor:
+        """The velocity with which the arm brakes to rest, as hard as it can [rad/s]."""
+        still = torch.zeros_like(given.command)
+        return self._limit_acceleration(given, still, given.bounds)[0]
+
+    def _easing(self, given: _Inputs) -> Tensor:
+        """The velocity with which the arm brakes as the speed barrier assumes [rad/s]."""
+        v, dt = given.state.velocity, given.dt
+        T = self.speed_barrier.braking_time(v).clamp(min=dt)
+        if self.config.jerk_limited:
+            return self._accelerated(given, -v / T, given.bounds)[0]
+        return self._limit_acceleration(given, v * (1 - dt / T), given.bounds)[0]
 
     @property
     def _exits_early(self) -> bool:
@@ -547,33 +483,22 @@ class SafetyFilter(nn.Module):
         constraints = self.config.constraints
         return constraints is not None and constraints.early_exit
 
-    def _stopping(self, given: _Inputs) -> _Motion | None:
-        """The motion that brakes to rest; None: not needed so far."""
-        if self._exits_early and not bool((given.invalid | given.stopped).any()):
-            return None
-        still = torch.zeros_like(given.command)
-        return self._limit_acceleration(given, still, given.bounds)[0]
-
     def _keep_constraints(
-        self,
-        given: _Inputs,
-        motion: _Motion,
-        distances: Distances | None,
-        stopping: _Motion | None,
-    ) -> tuple[_Motion, ConstraintReport]:
-        """The motion nearest to a given one with which limits and distances are kept."""
-        state, dt, command = given.state, given.dt, given.command
+        self, given: _Inputs, v: Tensor, distances: Distances | None
+    ) -> tuple[Tensor, ConstraintReport]:
+        """The velocity nearest to a given one with which limits and distances are kept."""
+        state, command = given.state, given.command
         assert given.jacobian is not None
         # The arm has picked up this fraction of the command so far.
         square = torch.linalg.vecdot(command, command)
-        along = torch.linalg.vecdot(command, motion.velocity)
+        along = torch.linalg.vecdot(command, v)
         fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
         kept = constrained_velocity(
-            motion.velocity,
+            v,
             command,
             given.jacobian,
             *self.barrier.reachable_velocity(
-                state.velocity, state.acceleration, given.bounds, dt
+                state.velocity, state.acceleration, given.bounds, given.dt
             ),
             distances,
             self.config.constraints,
@@ -584,58 +509,88 @@ class SafetyFilter(nn.Module):
         v = kept.joint_velocity
         v = torch.where(v.abs() < _REST, 0, v)
         braking = given.invalid | given.stopped
-        if stopping is not None:
-            v = torch.where(braking, stopping.velocity, v)
-        acceleration = motion.acceleration
-        if self.config.jerk_limited:
-            acceleration = (v - state.velocity) / dt
+        if not self._exits_early or bool(braking.any()):
+            v = torch.where(braking, self._stopping(given), v)
         idle = braking.squeeze(-1)
         report = ConstraintReport(
             slowed=kept.slowed.masked_fill(idle, 0),
             violation=kept.violation.masked_fill(idle, 0),
             solved=kept.solved | idle,
         )
-        return _Motion(v, acceleration), report
+        return v, report
 
-    def _brake_to_cap(
-        self, given: _Inputs, motion: _Motion, cap: Tensor | float, stopping: _Motion | None
-    ) -> _Motion:
-        """The motion braked as far as the cap on the tool speed requires."""
-        assert given.jacobian is not None
-        tool = _linear(given.jacobian, motion.velocity)
-        if stopping is None:
-            square = torch.linalg.vecdot(tool, tool).unsqueeze(-1)
-            if not bool((square > cap**2).any()):
-                return motion
-            still = torch.zeros_like(given.command)
-            stopping = self._limit_acceleration(given, still, given.bounds)[0]
-        fraction = _blend_to_cap(tool, _linear(given.jacobian, stopping.velocity), cap)
-        # Between two motions within the limits, so within them as well.
-        return _Motion(
-            torch.lerp(motion.velocity, stopping.velocity, fraction),
-            torch.lerp(motion.acceleration, stopping.acceleration, fraction),
+    def _keep_speed(
+        self, given: _Inputs, v: Tensor, cap: Tensor | float
+    ) -> tuple[Tensor, Bool[Tensor, "*batch 1"]]:
+        """The velocity braked as far as the cap on the speed of points requires, and a flag.
+
+        Between the wanted velocity and the one that eases off, both within the limits, it is
+        the last one inside the barrier. Where easing off is not enough, it lies between that
+        and the one that brakes as hard as the arm can. A stop brakes hard in any case.
+        """
+        cap = cap * (1 - 8 * torch.finfo(v.dtype).eps)
+        braking = given.invalid | given.stopped
+        speed = self._highest_speed(given, v)
+        if self._exits_early and not bool((speed > cap).any()):
+            return v, torch.zeros_like(braking)
+        stopping, easing = self._stopping(given), self._easing(given)
+        hard, gentle = self._highest_speed(given, stopping), self._highest_speed(given, easing)
+        eases = gentle <= cap
+        low, high = torch.where(eases, easing, stopping), torch.where(eases, v, easing)
+        at_low, at_high = torch.where(eases, gentle, hard), torch.where(eases, speed, gentle)
+        fraction = _secant(at_low, at_high, cap)
+        # The bound is almost straight on so short a line; where it bulges, once more.
+        at = self._highest_speed(given, torch.lerp(low, high, fraction))
+        fraction = fraction * _secant(at_low, at, cap)
+        kept = torch.where(braking, v, torch.lerp(low, high, fraction))
+        return kept, ~braking & ~(eases & (fraction > 1 - _REPORTED))
+
+    def _highest_speed(self, given: _Inputs, v: Tensor) -> Tensor:
+        """Bound on the speed of the points at a velocity and on the way to rest [m/s]."""
+        assert given.points is not None
+        acceleration = (v - given.state.velocity) / given.dt
+        return self.speed_barrier.highest_speed(given.points, v, acceleration, given.dt)
+
+    def _results(
+        self,
+        given: _Inputs,
+        v: Tensor,
+        flags: Tensor,
+        excess: Tensor,
+        constraints: ConstraintReport | None,
+    ) -> tuple[SafetyState, SafetyReport]:
+        """The next state, and the report."""
+        before = given.state
+        # Of the rounded velocities: errors do not add up, and a check finds the same.
+        acceleration = (v - before.velocity) / given.dt
+        too_fast = torch.where(excess > _REPORTED, before.too_fast + before.dt, 0.0)
+        state = SafetyState(
+            velocity=v,
+            acceleration=acceleration if self.config.jerk_limited else before.acceleration,
+            position=given.joint_position + v * given.dt,
+            dt=before.dt,
+            fresh=torch.zeros_like(before.fresh),
+            too_fast=too_fast,
+            counts=before.counts + flags,
+        )
+        return state, SafetyReport(
+            flags=flags,
+            speed_excess=excess,
+            speed_excess_time=too_fast,
+            constraints=constraints,
         )
 
 
-def _linear(jacobian: Tensor, joint_velocity: Tensor) -> Tensor:
-    """Linear velocity of the tool [m/s]."""
-    return torch.linalg.vecdot(jacobian[..., :3, :], joint_velocity.unsqueeze(-2))
+def _speed(points: Tensor, joint_velocity: Tensor) -> Float[Tensor, "*batch 1"]:
+    """Speed of the fastest point [m/s]."""
+    velocity = torch.linalg.vecdot(points, joint_velocity.unsqueeze(-2).unsqueeze(-2))
+    return torch.linalg.vector_norm(velocity, dim=-1).amax(-1, keepdim=True)
 
 
-def _blend_to_cap(wanted: Tensor, stopping: Tensor, cap: Tensor | float) -> Tensor:
-    """Interpolation weight from one tool velocity to another at which the speed is the cap.
-
-    Zero where the first keeps the cap; where none reaches it, the weight of least speed.
-    """
-    change = stopping - wanted
-    # |wanted + s change|^2 = cap^2, a quadratic in s. Negligible changes must not become a
-    # divisor, and a root of zero has no derivative.
-    a = torch.linalg.vecdot(change, change).clamp(min=_REPORTED**2)
-    b = torch.linalg.vecdot(wanted, change)
-    c = torch.linalg.vecdot(wanted, wanted).unsqueeze(-1) - cap**2
-    a, b = a.unsqueeze(-1), b.unsqueeze(-1)
-    root = (b * b - a * c).clamp(min=torch.finfo(a.dtype).tiny).sqrt()
-    return torch.where(c > 0, (-b - root) / a, 0.0).clamp(0, 1)
+def _secant(low: Tensor, high: Tensor, cap: Tensor | float) -> Tensor:
+    """Largest fraction of the way from a value to a higher one at which the cap is kept."""
+    rise = (high - low).clamp(min=_REPORTED)
+    return torch.where(high > cap, ((cap - low) / rise).clamp(0, 1), 1.0)
 
 
 def _excess(vector: Tensor, limit: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hrc_learn.controller.constraint_layer import Distances
 from hrc_learn.controller.joint_path import CHANGE_OF_RATE, changed_rate
-from hrc_learn.controller.safety_filter import ConstraintReport, SafetyConfig
+from hrc_learn.controller.safety_state import ConstraintReport, SafetyConfig
 from hrc_learn.pytree import pytree, static
 
 # Twist below which a fraction of it is not computed (metres and radians mixed) [1/s].

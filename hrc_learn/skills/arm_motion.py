@@ -158,10 +158,11 @@ class PositionServo:
         self.restart()
 
     def restart(self) -> None:
-        """Restart where the arm is, at rest."""
-        q = torch.from_numpy(self._arm.read().joint_position)
-        self.safety = self._filter.initial_state(q)
-        self._motion = self._smoother.initial_state(q)
+        """Restart from the measured motion of the arm."""
+        state = self._arm.read()
+        q, v = map(torch.from_numpy, (state.joint_position, state.joint_velocity))
+        self.safety = self._filter.initial_state(q, v)
+        self._motion = self._smoother.initial_state(q, v)
 
     def follow(
         self, target: Float[np.ndarray, " joints"]

@@ -178,7 +178,9 @@ class WorkCell:
         asked = human.read(state)
         self.human_input = replace(asked, nullspace_input=np.zeros(len(chain.joint_names)))
         self._sensed = self._sense(state, self.human_input)
-        self._state = self._loop.initial_state(self.joints, state.time)
+        self._state = self._loop.initial_state(
+            self.joints, state.time, torch.from_numpy(state.joint_velocity.copy())
+        )
 
     # Readings.
 

@@ -321,9 +321,10 @@ class HandGuidedArm:
         self.restart()
 
     def restart(self) -> None:
-        """Restart where the arm is, at rest."""
-        q = torch.from_numpy(self._arm.read().joint_position)
-        self.safety = self._filter.initial_state(q)
+        """Restart from the measured motion of the arm."""
+        state = self._arm.read()
+        q, v = map(torch.from_numpy, (state.joint_position, state.joint_velocity))
+        self.safety = self._filter.initial_state(q, v)
 
     def stop(self) -> None:
         """Bring the arm to rest."""

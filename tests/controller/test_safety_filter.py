@@ -254,7 +254,8 @@ def test_the_tool_is_capped_where_a_jacobian_is_given():
     state = safety.initial_state(READY)
     for _ in range(300):
         v, state, report = safety.step(state, READY, u, 0.002, jacobian=J)
-    assert (J @ v)[:3].norm().item() == pytest.approx(0.2)
+    # The rest is kept for the turning of the links and the ramps of the acceleration.
+    assert 0.19 < (J @ v)[:3].norm().item() <= 0.2
     torch.testing.assert_close(v / v.norm(), u / u.norm())
     assert report.acted("tcp_speed")
 

@@ -76,7 +76,8 @@ def test_the_tool_is_as_fast_as_the_distance_allows():
     speed = (J @ v[..., None])[:, :3, 0].norm(dim=-1)
     allowed = SeparationConfig().highest_speed(distance)
     assert speed[0] > 0.5
-    assert speed[1].item() == pytest.approx(allowed[1].item())
+    # The rest is kept for ramps of the acceleration.
+    assert 0.85 * allowed[1] < speed[1] <= allowed[1]
     assert 0 < speed[1] < 0.3
     assert v[2].norm() == 0
     assert report.acted("separation").tolist() == [False, True, True]
@@ -183,10 +184,9 @@ def test_above_its_cap_the_tool_brakes_as_for_a_stop():
             )
             speed, least = ((J @ x[..., None])[:, :3, 0].norm(dim=-1) for x in (v, stopping))
             assert (speed <= torch.maximum(cap, least) * (1 + 1e-9)).all()
-            beyond += int((speed > 1.01 * cap).sum())
+            beyond += int((speed > cap).sum())
             state, q = after, q + v * dt
-    # 3 in 1000 if each joint braked by itself.
-    assert beyond < 5e-4 * 240 * 200
+    assert beyond == 0
 
 
 def test_a_distance_without_a_jacobian_is_refused():
