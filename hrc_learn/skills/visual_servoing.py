@@ -21,6 +21,7 @@ from hrc_learn.controller import (
     Distances,
     Goals,
     Observation,
+    SafetyState,
 )
 from hrc_learn.controller.joint_path import changed_rate
 from hrc_learn.geometry import Pose, quaternion
@@ -160,17 +161,20 @@ class ServoStep:
             last_pixel=_NOT_SEEN,
         )
 
-    def restarted(self, state: ServoState, time: float) -> ServoState:
+    def restarted(self, state: ServoState, time: float, motion: SafetyState) -> ServoState:
         """State for a new target; the camera may have been moved since the last image.
 
         Args:
             state: State at the end of the last motion.
             time: Present time [s].
+            motion: Motion of the arm now, as commanded by the loop that led it since.
         """
         controller, pause = state.controller, time - state.last_image
         if 0 < pause < np.inf:
             resumed = self.controller.estimator.resumed(controller.estimator, pause)
             controller = replace(controller, estimator=resumed)
+        counts = controller.safety.counts
+        controller = replace(controller, safety=replace(motion, counts=counts))
         angle = state.angle
         if self._angle is not None and angle is not None:
             angle = self._angle.restarted(angle)
@@ -430,7 +434,7 @@ class VisualServo:
             MissedGraspError: It takes too long, or the marker stays undetected.
         """
         begun, start, config = self._cell.time, self._clock, self._config
-        self.state = self._law.restarted(self.state, begun)
+        self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
         if config.probe == 0:
             return self._converge(target, config.tolerance, start)[0] - begun
         reached = begun
