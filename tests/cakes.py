@@ -4,7 +4,7 @@ from pathlib import Path
 
 from hrc_learn.store import MANIFEST, Kind, replacing
 
-KIND = Kind(name="cake", mark="mark", files=("mark", "result", "layers/*"))
+KIND = Kind(name="cake", files=("mark", "result", "layers/*"))
 
 
 class WorkFailedError(Exception):

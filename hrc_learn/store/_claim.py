@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
-from hrc_learn.store._disk import (
+from hrc_learn.store._folder import (
+    MANIFEST,
     SUFFIX,
+    Kind,
     carry_over,
     delete,
     delete_entries,
@@ -18,13 +20,14 @@ from hrc_learn.store._disk import (
     holder,
     is_at,
     naming,
+    owned_entries,
     sign,
     sync_file,
     sync_folder,
     sync_tree,
     try_lock,
+    write_manifest,
 )
-from hrc_learn.store._ownership import Kind, owned_entries, write_manifest
 from hrc_learn.store._reading import json_text, read_json
 
 _LOCK, _NEW, _OLD, _OWNED = "lock", "new", "old", "owned.json"
@@ -124,7 +127,7 @@ class Claim:
         owned = owned_entries(path, kind, adopt=adopt)
         if owned is None:
             raise InTheWayError(
-                f"{path} is no {kind.name} of hrc_learn (one has {kind.mark}), so it is not "
+                f"{path} is no {kind.name} of hrc_learn (one has a {MANIFEST}), so it is not "
                 f"ours to overwrite: choose another folder"
             )
         others = sorted(entries(path) - owned)

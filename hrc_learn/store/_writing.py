@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hrc_learn.store._claim import Claim, InTheWayError, resolved, settle
-from hrc_learn.store._disk import naming
-from hrc_learn.store._ownership import MADE_BY, RESULTS, Kind
+from hrc_learn.store._folder import MADE_BY, RESULTS, Kind, naming
 from hrc_learn.store._reading import json_text, read_json
 
 

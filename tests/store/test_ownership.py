@@ -8,7 +8,6 @@ from cakes import KIND, cake, contents, fill
 from hrc_learn.store import (
     MADE_BY,
     MANIFEST,
-    Kind,
     new_folder,
     replacing,
 )
@@ -26,23 +25,10 @@ def test_what_is_not_ours_is_never_overwritten(tmp_path, kind):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize(
-    ("with_manifest", "name"),
-    [
-        (True, "thesis.tex"),
-        (True, "layers/own"),
-        (True, "own/empty folder/"),
-        (False, "thesis.tex"),
-        (False, "own/empty folder/"),
-    ],
-)
-def test_a_folder_that_holds_files_of_the_users_own_is_not_replaced(
-    tmp_path, with_manifest, name
-):
+@pytest.mark.parametrize("name", ["thesis.tex", "layers/own", "own/empty folder/"])
+def test_a_folder_that_holds_files_of_the_users_own_is_not_replaced(tmp_path, name):
     out = tmp_path / "out"
     fill(out, "old")
-    if not with_manifest:
-        (out / MANIFEST).unlink()
     precious = out / name
     precious.parent.mkdir(exist_ok=True)
     precious.mkdir() if name.endswith("/") else precious.write_text("years")
@@ -53,33 +39,14 @@ def test_a_folder_that_holds_files_of_the_users_own_is_not_replaced(
     precious.rmdir() if name.endswith("/") else precious.unlink()
 
 
-def test_what_older_versions_wrote_is_replaced(tmp_path):
+def test_a_folder_without_a_manifest_is_not_ours(tmp_path):
     fill(tmp_path / "out", "old")
     (tmp_path / "out" / MANIFEST).unlink()
-    fill(tmp_path / "out", "new", overwrite=True)
+    with pytest.raises(FileExistsError, match="not ours to overwrite"):
+        fill(tmp_path / "out", "new", overwrite=True)
+    assert contents(tmp_path) == cake("old")
+    fill(tmp_path / "out", "new", overwrite=True, others="keep")
     assert contents(tmp_path) == cake("new")
-
-
-@pytest.mark.parametrize(
-    ("text", "ours"),
-    [('{"by": "us"}', True), ('{"by": "them"}', False), ("[]", False), ("no JSON", False)],
-)
-def test_a_mark_without_a_manifest_must_say_whose_it_is(tmp_path, text, ours):
-    kind = Kind(name="pie", mark="mark", says=("by", "us"), files=("mark",))
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mark").write_text(text)
-
-    def bake():
-        with replacing(tmp_path / "out", kind, overwrite=True) as folder:
-            folder.mkdir()
-            (folder / "mark").write_text("new")
-
-    if ours:
-        bake()
-    else:
-        with pytest.raises(FileExistsError, match="not ours to overwrite"):
-            bake()
-    assert contents(tmp_path) == {"out/mark": "new" if ours else text}
 
 
 def test_an_empty_folder_may_be_filled(tmp_path):

@@ -11,7 +11,6 @@ from cakes import KIND, WorkFailedError, cake, contents, fail_to_fill, fill
 
 from hrc_learn import store
 from hrc_learn.store import (
-    MADE_BY,
     Claim,
     new_file,
     new_folder,
@@ -141,7 +140,7 @@ def test_results_replace_older_results_only(tmp_path):
     assert store.read_made_by(out) == {"seed": 2}
     fill(tmp_path / "cake", "sweet")
     with (
-        pytest.raises(FileExistsError, match=MADE_BY),
+        pytest.raises(FileExistsError, match="not ours to overwrite"),
         new_folder(tmp_path / "cake", {}, overwrite=True),
     ):
         pass

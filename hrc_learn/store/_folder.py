@@ -1,16 +1,27 @@
-"""Disk operations: file locks, listing, syncing, carrying over and deleting."""
+"""Folders on disk: locks, listing, syncing, deleting, and the manifests that say what is ours.
+
+Only files that this package has written may be deleted with their folder.
+"""
 
 import contextlib
 import errno
 import filecmp
+import hashlib
 import os
 import shutil
 import socket
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TextIO
+from typing import Literal, TextIO
 
+from hrc_learn.store._reading import json_text, read_json
+
+MADE_BY = "made_by.json"
+"""File in each folder of results that records its inputs."""
+MANIFEST = ".manifest.json"
+"""File that lists all other files of a folder, with their checksums."""
 # Errors of file systems without locks, such as some network ones; not every OS has each.
 _NO_LOCKS = {
     getattr(errno, name)
@@ -43,12 +54,7 @@ def try_lock(file: TextIO) -> bool:
 
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            return False
-        # Without locks, the process named in the file decides.
-        file.seek(0)
-        number = file.read().partition(" ")[0]
-        return not (number.isdecimal() and is_alive(int(number)))
+        return error.errno in _NO_LOCKS  # then nothing keeps two writers apart
     return True
 
 
@@ -74,19 +80,6 @@ def is_at(file: TextIO, path: Path) -> bool:
         return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
     except FileNotFoundError:
         return False
-
-
-def is_alive(pid: int) -> bool:
-    """True if a process of this machine may be running."""
-    if os.name == "nt":
-        return True  # signal 0 would end the process on Windows
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        pass
-    return True
 
 
 def entries(folder: Path) -> set[str]:
@@ -209,3 +202,145 @@ def delete_files(folder: Path, patterns: Iterable[str]) -> bool:
 def matches(entry: str, patterns: Iterable[str]) -> bool:
     """True if an entry matches one of the patterns."""
     return any(fnmatchcase(entry, pattern) for pattern in patterns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kind:
+    """Kind of folder that this package writes; only a folder of the same kind replaces it."""
+
+    name: str
+    files: tuple[str, ...] = ()
+    """Patterns of the files that an adopted folder without a manifest owns; * matches / too."""
+
+
+MODEL = Kind(name="saved model")
+EXPORT = Kind(name="export")
+RESULTS = Kind(name="folder of results")
+DATASET = Kind(
+    name="dataset",
+    files=(
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        "meta/hrc_learn.json",
+        "meta/episodes/chunk-*/file-*.parquet",
+        "data/chunk-*/file-*.parquet",
+        "videos/*/chunk-*/file-*.mp4",
+    ),
+)
+
+
+def owned_entries(folder: Path, kind: Kind, *, adopt: bool = False) -> set[str] | None:
+    """Entries of a folder that its writer made, and that may be deleted with it.
+
+    Args:
+        folder: The folder.
+        kind: Expected kind.
+        adopt: Accept the folder as one of the kind without a manifest too, and all files with
+            matching names as its own.
+
+    Returns:
+        Relative paths, those of folders with "/" at the end; None for a folder of another
+        kind.
+    """
+    if not folder.is_dir():
+        return None
+    present = entries(folder)
+    if not present:
+        return set()  # nothing could be lost
+    manifest = _read_manifest(folder)
+    if (manifest is None and not adopt) or (
+        manifest is not None and manifest.kind != kind.name
+    ):
+        return None
+    owned = set() if manifest is None else _listed(folder, manifest)
+    if adopt:
+        owned |= {entry for entry in present if matches(entry, kind.files)}
+        owned |= {f"{parent.as_posix()}/" for entry in owned for parent in Path(entry).parents}
+    return present & owned
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Manifest:
+    format: Literal["hrc_learn manifest"] = "hrc_learn manifest"
+    version: Literal[1] = 1
+    kind: str
+    source: str = ""
+    entries: list[str]
+    """All files and folders of the folder, the latter with "/" at the end."""
+    sha256: dict[str, str] = field(default_factory=dict)
+    """Checksums of the files, by entry."""
+
+
+def write_manifest(folder: Path, kind: Kind, source: str) -> None:
+    """Write the manifest of a folder, whose whole content was written here."""
+    names = sorted(entries(folder) - {MANIFEST})
+    checksums = {name: _checksum(folder / name) for name in names if (folder / name).is_file()}
+    manifest = _Manifest(kind=kind.name, source=source, entries=names, sha256=checksums)
+    (folder / MANIFEST).write_text(json_text(manifest), encoding="utf-8")
+
+
+def changed_files(folder: str | os.PathLike[str]) -> list[str]:
+    """Files of a folder that have changed, or are missing, since this package wrote it.
+
+    Returns:
+        Paths relative to the folder; none for a folder without a manifest.
+
+    Raises:
+        ValueError: The manifest is damaged.
+    """
+    folder = Path(folder)
+    if not (folder / MANIFEST).is_file():
+        return []
+    manifest = read_json(
+        folder / MANIFEST, _Manifest, "restore the folder, or delete this file"
+    )
+    return [
+        name
+        for name, checksum in manifest.sha256.items()
+        if not (folder / name).is_file() or _checksum(folder / name) != checksum
+    ]
+
+
+def require_unchanged(folder: str | os.PathLike[str]) -> None:
+    """Check that a folder is as this package wrote it.
+
+    Raises:
+        ValueError: A file has changed or is missing.
+    """
+    if changed := changed_files(folder):
+        raise ValueError(
+            f"{Path(folder) / changed[0]} has changed since it was written: restore it, or "
+            f"delete {MANIFEST} next to it if the change is intended"
+        )
+
+
+def source_of(folder: str | os.PathLike[str]) -> str:
+    """Source given by the writer of a folder; "" if there is none."""
+    manifest = _read_manifest(Path(folder))
+    return "" if manifest is None else manifest.source
+
+
+def _checksum(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read_manifest(folder: Path) -> _Manifest | None:
+    try:
+        return read_json(folder / MANIFEST, _Manifest)
+    except (OSError, ValueError):
+        return None
+
+
+def _listed(folder: Path, manifest: _Manifest) -> set[str]:
+    """Entries of a manifest, and those of the manifests of the folders it lists.
+
+    A foreign folder added later is not listed, whatever its own manifest says.
+    """
+    listed = {*manifest.entries, MANIFEST}
+    for entry in [entry for entry in listed if entry.endswith("/")]:
+        inner = _read_manifest(folder / entry)
+        if inner is not None:
+            listed |= {entry + name for name in _listed(folder / entry, inner)}
+    return listed
