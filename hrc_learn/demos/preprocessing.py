@@ -83,7 +83,7 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
         if name in _SMOOTH:
             moved[name] = CubicSpline(demo.time, values)(time)
         else:
-            moved[name] = _linear(demo.time, values.astype(float), time)
+            moved[name] = linear(demo.time, values.astype(float), time)
     if "orientation" in moved:
         moved["orientation"] /= np.linalg.norm(moved["orientation"], axis=1, keepdims=True)
     if "feature_visible" in moved:
@@ -93,12 +93,12 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
     nearest = nearest_frames(demo.time, time)
     for key, values in demo.extra.items():
         whole = (values == np.rint(values)).all(0)
-        between = _linear(demo.time, values, time)
+        between = linear(demo.time, values, time)
         moved["extra"][key] = np.where(whole, values[nearest], between)
     return moved
 
 
-def _linear(
+def linear(
     known: Float64[np.ndarray, " frames"],
     values: Float[np.ndarray, "frames *components"],
     time: Float64[np.ndarray, " times"],

@@ -112,7 +112,7 @@ def test_what_was_broken_off_goes_on_where_it_was(tmp_path):
 
 def test_parts_of_videos_are_looked_at_from_their_own_start(tmp_path):
     root = record(tmp_path / "set", still=25)
-    options = RepairOptions(drop_repeats=False, keep_rest=0.0)
+    options = RepairOptions()
     repair_dataset(root, tmp_path / "part", options)
     extract_features(tmp_path / "part", "spot", lambda: brightest)
     demos = load_demos(tmp_path / "part")

@@ -70,7 +70,7 @@ def test_what_is_sound_stays_as_it_is_in_every_version(tmp_path, version, withou
 def test_standing_still_is_trimmed(tmp_path, version):
     q = joint_path(100, seed=2)
     waiting = np.concatenate([np.repeat(q[:1], 70, 0), q, np.repeat(q[-1:], 90, 0)])
-    options = RepairOptions(drop_repeats=False, keep_rest=0.2)
+    options = RepairOptions()
     report, (demo,) = repaired(tmp_path, [waiting], options, version=version)
     assert report.changes[0][0].startswith("trimmed 1.")
     assert 100 <= len(demo) <= 130
@@ -252,8 +252,7 @@ def with_videos(root: Path) -> Path:
 
 def test_trimmed_episodes_keep_the_part_of_their_video(tmp_path):
     root = with_videos(tmp_path / "old")
-    options = RepairOptions(drop_repeats=False, keep_rest=0.0)
-    repair_dataset(root, tmp_path / "new", options)
+    repair_dataset(root, tmp_path / "new")
     assert check_dataset(tmp_path / "new").ok
     demos = load_demos(tmp_path / "new")
     rows = pq.read_table(tmp_path / "new/meta/episodes/chunk-000/file-000.parquet").to_pylist()
@@ -309,8 +308,7 @@ def test_lerobot_decodes_the_images_of_the_frames_that_are_left(tmp_path, monkey
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     lerobot_dataset = pytest.importorskip("lerobot.datasets").LeRobotDataset
     root = with_videos(tmp_path / "old")
-    options = RepairOptions(drop_repeats=False, keep_rest=0.0)
-    repair_dataset(root, tmp_path / "new", options)
+    repair_dataset(root, tmp_path / "new")
     old = lerobot_dataset("local/old", root=root, video_backend="pyav")
     new = lerobot_dataset("local/new", root=tmp_path / "new", video_backend="pyav")
     first = round(load_demos(tmp_path / "new")[0].start_time * 50)
@@ -394,7 +392,7 @@ def test_trimming_waits_for_the_gripper_and_for_the_command(tmp_path):
     episode = {STATE: np.hstack([waiting, opening]), "action": command}
     names = {STATE: [*NAMES, "gripper.pos"], "action": NAMES}
     root = write_folder(tmp_path / "old", [episode], names, dtype="float64")
-    repair_dataset(root, tmp_path / "new", RepairOptions(keep_rest=0.0))
+    repair_dataset(root, tmp_path / "new")
     (demo,) = load_demos(tmp_path / "new")
     first, last = round(demo.start_time * FPS), round((demo.start_time + demo.duration) * FPS)
     assert (first, last) == (40, 251)

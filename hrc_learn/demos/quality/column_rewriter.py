@@ -26,9 +26,9 @@ from hrc_learn.demos.format.videos import (
     subsampled,
     video_keys,
 )
-from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.quality.frame_edits import ColumnSemantics, EpisodeEdit
+from hrc_learn.demos.quality.episode_edits import EpisodeEdit
 from hrc_learn.demos.read.quantities import INDEX_KEYS
+from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.write.episode import (
     TIME_KEY,
     RecordingHeader,
@@ -54,7 +54,7 @@ class ColumnRewriter:
 
     def __init__(
         self,
-        semantics: ColumnSemantics,
+        dataset: OpenedDataset,
         units: Mapping[str, str],
         *,
         fps: float | int | None,
@@ -62,28 +62,26 @@ class ColumnRewriter:
     ):
         """
         Args:
-            semantics: Meaning of the old dataset's columns.
+            dataset: The old dataset.
             units: Units from the caller.
             fps: Rate that episodes are resampled to [1/s]; None for the old one.
             segments: Video segments by episode index; None leaves the videos out.
         """
-        dataset = semantics.dataset
-        self._folder = dataset.folder
-        self.notes: list[str] = [] if dataset.contract_note is None else [dataset.contract_note]
+        folder = self._folder = dataset.folder
+        self.notes: list[str] = [dataset.contract_note] if dataset.contract_note else []
         self._segments = segments or {}
         self._cameras = self._choose_cameras(videos=segments is not None)
-        images = [k for k, f in self._folder.features.items() if f.dtype == "image"]
-        self._image_columns = images
-        pictures = self._cameras or images
-        self._recorded = recorded_statistics(self._folder) if pictures else {}
-        self._task_index = {index: n for n, index in enumerate(sorted(self._folder.tasks))}
+        self._image_columns = [k for k, f in folder.features.items() if f.dtype == "image"]
+        pictures = self._cameras or self._image_columns
+        self._recorded = recorded_statistics(folder) if pictures else {}
+        self._task_index = {index: n for n, index in enumerate(sorted(folder.tasks))}
         self.tasks = self._task_texts()
-        self._add_time = "time" not in semantics.selections and fps is None
+        self._add_time = "time" not in dataset.columns.selections and fps is None
         self._header = RecordingHeader(
-            fps=float(fps or self._folder.fps),
-            robot_type=self._folder.robot_type or "unknown",
+            fps=float(fps or folder.fps),
+            robot_type=folder.robot_type or "unknown",
             features=self._features(),
-            sidecar=self._sidecar(semantics, units),
+            sidecar=self._sidecar(dataset.sidecar, units),
         )
 
     def _choose_cameras(self, videos: bool) -> list[str]:
@@ -125,13 +123,12 @@ class ColumnRewriter:
             features[TIME_KEY] = {"dtype": "float64", "shape": [1], "names": ["time"]}
         return {**features, **INDEX_FEATURES}
 
-    def _sidecar(self, semantics: ColumnSemantics, given: Mapping[str, str]) -> Sidecar:
-        sidecar = semantics.dataset.sidecar
-        columns, units = dict(sidecar.columns), {**sidecar.units, **given}
+    def _sidecar(self, old: Sidecar, given: Mapping[str, str]) -> Sidecar:
+        columns, units = dict(old.columns), {**old.units, **given}
         if self._add_time and columns:
             columns["time"] = SidecarColumn(key=TIME_KEY, names=("time",))
             units["time"] = "s"
-        return replace(sidecar, columns=columns, units=units)
+        return replace(old, columns=columns, units=units)
 
     def videos_of(self, edit: EpisodeEdit) -> Segments:
         """Parts of the old videos that show the remaining frames.
@@ -140,14 +137,13 @@ class ColumnRewriter:
             DatasetError: A video is missing, or the frames are not contiguous.
         """
         found, fps = self._segments.get(edit.entry.index, {}), self._folder.fps
-        missing = [key for key in self._cameras if key not in found]
-        if missing:
-            raise DatasetError(
-                "the video of this episode is missing: leave out the videos (videos=False), or "
-                "the episode (drop_bad_episodes)",
-                episode=edit.entry.index,
-                key=missing[0],
-            )
+        for key in self._cameras:
+            if key not in found:
+                raise edit.fault(
+                    "the video of this episode is missing: leave out the videos "
+                    "(videos=False), or the episode (drop_bad_episodes)",
+                    key=key,
+                )
         if self._cameras and (edit.resampled or (np.diff(edit.kept) != 1).any()):
             raise edit.fault(
                 "its videos would have to be encoded anew, because frames were dropped in the "

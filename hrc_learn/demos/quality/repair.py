@@ -11,16 +11,18 @@ from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
 from hrc_learn.demos.format.videos import Segments, read_segments
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
-from hrc_learn.demos.quality.frame_edits import (
+from hrc_learn.demos.quality.episode_edits import (
     ColumnSemantics,
     EpisodeEdit,
     drop_bad_frames,
     drop_late,
     drop_repeats,
+    fix_signs,
     renew_stamps,
+    resample_to_grid,
     trim,
+    unwrap,
 )
-from hrc_learn.demos.quality.value_edits import fix_signs, resample_to_grid, unwrap
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.contract import fingerprint, keep_contract
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
@@ -42,9 +44,7 @@ class RepairOptions:
     """Changes that a repair may make in the copy."""
 
     trim: bool = True
-    """Trim the rest before and after the motion."""
-    keep_rest: float | int = 0.1
-    """Rest left at either end [s]."""
+    """Trim the rest before and after the motion to 0.1 s."""
     drop_late: bool = True
     """Drop frames that a column of true stamps has no later than the one before."""
     drop_repeats: bool = False
@@ -67,8 +67,6 @@ class RepairOptions:
     def __post_init__(self) -> None:
         if self.fps is not None and not self.fps > 0:
             raise ValueError(f"fps must be positive, got {self.fps}")
-        if self.keep_rest < 0:
-            raise ValueError(f"keep_rest must not be negative, got {self.keep_rest}")
 
 
 @dataclass(kw_only=True)
@@ -163,35 +161,33 @@ class _Repair:
         folder = open_folder(path)
         if not folder.episodes:
             raise DatasetError("the dataset holds no episodes", file=folder.root)
-        self.folder = folder
-        self.out = out
-        self.options = options
+        self.dataset = OpenedDataset.of(folder, mapping)
+        self.folder, self.out, self.options, self.kept = folder, out, options, kept
         self.units = units or {}
-        self.kept = kept
-        self.semantics = self._semantics(OpenedDataset.of(folder, mapping))
-        self.rewriter = ColumnRewriter(
-            self.semantics,
+        columns = self.dataset.columns
+        decisions, faults = units_from_episodes(
+            columns.selections,
+            self._readable(),
+            folder.fps,
+            self.dataset.declared_units,
             self.units,
-            fps=options.fps,
-            segments=read_segments(folder) if options.videos else None,
+        )
+        self.faults = {fault.episode: fault for fault in faults}
+        """Episodes that contradict the units of the others."""
+        self.semantics = ColumnSemantics(
+            selections=columns.selections, joint_names=columns.joint_names, units=decisions
+        )
+        segments = read_segments(folder) if options.videos else None
+        self.rewriter = ColumnRewriter(
+            self.dataset, self.units, fps=options.fps, segments=segments
         )
         self.report = RepairReport(path=out, notes=self.rewriter.notes, dry_run=options.dry_run)
 
-    def _semantics(self, dataset: OpenedDataset) -> ColumnSemantics:
-        """Meaning of the columns, with units guessed from all finite, readable episodes."""
-        selections = dataset.columns.selections
-
-        def readable() -> Iterator[tuple[EpisodeEntry, Quantities]]:
-            for entry, frames in zip(self.folder.episodes, self._read(), strict=True):
-                # Unreadable episodes are reported, or left out, when they are repaired.
-                if not isinstance(frames, DatasetError):
-                    yield entry, select_quantities(frames, selections)
-
-        decisions, faults = units_from_episodes(
-            selections, readable(), self.folder.fps, dataset.declared_units, self.units
-        )
-        bad = {fault.episode: fault for fault in faults}
-        return ColumnSemantics(dataset=dataset, units=decisions, bad=bad)
+    def _readable(self) -> Iterator[tuple[EpisodeEntry, Quantities]]:
+        """Quantities of the readable episodes; the others are reported when repaired."""
+        for entry, frames in zip(self.folder.episodes, self._read(), strict=True):
+            if not isinstance(frames, DatasetError):
+                yield entry, select_quantities(frames, self.dataset.columns.selections)
 
     def _read(self) -> Iterator[RawFrames | DatasetError]:
         """Numeric columns of every episode."""
@@ -244,27 +240,26 @@ class _Repair:
 
     def _repaired(self, entry: EpisodeEntry, frames: RawFrames | DatasetError) -> EpisodeEdit:
         """Apply the permitted edits to one episode."""
-        options, semantics = self.options, self.semantics
-        if (fault := semantics.bad.get(entry.index)) is not None:
+        options = self.options
+        if (fault := self.faults.get(entry.index)) is not None:
             raise fault
         if isinstance(frames, DatasetError):
             raise frames
         edit = self._unedited(entry, frames)
-        if "time" not in semantics.selections:
+        if "time" not in edit.semantics.selections:
             edit = renew_stamps(edit, self.folder.fps)
-        edit = drop_bad_frames(edit, semantics, options.drop_bad_frames)
-        if options.drop_late:
-            edit = drop_late(edit)
-        if options.trim:
-            edit = trim(edit, semantics, options.keep_rest)
-        if options.drop_repeats:
-            edit = drop_repeats(edit)
-        if options.unwrap:
-            edit = unwrap(edit, semantics)
-        if options.fix_signs:
-            edit = fix_signs(edit, semantics)
+        edit = drop_bad_frames(edit, options.drop_bad_frames)
+        for wanted, change in (
+            (options.drop_late, drop_late),
+            (options.trim, trim),
+            (options.drop_repeats, drop_repeats),
+            (options.unwrap, unwrap),
+            (options.fix_signs, fix_signs),
+        ):
+            if wanted:
+                edit = change(edit)
         if options.fps is not None:
-            edit = resample_to_grid(edit, semantics, options.fps)
+            edit = resample_to_grid(edit, options.fps)
         stalled = np.flatnonzero(np.diff(edit.time) <= 0)
         if len(stalled):
             raise edit.fault(
@@ -276,13 +271,14 @@ class _Repair:
 
     def _unedited(self, entry: EpisodeEntry, frames: RawFrames) -> EpisodeEdit:
         """The frames of an episode that are to be kept."""
-        selections = self.semantics.selections
+        semantics = self.semantics
         time = recorded_stamps(self.folder, frames)
-        if "time" in selections:
-            ((key, index),) = selections["time"].columns
-            time = frames[key][:, index].astype(float) * self.semantics.units["time"].factor
+        if "time" in semantics.selections:
+            ((key, index),) = semantics.selections["time"].columns
+            time = frames[key][:, index].astype(float) * semantics.units["time"].factor
         edit = EpisodeEdit(
             entry=entry,
+            semantics=semantics,
             frames={
                 k: v for k, v in frames.items() if k not in INDEX_KEYS or k == "task_index"
             },
@@ -298,7 +294,7 @@ class _Repair:
 
     def _carry_contract(self, target: Path) -> None:
         """Keep the old dataset's contract with the new one, in the units given."""
-        contract = self.semantics.dataset.contract
+        contract = self.dataset.contract
         if contract is None:
             return
         given = {

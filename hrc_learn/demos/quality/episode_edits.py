@@ -1,0 +1,421 @@
+"""Edits of an episode: frames removed, values mended, and a regular grid of frames."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from numpy.lib.stride_tricks import sliding_window_view
+
+from hrc_learn.demos.demonstration import Demonstration
+from hrc_learn.demos.filters import trim_rest
+from hrc_learn.demos.format.dataset_folder import EpisodeEntry
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.preprocessing import linear, nearest_frames
+from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
+from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.frames import RawFrames, select_quantities
+from hrc_learn.demos.read.profiles import is_discrete, profile_columns
+from hrc_learn.demos.read.quantities import is_hand
+from hrc_learn.demos.read.units import Quantities, UnitDecision
+from hrc_learn.geometry import quaternion
+
+_PAUSE = 0.1
+"""Longest time between two reports of a moving robot [s]."""
+_RESTING = 0.01
+"""Fraction of its range within which a value rests: more than the noise of encoders."""
+_MEASURED_ANGLES = ("joint_position", "euler_xyz", "euler_intrinsic_xyz")
+_LARGEST_REMAINDER = 0.3 / (2 * np.pi)
+"""Largest motion within a frame: what may be left of a jump without its whole turns [turns]."""
+_NEIGHBOURS = 4
+"""Steps on either side that tell the speed of the joint."""
+_SMOOTH = ("joint_position", "joint_velocity", "position")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnSemantics:
+    """Meaning and units of the columns of a dataset."""
+
+    selections: dict[str, ColumnSelection]
+    """Columns by role."""
+    joint_names: tuple[str, ...]
+    units: dict[str, UnitDecision]
+
+    def turn(self, role: str) -> Float64[np.ndarray, " components"]:
+        """A full turn in the unit of each component."""
+        width = len(self.selections[role].columns)
+        return 2 * np.pi / np.broadcast_to(self.units[role].factor, width)
+
+    def hands(self, role: str) -> Bool[np.ndarray, " components"]:
+        """Mask of the fingers and grippers among the columns of a role."""
+        labels = self.selections[role].labels
+        named = [label in self.joint_names and is_hand(label) for label in labels]
+        return np.array(named) | (role == "gripper")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeEdit:
+    """One episode during its repair."""
+
+    entry: EpisodeEntry
+    """Entry in the old dataset."""
+    semantics: ColumnSemantics
+    frames: RawFrames
+    """Columns to be written; of LeRobot's own, only `task_index`."""
+    time: Float64[np.ndarray, " _frames"]
+    """True stamps if there are any, LeRobot's otherwise [s]."""
+    kept: Int64[np.ndarray, " _frames"]
+    """Frame of the old episode; the nearest one after resampling."""
+    resampled: bool = False
+    changes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def quantities(self) -> Quantities:
+        """Quantities in the units on disk."""
+        return select_quantities(self.frames, self.semantics.selections)
+
+    def only(self, wanted: Bool[np.ndarray, " _frames"], change: str) -> "EpisodeEdit":
+        """The wanted frames alone.
+
+        Raises:
+            DatasetError: Fewer than two frames would be left.
+        """
+        if wanted.all():
+            return self
+        if wanted.sum() < 2:
+            raise self.fault(f"{change}: no two frames are left")
+        return replace(
+            self,
+            frames={key: values[wanted] for key, values in self.frames.items()},
+            time=self.time[wanted],
+            kept=self.kept[wanted],
+            changes=(*self.changes, change),
+        )
+
+    def with_quantity(
+        self, role: str, values: Float64[np.ndarray, "frames columns"], *changes: str
+    ) -> "EpisodeEdit":
+        """The episode with other values of a quantity, in the unit on disk."""
+        columns: RawFrames = {}
+        for number, (key, index) in enumerate(self.semantics.selections[role].columns):
+            column = columns.setdefault(key, self.frames[key].copy())
+            column[:, index] = values[:, number]
+        return replace(self, frames=self.frames | columns, changes=(*self.changes, *changes))
+
+    def fault(
+        self, message: str, frame: int | None = None, key: str | None = None
+    ) -> DatasetError:
+        """An error that names the episode, and the frame of the old dataset."""
+        original = None if frame is None or self.resampled else int(self.kept[frame])
+        return self.entry.error(message, frame=original, key=key)
+
+
+def renew_stamps(edit: EpisodeEdit, fps: float) -> EpisodeEdit:
+    """Replace LeRobot's own stamps if they do not increase: they are frame / fps."""
+    stalled = int((~(np.diff(edit.time) > 0)).sum())
+    if not stalled:
+        return edit
+    change = f"renewed the stamps: {stalled} steps that did not increase -> 0"
+    time = np.arange(len(edit)) / fps
+    return replace(edit, time=time, changes=(*edit.changes, change))
+
+
+def drop_bad_frames(edit: EpisodeEdit, allowed: bool) -> EpisodeEdit:
+    """Drop the frames with values that are not finite.
+
+    A feature that was not visible need not be finite.
+
+    Raises:
+        DatasetError: There are such frames and `allowed` is False, or too few are left.
+    """
+    selections, feature = edit.semantics.selections, set()
+    hidden = np.zeros(len(edit), dtype=bool)
+    if {"feature", "feature_visible"} <= selections.keys():
+        hidden = ~(edit.quantities["feature_visible"][:, 0] > 0)
+        feature = {*selections["feature"].columns}
+    bad = ~np.isfinite(edit.time)
+    for key, values in edit.frames.items():
+        faulty = ~np.isfinite(values.astype(float))
+        for index in range(values.shape[1]):
+            if (key, index) in feature:
+                faulty[hidden, index] = False
+        bad |= faulty.any(1)
+    if bad.any() and not allowed:
+        raise edit.fault(
+            f"holds values that are not finite in {bad.sum()} frames; drop those "
+            f"(drop_bad_frames), or the episode (drop_bad_episodes)",
+            frame=int(bad.argmax()),
+        )
+    return edit.only(~bad, f"dropped {bad.sum()} frames with values that are not finite")
+
+
+def drop_late(edit: EpisodeEdit) -> EpisodeEdit:
+    """Drop the frames whose stamp is not later than all before.
+
+    Raises:
+        DatasetError: No two frames are left.
+    """
+    highest = np.maximum.accumulate(edit.time)
+    later = np.concatenate([[True], edit.time[1:] > highest[:-1]])
+    return edit.only(
+        later,
+        f"dropped {(~later).sum()} frames whose stamp does not increase: {len(edit)} -> "
+        f"{later.sum()}",
+    )
+
+
+def drop_repeats(edit: EpisodeEdit) -> EpisodeEdit:
+    """Drop the frames that repeat the previous one because the robot reports more slowly.
+
+    A frame with a different command, or any other difference, stays. Repetitions that last
+    longer than `_PAUSE` show an arm at rest, and stay too.
+
+    Raises:
+        DatasetError: No two frames are left.
+    """
+    repeated = repeated_frames(edit.frames)
+    for values in edit.frames.values():
+        if not is_clock(values):
+            repeated[1:] &= (values[1:] == values[:-1]).all(1)
+    begin = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(edit))))
+    end = np.append(np.flatnonzero(~repeated)[1:], len(edit))[np.cumsum(~repeated) - 1] - 1
+    repeated &= edit.time[end] - edit.time[begin] <= _PAUSE
+    return edit.only(
+        ~repeated,
+        f"dropped {repeated.sum()} repeated frames: {len(edit)} -> {(~repeated).sum()}",
+    )
+
+
+def trim(edit: EpisodeEdit) -> EpisodeEdit:
+    """Trim the rest before and after the motion to 0.1 s.
+
+    Raises:
+        DatasetError: The arm never moves, or the stamps do not increase.
+    """
+    quantities, semantics = edit.quantities, edit.semantics
+    role = next((r for r in ("joint_position", "position") if r in quantities), None)
+    if role is None:
+        return edit
+    moving: dict[str, Any] = {role: quantities[role] * semantics.units[role].factor}
+    try:
+        demo = Demonstration(
+            time=edit.time - edit.time[0],
+            joint_names=semantics.joint_names if role == "joint_position" else (),
+            fps=1.0,
+            episode=edit.entry.index,
+            **moving,
+        )
+        left = trim_rest(demo)
+    except ValueError as error:
+        raise edit.fault(str(error)) from error
+    first = int(np.searchsorted(demo.time, left.start_time))
+    first, last = _while_all_rest(edit, first, first + len(left) - 1)
+    wanted = np.zeros(len(edit), dtype=bool)
+    wanted[first : last + 1] = True
+    lead, tail = demo.time[first], demo.time[-1] - demo.time[last]
+    return edit.only(
+        wanted,
+        f"trimmed {lead:.2f} s at the beginning, {tail:.2f} s at the end: {len(edit)} -> "
+        f"{wanted.sum()} frames",
+    )
+
+
+def _while_all_rest(edit: EpisodeEdit, first: int, last: int) -> tuple[int, int]:
+    """First and last frame to keep, such that grippers, hands and commands rest outside."""
+    for key, values in edit.frames.items():
+        if not key.startswith(("observation.", "action", "state")) or is_clock(values):
+            continue
+        values = values.astype(float)
+        margin = _RESTING * np.ptp(values, axis=0)
+        # One frame of rest stays before the first change and after the last.
+        before = (np.abs(values[: first + 1] - values[0]) > margin).any(1)
+        after = (np.abs(values[last:] - values[-1]) > margin).any(1)
+        if before.any():
+            first = max(0, int(before.argmax()) - 1)
+        if after.any():
+            last = min(len(values) - 1, last + len(after) - int(after[::-1].argmax()))
+    return first, last
+
+
+def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
+    """Remove jumps by whole turns from joints, Euler angles and rotation vectors.
+
+    Only measurements of the arm change: commands, hands, grippers and switches stay as they
+    are. A joint whose command jumps with it stays too, so that the two agree.
+    """
+    semantics, quantities = edit.semantics, edit.quantities
+    for role in (*_MEASURED_ANGLES, "rotation_vector"):
+        if role not in quantities:
+            continue
+        values, turn = quantities[role], semantics.turn(role)
+        if role == "rotation_vector":
+            scaled = torch.from_numpy(values * 2 * np.pi / turn)
+            smooth = quaternion.unwrap_log(scaled).numpy() * turn / (2 * np.pi)
+        else:
+            smooth = values - turn * _turns(values / turn)
+            fixed = is_discrete(profile_columns({role: values})[role], len(edit))
+            fixed |= semantics.hands(role)
+            if role == "joint_position" and "command_position" in quantities:
+                other = quantities["command_position"] / semantics.turn("command_position")
+                fixed |= _turns(other).any(0)
+            smooth[:, fixed] = values[:, fixed]
+        # Scaling changes a rotation vector in its last digit.
+        changed = np.abs(smooth - values).max(0) > 1e-6 * turn
+        smooth[:, ~changed] = values[:, ~changed]
+        if changed.any():
+            labels = semantics.selections[role].labels
+            names = ", ".join(labels[int(i)] for i in np.flatnonzero(changed))
+            before, after = (
+                np.abs(np.diff(v[:, changed], axis=0)).max() for v in (values, smooth)
+            )
+            change = (
+                f"unwrapped {role} ({names}): largest step {before:.4g} -> {after:.4g} "
+                f"{semantics.units[role].unit}"
+            )
+            edit = edit.with_quantity(role, smooth, change)
+    return edit
+
+
+def _turns(
+    values: Float64[np.ndarray, "frames columns"],
+) -> Float64[np.ndarray, "frames columns"]:
+    """Whole turns by which each value has jumped since the first frame.
+
+    A jump counts only if its remainder fits the motion before and after: a two-level signal of
+    -3 and 3 rad leaves 0.28 rad while it rests otherwise, which is no turn.
+    """
+    steps = np.diff(values, axis=0)
+    whole = np.rint(steps)
+    left = np.abs(steps - whole)
+    jumps = np.where(left < _LARGEST_REMAINDER, whole, 0.0)
+    usual = np.where(whole == 0, np.abs(steps), 0.0)
+    padded = np.pad(usual, ((_NEIGHBOURS, _NEIGHBOURS), (0, 0)))
+    around = sliding_window_view(padded, 2 * _NEIGHBOURS + 1, axis=0).max(-1)
+    # Three times the neighbouring steps, and a thousandth of a turn for noise.
+    # The factor allows for acceleration between neighbouring frames.
+    jumps[left > 3 * around + 1e-3] = 0.0
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(jumps, axis=0)])
+
+
+def fix_signs(edit: EpisodeEdit) -> EpisodeEdit:
+    """Choose the signs of quaternions such that they do not jump."""
+    for role, values in edit.quantities.items():
+        if role.startswith("quaternion"):
+            flips = int(((values[1:] * values[:-1]).sum(1) < 0).sum())
+            change = f"fixed {flips} jumps of the sign of {role}: {flips} -> 0"
+            if flips:
+                edit = edit.with_quantity(role, _continuous(values), change)
+    return edit
+
+
+def _continuous(
+    values: Float64[np.ndarray, "frames 4"],
+) -> Float64[np.ndarray, "frames 4"]:
+    """Quaternions in any order of their components whose signs do not jump."""
+    flips = (values[1:] * values[:-1]).sum(1) < 0
+    return values * np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))[:, None]
+
+
+def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
+    """Resample every column to a regular grid that begins at the first frame.
+
+    Joints, joint velocities and poses follow cubic splines, other columns straight lines;
+    integers, switches and hands take the nearest frame. Angles that jump by whole turns are
+    unwrapped, interpolated and wrapped again. Rotation vectors are interpolated as they are:
+    unwrap them first.
+
+    Raises:
+        DatasetError: The stamps do not increase, the episode is shorter than a period, or it
+            holds transforms, which cannot be interpolated by their entries.
+    """
+    from scipy.interpolate import CubicSpline
+
+    known, semantics = edit.time - edit.time[0], edit.semantics
+    # The tolerance of a thousandth of a period allows for rounded stamps.
+    count = int(np.floor(known[-1] * fps + 1e-3)) + 1
+    if count < 2 or (np.diff(known) <= 0).any():
+        raise edit.fault(f"{known[-1]:.3g} s hold no two frames at {fps:g} Hz")
+    if "pose_matrix" in semantics.selections:
+        raise edit.fault(
+            "holds poses as matrices, which are not resampled; map them away "
+            "(mapping={'pose_matrix': None}) or leave the frames as they are (no fps)",
+            key="pose_matrix",
+        )
+    grid = np.arange(count) / fps
+    time = np.minimum(grid, known[-1])
+    smooth, wrapped = _unwrapped_all(edit)
+    moved = replace(
+        smooth,
+        frames={
+            key: linear(known, values.astype(float), time)
+            for key, values in smooth.frames.items()
+        },
+        time=grid + edit.time[0],
+    )
+    for role, values in smooth.quantities.items():
+        if role in _SMOOTH:
+            moved = moved.with_quantity(role, CubicSpline(known, values)(time))
+        elif role.startswith("quaternion"):
+            q = CubicSpline(known, _continuous(values))(time)
+            q /= np.linalg.norm(q, axis=1, keepdims=True)
+            moved = moved.with_quantity(role, q)
+    for (key, index), (turn, middle) in wrapped:
+        column = moved.frames[key][:, index]
+        column -= turn * np.rint((column - middle) / turn)
+    nearest = nearest_frames(known, time)
+    for key, held in _levels(edit):
+        moved.frames[key][:, held] = edit.frames[key][nearest][:, held]
+    return replace(
+        moved,
+        kept=edit.kept[nearest],
+        resampled=True,
+        changes=(*edit.changes, f"resampled {len(edit)} frames to {count} at {fps:g} Hz"),
+    )
+
+
+def _levels(edit: EpisodeEdit) -> Iterator[tuple[str, Bool[np.ndarray, " components"]]]:
+    """Components of each column without values between: integers, switches and hands."""
+    semantics, profiles = edit.semantics, profile_columns(edit.frames)
+    hands = {
+        column
+        for role in ("joint_position", "gripper", "command_position")
+        if role in semantics.selections
+        for column, hand in zip(
+            semantics.selections[role].columns, semantics.hands(role), strict=True
+        )
+        if hand
+    }
+    for key, values in edit.frames.items():
+        held = np.array([(key, index) in hands for index in range(values.shape[1])])
+        if key in profiles:
+            held |= is_discrete(profiles[key], len(edit))
+        yield key, held | (values.dtype.kind != "f")
+
+
+def _unwrapped_all(
+    edit: EpisodeEdit,
+) -> tuple[EpisodeEdit, list[tuple[tuple[str, int], tuple[float, float]]]]:
+    """Angles and commands without jumps by whole turns.
+
+    Returns:
+        The episode, and for each column that jumps a turn and the middle of its range, in its
+        unit.
+    """
+    quantities, wrapped = edit.quantities, []
+    for role in (*_MEASURED_ANGLES, "command_position"):
+        if role not in quantities:
+            continue
+        values, turn = quantities[role], edit.semantics.turn(role)
+        turns = _turns(values / turn)
+        columns = edit.semantics.selections[role].columns
+        for k in np.flatnonzero(turns.any(0)):
+            middle = float(values[:, k].min() + values[:, k].max()) / 2
+            wrapped.append((columns[k], (float(turn[k]), middle)))
+        if turns.any():
+            edit = edit.with_quantity(role, values - turn * turns)
+    return edit, wrapped
