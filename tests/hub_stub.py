@@ -18,8 +18,11 @@ import yaml
 
 TOKEN = "hf_of_alice"
 OWNER = "alice"
-FIRST_ATTRIBUTES = "*.parquet filter=lfs diff=lfs merge=lfs -text\n*.zip filter=lfs -text\n"
-"""Attributes of a new repository on the Hub, which cover some kinds of large files."""
+FIRST_ATTRIBUTES = "".join(
+    f"*.{kind} filter=lfs diff=lfs merge=lfs -text\n"
+    for kind in ("parquet", "mp4", "png", "jpg")
+)
+"""Attributes of a new repository of a dataset on the Hub, as far as they matter here."""
 
 
 @dataclass

@@ -1,10 +1,8 @@
 """Check a dataset and upload it to the Hugging Face Hub with a dataset card.
 
-A dataset repository needs three things besides its data: a card, a tag and Git attributes.
-The Hub indexes and displays the header of the card (`README.md`). LeRobot looks for a tag with
-the version of the format. `.gitattributes` makes Git store tables and videos in Git LFS
-rather than as ordinary blobs. The upload sets the tag last, so that LeRobot does not load a
-partial upload.
+A dataset repository needs two things besides its data. The Hub indexes and displays the header
+of the card (`README.md`). LeRobot looks for a tag with the version of the format. The upload
+sets the tag last, so that LeRobot does not load a partial upload.
 """
 
 from collections import Counter
@@ -25,12 +23,7 @@ UPLOADED = ("data/**", "videos/**", "images/**", "meta/**", "LICENSE*", "*.md")
 _OWNED = ("data/*", "videos/*", "images/*", "meta/*")
 """Files that the upload deletes from the repository if the folder no longer has them; * also
 matches subfolders."""
-_LARGE = ("*.parquet", "*.mp4", "*.png", "*.jpg")
-ATTRIBUTES = "".join(f"{name} filter=lfs diff=lfs merge=lfs -text\n" for name in _LARGE)
-"""`.gitattributes` of a dataset."""
 _CARD = "README.md"
-_SIZES = ("1K", "10K", "100K", "1M", "10M", "100M", "1B", "10B", "100B", "1T")
-"""Bounds of the Hub's size categories [frames]: "n<1K", "1K<n<10K", ..."""
 _MOST_TASKS = 20
 """Largest number of tasks that the card lists."""
 
@@ -96,7 +89,6 @@ def push_dataset(
     report = check_dataset(path)
     if report.errors and not unsound:
         raise DatasetError(
-            # The advice comes first: long messages are cut at their end.
             f"has {len(report.errors)} errors: repair the dataset, or upload it as it is "
             f"(--unsound). The first: {report.errors[0]}",
             file=folder.root,
@@ -113,19 +105,18 @@ def push_dataset(
     api = api or HfApi()
     url = api.create_repo(repo, repo_type="dataset", private=private, exist_ok=True)
     _upload(api, folder.root, push)
-    _move_tag(api, push)
     return replace(push, url=str(url))
 
 
 def _upload(api: "HfApi", root: Path, push: Push) -> None:
-    from huggingface_hub import CommitOperationAdd
-
-    head = [CommitOperationAdd(_CARD, push.card.encode())]
-    if attributes := _missing_attributes(api, push.repo):
-        head.append(CommitOperationAdd(".gitattributes", attributes.encode()))
+    """Upload the files, then set the tag with the format version."""
     where: Any = {"repo_id": push.repo, "repo_type": "dataset"}
-    # Git LFS applies only to files that are uploaded after `.gitattributes`.
-    api.create_commit(operations=head, commit_message="Describe the dataset", **where)
+    api.upload_file(
+        path_or_fileobj=push.card.encode(),
+        path_in_repo=_CARD,
+        commit_message="Describe the dataset",
+        **where,
+    )
     api.upload_folder(
         folder_path=root,
         allow_patterns=[*UPLOADED],
@@ -134,10 +125,6 @@ def _upload(api: "HfApi", root: Path, push: Push) -> None:
         commit_message="Upload the dataset",
         **where,
     )
-
-
-def _move_tag(api: "HfApi", push: Push) -> None:
-    """Move the tag with the format version to the uploaded commit."""
     known = api.list_repo_refs(push.repo, repo_type="dataset").tags
     if any(tag.name == push.tag for tag in known):
         api.delete_tag(push.repo, tag=push.tag, repo_type="dataset")
@@ -149,17 +136,6 @@ def _files(root: Path) -> Iterator[tuple[str, int]]:
         for path in sorted(root.glob(pattern.replace("/**", "/**/*"))):
             if path.is_file():
                 yield str(path.relative_to(root)), path.stat().st_size
-
-
-def _missing_attributes(api: "HfApi", repo: str) -> str:
-    """The repository's `.gitattributes` with missing lines added; "" if none is missing."""
-    name, there = ".gitattributes", ""
-    if api.file_exists(repo, name, repo_type="dataset"):
-        file = api.hf_hub_download(repo, name, repo_type="dataset")
-        there = Path(file).read_text(encoding="utf-8")
-    known = {line.split()[0] for line in there.splitlines() if "filter=lfs" in line}
-    lacking = [line for line in ATTRIBUTES.splitlines() if line.split()[0] not in known]
-    return "\n".join([*there.splitlines(), *lacking]) + "\n" if lacking else ""
 
 
 def dataset_card(
@@ -193,21 +169,11 @@ def dataset_card(
     earlier = getattr(head, "tags", None) or []
     head.tags = [*dict.fromkeys([*earlier, "LeRobot", *robot, *tags])]
     head.task_categories = head.task_categories or ["robotics"]
-    head.size_categories = [_size_category(sum(entry.length for entry in folder.episodes))]
     if not getattr(head, "configs", None):
         # The Hub's dataset viewer and `datasets.load_dataset` read `configs`.
         head.configs = [{"config_name": "default", "data_files": "data/*/*.parquet"}]
     card.data = head
     return card
-
-
-def _size_category(frames: int) -> str:
-    place = sum(frames >= 10 ** (3 + k) for k in range(len(_SIZES)))
-    if place == 0:
-        return f"n<{_SIZES[0]}"
-    if place == len(_SIZES):
-        return f"n>{_SIZES[-1]}"
-    return f"{_SIZES[place - 1]}<n<{_SIZES[place]}"
 
 
 def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterator[str]:

@@ -17,17 +17,11 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, UInt8
 
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
-from hrc_learn.demos.format.dataset_files import open_parquet, read_table
+from hrc_learn.demos.format.dataset_files import open_parquet, read_table, write_parquet
 from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
-from hrc_learn.demos.format.videos import (
-    VideoSegment,
-    decode,
-    image_key,
-    read_segments,
-    video_keys,
-)
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.frames import to_numpy
+from hrc_learn.demos.videos import VideoSegment, decode, image_key, read_segments, video_keys
 from hrc_learn.store import new_file
 
 _SOURCE = b"hrc_learn.video"
@@ -38,13 +32,8 @@ Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray,
 Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class FeatureTrack:
-    """Path of an image feature along one episode."""
-
-    pixels: Float64[np.ndarray, "_frames 2"]
-    """Pixel (u right, v down) [px], 0 where the feature is not visible."""
-    visible: Bool[np.ndarray, " _frames"]
+Track = tuple[Float64[np.ndarray, "_frames 2"], Bool[np.ndarray, " _frames"]]
+"""Pixels (u right, v down) [px], 0 where the feature is not visible, and its visibility."""
 
 
 class FeatureCache:
@@ -71,18 +60,16 @@ class FeatureCache:
         metadata = pq.read_schema(path).metadata or {}
         return metadata.get(_SOURCE) == _fingerprint(segment)
 
-    def write(self, episode: int, segment: VideoSegment, track: FeatureTrack) -> None:
+    def write(self, episode: int, segment: VideoSegment, track: Track) -> None:
         """Keep the track of an episode."""
         path = self.path(episode)
         path.parent.mkdir(parents=True, exist_ok=True)
-        columns = {"u": track.pixels[:, 0], "v": track.pixels[:, 1], "visible": track.visible}
-        table = pa.table({name: pa.array(values) for name, values in columns.items()})
+        pixels, visible = track
+        table = pa.table({"u": pixels[:, 0], "v": pixels[:, 1], "visible": visible})
         with new_file(path) as part:
-            pq.write_table(
-                table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), part
-            )
+            write_parquet(table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), part)
 
-    def read(self, episode: int, frames: int) -> FeatureTrack:
+    def read(self, episode: int, frames: int) -> Track:
         """Track of an episode.
 
         Raises:
@@ -104,7 +91,7 @@ class FeatureCache:
                 file=path,
                 episode=episode,
             )
-        return FeatureTrack(pixels=np.stack([u, v], axis=1), visible=visible.astype(bool))
+        return np.stack([u, v], axis=1), visible.astype(bool)
 
 
 def _features_folder(root: Path) -> Path:
@@ -196,14 +183,14 @@ def extract_features(
         cache.write(entry.index, segment, track)
         done.episodes += 1
         done.frames += entry.length
-        done.seen += int(track.visible.sum())
+        done.seen += int(track[1].sum())
         done.without_image += entry.length - images
     return done
 
 
 def _track(
     segment: VideoSegment, frames: int, fps: float, detect: Detector
-) -> tuple[FeatureTrack, int]:
+) -> tuple[Track, int]:
     """Track of the feature along one episode, and the number of frames with an image."""
     pixels, visible = np.zeros((frames, 2)), np.zeros(frames, dtype=bool)
     decoded = set()
@@ -214,7 +201,7 @@ def _track(
         pixel = detect(image)
         if pixel is not None:
             pixels[frame], visible[frame] = pixel, True
-    return FeatureTrack(pixels=pixels, visible=visible), len(decoded)
+    return (pixels, visible), len(decoded)
 
 
 def _camera_key(keys: Sequence[str], camera: str | None) -> str:
@@ -285,5 +272,5 @@ def with_feature(
     if if_known and not cache.path(demo.episode).is_file():
         hidden = np.zeros(len(demo), dtype=bool)
         return replace(demo, feature=np.zeros((len(demo), 2)), feature_visible=hidden)
-    track = cache.read(demo.episode, len(demo))
-    return replace(demo, feature=track.pixels, feature_visible=track.visible)
+    pixels, visible = cache.read(demo.episode, len(demo))
+    return replace(demo, feature=pixels, feature_visible=visible)

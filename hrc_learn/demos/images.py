@@ -2,9 +2,8 @@
 
 import io
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,20 +15,15 @@ from torch import Tensor
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.format.dataset_files import INFO_PATH, open_parquet, read_table
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
-from hrc_learn.demos.format.videos import Image, Segments, decode, decode_image, read_segments
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.videos import Image, Segments, decode, decode_image, read_segments
 
 Images = Mapping[str, UInt8[Tensor, "frames 3 height width"]]
 """Camera -> RGB images, 0 to 255. In memory, the colours of a pixel are adjacent
 (`torch.channels_last`)."""
 StampedImages = tuple[Float[np.ndarray, " images"], tuple[bytes, ...]]
 """Times [s], and a JPEG file for each."""
-Thumbnails = dict[str, StampedImages]
-"""Images by camera name, without LeRobot's prefix."""
 
-_SKIP_SECONDS = 2.0
-"""Gap between wanted images above which the video is sought: key frames are rarely farther
-apart."""
 _THUMBNAIL_RATE = 5.0
 """Thumbnails per second: a hand-guided arm moves by a few centimetres between two."""
 _JPEG_QUANTISER = 4
@@ -198,34 +192,19 @@ class ImageReader:
                 episode=entry.index,
                 key=camera,
             )
-        for run in _runs(wanted, max(1, round(_SKIP_SECONDS * fps))):
-            part = replace(
-                segment,
-                start=segment.start + run[0] / fps,
-                stop=segment.start + (run[-1] + 1) / fps,
+        missing = dict.fromkeys(wanted)
+        for frame, image in decode(segment, fps, size, wanted):
+            del missing[frame]
+            yield frame, image
+        for frame in missing:
+            raise DatasetError(
+                f"holds no image of frame {frame}: the recording was interrupted, or the "
+                f"video is that of another episode",
+                file=segment.file,
+                episode=entry.index,
+                frame=frame,
+                key=camera,
             )
-            missing, last = iter(run), -1
-            expected = next(missing)
-            for offset, image in decode(part, fps, size, skip=_unwanted(run)):
-                frame = run[0] + offset
-                if frame <= last:
-                    continue  # a second image of the same frame
-                last = frame
-                if frame != expected:
-                    break
-                yield frame, image
-                expected = next(missing, None)
-                if expected is None:
-                    break
-            if expected is not None:
-                raise DatasetError(
-                    f"holds no image of frame {expected}: the recording was interrupted, or "
-                    f"the video is that of another episode",
-                    file=segment.file,
-                    episode=entry.index,
-                    frame=expected,
-                    key=camera,
-                )
 
     def _from_column(
         self,
@@ -247,22 +226,6 @@ class ImageReader:
                 ) from error
 
 
-def _runs(frames: Sequence[int], gap: int) -> Iterator[list[int]]:
-    """Ascending frames, split where two are more than `gap` apart."""
-    numbers = np.asarray(frames)
-    for run in np.split(numbers, np.flatnonzero(np.diff(numbers) > gap) + 1):
-        if len(run):
-            yield run.tolist()
-
-
-def _unwanted(run: Sequence[int]) -> Callable[[int], bool] | None:
-    """Filter of the images of a run, counted from its first, that need no conversion."""
-    if len(run) == run[-1] - run[0] + 1:
-        return None
-    wanted = {frame - run[0] for frame in run}
-    return lambda frame: frame not in wanted
-
-
 def load_images(
     path: str | Path,
     episode: int,
@@ -276,7 +239,7 @@ def load_images(
 
 def thumbnails(
     path: str | Path | DatasetFolder, demos: Iterable[Demonstration], most: int = 200
-) -> tuple[dict[int, Thumbnails], list[str]]:
+) -> tuple[dict[int, dict[str, StampedImages]], list[str]]:
     """Small images of episodes: enough to see the motion.
 
     Args:
@@ -285,7 +248,8 @@ def thumbnails(
         most: Largest number of images per camera and episode: 200 take about 2 MB.
 
     Returns:
-        Images by episode index, and one line for each video that cannot be read.
+        Images by episode index and camera, without LeRobot's prefix, and one line for each
+        video that cannot be read.
 
     Raises:
         DatasetError: The metadata cannot be read.

@@ -14,7 +14,7 @@ from rrd_reading import Rrd
 
 from hrc_learn.cli import dashboard_commands, dataset_commands
 from hrc_learn.demos import DatasetWriter, load_demos
-from hrc_learn.demos.format.videos import decode_image
+from hrc_learn.demos.videos import decode_image
 from hrc_learn.teleoperation import dashboard_page
 
 ROOT = Path(__file__).parents[2]

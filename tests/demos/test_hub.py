@@ -81,7 +81,6 @@ def test_the_card_says_what_is_in_it(hub, dataset):
         "license": "mit",
         "tags": ["LeRobot", info["robot_type"], "reach"],
         "task_categories": ["robotics"],
-        "size_categories": ["n<1K"],
         "configs": [{"config_name": "default", "data_files": "data/*/*.parquet"}],
     }
     frames = info["total_frames"]

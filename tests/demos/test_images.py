@@ -9,11 +9,10 @@ from clean_sets import CAMERA, SIZE, bar, write_set, write_video
 from lerobot_folders import read_info, rewrite, write_info
 from unchecked import shapes_unchecked
 
-from hrc_learn.demos import DatasetError, ImageReader, load_demos, load_images
-from hrc_learn.demos.format import videos
+from hrc_learn.demos import DatasetError, ImageReader, load_demos, load_images, videos
 from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.format.videos import decode_image, read_segments
 from hrc_learn.demos.images import jpeg
+from hrc_learn.demos.videos import decode_image, read_segments
 
 
 @pytest.fixture(params=["v3.0", "v2.1"])

@@ -8,8 +8,8 @@ import torch
 from clean_sets import CAMERA, SIZE, bar, write_set
 
 from hrc_learn.demos import load_demos, load_images, thumbnails
-from hrc_learn.demos.format.videos import decode_image
 from hrc_learn.demos.images import thumbnail_size
+from hrc_learn.demos.videos import decode_image
 
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])

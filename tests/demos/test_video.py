@@ -7,7 +7,7 @@ from lerobot_folders import read_info, write_info
 from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, recover_dataset
-from hrc_learn.demos.format.videos import video_path
+from hrc_learn.demos.videos import video_path
 
 SIZE = (96, 128)
 

@@ -18,7 +18,10 @@ from hrc_learn.demos.format.metadata import (
     episode_statistics,
     image_statistics,
 )
-from hrc_learn.demos.format.videos import (
+from hrc_learn.demos.quality.episode_edits import EpisodeEdit
+from hrc_learn.demos.read.quantities import INDEX_KEYS
+from hrc_learn.demos.read.source import OpenedDataset
+from hrc_learn.demos.videos import (
     Segments,
     VideoSegment,
     decode_image,
@@ -26,9 +29,6 @@ from hrc_learn.demos.format.videos import (
     subsampled,
     video_keys,
 )
-from hrc_learn.demos.quality.episode_edits import EpisodeEdit
-from hrc_learn.demos.read.quantities import INDEX_KEYS
-from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.write.episode import (
     TIME_KEY,
     RecordingHeader,

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
-from hrc_learn.demos.format.videos import Segments, read_segments
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
 from hrc_learn.demos.quality.episode_edits import (
@@ -29,6 +28,7 @@ from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, s
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities, units_from_episodes
+from hrc_learn.demos.videos import Segments, read_segments
 from hrc_learn.demos.write.assembly import assemble
 from hrc_learn.demos.write.episode import episode_path
 from hrc_learn.store import DATASET, replacing

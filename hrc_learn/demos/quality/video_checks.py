@@ -2,23 +2,16 @@
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hrc_learn.demos.format.dataset_files import is_inside, require_file
-from hrc_learn.demos.format.dataset_folder import DatasetFolder
-from hrc_learn.demos.format.videos import (
-    Segments,
-    VideoSegment,
-    image_at,
-    read_segments,
-    video_keys,
-)
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
+from hrc_learn.demos.videos import VideoSegment, image_at, read_segments, video_keys
 
 _MOST_FILES = 2000
 """Files whose packets are counted; reading a terabyte of videos takes an hour."""
@@ -28,109 +21,73 @@ _MOST_EPISODES = 8
 """Episodes of one file of which images are decoded."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _VideoFile:
-    """One file of a camera and the episodes in it."""
-
-    folder: DatasetFolder
-    key: str
-    path: Path
-    shown: list[tuple[int, VideoSegment]]
-    """Episode index and segment, in the order of their start."""
-
-    @property
-    def name(self) -> str:
-        """Path relative to the dataset."""
-        return str(self.path.relative_to(self.folder.root))
-
-    @property
-    def lengths(self) -> dict[int, int]:
-        """Number of frames by episode index."""
-        return {entry.index: entry.length for entry in self.folder.episodes}
+Shown = list[tuple[EpisodeEntry, VideoSegment]]
+"""Episodes shown in one file, with their segments."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Stream:
+class _Stream(NamedTuple):
     """Properties of a video stream, without decoding it."""
 
     images: int
     rate: float
     """Frame rate [1/s], 0 if unknown."""
-    height: int
-    width: int
-
-    @property
-    def duration(self) -> float:
-        """Duration of all images [s]."""
-        return self.images / self.rate if self.rate else 0.0
+    size: tuple[int, int]
+    """Height and width [px]."""
 
 
 def check_videos(folder: DatasetFolder, report: ValidationReport) -> None:
     """Check the videos of every camera."""
     keys = video_keys(folder)
-    if not keys:
-        return
     segments = read_segments(folder, missing=True)
-    files = [s.file for segment in segments.values() for s in segment.values()]
-    if not any(file.exists() for file in files):
-        report.run("videos exist", _absent, keys)
-        return
+    files = [s.file for found in segments.values() for s in found.values()]
     for key in keys:
-        report.run("videos listed", _unlisted, key, segments)
-        _check_camera(folder, key, segments, report)
-
-
-def _absent(keys: list[str]) -> Iterator[Issue]:
-    for key in keys:
-        yield warning(
-            message="the video is declared, but no file of it is here; joints and poses can be "
-            "read, LeRobot itself needs it",
-            file=f"videos/**/{key}",
-            key=key,
-        )
-
-
-def _unlisted(key: str, segments: dict[int, Segments]) -> Iterator[Issue]:
-    for index, found in segments.items():
-        if key not in found:
-            text = "the list of episodes names no video"
-            yield Issue(message=text, episode=index, key=key)
+        if not any(file.exists() for file in files):
+            text = (
+                "the video is declared, but no file of it is here; joints and poses can be "
+                "read, LeRobot itself needs it"
+            )
+            report.add(warning(message=text, file=f"videos/**/{key}", key=key))
+            continue
+        by_file: dict[Path, Shown] = {}
+        for entry in folder.episodes:
+            segment = segments[entry.index].get(key)
+            if segment is None:
+                text = "the list of episodes names no video"
+                report.add(Issue(message=text, episode=entry.index, key=key))
+            else:
+                by_file.setdefault(segment.file, []).append((entry, segment))
+        _check_camera(folder, key, by_file, report)
 
 
 def _check_camera(
-    folder: DatasetFolder, key: str, segments: dict[int, Segments], report: ValidationReport
+    folder: DatasetFolder, key: str, by_file: dict[Path, Shown], report: ValidationReport
 ) -> None:
-    by_file: dict[Path, list[tuple[int, VideoSegment]]] = {}
-    for index, found in segments.items():
-        if key in found:
-            by_file.setdefault(found[key].file, []).append((index, found[key]))
     every = max(1, len(by_file) // _MOST_DECODED)
     seen: dict[str, int] = {}
     for number, (path, shown) in enumerate(by_file.items()):
-        ordered = sorted(shown, key=lambda item: item[1].start)
-        file, first = _VideoFile(folder=folder, key=key, path=path, shown=ordered), shown[0][0]
-        place: dict[str, Any] = {"file": file.name, "episode": first, "key": key}
+        name, first = str(path.relative_to(folder.root)), shown[0][0].index
+        place: dict[str, Any] = {"file": name, "key": key}
         if number == _MOST_FILES:
             text = f"{len(by_file) - number} further videos were not examined"
-            report.add(warning(message=text, file=file.name, key=key))
+            report.add(warning(message=text, **place))
             return
         try:
-            require_file(path, file.name, first)
-            if not is_inside(folder.root, file.name):
+            require_file(path, name, first)
+            if not is_inside(folder.root, name):
                 raise DatasetError("leads out of the dataset: it is not followed")
             stream = _read_stream(path)
-            report.run("video size and rate", _size_and_rate, file, stream)
-            report.run("video length", _length, file, stream)
+            report.run("video size and rate", _size_and_rate, folder, stream, place)
+            report.run("video length", _length, folder, shown, stream, place)
             if number % every == 0:
-                for issue in _images(file, shown):
+                for issue in _images(folder, shown, place):
                     report.add(issue)
         except DatasetError as error:
-            report.add(Issue(message=error.issue.message, **place))
+            report.add(Issue(message=error.issue.message, episode=first, **place))
             continue
         digest = _digest(path)
         if digest in seen:
             text = f"is the same video as that of episode {seen[digest]}"
-            report.add(warning(message=text, **place))
+            report.add(warning(message=text, episode=first, **place))
         seen.setdefault(digest, first)
 
 
@@ -153,7 +110,7 @@ def _read_stream(path: Path) -> _Stream:
                     if packet.is_corrupt:
                         raise DatasetError("holds damaged packets: copy it again")
             rate = float(stream.average_rate or stream.guessed_rate or 0)
-            found = _Stream(images=count, rate=rate, height=stream.height, width=stream.width)
+            found = _Stream(count, rate, (stream.height, stream.width))
     except DatasetError:
         raise
     except (av.FFmpegError, IndexError, ValueError, OSError) as error:
@@ -175,74 +132,71 @@ def _digest(path: Path) -> str:
         return hashlib.sha256(head + stream.read() + str(size).encode()).hexdigest()
 
 
-def _size_and_rate(file: _VideoFile, stream: _Stream) -> Iterator[Issue]:
-    declared = file.folder.features[file.key].shape
-    size, fps = (stream.height, stream.width), file.folder.fps
-    if len(declared) == 3 and size not in (declared[:2], declared[1:]):
-        yield Issue(
-            message=f"has images of {size[0]} x {size[1]}, declared are {list(declared)}",
-            file=file.name,
-            key=file.key,
-        )
+def _size_and_rate(
+    folder: DatasetFolder, stream: _Stream, place: dict[str, Any]
+) -> Iterator[Issue]:
+    declared, fps = folder.features[place["key"]].shape, folder.fps
+    if len(declared) == 3 and stream.size not in (declared[:2], declared[1:]):
+        height, width = stream.size
+        text = f"has images of {height} x {width}, declared are {list(declared)}"
+        yield Issue(message=text, **place)
     if stream.rate and abs(stream.rate / fps - 1) > 0.02:
-        yield Issue(
-            message=f"runs at {stream.rate:.4g} images a second, the dataset at {fps:g}",
-            file=file.name,
-            key=file.key,
-        )
+        text = f"runs at {stream.rate:.4g} images a second, the dataset at {fps:g}"
+        yield Issue(message=text, **place)
 
 
-def _length(file: _VideoFile, stream: _Stream) -> Iterator[Issue]:
+def _length(
+    folder: DatasetFolder, shown: Shown, stream: _Stream, place: dict[str, Any]
+) -> Iterator[Issue]:
     """Number of images per episode, end of the file, and overlaps of episodes."""
-    fps, is_v3, lengths = file.folder.fps, file.folder.is_v3, file.lengths
-    place: dict[str, Any] = {"file": file.name, "key": file.key}
-    for index, segment in file.shown:
-        length = lengths[index]
-        images = round((segment.stop - segment.start) * fps) if is_v3 else stream.images
-        if abs(images - length) > 1:
+    fps = folder.fps
+    for entry, segment in shown:
+        images = stream.images
+        if folder.is_v3:
+            images = round((segment.stop - segment.start) * fps)
+        if abs(images - entry.length) > 1:
             yield Issue(
-                message=f"shows {images} images, but the episode has {length} frames: it is "
-                f"that of another episode, or frames were lost",
-                episode=index,
-                severity=abs(images - length),
+                message=f"shows {images} images, but the episode has {entry.length} frames: "
+                f"it is that of another episode, or frames were lost",
+                episode=entry.index,
+                severity=abs(images - entry.length),
                 **place,
             )
-    if not is_v3:
+    if not folder.is_v3:
         return
-    end = max(segment.stop for _, segment in file.shown)
-    if stream.duration and end > stream.duration + 1.5 / fps:
-        yield Issue(
-            message=f"ends after {stream.duration:.3f} s, but episodes reach to {end:.3f} s",
-            **place,
-        )
-    for (before, first), (index, second) in pairwise(file.shown):
+    end = max(segment.stop for _, segment in shown)
+    lasts = stream.images / stream.rate if stream.rate else 0.0
+    if lasts and end > lasts + 1.5 / fps:
+        text = f"ends after {lasts:.3f} s, but episodes reach to {end:.3f} s"
+        yield Issue(message=text, **place)
+    ordered = sorted(shown, key=lambda item: item[1].start)
+    for (before, first), (entry, second) in pairwise(ordered):
         if second.start < first.stop - 0.5 / fps:
             yield Issue(
-                message=f"begins at {second.start:.3f} s, before episode {before} ends "
+                message=f"begins at {second.start:.3f} s, before episode {before.index} ends "
                 f"({first.stop:.3f} s)",
-                episode=index,
+                episode=entry.index,
                 **place,
             )
             return
 
 
-def _images(file: _VideoFile, shown: list[tuple[int, VideoSegment]]) -> Iterator[Issue]:
+def _images(folder: DatasetFolder, shown: Shown, place: dict[str, Any]) -> Iterator[Issue]:
     """Some images of some episodes: decodable, and not all the same.
 
     Raises:
         DatasetError: An image cannot be decoded.
     """
     some = np.unique(np.linspace(0, len(shown) - 1, _MOST_EPISODES).round().astype(int))
-    for index, segment in (shown[i] for i in some):
-        length = file.lengths[index]
-        frames = dict.fromkeys((0, length // 3, 2 * length // 3, length - 1))
-        images = [image_at(segment, frame, file.folder.fps) for frame in frames]
+    for entry, segment in (shown[i] for i in some):
+        last = entry.length - 1
+        frames = dict.fromkeys((0, entry.length // 3, 2 * entry.length // 3, last))
+        images = [image_at(segment, frame, folder.fps) for frame in frames]
         if len(images) > 2 and all(np.array_equal(images[0], i) for i in images[1:]):
             blank = "all of one colour" if np.ptp(images[0]) == 0 else "the same image"
             yield warning(
                 message=f"shows {blank} at the beginning, in the middle and at the end",
-                file=file.name,
-                episode=index,
-                key=file.key,
+                episode=entry.index,
                 check="video images",
+                **place,
             )

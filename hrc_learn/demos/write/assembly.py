@@ -1,8 +1,8 @@
 """Assembly of a dataset of version 3.0 from saved episodes, new or as an extension."""
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ from hrc_learn.demos.format.metadata import (
     SIDECAR_PATH,
     VIDEO_PATH,
     Sidecar,
-    Statistics,
     combined_statistics,
     data_schema,
     dump_json,
@@ -28,7 +27,7 @@ from hrc_learn.demos.format.metadata import (
     read_sidecar,
     write_tasks,
 )
-from hrc_learn.demos.format.videos import Segments, VideoSegment, video_path
+from hrc_learn.demos.videos import Segments, VideoSegment, video_path
 from hrc_learn.demos.write.episode import (
     RecordingHeader,
     StagedEpisode,
@@ -64,39 +63,45 @@ def assemble(
     for folder in ("meta/episodes/chunk-000", "data"):
         (target / folder).mkdir(parents=True)
     cameras = [key for key, f in header.features.items() if f["dtype"] == "video"]
-    listed = _EpisodeList() if earlier is None else _carry_over(earlier, target)
+    listed = _EpisodeList(target, link_videos)
+    sidecar = header.sidecar
+    if earlier is not None:
+        _carry_over(earlier, listed, cameras)
+        # Details and contract kept with the earlier dataset also hold for the longer one.
+        before = read_sidecar(earlier)
+        details = before.details | sidecar.details
+        sidecar = replace(sidecar, details=details, contract=before.contract)
     listed.tasks |= dict.fromkeys(tasks)
-    taken = {key: listed.count_videos(key) for key in cameras}
-    placement = _VideoPlacement(target, taken, link=link_videos)
     if videos is None:
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
     segments = iter(videos)
     for file, group in enumerate(_by_size(paths), start=listed.data_files):
         for staged in _write_frames(target / place(DATA_PATH, file), header, group):
-            columns: dict[str, object] = {}
-            for key, segment in next(segments).items():
-                columns |= placement.columns(key, segment)
-            listed.add(staged, file, columns)
-    sidecar = header.sidecar
-    if earlier is not None:
-        # Details and contract kept with the earlier dataset also hold for the longer one.
-        before = read_sidecar(earlier)
-        details = before.details | sidecar.details
-        sidecar = replace(sidecar, details=details, contract=before.contract)
+            listed.add(staged, file, next(segments))
     _write_metadata(target, header, listed, sidecar)
 
 
-@dataclass
 class _EpisodeList:
-    """List of episodes as it grows, one row of `meta/episodes` each."""
+    """List of episodes as it grows, one row of `meta/episodes` each.
 
-    tasks: dict[str, None] = field(default_factory=dict)
-    """Task texts in the order of their indices."""
-    data_files: int = 0
-    episodes: int = 0
-    frames: int = 0
-    _tables: list[pa.Table] = field(default_factory=list)
-    _rows: list[dict] = field(default_factory=list)
+    Attributes:
+        target: Folder of the new dataset.
+        tasks: Task texts in the order of their indices.
+        data_files: Number of data files of an earlier dataset.
+        episodes: Number of episodes.
+        frames: Number of frames.
+        videos: Number of video files of each camera.
+    """
+
+    def __init__(self, target: Path, link_videos: bool):
+        self.target = target
+        self.tasks: dict[str, None] = {}
+        self.data_files = self.episodes = self.frames = 0
+        self.videos: dict[str, int] = {}
+        self._link = link_videos
+        self._placed: dict[tuple[str, Path], int] = {}
+        self._tables: list[pa.Table] = []
+        self._rows: list[dict] = []
 
     def carry(self, table: pa.Table) -> None:
         """Begin with the list of an earlier dataset."""
@@ -104,33 +109,44 @@ class _EpisodeList:
         self.episodes += len(table)
         self.frames = table.column("dataset_to_index")[-1].as_py()
 
-    def add(self, staged: StagedEpisode, file: int, videos: Mapping[str, object]) -> None:
-        """Append an episode of a data file, with the places of its videos."""
+    def add(self, staged: StagedEpisode, file: int, videos: Segments) -> None:
+        """Append an episode of a data file, and place its videos."""
         length = len(staged.table)
         self.tasks |= dict.fromkeys(staged.tasks)
-        self._rows.append(
-            {
-                "episode_index": self.episodes,
-                "tasks": list(staged.tasks),
-                "length": length,
-                "data/chunk_index": file // CHUNK_SIZE,
-                "data/file_index": file % CHUNK_SIZE,
-                "dataset_from_index": self.frames,
-                "dataset_to_index": self.frames + length,
-                **videos,
-                **{
-                    f"stats/{key}/{name}": values
-                    for key, statistics in staged.statistics.items()
-                    for name, values in statistics.items()
-                },
-                "meta/episodes/chunk_index": 0,
-                "meta/episodes/file_index": 0,
-            }
-        )
+        row = {
+            "episode_index": self.episodes,
+            "tasks": list(staged.tasks),
+            "length": length,
+            "data/chunk_index": file // CHUNK_SIZE,
+            "data/file_index": file % CHUNK_SIZE,
+            "dataset_from_index": self.frames,
+            "dataset_to_index": self.frames + length,
+        }
+        for key, segment in videos.items():
+            row |= self._place_video(key, segment)
+        for key, statistics in staged.statistics.items():
+            row |= {f"stats/{key}/{name}": values for name, values in statistics.items()}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        self._rows.append(row)
         self.episodes += 1
         self.frames += length
         if len(self._rows) == _PACKED:
             self._pack()
+
+    def _place_video(self, key: str, segment: VideoSegment) -> dict[str, int | float]:
+        """Place the file of a segment, once for all episodes in it."""
+        if (key, segment.file) not in self._placed:
+            number = self.videos.get(key, 0)
+            path = self.target / place(VIDEO_PATH, number, video_key=key)
+            _put(segment.file, path, link=self._link)
+            self.videos[key], self._placed[key, segment.file] = number + 1, number
+        number = self._placed[key, segment.file]
+        return {
+            f"videos/{key}/chunk_index": number // CHUNK_SIZE,
+            f"videos/{key}/file_index": number % CHUNK_SIZE,
+            f"videos/{key}/from_timestamp": segment.start,
+            f"videos/{key}/to_timestamp": segment.stop,
+        }
 
     def _pack(self) -> None:
         self._tables.append(_table_of(self._rows))
@@ -140,22 +156,7 @@ class _EpisodeList:
         """All rows."""
         if self._rows:
             self._pack()
-        self._tables = [_concatenated(self._tables)]
-        return self._tables[0]
-
-    def count_videos(self, key: str) -> int:
-        """Number of video files of a camera so far."""
-        return 1 + _last_file(self.table(), f"videos/{key}") if self.episodes else 0
-
-    def statistics(self) -> Statistics:
-        """Statistics of the dataset, for features with statistics in all episodes."""
-        table, stacked = self.table(), {}
-        for name in table.column_names:
-            column = table.column(name)
-            if name.startswith("stats/") and not column.null_count:
-                key, _, statistic = name.removeprefix("stats/").rpartition("/")
-                stacked.setdefault(key, {})[statistic] = np.array(column.to_pylist())
-        return combined_statistics(stacked)
+        return _concatenated(self._tables)
 
 
 def _table_of(rows: Sequence[dict]) -> pa.Table:
@@ -171,12 +172,12 @@ def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
         return _table_of([row for table in tables for row in table.to_pylist()])
 
 
-def _last_file(table: pa.Table, kind: str) -> int:
-    """Number of the last file of data, or of a video, in a list of episodes."""
+def _count_files(table: pa.Table, kind: str) -> int:
+    """Number of files of data, or of a video, in a list of episodes."""
     chunks, files = (
         table.column(f"{kind}/{part}_index").to_pylist() for part in ("chunk", "file")
     )
-    return max(c * CHUNK_SIZE + f for c, f in zip(chunks, files, strict=True))
+    return 1 + max(c * CHUNK_SIZE + f for c, f in zip(chunks, files, strict=True))
 
 
 def _write_frames(
@@ -206,9 +207,9 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
 def _write_metadata(
     target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: Sidecar
 ) -> None:
-    tasks = list(listed.tasks)
+    table, tasks = listed.table(), list(listed.tasks)
     write_tasks(target / "meta/tasks.parquet", tasks)
-    write_parquet(listed.table(), target / EPISODES_PATH)
+    write_parquet(table, target / EPISODES_PATH)
     content = info_content(
         header.features,
         header.fps,
@@ -218,31 +219,34 @@ def _write_metadata(
         tasks=len(tasks),
     )
     dump_json(target / "meta/info.json", content)
-    dump_json(target / "meta/stats.json", listed.statistics())
+    stacked: dict[str, dict[str, np.ndarray]] = {}
+    for name in table.column_names:
+        column = table.column(name)
+        # Features with statistics in all episodes have some for the dataset.
+        if name.startswith("stats/") and not column.null_count:
+            key, _, statistic = name.removeprefix("stats/").rpartition("/")
+            stacked.setdefault(key, {})[statistic] = np.array(column.to_pylist())
+    dump_json(target / "meta/stats.json", combined_statistics(stacked))
     if sidecar != Sidecar():
         dump_json(target / SIDECAR_PATH, sidecar)
 
 
-def _carry_over(earlier: Path, target: Path) -> _EpisodeList:
+def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> None:
     """Give the data and videos of a dataset a second name in the new one."""
     folder = open_folder(earlier)
     for file in (*earlier.glob("data/*/*.parquet"), *earlier.glob("videos/**/*.mp4")):
-        _link(file, target / file.relative_to(earlier))
-    tables = [
-        read_table(open_parquet(earlier, name), name, None) for name in episode_lists(earlier)
-    ]
+        _put(file, listed.target / file.relative_to(earlier), link=True)
+    tables = [read_table(open_parquet(earlier, n), n) for n in episode_lists(earlier)]
     table = _concatenated(tables).sort_by("episode_index")
     for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
         zeros = pa.array(np.zeros(len(table), np.int64))  # the new list is one file
         if name in table.column_names:
             table = table.drop_columns([name])
         table = table.append_column(name, zeros)
-    listed = _EpisodeList(
-        tasks=dict.fromkeys(folder.tasks[i] for i in sorted(folder.tasks)),
-        data_files=1 + _last_file(table, "data"),
-    )
     listed.carry(table)
-    return listed
+    listed.tasks |= dict.fromkeys(folder.tasks[i] for i in sorted(folder.tasks))
+    listed.data_files = _count_files(table, "data")
+    listed.videos = {key: _count_files(table, f"videos/{key}") for key in cameras}
 
 
 def _recorded_videos(path: Path, cameras: Sequence[str], fps: float) -> Segments:
@@ -254,45 +258,13 @@ def _recorded_videos(path: Path, cameras: Sequence[str], fps: float) -> Segments
     }
 
 
-class _VideoPlacement:
-    """Video files placed in a new dataset, each once for all episodes in it."""
-
-    def __init__(self, root: Path, taken: Mapping[str, int], *, link: bool):
-        """
-        Args:
-            root: The new dataset.
-            taken: Number of files that each camera already has there.
-            link: Give files a second name instead of copying them.
-        """
-        self._root = root
-        self._put = _link if link else _copy
-        self._count = dict(taken)
-        self._placed: dict[tuple[str, Path], int] = {}
-
-    def columns(self, key: str, segment: VideoSegment) -> dict[str, int | float]:
-        """Place the file of a segment, and give the columns of the list of episodes."""
-        if (key, segment.file) not in self._placed:
-            number = self._count.get(key, 0)
-            self._put(segment.file, self._root / place(VIDEO_PATH, number, video_key=key))
-            self._count[key], self._placed[key, segment.file] = number + 1, number
-        number = self._placed[key, segment.file]
-        return {
-            f"videos/{key}/chunk_index": number // CHUNK_SIZE,
-            f"videos/{key}/file_index": number % CHUNK_SIZE,
-            f"videos/{key}/from_timestamp": segment.start,
-            f"videos/{key}/to_timestamp": segment.stop,
-        }
-
-
-def _copy(source: Path, target: Path) -> None:
+def _put(source: Path, target: Path, *, link: bool) -> None:
+    """Copy a file, or give it a second name: both exist until the dataset is complete."""
     target.parent.mkdir(parents=True, exist_ok=True)
+    if link:
+        try:
+            target.hardlink_to(source)
+            return
+        except OSError:  # a file system without links
+            pass
     shutil.copyfile(source, target)
-
-
-def _link(source: Path, target: Path) -> None:
-    """Give a file a second name: both names must exist until the dataset is complete."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        target.hardlink_to(source)
-    except OSError:  # a file system without links
-        shutil.copyfile(source, target)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,12 @@ class RecordedColumn:
     """Feature of the dataset that holds it."""
     names: tuple[str, ...]
     """Component names within that feature; in `_COLUMNS`, `{joint}` stands for each joint."""
+
+    def of_joints(self, joints: Sequence[str]) -> "RecordedColumn":
+        """The column with `{joint}` replaced."""
+        if "{joint}" not in self.names[0]:
+            return self
+        return replace(self, names=tuple(self.names[0].format(joint=j) for j in joints))
 
 
 # One `observation.state` for every quantity of the robot, distinguished by name, as written by
@@ -76,38 +82,21 @@ def columns_for(
         joint_names: Joints of the robot.
         features: User-defined features: key -> component names.
     """
-    columns = [
-        RecordedColumn(
-            given=column.given,
-            role=column.role,
-            key=column.key,
-            names=_joint_components(column.names, joint_names),
-        )
-        for column in _COLUMNS
-        if column.given in given
-    ]
-    own = [
-        RecordedColumn(given=key, role=None, key=key, names=tuple(names))
-        for key, names in features.items()
-    ]
-    return columns + own
+    columns = [column.of_joints(joint_names) for column in _COLUMNS if column.given in given]
+    for key, names in features.items():
+        columns.append(RecordedColumn(given=key, role=None, key=key, names=tuple(names)))
+    return columns
 
 
-def _joint_components(names: tuple[str, ...], joint_names: Sequence[str]) -> tuple[str, ...]:
-    if len(names) == 1 and "{joint}" in names[0]:
-        return tuple(names[0].format(joint=joint) for joint in joint_names)
-    return names
-
-
-def lerobot_features(columns: Sequence[RecordedColumn], dtype: str) -> dict[str, dict]:
+def lerobot_features(columns: Sequence[RecordedColumn]) -> dict[str, dict]:
     """Features as declared in `meta/info.json`, without LeRobot's index columns."""
     names: dict[str, list[str]] = {}
     for column in columns:
         names.setdefault(column.key, []).extend(column.names)
     return {
         key: {
-            # In float32, a Unix stamp has a resolution of two minutes.
-            "dtype": "float64" if key == TIME_KEY else dtype,
+            # Policies expect float32, in which a Unix stamp has a resolution of two minutes.
+            "dtype": "float64" if key == TIME_KEY else "float32",
             "shape": [len(components)],
             "names": components,
         }

@@ -6,11 +6,10 @@ a recording interrupted between the last two steps is not mistaken for another o
 """
 
 import itertools
-import json
 import os
 import uuid
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from hrc_learn.demos.format.dataset_folder import recovery_advice, staging_folder
 from hrc_learn.demos.issues import DatasetError
@@ -20,18 +19,29 @@ from hrc_learn.store import (
     DATASET,
     BusyError,
     Claim,
+    Count,
     delete_files,
-    new_file,
+    read_json,
     recover,
     replacing,
     resolved,
     source_of,
+    write_json,
 )
 
 _RECORDING = "recording.json"
 _EPISODE = "episode_[0-9][0-9][0-9][0-9][0-9][0-9]."
 _FILES = (f"{_EPISODE}parquet", f"{_EPISODE}*.mp4", "*.unfinished.mp4", ".*.writing/*")
 """Other files of a recording."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Recording:
+    """Header of a recording."""
+
+    id: str = field(default_factory=lambda: uuid.uuid4().hex)
+    episodes: Count | None = None
+    """Number of episodes of the dataset that it extends; None for a new one."""
 
 
 def begin(root: Path, earlier_episodes: int | None) -> None:
@@ -66,7 +76,7 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
             f"{recovery_advice(root)} makes a dataset of its saved episodes; remove it to "
             f"start anew"
         ) from None
-    _write_header(staging, earlier_episodes)
+    write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
 
 
 def finish(root: Path, claim: Claim) -> None:
@@ -79,7 +89,7 @@ def finish(root: Path, claim: Claim) -> None:
     root, staging = resolved(root), staging_folder(root)
     if not _is_done(root, staging):
         header = _read_header(staging)
-        episodes = header["episodes"]
+        episodes = header.episodes
         if not _has_episodes(staging):
             discard(staging)
             if episodes is None:
@@ -92,7 +102,7 @@ def finish(root: Path, claim: Claim) -> None:
             )
         paths = staged_paths(staging, episodes or 0)
         with replacing(
-            claim, DATASET, overwrite=episodes is not None, others="keep", source=header["id"]
+            claim, DATASET, overwrite=episodes is not None, others="keep", source=header.id
         ) as new:
             assemble(paths, new, earlier=None if episodes is None else root)
     discard(staging)
@@ -165,18 +175,12 @@ def discard(staging: Path) -> None:
         staging.rename(next(path for path in kept if not os.path.lexists(path)))
 
 
-def _read_header(staging: Path) -> dict[str, Any]:
-    """Identifier of a recording, and the number of episodes of the dataset it extends."""
+def _read_header(staging: Path) -> _Recording:
+    """Header of a recording; one without was interrupted before it was written."""
     path = staging / _RECORDING
-    if not path.is_file():  # interrupted before the header was written
-        _write_header(staging, None)
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def _write_header(staging: Path, earlier_episodes: int | None) -> None:
-    with new_file(staging / _RECORDING) as part:
-        content = {"id": uuid.uuid4().hex, "episodes": earlier_episodes}
-        part.write_text(json.dumps(content), encoding="utf-8")
+    if not path.is_file():
+        write_json(path, _Recording())
+    return read_json(path, _Recording, "move the recording away")
 
 
 def _is_recording(staging: Path) -> bool:
@@ -196,4 +200,4 @@ def _has_episodes(staging: Path) -> bool:
 def _is_done(root: Path, staging: Path) -> bool:
     """True if the dataset holds the recorded episodes and only the recording remains."""
     named = root.is_dir() and (staging / _RECORDING).is_file()
-    return named and source_of(root) == _read_header(staging)["id"]
+    return named and source_of(root) == _read_header(staging).id

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from hrc_learn.demos.format.dataset_folder import (
     staging_folder,
 )
 from hrc_learn.demos.format.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
-from hrc_learn.demos.format.videos import CameraRecorder, Image, video_features
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.videos import CameraRecorder, Image, video_features
 from hrc_learn.demos.write.episode import (
     Episode,
     EpisodeBuffer,
@@ -71,7 +71,6 @@ class DatasetWriter:
         features: Mapping[str, Sequence[str]] | None = None,
         *,
         cameras: Mapping[str, tuple[int, int]] | None = None,
-        dtype: Literal["float32", "float64"] = "float32",
         frames: Mapping[str, str] | None = None,
         details: Mapping[str, object] | None = None,
         append: bool = False,
@@ -85,7 +84,6 @@ class DatasetWriter:
             joint_names: Joints, in the order of the values of `joint_position` and the like.
             features: Further features: key, such as "observation.shelf" -> component names.
             cameras: Cameras whose images are stored as videos: name -> height, width [px].
-            dtype: Type on disk. Policies that train on the dataset expect float32.
             frames: Reference frames of the poses, such as
                 {"base": "panda_link0", "ee": "panda_hand_tcp"}.
             details: Further values to keep with the dataset, as JSON values.
@@ -112,7 +110,6 @@ class DatasetWriter:
         self.robot_type = robot_type
         self.joint_names = tuple(joint_names)
         self.features = {key: tuple(names) for key, names in (features or {}).items()}
-        self._dtype = dtype
         self._frames_of_poses = dict(frames or {})
         self._details = dict(details or {})
         self._columns: list[RecordedColumn] = []
@@ -367,7 +364,7 @@ class DatasetWriter:
             fps=self.fps,
             robot_type=self.robot_type,
             features={
-                **lerobot_features(columns, self._dtype),
+                **lerobot_features(columns),
                 **self._video_features,
                 **INDEX_FEATURES,
             },

@@ -7,8 +7,8 @@ lost if the recording were interrupted.
 
 import contextlib
 import io
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from hrc_learn.demos.format.dataset_files import path_in, read_rows
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, episode_lists
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, episode_lists
 from hrc_learn.demos.format.metadata import Statistics, image_statistics
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.store import sync_file
@@ -26,8 +26,11 @@ Image = UInt8[np.ndarray, "_height _width 3"]
 
 _PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 """Columns of the list of episodes for each video feature."""
-# Statistics use images of about 150 pixels, as in LeRobot.
 _SAMPLE_PIXELS = 150
+"""Longer side of the images that enter statistics [px], about as in LeRobot."""
+_SKIP_SECONDS = 2.0
+"""Gap between wanted images above which the video is sought: key frames are rarely farther
+apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +71,15 @@ def read_segments(folder: DatasetFolder, missing: bool = False) -> dict[int, Seg
     keys = video_keys(folder)
     if not keys:
         return {}
-    listed = _segments_v3(folder, keys) if folder.is_v3 else {}
-    segments = {}
-    for entry in folder.episodes:
-        found = listed.get(entry.index) or _segments_v2(folder, entry, keys)
-        segments[entry.index] = {k: s for k, s in found.items() if missing or s.file.is_file()}
-    return segments
+    segments = _segments_v3(folder, keys) if folder.is_v3 else _segments_v2(folder, keys)
+    return {
+        entry.index: {
+            key: segment
+            for key, segment in segments.get(entry.index, {}).items()
+            if missing or segment.file.is_file()
+        }
+        for entry in folder.episodes
+    }
 
 
 def _segments_v3(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
@@ -101,26 +107,26 @@ def _segment(
                 episode=row["episode_index"],
                 key=f"videos/{key}/{name}",
             )
-    chunk, number = values["chunk_index"], values["file_index"]
-    return VideoSegment(
-        file=_video_file(folder, key, chunk_index=chunk, file_index=number),
-        start=float(values["from_timestamp"]),
-        stop=float(values["to_timestamp"]),
-    )
+    chunk, number, start, stop = values.values()
+    path = _video_file(folder, key, chunk_index=chunk, file_index=number)
+    return VideoSegment(file=path, start=float(start), stop=float(stop))
 
 
-def _segments_v2(folder: DatasetFolder, entry: EpisodeEntry, keys: list[str]) -> Segments:
+def _segments_v2(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
     """Segments of the versions 2, which keep one file per episode and camera."""
-    if folder.is_v3:
-        return {}
-    chunk = entry.index // int(folder.info.get("chunks_size", 1000))
-    places = {"episode_chunk": chunk, "episode_index": entry.index}
-    return {
-        key: VideoSegment(
-            file=_video_file(folder, key, **places), start=0.0, stop=entry.length / folder.fps
-        )
-        for key in keys
-    }
+    size = int(folder.info.get("chunks_size", 1000))
+    segments = {}
+    for entry in folder.episodes:
+        places = {"episode_chunk": entry.index // size, "episode_index": entry.index}
+        segments[entry.index] = {
+            key: VideoSegment(
+                file=_video_file(folder, key, **places),
+                start=0.0,
+                stop=entry.length / folder.fps,
+            )
+            for key in keys
+        }
+    return segments
 
 
 def _video_file(folder: DatasetFolder, key: str, **places: int) -> Path:
@@ -132,7 +138,7 @@ def decode(
     segment: VideoSegment,
     fps: float,
     size: tuple[int, int] | None = None,
-    skip: Callable[[int], bool] | None = None,
+    frames: Sequence[int] | None = None,
 ) -> Iterator[tuple[int, Image]]:
     """Frame numbers of the episode with their RGB images, in order.
 
@@ -140,30 +146,33 @@ def decode(
         segment: Part of a video.
         fps: Frame rate of the dataset [1/s].
         size: Height and width to scale to [px]; None keeps the size.
-        skip: True for frames whose image is not wanted; None decodes all.
+        frames: Frames wanted, ascending; None for all. Those without an image are left out.
 
     Raises:
         DatasetError: The file is no video that can be decoded.
     """
     import av
 
-    half_period = 0.5 / fps
+    if frames is None:
+        frames = range(round((segment.stop - segment.start) * fps))
+    numbers = np.asarray(frames, dtype=int)
+    gaps = np.flatnonzero(np.diff(numbers) > max(1, round(_SKIP_SECONDS * fps)))
     try:
         with av.open(str(segment.file)) as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
-            if segment.start > 0 and stream.time_base is not None:
-                # Seeks the key frame before; images up to the start are decoded and dropped.
-                container.seek(int(segment.start / stream.time_base), stream=stream)
-            for image in container.decode(stream):
-                time = float(image.time or 0.0)
-                if time > segment.stop - half_period:
-                    return
-                if time <= segment.start - half_period:
-                    continue
-                frame = round((time - segment.start) * fps)
-                if skip is None or not skip(frame):
-                    yield frame, _rgb(image, size)
+            for number, run in enumerate(np.split(numbers, gaps + 1)):
+                wanted, start = {*run.tolist()}, segment.start + run[0] / fps
+                if (start > 0 or number) and stream.time_base is not None:
+                    # Seeks the key frame before; images up to the start are decoded, too.
+                    container.seek(int(start / stream.time_base), stream=stream)
+                for image in container.decode(stream):
+                    frame = round((float(image.time or 0.0) - segment.start) * fps)
+                    if frame in wanted:  # a second image of a frame is passed over
+                        wanted.remove(frame)
+                        yield frame, _rgb(image, size)
+                    if not wanted or frame > run[-1]:
+                        break
     except (av.FFmpegError, IndexError) as error:
         raise DatasetError(
             f"cannot be decoded ({error}): the recording was interrupted, or the copy is "
@@ -178,9 +187,7 @@ def image_at(segment: VideoSegment, frame: int, fps: float) -> Image:
     Raises:
         DatasetError: The file is no video that can be decoded, or ends before the frame.
     """
-    start = segment.start + frame / fps
-    part = replace(segment, start=start, stop=start + 1 / fps)
-    found = next(decode(part, fps), None)
+    found = next(decode(segment, fps, frames=[frame]), None)
     if found is None:
         raise DatasetError(f"ends before frame {frame} of the episode", file=segment.file)
     return found[1]
