@@ -1,7 +1,7 @@
 """Issues of a dataset with their place: raised by readers, listed in validation reports."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,19 @@ def plain_text(text: str) -> str:
     """Text from a file, safe to print in a terminal: escapes removed, length bounded."""
     shown = _UNPRINTABLE.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
     return shown if len(shown) <= _LONGEST_NAME else f"{shown[:_LONGEST_NAME]}..."
+
+
+def aligned(rows: Sequence[tuple[str, ...]], side: Literal["<", ">"] = "<") -> Iterator[str]:
+    """A table as text; the last column is not padded.
+
+    Args:
+        rows: Cells of each row.
+        side: "<" for cells at the left of their columns, ">" at the right.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
+    for row in rows:
+        cells = [f"{cell:{side}{w}}" for cell, w in zip(row, widths, strict=False)]
+        yield "  ".join([*cells, row[-1]]).rstrip()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +63,11 @@ class Issue:
         words = (w for w in self.message.split() if w.strip(".,:;") not in self.components)
         text = _FIGURE_OR_QUOTE.sub("#", " ".join(words))
         return column, " ".join(w for w in text.split() if "." not in w.strip(".,:;"))[:120]
+
+    @property
+    def reason(self) -> str:
+        """Column and message, for a list about one episode."""
+        return plain_text(f"{self.key}: {self.message}" if self.key else self.message)
 
     def __str__(self) -> str:
         episode = None if self.episode is None else f"episode {self.episode}"

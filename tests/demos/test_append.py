@@ -101,7 +101,6 @@ def test_nothing_is_appended_where_nothing_was_recorded(tmp_path):
         ({"fps": 30}, r"its frame rate is 50\.0, not 30\.0"),
         ({"robot_type": "panda"}, "its robot is 'any', not 'panda'"),
         ({"joint_names": ("a", "b", "d")}, "its joints is"),
-        ({"dtype": "float64"}, "observation.state there is"),
         ({"cameras": {"front": (4, 6)}}, "gives? images of no camera|expected front"),
     ],
 )

@@ -11,7 +11,7 @@ from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
 from hrc_learn.demos.quality import consistency_checks as consistency
 from hrc_learn.demos.quality import episode_checks, structure_checks
-from hrc_learn.demos.quality.episode_checks import MotionRecord, motion_sketch
+from hrc_learn.demos.quality.episode_checks import MotionRecord, UsualMotion, motion_sketch
 from hrc_learn.demos.quality.structure_checks import read_metadata, read_sound_episodes
 from hrc_learn.demos.quality.video_checks import check_videos
 from hrc_learn.demos.read.columns import (
@@ -30,9 +30,6 @@ from hrc_learn.demos.read.units import (
     unit_factor,
     units_from_episodes,
 )
-
-_KEPT_BYTES = 2**24
-"""Size of the frames kept for the second pass [bytes]; larger datasets are read twice."""
 
 METADATA_CHECKS: dict[str, Callable[[DatasetFolder], Iterable[Issue]]] = {
     "statistics exist": structure_checks.statistics_exist,
@@ -57,7 +54,6 @@ MOTION_CHECKS: dict[str, Callable[[MotionRecord], Iterable[Issue]]] = {
     "spikes and jumps": episode_checks.spikes_and_jumps,
     "joint speeds": episode_checks.joint_speeds,
     "copied commands": episode_checks.copied_commands,
-    "frozen encoders": episode_checks.frozen_encoders,
 }
 CONSISTENCY_CHECKS: dict[str, Callable[[consistency.FeatureProfiles], Iterable[Issue]]] = {
     "holds": consistency.holds,
@@ -99,16 +95,13 @@ def check_dataset(
     if speed_limits:
         _require_limits(folder, mapping, speed_limits)
     report.attempt(lambda: check_videos(folder, report))
-    survey = _Survey(folder, report)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
     if dataset is None:
-        for _ in survey.first_pass(None):
+        for _ in _first_pass(folder, report, None, {}):
             pass
     else:
-        limits = speed_limits or {}
-        report.attempt(
-            lambda: _check_content(survey, dataset, mapping or {}, units or {}, limits)
-        )
+        given = (mapping or {}, units or {}, speed_limits or {})
+        report.attempt(lambda: _check_content(dataset, report, *given))
     return report
 
 
@@ -130,56 +123,29 @@ def _require_limits(
             raise ValueError(f"speed_limits: that of {name} must be positive, but is {limit}")
 
 
-class _Survey:
-    """Readable episodes of a dataset, first without and then with the units of columns.
-
-    Attributes:
-        profiles: Profile of each episode by its index, from the first pass on.
-    """
-
-    def __init__(self, folder: DatasetFolder, report: ValidationReport):
-        self.folder = folder
-        self.report = report
-        self.profiles: dict[int, EpisodeProfile] = {}
-        self._kept: list[tuple[EpisodeEntry, RawFrames]] | None = []
-
-    def first_pass(
-        self, columns: ColumnMapping | None
-    ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
-        """Run the checks that need no units, and give the quantities on disk."""
-        folder, report, size = self.folder, self.report, 0
-        for entry, frames in read_sound_episodes(folder, report):
-            for name, check in RAW_EPISODE_CHECKS.items():
-                report.run(name, check, folder, entry, frames)
-            report.episodes += 1
-            report.frames += entry.length
-            size += sum(values.nbytes for values in frames.values())
-            # A second read of a small dataset costs more than its memory.
-            if self._kept is None or size >= _KEPT_BYTES:
-                self._kept = None
-            else:
-                # Views into a file's columns would keep all of them in memory.
-                kept = {key: values.copy() for key, values in frames.items()}
-                self._kept.append((entry, kept))
-            found = None
-            if columns is not None and _is_sound(frames, columns):
-                found = select_quantities(frames, columns.selections)
-            profile = profile_episode(entry.index, frames, found, folder.fps)
-            self.profiles[entry.index] = profile
-            if found is not None:
-                yield entry, found
-
-    def episodes(self) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-        """The same episodes once more; nothing is reported twice."""
-        if self._kept is not None:
-            yield from self._kept
-        else:
-            yield from read_sound_episodes(self.folder, ValidationReport(path=self.report.path))
+def _first_pass(
+    folder: DatasetFolder,
+    report: ValidationReport,
+    columns: ColumnMapping | None,
+    profiles: dict[int, EpisodeProfile],
+) -> Iterator[tuple[EpisodeEntry, Quantities]]:
+    """Run the checks that need no units, fill in the profiles, and give the quantities."""
+    for entry, frames in read_sound_episodes(folder, report):
+        for name, check in RAW_EPISODE_CHECKS.items():
+            report.run(name, check, folder, entry, frames)
+        report.episodes += 1
+        report.frames += entry.length
+        found = None
+        if columns is not None and _is_sound(frames, columns):
+            found = select_quantities(frames, columns.selections)
+        profiles[entry.index] = profile_episode(entry.index, frames, found, folder.fps)
+        if found is not None:
+            yield entry, found
 
 
 def _check_content(
-    survey: _Survey,
     dataset: OpenedDataset,
+    report: ValidationReport,
     mapping: MappingSpec,
     units: Mapping[str, str],
     speed_limits: Mapping[str, float | int],
@@ -189,17 +155,13 @@ def _check_content(
     Raises:
         DatasetError: The units are wrong.
     """
-    folder, report, profiles, columns = (
-        survey.folder,
-        survey.report,
-        survey.profiles,
-        dataset.columns,
-    )
+    folder, columns = dataset.folder, dataset.columns
+    profiles: dict[int, EpisodeProfile] = {}
     if dataset.contract_note is not None:
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
     decisions, faults = units_from_episodes(
         columns.selections,
-        survey.first_pass(columns),
+        _first_pass(folder, report, columns, profiles),
         folder.fps,
         dataset.declared_units,
         units,
@@ -208,8 +170,22 @@ def _check_content(
         report.add_error(fault)
     report.run("guesses", _guesses, columns, decisions if profiles else {})
     report.run("joint sets", _joint_sets, columns)
-    _check_motions(survey, columns, decisions, speed_limits, faults)
-    _check_consistency(folder, columns, profiles, report)
+    entries = {entry.index: entry for entry in folder.episodes}
+    features = [*consistency.feature_profiles(folder, entries, profiles)]
+    usual = _usual_motion(columns, decisions, {f.key: f for f in features})
+    doubtful = {fault.episode for fault in faults}
+    _check_motions(folder, report, columns, decisions, speed_limits, usual, doubtful)
+    report.run("column ranges", consistency.column_ranges, features)
+    report.run("statistics fit", structure_checks.statistics_fit, folder, features)
+    report.run("episode lengths", consistency.lengths, [entries[i] for i in profiles])
+    report.run(
+        "command tracking", consistency.command_tracking, folder, columns, entries, profiles
+    )
+    for feature in features:
+        report.run("sizes", consistency.sizes, feature)
+        for name, check in CONSISTENCY_CHECKS.items():
+            if len(feature.entries) >= consistency.FEWEST:
+                report.run(name, check, feature)
     report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
     if dataset.contract is not None:
         overruled = replaced_roles(mapping) | {*units}
@@ -226,26 +202,25 @@ def _check_content(
 
 
 def _check_motions(
-    survey: _Survey,
+    folder: DatasetFolder,
+    report: ValidationReport,
     columns: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
     speed_limits: Mapping[str, float | int],
-    faults: list[DatasetError],
+    usual: UsualMotion,
+    doubtful: set[int | None],
 ) -> None:
-    """Check the motion of every sound episode whose units are known."""
-    folder, report = survey.folder, survey.report
-    doubtful = {fault.episode for fault in faults}
-    usual = _usual_motion(columns, decisions, survey.profiles)
+    """Check the motion of every sound episode whose units are known, in a second pass."""
     sketches = []
-    for entry, frames in survey.episodes():
+    # What cannot be read was reported in the first pass.
+    for entry, frames in read_sound_episodes(folder, ValidationReport(path=report.path)):
         if not _is_sound(frames, columns):
             continue
         raw = select_quantities(frames, columns.selections)
         scaled = {role: v * decisions[role].factor for role, v in raw.items()}
-        time = scaled["time"][:, 0] if "time" in scaled else recorded_stamps(folder, frames)
         episode = MotionRecord(
             entry=entry,
-            time=time,
+            time=scaled["time"][:, 0] if "time" in scaled else recorded_stamps(folder, frames),
             raw=raw,
             quantities=scaled,
             joint_names=columns.joint_names,
@@ -255,9 +230,8 @@ def _check_motions(
         report.run("orientations", episode_checks.orientation_values, episode)
         if entry.index not in doubtful:
             if "time" in scaled:
-                report.run(
-                    "true stamps", episode_checks.stamps, entry, "time", time, folder.fps
-                )
+                stamps = (entry, "time", episode.time, folder.fps)
+                report.run("true stamps", episode_checks.stamps, *stamps)
             # Stamps that do not increase are reported as such; speeds make no sense then.
             for name, check in MOTION_CHECKS.items() if episode.is_ordered else ():
                 report.run(name, check, episode)
@@ -267,49 +241,22 @@ def _check_motions(
     report.run("duplicates", episode_checks.duplicates, sketches)
 
 
-def _check_consistency(
-    folder: DatasetFolder,
-    columns: ColumnMapping,
-    profiles: Mapping[int, EpisodeProfile],
-    report: ValidationReport,
-) -> None:
-    """Compare every episode with the others."""
-    entries = {entry.index: entry for entry in folder.episodes}
-    features = [*consistency.feature_profiles(folder, entries, profiles)]
-    report.run("column ranges", consistency.column_ranges, features)
-    report.run("statistics fit", structure_checks.statistics_fit, folder, features)
-    report.run("episode lengths", consistency.lengths, [entries[i] for i in profiles])
-    report.run(
-        "command tracking", consistency.command_tracking, folder, columns, entries, profiles
-    )
-    for feature in features:
-        report.run("sizes", consistency.sizes, feature)
-        for name, check in CONSISTENCY_CHECKS.items():
-            if len(feature.entries) >= consistency.FEWEST:
-                report.run(name, check, feature)
-
-
 def _usual_motion(
     columns: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
-    profiles: Mapping[int, EpisodeProfile],
-) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    features: Mapping[str, consistency.FeatureProfiles],
+) -> UsualMotion:
     """Usual fast step and span of joints and commands in SI units, by role."""
     usual = {}
     for role in ("joint_position", "command_position"):
-        if role not in columns.selections:
-            continue
-        places = columns.selections[role].columns
-        known = [
-            [(p.columns[key], index) for key, index in places]
-            for p in profiles.values()
-            if all(k in p.columns and i < len(p.columns[k].start) for k, i in places)
-        ]
-        if known:
-            steps = [[column.step[i] for column, i in episode] for episode in known]
-            spans = [[column.span[i] for column, i in episode] for episode in known]
+        selection = columns.selections.get(role)
+        if selection is not None and all(key in features for key, _ in selection.columns):
+            step, span = (
+                np.array([features[k].median(name)[i] for k, i in selection.columns])
+                for name in ("step", "span")
+            )
             factor = decisions[role].factor
-            usual[role] = (np.median(steps, axis=0) * factor, np.median(spans, axis=0) * factor)
+            usual[role] = (step * factor, span * factor)
     return usual
 
 

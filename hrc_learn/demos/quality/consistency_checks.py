@@ -56,6 +56,10 @@ class FeatureProfiles:
         """One statistic of every profile."""
         return np.stack([getattr(profile, name) for profile in self.profiles]).astype(float)
 
+    def median(self, name: str) -> Float64[np.ndarray, " components"]:
+        """Usual value of one statistic of each component."""
+        return np.median(self.stack(name), axis=0)
+
     def named(self, chosen: np.ndarray) -> str:
         """Names of components, given by a mask or their numbers."""
         if chosen.dtype == bool and chosen.all() and len(chosen) > 1:
@@ -67,11 +71,6 @@ class FeatureProfiles:
     def lengths(self) -> Int64[np.ndarray, " episodes"]:
         """Number of frames of each episode."""
         return np.array([entry.length for entry in self.entries])
-
-    @property
-    def span(self) -> Float64[np.ndarray, " components"]:
-        """Usual range of each component."""
-        return np.median(self.stack("span"), axis=0)
 
 
 def feature_profiles(
@@ -135,7 +134,7 @@ def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
 
 def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
     """Values that no robot reports."""
-    usual = np.median(feature.stack("peak"), axis=0)
+    usual = feature.median("peak")
     largest = np.maximum(np.abs(feature.stack("low")), np.abs(feature.stack("high")))
     scale = np.maximum(usual, np.where(feature.smooth, 1e-3, np.inf))
     absurd = (largest > _IMPOSSIBLE) | (largest > _IMPLAUSIBLE * scale)
@@ -162,7 +161,7 @@ def holds(feature: FeatureProfiles) -> Iterator[Issue]:
     frozen = (
         (fraction > 0.1) & (fraction > 5 * usual + 0.02) & (held > max(10, 0.3 * feature.fps))
     )
-    frozen &= feature.smooth & (feature.span > 0)
+    frozen &= feature.smooth & (feature.median("span") > 0)
     for number, component in np.argwhere(frozen):
         name = feature.names[component]
         yield feature.entries[number].warning(
@@ -177,10 +176,10 @@ def holds(feature: FeatureProfiles) -> Iterator[Issue]:
 
 def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     """Components far noisier, or far coarser, in one episode than in the others."""
-    noise, span = feature.stack("noise"), feature.span
+    noise, span = feature.stack("noise"), feature.median("span")
     moving = feature.smooth & (span > 0)
     # Second differences vary by a factor of three between operators, not by ten.
-    noisy = (noise > 10 * np.median(noise, axis=0)) & (noise > 0.005 * span) & moving
+    noisy = (noise > 10 * feature.median("noise")) & (noise > 0.005 * span) & moving
     frames = feature.lengths[:, None]
     levels = feature.stack("distinct") / frames
     # A fifth of the usual levels: values were rounded or the encoder lost bits.
@@ -199,7 +198,7 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
 
 def switches(feature: FeatureProfiles) -> Iterator[Issue]:
     """Grippers and flags that stay, or switch the other way, in one episode alone."""
-    span, usual_span = feature.stack("span"), feature.span
+    span, usual_span = feature.stack("span"), feature.median("span")
     ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)
     usual = np.median(ends, axis=0)
     # Ends within a tenth of the range count as the same level.
@@ -230,7 +229,8 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
     """
     if not feature.key.startswith(("observation.", "state", "action")):
         return
-    moving = np.flatnonzero(feature.smooth & (feature.span > 0) & ~_without_sign(feature))
+    span = feature.median("span")
+    moving = np.flatnonzero(feature.smooth & (span > 0) & ~_without_sign(feature))
     if not len(moving):
         return
     levels = feature.stack("levels")[:, 1:4, moving]
@@ -240,7 +240,7 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
     # 1.4826 scales a median deviation to the standard deviation of a normal distribution.
     spread = 1.4826 * np.median(np.abs(figures - usual), axis=0).mean(0)
     # Nearly identical episodes have no spread; 5 % of the range replaces it.
-    scale = np.maximum(spread, 0.05 * feature.span[moving]) + 1e-9
+    scale = np.maximum(spread, 0.05 * span[moving]) + 1e-9
     names = [feature.names[i] for i in moving]
     for number, own in enumerate(figures):
         off = np.abs(own - usual).mean(0) / scale

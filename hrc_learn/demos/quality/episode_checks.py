@@ -1,7 +1,7 @@
 """Checks of single episodes: values, stamps and motion."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -159,6 +159,10 @@ def stamps(
         )
 
 
+UsualMotion = Mapping[str, tuple[np.ndarray, np.ndarray]]
+"""Role -> usual fast step (99 % quantile) and usual range of each joint [rad]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class MotionRecord:
     """Motion of one sound episode in SI units, with the values usual in the dataset."""
@@ -173,8 +177,7 @@ class MotionRecord:
     joint_names: tuple[str, ...]
     speed_limits: Mapping[str, float | int]
     """Joint -> largest speed [rad/s]."""
-    usual: Mapping[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    """Role -> usual fast step (99 % quantile) and usual range of each joint [rad]."""
+    usual: UsualMotion
 
     @property
     def motion(self) -> Float64[np.ndarray, "frames _"] | None:
@@ -313,38 +316,6 @@ def copied_commands(episode: MotionRecord) -> Iterator[Issue]:
             ("is a copy of the state at the same frame; a policy learns to stay where it is"),
             key="action",
         )
-
-
-def frozen_encoders(episode: MotionRecord) -> Iterator[Issue]:
-    """Joints that follow their command; fingers may stop at an object."""
-    joints = episode.quantities.get("joint_position")
-    command = episode.quantities.get("command_position")
-    if joints is None or command is None or "joint_position" not in episode.usual:
-        return
-    if joints.shape != command.shape or len(joints) < 20:
-        return
-    span = episode.usual["joint_position"][1]
-    for joint, name in enumerate(episode.joint_names):
-        if not span[joint] > 0 or is_hand(name):
-            continue
-        moves = np.flatnonzero(np.diff(joints[:, joint]) != 0)
-        edges = np.concatenate([[-1], moves, [len(joints) - 1]])
-        longest = int(np.diff(edges).argmax())
-        first, last = int(edges[longest]) + 1, int(edges[longest + 1])
-        # Shorter holds occur at turning points.
-        if last - first < 10:
-            continue
-        commanded = float(np.ptp(command[first : last + 1, joint]))
-        # A quarter of the usual range, and more than backlash and friction explain [rad].
-        if commanded > 0.25 * span[joint] and commanded > 0.02:
-            yield episode.entry.warning(
-                f"{name} stays exactly the same for {last - first} frames while its "
-                f"command moves by {commanded:.3g}: the encoder froze?",
-                frame=first,
-                key=f"joint_position ({name})",
-                components=(name,),
-                severity=commanded,
-            )
 
 
 def duplicates(

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
-from hrc_learn.demos.issues import DatasetError, Issue, plain_text
+from hrc_learn.demos.issues import DatasetError, Issue, aligned
 from hrc_learn.demos.preprocessing import resting
 from hrc_learn.demos.quality.check import check_dataset
 from hrc_learn.demos.quality.episode_checks import motion_sketch
@@ -115,13 +115,9 @@ class Ranking:
             most: Number of episodes shown; None for all.
         """
         head, *rows = self.rows()
-        shown = [head, *rows[:most]]
-        widths = [max(len(row[i]) for row in shown) for i in range(len(head) - 1)]
-        for row in shown:
-            cells = (f"{cell:>{w}}" for cell, w in zip(row, widths, strict=False))
-            yield f"{'  '.join(cells)}  {row[-1]}".rstrip()
-        if len(rows) > len(shown) - 1:
-            yield f"and {len(rows) - len(shown) + 1} less doubtful episodes"
+        yield from aligned([head, *rows[:most]], ">")
+        if most is not None and len(rows) > most:
+            yield f"and {len(rows) - most} less doubtful episodes"
         groups = {k: v for k, v in self.clusters.items() if k >= 0}
         alone = len(self.clusters.get(-1, ()))
         sizes = ", ".join(str(len(v)) for v in groups.values())
@@ -160,9 +156,9 @@ def rank_episodes(
     notes = [f"error: {issue}" for issue in report.errors if issue.episode not in qualities]
     for quality, issue in _one_of_each_kind(qualities, report.errors):
         quality.broken = True
-        quality.doubt(_ERROR, _reason(issue))
+        quality.doubt(_ERROR, issue.reason)
     for quality, issue in _one_of_each_kind(qualities, report.warnings, len(qualities) // 2):
-        quality.doubt(_WARNING, _reason(issue))
+        quality.doubt(_WARNING, issue.reason)
     shapes: dict[int, Float64[np.ndarray, " numbers"]] = {}
     for quality, demo in _demonstrations(root, qualities, progress):
         _measure(quality, demo)
@@ -184,21 +180,14 @@ def _one_of_each_kind(
         issues: Issues of the dataset.
         most: Number of episodes above which a kind distinguishes none; None for no limit.
     """
+    placed = [(issue.episode, issue) for issue in issues if issue.episode in qualities]
     worst: dict[tuple, Issue] = {}
-    for issue in issues:
-        if issue.episode in qualities:
-            place = (issue.episode, issue.kind)
-            if place not in worst or issue.severity > worst[place].severity:
-                worst[place] = issue
+    for episode, issue in sorted(placed, key=lambda pair: -pair[1].severity):
+        worst.setdefault((episode, issue.kind), issue)
     counts = Counter(kind for _, kind in worst)
     for (episode, kind), issue in worst.items():
         if most is None or counts[kind] <= max(1, most):
             yield qualities[episode], issue
-
-
-def _reason(issue: Issue) -> str:
-    where = f"{issue.key}: " if issue.key else ""
-    return plain_text(f"{where}{issue.message}")
 
 
 def _demonstrations(
@@ -338,35 +327,36 @@ def _principal_components(
     return (left * sizes)[:, :_DIMENSIONS] / np.sqrt(_PHASES)
 
 
-@dataclass(frozen=True)
-class _Unusual:
-    """Test of one measure for unusual values."""
-
-    reason: str
-    least: float
-    """Smallest difference from the usual value that counts."""
-    spread: float
-    """Lower bound of the spread, for datasets of nearly equal episodes."""
-
-
-_TESTS = {
-    "distance": _Unusual(
-        "moves unlike all others: {value:.1f} times as far from the nearest", 1.0, 0.25
+_TESTS: dict[str, tuple[float, float, Callable[[float, float], str]]] = {
+    "distance": (
+        *(1.0, 0.25),
+        lambda own, _: f"moves unlike all others: {own:.1f} times as far from the nearest",
     ),
-    "duration": _Unusual("takes {value:.1f} s, {usual:.1f} s are usual", 0.0, 0.05),
-    "idle": _Unusual(
-        "rests for {percent:.0f} % of the time, {usual_percent:.0f} % are usual", 0.1, 0.025
+    "duration": (0.0, 0.05, lambda own, usual: f"takes {own:.1f} s, {usual:.1f} s are usual"),
+    "idle": (
+        *(0.1, 0.025),
+        lambda own, usual: (
+            f"rests for {100 * own:.0f} % of the time, {100 * usual:.0f} % are usual"
+        ),
     ),
-    "jerk": _Unusual("moves jerkily: e^{excess:.1f} times the usual jerk", 1.0, 0.25),
-    "late": _Unusual(
-        "{percent:.0f} % of its frames came late, {usual_percent:.0f} % are usual", 0.02, 0.005
+    "jerk": (
+        *(1.0, 0.25),
+        lambda own, usual: f"moves jerkily: e^{own - usual:.1f} times the usual jerk",
+    ),
+    "late": (
+        *(0.02, 0.005),
+        lambda own, usual: (
+            f"{100 * own:.0f} % of its frames came late, {100 * usual:.0f} % are usual"
+        ),
     ),
 }
+"""Measure -> smallest difference from the usual value that counts, lower bound of the spread
+(for datasets of nearly equal episodes), and the reason given."""
 
 
 def _mark_unusual(qualities: Sequence[EpisodeQuality]) -> None:
     """Add a doubt for each unusual measure; durations are compared by their logarithms."""
-    for name, test in _TESTS.items():
+    for name, (least, least_spread, reason) in _TESTS.items():
         known = [q for q in qualities if np.isfinite(q.measures.get(name, np.nan))]
         if len(known) < 4:
             continue
@@ -375,20 +365,8 @@ def _mark_unusual(qualities: Sequence[EpisodeQuality]) -> None:
         if is_duration:
             values = np.log(np.maximum(values, 1e-9))
         usual = float(np.median(values))
-        spread = max(1.4826 * float(np.median(np.abs(values - usual))), test.spread)
-        for quality, value in zip(known, values, strict=True):
-            off = (value - usual) / spread
-            if not (abs(off) if is_duration else off) > _UNUSUAL:
-                continue
-            if abs(value - usual) < test.least:
-                continue
-            own = quality.measures[name]
+        spread = max(1.4826 * float(np.median(np.abs(values - usual))), least_spread)
+        off = (np.abs(values - usual) if is_duration else values - usual) / spread
+        for k in np.flatnonzero((off > _UNUSUAL) & (np.abs(values - usual) >= least)):
             shown = float(np.exp(usual)) if is_duration else usual
-            reason = test.reason.format(
-                value=own,
-                usual=shown,
-                percent=100 * own,
-                usual_percent=100 * shown,
-                excess=own - shown,
-            )
-            quality.doubt(min(abs(off) / _UNUSUAL, 5.0), reason)
+            known[k].doubt(min(off[k] / _UNUSUAL, 5.0), reason(known[k].measures[name], shown))

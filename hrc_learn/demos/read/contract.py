@@ -10,6 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from hrc_learn.demos.format.metadata import (
     dump_json,
     read_sidecar,
 )
-from hrc_learn.demos.issues import DatasetError, plain_text
+from hrc_learn.demos.issues import DatasetError, aligned, plain_text
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, is_discrete
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES, is_hand, joint_of
@@ -111,7 +112,10 @@ class Contract:
     def rows(self) -> list[tuple[str, ...]]:
         """The contract as a table with its header; similar neighbours are one row."""
         rows = [("column", "role", "unit", "range", "sign", "delay", "sure", "evidence")]
-        for group in self._groups():
+        for _, alike in groupby(
+            self.components, lambda p: (p.key, p.role, p.unit, p.sign, p.delay)
+        ):
+            group = [*alike]
             first, last = group[0], group[-1]
             name = first.name if len(group) == 1 else f"{first.name} .. {last.name}"
             low, high = min(p.low for p in group), max(p.high for p in group)
@@ -130,28 +134,9 @@ class Contract:
             )
         return rows
 
-    def _groups(self) -> list[list[ComponentContract]]:
-        """Consecutive components of one feature with equal role, unit, sign and delay."""
-        groups: list[list[ComponentContract]] = []
-        for part in self.components:
-            last = groups[-1][-1] if groups else None
-            alike = last and all(
-                getattr(part, name) == getattr(last, name)
-                for name in ("key", "role", "unit", "sign", "delay")
-            )
-            if alike:
-                groups[-1].append(part)
-            else:
-                groups.append([part])
-        return groups
-
     def lines(self) -> Iterator[str]:
         """The table as aligned text."""
-        rows = self.rows()
-        widths = [max(len(row[i]) for row in rows) for i in range(7)]
-        for row in rows:
-            cells = (f"{cell:{w}}" for cell, w in zip(row, widths, strict=False))
-            yield f"{'  '.join(cells)}  {row[-1]}".rstrip()
+        yield from aligned(self.rows())
 
     def units(self, selections: Mapping[str, ColumnSelection]) -> dict[str, tuple[str, ...]]:
         """Unit of each component of the selected quantities, by role.
