@@ -24,8 +24,8 @@ from hrc_learn.learning.channels import (
     load_primitive,
     reproduction_error,
 )
-from hrc_learn.learning.large_datasets import sampled
 from hrc_learn.learning.model_choice import best_models, predict
+from hrc_learn.learning.primitive_fitting import sampled
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure

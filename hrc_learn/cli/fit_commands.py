@@ -25,9 +25,13 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.learning.fit_recordings import fit_recording, fit_report, learning_recording
-from hrc_learn.learning.large_datasets import fit_all, fit_streamed, sampled
-from hrc_learn.learning.model_choice import best_models, keep_best
-from hrc_learn.learning.primitive_fitting import FittedPrimitives, fit_contextual
+from hrc_learn.learning.model_choice import best_models, fit_contextual, keep_best
+from hrc_learn.learning.primitive_fitting import (
+    FittedPrimitives,
+    fit_all,
+    fit_streamed,
+    sampled,
+)
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.skills.visual_skill import VisualServoSkill

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -34,18 +34,12 @@ CLASSES = {
 
 
 class LazyMap[S, T](Sequence[T]):
-    """Lazy map of a sequence: an item is computed when it is accessed."""
+    """Lazy map of a sequence: an item is computed when it is accessed by its index."""
 
     def __init__(self, items: Sequence[S], function: Callable[[S], T]):
         self._items, self._function = items, function
 
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-    @overload
-    def __getitem__(self, index: slice) -> "LazyMap[S, T]": ...
-    def __getitem__(self, index):
-        if isinstance(index, slice):
-            return LazyMap(self._items[index], self._function)
+    def __getitem__(self, index: Any) -> Any:
         return self._function(self._items[index])
 
     def __len__(self) -> int:

@@ -3,11 +3,12 @@
 Candidates are the mean, a function of start and goal, and the nearest demonstration.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, cast
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,15 +21,11 @@ from hrc_learn.learning.channels import (
     load_primitive,
     reproduction_error,
 )
-from hrc_learn.learning.primitive_fitting import (
-    CONTEXTUAL,
-    EACH,
-    FittedPrimitives,
-    contexts,
-    fit_contextual,
-)
+from hrc_learn.learning.primitive_fitting import EACH, FittedPrimitives
 from hrc_learn.store import read_json, write_json
 
+CONTEXTUAL = "contextual"
+"""Folder of contextual primitives."""
 CHOICE = "prediction.json"
 """File in a model's folder that names the model of each channel."""
 MODELS = ("mean", "contextual", "nearest")
@@ -51,6 +48,84 @@ class _Choice:
     """Best model by channel."""
     context: tuple[str, ...]
     """Columns whose first row is the context."""
+
+
+def contexts(
+    demos: DemonstrationSet, columns: Sequence[str], motions: Motions, channel: str
+) -> Float[Tensor, "demos C"]:
+    """Context of each demonstration.
+
+    Args:
+        demos: Demonstrations.
+        columns: Columns whose first row is the context. Default: start and goal.
+        motions: The same demonstrations, padded.
+        channel: Channel of start and goal.
+
+    Raises:
+        ValueError: A demonstration lacks a column.
+    """
+    if not columns:
+        position = motions.position(channel)
+        last = (motions.demos.length - 1)[:, None, None]
+        goal = position.take_along_dim(last, dim=1)[:, 0]
+        return torch.cat([position[:, 0], goal], dim=-1)
+    rows = []
+    for demo in demos:
+        missing = [name for name in columns if name not in demo.extra]
+        if missing:
+            raise ValueError(
+                f"{demos.source}, episode {demo.episode}: no column {missing[0]!r} for the "
+                f"context; there are {', '.join(demo.extra) or 'none'}."
+            )
+        rows.append(np.concatenate([np.atleast_1d(demo.extra[name][0]) for name in columns]))
+    return torch.from_numpy(np.stack(rows)).double()
+
+
+def fit_contextual(
+    fitted: FittedPrimitives,
+    demos: DemonstrationSet,
+    columns: Sequence[str],
+    folder: Path,
+    channels: Sequence[str] = ("joint", "position"),
+    regularization: float = 1e-6,
+) -> dict[str, float]:
+    """Fit joints and positions as functions of a context, and save them.
+
+    Args:
+        fitted: Primitives of the demonstrations.
+        demos: Demonstrations.
+        columns: Columns whose first row is the context. Default: start and goal.
+        folder: Folder of the model.
+        channels: Channels to fit, if they were learned.
+        regularization: See `ContextualDMP.fit`.
+
+    Returns:
+        Median and largest error of demonstrations predicted from all others.
+
+    Raises:
+        ValueError: There are fewer than two demonstrations, no such channel, or no context.
+    """
+    linear = [channel for channel in channels if channel in fitted.each]
+    if not linear:
+        raise ValueError("a function of a context needs the channel joint or position.")
+    metrics = {}
+    for channel in linear:
+        motions = fitted.motions
+        model = ContextualDMP.fit(
+            motions.demos.time,
+            motions.position(channel),
+            contexts(demos, columns, motions, channel),
+            fitted.n_basis,
+            regularization=regularization,
+            mask=motions.demos.mask,
+            **motions.naming(channel),
+            **fitted.options,
+        )
+        model.save(folder / CONTEXTUAL / channel)
+        error = model.held_out.nrmse
+        metrics[f"contextual_{channel}_held_out_nrmse_median"] = float(error.median())
+        metrics[f"contextual_{channel}_held_out_nrmse_max"] = float(error.max())
+    return metrics
 
 
 @dataclass(frozen=True, kw_only=True)

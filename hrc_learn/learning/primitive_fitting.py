@@ -1,7 +1,11 @@
-"""Movement primitives of demonstrations by channel: each, their mean, and contextual ones."""
+"""Movement primitives of demonstrations by channel: of each, and their mean.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+Datasets larger than memory are fitted from a sample, in batches, or streamed.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -10,21 +14,29 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.demos import DemonstrationSet, PaddedDemonstrations
+from hrc_learn.demos import (
+    Demonstration,
+    DemonstrationSet,
+    DemonstrationSource,
+    PaddedDemonstrations,
+)
 from hrc_learn.dmp import (
     BasisSelection,
-    ContextualDMP,
-    JointDMP,
-    PoseDMP,
     ProbabilisticDMP,
+    SharedFit,
+    fit_shared,
     mean_primitive,
     select_basis_count,
 )
+from hrc_learn.dmp.motion_primitive import concatenate
 from hrc_learn.learning.channels import (
+    CHANNELS,
+    LazyMap,
     Motions,
     Primitive,
     ReproductionError,
     reproduction_error,
+    require_motion,
     select_channels,
 )
 
@@ -58,16 +70,6 @@ class FittedPrimitives:
         """Padded demonstrations."""
         return self.motions.demos
 
-    @property
-    def joint(self) -> JointDMP | None:
-        """Joint primitives of the demonstrations; None if joints were not learned."""
-        return cast(JointDMP | None, self.each.get("joint"))
-
-    @property
-    def pose(self) -> PoseDMP | None:
-        """Pose primitives of the demonstrations, with the arm angle of a Panda."""
-        return cast(PoseDMP | None, self.each.get("pose"))
-
     def save(self, folder: Path, each: bool = False) -> None:
         """Write the mean primitives to `folder/CHANNEL`.
 
@@ -95,22 +97,22 @@ class FittedPrimitives:
         `mean_` marks the mean primitive, given start, goal and duration of each demonstration
         (of the sample, if there is one).
         """
-        count = len(self.demonstrations.length)
-        values = {"demonstrations": float(count), "basis_functions": float(self.n_basis)}
+        count = float(len(self.demonstrations.length))
+        values = {"demonstrations": count, "basis_functions": float(self.n_basis)}
         if self.every:
-            values["demonstrations_sampled"] = float(count)
-        for channel in self.each:
-            adapted = self.motions.adapted(channel, self.common[channel])
-            own = self.every_error.get(channel)
-            if own is None:
-                made = self.motions.own(self.each[channel])
-                own = reproduction_error(channel, self.motions, made)
-            else:
-                values["demonstrations"] = float(len(next(iter(own.columns().values()))))
-            values |= own.summary(channel)
-            values |= reproduction_error(channel, self.motions, adapted).summary(
-                f"mean_{channel}"
+            values["demonstrations_sampled"] = count
+        for channel, primitives in self.each.items():
+            own, mean = (
+                reproduction_error(channel, self.motions, made)
+                for made in (
+                    self.motions.own(primitives),
+                    self.motions.adapted(channel, self.common[channel]),
+                )
             )
+            if self.every:
+                own = self.every_error[channel]
+                values["demonstrations"] = float(len(next(iter(own.columns().values()))))
+            values |= own.summary(channel) | mean.summary(f"mean_{channel}")
         return values
 
 
@@ -183,83 +185,154 @@ def _select(
     )
 
 
-CONTEXTUAL = "contextual"
-"""Folder of contextual primitives."""
+HELD_AT_ONCE = 700_000
+"""Values of a channel (padded frames times joints, or 7 of a pose) that are held at once. Their
+fit and the comparison of models take up to 300 MB."""
+FITTED_AT_ONCE = 140_000
+"""Values per batch in `fit_all`, large enough for fast matrix products."""
+LONGEST = 5_000
+"""Largest number of frames of one demonstration, up to 100 basis functions."""
+_SAMPLES = 50
+"""Frames for each basis function of more than 100: more add nothing that they can follow."""
 
 
-def contexts(
-    demos: DemonstrationSet, columns: Sequence[str], motions: Motions, channel: str
-) -> Float[Tensor, "demos C"]:
-    """Context of each demonstration.
+def sampled(source: DemonstrationSource) -> DemonstrationSet:
+    """All demonstrations, or an evenly spread sample of a dataset that is too large.
+
+    Demonstrations of more than twice the median length are thinned. A note describes this.
 
     Args:
-        demos: Demonstrations.
-        columns: Columns whose first row is the context. Default: start and goal.
-        motions: The same demonstrations, padded.
-        channel: Channel of start and goal.
+        source: Demonstrations on disk.
+    """
+    lengths = source.lengths
+    if len(lengths) * max(lengths) * _width(source) <= HELD_AT_ONCE:
+        return source.load()
+    longest = min(LONGEST, 2 * int(np.median(lengths)), max(lengths))
+    count = min(len(lengths), max(1, HELD_AT_ONCE // (longest * _width(source))))
+    demos = [_thinned(demo, longest) for demo in source.spread(count)]
+    note = "the demonstrations are too long for memory"
+    if count < len(lengths):
+        note = f"{count} of {len(lengths)} demonstrations, evenly spread, are a sample"
+    if max(lengths) > longest:
+        note += f"; of longer ones {longest} frames are used"
+    return DemonstrationSet(demos, notes=(*source.notes, note), source=source.source)
+
+
+def fit_all(fitted: FittedPrimitives, source: DemonstrationSource) -> FittedPrimitives:
+    """Fit every demonstration with the options of a sample's fit, batch by batch.
+
+    The mean, `every` and `every_error` of the result cover all demonstrations; `motions` and
+    `each` stay those of the sample.
+
+    Args:
+        fitted: Fit of the sample that `sampled` returns.
+        source: All demonstrations on disk.
 
     Raises:
-        ValueError: A demonstration lacks a column.
+        ValueError: A demonstration cannot be read or holds no motion; the message names it.
     """
-    if not columns:
-        position = motions.position(channel)
-        last = (motions.demos.length - 1)[:, None, None]
-        goal = position.take_along_dim(last, dim=1)[:, 0]
-        return torch.cat([position[:, 0], goal], dim=-1)
-    rows = []
-    for demo in demos:
-        missing = [name for name in columns if name not in demo.extra]
-        if missing:
-            raise ValueError(
-                f"{demos.source}, episode {demo.episode}: no column {missing[0]!r} for the "
-                f"context; there are {', '.join(demo.extra) or 'none'}."
-            )
-        rows.append(np.concatenate([np.atleast_1d(demo.extra[name][0]) for name in columns]))
-    return torch.from_numpy(np.stack(rows)).double()
+    found = {channel: _fit_channel(fitted, source, channel) for channel in fitted.each}
+    every = {channel: primitives for channel, (primitives, _) in found.items()}
+    return replace(
+        fitted,
+        every=every,
+        every_error={channel: error for channel, (_, error) in found.items()},
+        common={k: mean_primitive(cast(Any, primitives)) for k, primitives in every.items()},
+    )
 
 
-def fit_contextual(
-    fitted: FittedPrimitives,
-    demos: DemonstrationSet,
-    columns: Sequence[str],
-    folder: Path,
-    channels: Sequence[str] = ("joint", "position"),
-    regularization: float = 1e-6,
-) -> dict[str, float]:
-    """Fit joints and positions as functions of a context, and save them.
+def _fit_channel(
+    fitted: FittedPrimitives, source: DemonstrationSource, channel: str
+) -> tuple[Primitive, ReproductionError]:
+    """Primitives of all demonstrations with their errors."""
+    errors: list[dict[str, Tensor]] = []
+
+    def batches() -> Iterator[Primitive]:
+        for demos in _batches(source, max(LONGEST, _SAMPLES * fitted.n_basis)):
+            motions = Motions.of(demos)
+            primitives = motions.fit(channel, fitted.n_basis, **fitted.options)
+            error = reproduction_error(channel, motions, motions.own(primitives))
+            errors.append(error.columns())
+            yield primitives
+
+    primitives = concatenate(batches(), fitted.motions.demos.mask.shape[1])
+    columns = {name: torch.cat([e[name] for e in errors]) for name in errors[0]}
+    return primitives, ReproductionError(**columns)
+
+
+def _batches(source: DemonstrationSource, longest: int) -> Iterator[DemonstrationSet]:
+    """Batches of demonstrations within `FITTED_AT_ONCE`."""
+    batch: list[Demonstration] = []
+    for demo in source:
+        demo = _thinned(demo, longest)
+        padded = max(len(one) for one in (*batch, demo)) * (len(batch) + 1)
+        if batch and padded * _width(source) > FITTED_AT_ONCE:
+            yield DemonstrationSet(batch, source=source.source)
+            batch = []
+        batch.append(demo)
+    if batch:
+        yield DemonstrationSet(batch, source=source.source)
+
+
+def _width(source: DemonstrationSource) -> int:
+    """Number of columns of the widest channel."""
+    return max(7, len(source.joint_names))
+
+
+def _thinned(demo: Demonstration, longest: int) -> Demonstration:
+    """Demonstration with at most that many frames, including the first and the last."""
+    if len(demo) <= longest:
+        return demo
+    kept = np.linspace(0, len(demo) - 1, longest).round().astype(int)
+    return replace(
+        demo,
+        **{name: getattr(demo, name)[kept] for name in demo.recorded},
+        fps=demo.fps * (longest - 1) / (len(demo) - 1),
+        extra={key: values[kept] for key, values in demo.extra.items()},
+    )
+
+
+def fit_streamed(
+    demos: DemonstrationSource, n_basis: int, *, channels: Sequence[str] = ()
+) -> tuple[dict[str, SharedFit], dict[str, float]]:
+    """Fit one primitive to all demonstrations in a single pass, one in memory at a time.
 
     Args:
-        fitted: Primitives of the demonstrations.
-        demos: Demonstrations.
-        columns: Columns whose first row is the context. Default: start and goal.
-        folder: Folder of the model.
-        channels: Channels to fit, if they were learned.
-        regularization: See `ContextualDMP.fit`.
+        demos: Demonstrations on disk.
+        n_basis: Number of basis functions.
+        channels: "joint", "position" or both. Default: joint.
 
     Returns:
-        Median and largest error of demonstrations predicted from all others.
+        Fits by channel, and measured values by name.
 
     Raises:
-        ValueError: There are fewer than two demonstrations, no such channel, or no context.
+        ValueError: Another channel, whose coordinates depend on the goal of a demonstration.
     """
-    linear = [channel for channel in channels if channel in fitted.each]
-    if not linear:
-        raise ValueError("a function of a context needs the channel joint or position.")
-    metrics = {}
-    for channel in linear:
-        motions = fitted.motions
-        model = ContextualDMP.fit(
-            motions.demos.time,
-            motions.position(channel),
-            contexts(demos, columns, motions, channel),
-            fitted.n_basis,
-            regularization=regularization,
-            mask=motions.demos.mask,
-            **motions.naming(channel),
-            **fitted.options,
+    fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
+    for channel in channels or ("joint",):
+        if channel not in ("joint", "position"):
+            raise ValueError(
+                f"channel {channel!r} cannot be streamed, only joint and position."
+            )
+        names = demos.joint_names if channel == "joint" else ("x", "y", "z")
+        column = partial(_stamped_column, name=CHANNELS[channel][0], source=demos.source)
+        fit = fit_shared(
+            LazyMap(demos, column),
+            n_basis,
+            joint_names=names,
+            units="rad" if channel == "joint" else "m",
         )
-        model.save(folder / CONTEXTUAL / channel)
-        error = model.held_out.nrmse
-        metrics[f"contextual_{channel}_held_out_nrmse_median"] = float(error.median())
-        metrics[f"contextual_{channel}_held_out_nrmse_max"] = float(error.max())
-    return metrics
+        fits[channel] = fit
+        metrics[f"mean_{channel}_rmse"] = float(fit.rmse.square().mean().sqrt())
+    return fits, metrics
+
+
+def _stamped_column(
+    demo: Demonstration, name: str, source: str
+) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T D"]]:
+    """Time stamps [s] and one column of a demonstration."""
+    require_motion(demo, source)
+    values = getattr(demo, name)
+    if values is None:
+        raise ValueError(f"{source}, episode {demo.episode}: no {name}.")
+    return demo.time, values

@@ -9,7 +9,7 @@ import torch
 from hrc_learn.demos import DatasetWriter, Demonstration, DemonstrationSet, open_demos
 from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
-from hrc_learn.learning import large_datasets
+from hrc_learn.learning import primitive_fitting
 from hrc_learn.learning.channels import (
     Motions,
     Reproduction,
@@ -17,13 +17,8 @@ from hrc_learn.learning.channels import (
     load_primitive,
     reproduction_error,
 )
-from hrc_learn.learning.large_datasets import fit_all, sampled
-from hrc_learn.learning.primitive_fitting import (
-    EACH,
-    contexts,
-    fit_contextual,
-    fit_primitives,
-)
+from hrc_learn.learning.model_choice import contexts, fit_contextual
+from hrc_learn.learning.primitive_fitting import EACH, fit_all, fit_primitives, sampled
 
 
 def demonstration(episode, frames=120):
@@ -146,7 +141,7 @@ def test_dimensionless_jerk_of_a_minimum_jerk_motion():
 def big_set(root, monkeypatch, episodes=11):
     """Poses on disk, of several lengths, of which three and no more fit into memory."""
     for name, numbers in (("HELD_AT_ONCE", 3 * 110 * 7), ("FITTED_AT_ONCE", 4 * 120 * 7)):
-        monkeypatch.setattr(large_datasets, name, numbers)
+        monkeypatch.setattr(primitive_fitting, name, numbers)
     with DatasetWriter(root, fps=60, robot_type="hand", joint_names=[]) as writer:
         for episode in range(episodes):
             demo = demonstration(episode, 90 + 10 * (episode % 3))
@@ -188,9 +183,9 @@ def test_more_than_fit_into_memory_give_what_all_of_them_give(tmp_path, monkeypa
 
 
 def test_of_demonstrations_too_long_to_hold_some_frames_are_fitted(tmp_path, monkeypatch):
-    monkeypatch.setattr(large_datasets, "LONGEST", 60)
+    monkeypatch.setattr(primitive_fitting, "LONGEST", 60)
     source = big_set(tmp_path / "set", monkeypatch, episodes=2)
-    monkeypatch.setattr(large_datasets, "HELD_AT_ONCE", 60 * 7)
+    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 60 * 7)
     (demo,) = sampled(source)
     whole = source[0]
     assert len(demo) == 60
@@ -205,6 +200,6 @@ def test_of_demonstrations_too_long_to_hold_some_frames_are_fitted(tmp_path, mon
 
 def test_few_are_loaded_as_they_are(tmp_path, monkeypatch):
     source = big_set(tmp_path / "set", monkeypatch)
-    monkeypatch.setattr(large_datasets, "HELD_AT_ONCE", 11 * 110 * 7)
+    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 11 * 110 * 7)
     assert len(sampled(source)) == 11
     assert sampled(source).notes == source.notes

@@ -9,8 +9,7 @@ import torch
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.dmp import ContextualDMP, JointDMP, mean_primitive
 from hrc_learn.learning import fit_primitives, held_out_errors, predict, reproduction_error
-from hrc_learn.learning.model_choice import CHOICE, best_models, keep_best
-from hrc_learn.learning.primitive_fitting import contexts
+from hrc_learn.learning.model_choice import CHOICE, best_models, contexts, keep_best
 
 
 def motions(bend, count=10, seed=0):

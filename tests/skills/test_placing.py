@@ -200,7 +200,7 @@ def test_a_goal_out_of_reach_is_refused_before_anything_is_planned(skill):
 
 def test_a_skill_of_another_arm_is_refused(fitted, tmp_path):
     fitted.save(tmp_path)
-    renamed = fit_primitives(_renamed(fitted)).joint
+    renamed = fit_primitives(_renamed(fitted)).each["joint"]
     renamed.save(tmp_path / "joint")
     with pytest.raises(ValueError, match="j1"):
         PlacingSkill.load(tmp_path, panda)
@@ -218,7 +218,7 @@ def _renamed(fitted):
 
 def test_another_robots_demonstrations_need_no_robot_model(fitted):
     other = fit_primitives(_renamed(fitted))
-    assert other.pose is None
+    assert "pose" not in other.each
     assert other.metrics()["joint_nrmse_max"] < 1e-3
 
 
