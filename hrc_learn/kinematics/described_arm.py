@@ -18,6 +18,7 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.shapes import Colour, MeshFile
 from hrc_learn.kinematics.arm import Arm, ArmShape, FingerJoint
 from hrc_learn.kinematics.chain import JointKind, SerialChain
+from hrc_learn.kinematics.collision import LinkCapsule
 from hrc_learn.kinematics.description import (
     MOVING,
     Description,
@@ -33,6 +34,9 @@ from hrc_learn.kinematics.urdf import read_urdf
 
 type LimitsGiven = Mapping[str, Mapping[str, float]] | Path | None
 """Limits that replace or complete those of a description, see `complete_limits`, or a file."""
+
+type FittedBody = tuple[Sequence[LinkCapsule], Sequence[tuple[int, int]]]
+"""Capsules of an arm, and pairs of links that overlap by design, besides neighbours."""
 
 _GREY: Colour = (0.7, 0.7, 0.72, 1.0)
 # Number of finger positions, from closed to open, that the capsules contain.
@@ -63,6 +67,7 @@ def arm_from_file(
     tool: Float[Tensor, "4 4"] | None = None,
     limits: LimitsGiven = None,
     ready: Sequence[float] | None = None,
+    body: FittedBody | None = None,
 ) -> Arm:
     """An arm from a URDF or MJCF file.
 
@@ -81,6 +86,7 @@ def arm_from_file(
             after it, `ur5e.limits.toml` for `ur5e.urdf`, if there is one.
         ready: A comfortable posture [rad, m]; None: the file's `home`, or a posture near the
             middle of the joints' ranges and far from singularities.
+        body: Capsules and overlapping links; None fits capsules on first use.
 
     Raises:
         ValueError: The format is unknown, the links form no serial chain, or `ready` is outside
@@ -119,10 +125,13 @@ def arm_from_file(
     )
     if posture is None:
         chain.ready = _comfortable(chain)
+    capsules, overlapping = body or (None, ())
     return Arm(
         name=name or path.stem,
         chain=chain,
         shape=_shape(description, places, joints, np.linalg.inv(flange @ tcp)),
+        capsules=capsules,
+        overlapping=overlapping,
         description=path,
         base=base,
         tip=tip,

@@ -18,7 +18,7 @@ from hrc_learn.kinematics import (
     registered_arms,
     solve_inverse,
 )
-from hrc_learn.kinematics.capsule_fit import _parted, fit_link, hull_of
+from hrc_learn.kinematics.capsule_fit import fit_body, fit_link, hull_of, shape_points
 from hrc_learn.kinematics.chain import transform_and_jacobian
 from hrc_learn.kinematics.description import Shape, turn_to
 
@@ -271,35 +271,32 @@ def test_capsules_contain_what_they_are_fitted_to():
     assert distance.max() <= 0
 
 
-BOX = Shape(kind="box", pose=np.eye(4), size=(0.1, 0.2, 0.3))
-
-
-@pytest.mark.parametrize("gap", [-0.2, -1e-3, 0.02, 0.2])
-def test_hulls_are_parted_where_a_plane_fits_between(gap):
-    corners = hull_of(BOX).points
-    rng = generator(4)
-    # A corner of one box is as far from a face of the other as is said, in any orientation.
-    R = torch.linalg.qr(torch.randn(50, 3, 3, generator=rng, dtype=torch.float64))[0]
-    turned = R @ torch.from_numpy(corners).T
-    lowest = turned.amin(-1)
-    shift = torch.stack(
-        [0.1 + gap - lowest[:, 0], 0.05 + 0 * lowest[:, 1], 0.05 + 0 * lowest[:, 2]], dim=-1
-    )
-    # Its corner lies over the face, within it.
-    at = turned.gather(-1, turned[:, :1].argmin(-1, keepdim=True).expand(-1, 3, 1))[..., 0]
-    shift[:, 1:] -= at[:, 1:]
-    assert bool((_parted(corners, corners, R, shift) == (gap > 0)).all())
-
-
-@pytest.mark.parametrize("name", ["z1", "ur5"])
-def test_most_postures_of_an_arm_are_no_contact_with_itself(name):
+@pytest.mark.parametrize("name", ["ur5e", "so101"])
+def test_stored_capsules_contain_the_shapes_of_the_file(name):
     a = installed(name)
-    q = random_positions(a.chain, 1000, seed=6)
-    assert float((a.whole.self_distance(q) < 0).double().mean()) < 0.6
+    fitted = {link for link, _ in a.shape.shapes}
+    assert {capsule.link for capsule in a.whole.capsules} == fitted
+    for link, shape in a.shape.shapes:
+        points = shape_points(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        away = np.full(len(points), np.inf)
+        for capsule in a.whole.capsules:
+            if capsule.link == link:
+                start, way = np.array(capsule.start), np.subtract(capsule.end, capsule.start)
+                t = np.clip((points - start) @ way / max(way @ way, 1e-30), 0, 1)
+                gap = np.linalg.norm(points - start - t[:, None] * way, axis=1)
+                away = np.minimum(away, gap - capsule.radius)
+        assert away.max() < 1e-6
+
+
+def test_most_postures_of_an_arm_are_no_contact_with_itself():
+    a = installed("xarm7")
+    q = random_positions(a, 500, seed=6)
+    for body in (a.whole, fit_body(a, a.shape.shapes)):
+        assert 0 < float((body.self_distance(q) < 0).double().mean()) < 0.4
 
 
 def test_without_scipy_shapes_are_not_fitted_and_it_says_why(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.spatial", None)
     box = Shape(pose=np.eye(4), kind="box", size=(0.1, 0.1, 0.1))
-    with pytest.raises(ModuleNotFoundError, match=r"SciPy: pip install 'hrc-learn\[demos\]'"):
+    with pytest.raises(ModuleNotFoundError, match=r"SciPy: pip install 'hrc-learn\[meshes\]'"):
         hull_of(box)
