@@ -90,7 +90,7 @@ def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies import get_policy_class, make_pre_post_processors
 
-    from hrc_learn.demos.format.dataset_folder import read_info
+    from hrc_learn.demos.read.dataset_folder import read_info
     from hrc_learn.lerobot.camera_watch import add_camera_watch
     from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
     from hrc_learn.lerobot.mujoco_arm import MovedCameraConfig

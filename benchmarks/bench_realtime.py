@@ -112,7 +112,7 @@ def main(args: Args) -> None:
 
 
 def _fps(root: Path) -> float:
-    from hrc_learn.demos.format.dataset_folder import read_info
+    from hrc_learn.demos.read.dataset_folder import read_info
 
     return float(read_info(root)["fps"])
 

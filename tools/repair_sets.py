@@ -37,7 +37,7 @@ from lerobot_folders import (  # noqa: E402
 from value_defects import VALUES  # noqa: E402
 
 from hrc_learn.demos import check_dataset, repair_dataset  # noqa: E402
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder  # noqa: E402
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, open_folder  # noqa: E402
 from hrc_learn.demos.read.frames import read_frames  # noqa: E402
 from hrc_learn.demos.read.quantities import INDEX_KEYS  # noqa: E402
 

@@ -17,7 +17,7 @@ from hrc_learn.demos.array_import import (
     demonstrations_from_arrays,
     read_arrays,
 )
-from hrc_learn.demos.write.episode import rotation_vectors
+from hrc_learn.demos.recorded_episode import rotation_vectors
 from hrc_learn.vision import MarkerDetector, centre
 
 

@@ -19,10 +19,9 @@ from hrc_learn.demos import (
     recover_all,
     repair_dataset,
 )
-from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.issues import ValidationReport
-from hrc_learn.demos.quality.decisions import (
+from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
+from hrc_learn.demos.quality.repair import (
     Decisions,
     decide,
     decisions_path,
@@ -30,8 +29,9 @@ from hrc_learn.demos.quality.decisions import (
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
 from hrc_learn.demos.read.contract import Contract, keep_contract
+from hrc_learn.demos.read.dataset_folder import open_folder
+from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.jacobian import camera_placements
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 from hrc_learn.store import new_folder, write_json

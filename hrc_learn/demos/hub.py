@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
 from hrc_learn.demos.issues import DatasetError, ValidationReport, plain_text
 from hrc_learn.demos.quality.check import check_dataset
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, open_folder
 
 if TYPE_CHECKING:
     from huggingface_hub import DatasetCard, HfApi

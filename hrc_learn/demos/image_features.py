@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, UInt8
 
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
-from hrc_learn.demos.format.dataset_files import open_parquet, read_table, write_parquet
-from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
 from hrc_learn.demos.read.frames import to_numpy
 from hrc_learn.demos.videos import VideoSegment, decode, image_key, read_segments, video_keys
 from hrc_learn.store import new_file

@@ -13,9 +13,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.format.dataset_files import INFO_PATH, open_parquet, read_table
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.dataset_files import INFO_PATH, open_parquet, read_table
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
 from hrc_learn.demos.videos import Image, Segments, decode, decode_image, read_segments
 
 Images = Mapping[str, UInt8[Tensor, "frames 3 height width"]]

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-from hrc_learn.demos.format.dataset_files import path_in, read_rows
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, episode_lists
-from hrc_learn.demos.format.metadata import Statistics, image_statistics
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.dataset_files import path_in, read_rows
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, episode_lists
+from hrc_learn.demos.read.metadata import Statistics, image_statistics
 from hrc_learn.store import sync_file
 
 Image = UInt8[np.ndarray, "_height _width 3"]

@@ -21,7 +21,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from hrc_learn.demos.format.dataset_folder import read_info
+from hrc_learn.demos.read.dataset_folder import read_info
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     CameraCorrection,

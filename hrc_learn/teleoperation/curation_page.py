@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
-from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.format.metadata import Feature
 from hrc_learn.demos.images import ImageReader, jpeg
 from hrc_learn.demos.issues import plain_text
-from hrc_learn.demos.quality.decisions import (
+from hrc_learn.demos.quality.ranking import MEASURES, Ranking
+from hrc_learn.demos.quality.repair import (
     Decision,
     decide,
     keep_decisions,
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.quality.ranking import MEASURES, Ranking
 from hrc_learn.demos.read.columns import MappingSpec
+from hrc_learn.demos.read.dataset_folder import open_folder
+from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.gate import Visitor, incoming

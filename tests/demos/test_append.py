@@ -19,7 +19,7 @@ from hrc_learn.demos import (
     load_demos,
     recover_all,
 )
-from hrc_learn.demos.format.metadata import read_sidecar
+from hrc_learn.demos.read.metadata import read_sidecar
 
 JOINTS = ("a", "b", "c")
 
@@ -68,7 +68,7 @@ def test_the_longer_dataset_is_as_if_recorded_at_once(tmp_path):
 def test_a_list_of_episodes_that_is_put_together_of_pieces_is_the_same(tmp_path, monkeypatch):
     tasks = ("reach", "place", "reach", "pour", "reach")
     whole = record(tmp_path / "whole", range(5), tasks)
-    monkeypatch.setattr("hrc_learn.demos.write.assembly._PACKED", 2)
+    monkeypatch.setattr("hrc_learn.demos.dataset_assembly._PACKED", 2)
     pieces = record(tmp_path / "pieces", range(3), tasks[:3])
     record(pieces, (3, 4), tasks[3:], append=True)
     lists = [

@@ -7,9 +7,9 @@ import pytest
 from lerobot_folders import FPS, write_folder
 
 from hrc_learn.demos import check_dataset
-from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.issues import ValidationReport
 from hrc_learn.demos.quality import structure_checks
+from hrc_learn.demos.read.dataset_folder import open_folder
 
 STATE = "observation.state"
 JOINTS = ["shoulder.pos", "elbow.pos", "wrist.pos"]

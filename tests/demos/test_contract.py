@@ -18,8 +18,8 @@ from hrc_learn.demos import (
     load_demos,
     repair_dataset,
 )
-from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.contract import keep_contract
+from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.source import open_dataset
 
 STATE = "observation.state"

@@ -14,7 +14,8 @@ from lerobot_folders import write_folder
 from hrc_learn.cli import dataset_commands
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.images import load_images
-from hrc_learn.demos.quality.decisions import (
+from hrc_learn.demos.quality.ranking import log_dimensionless_jerk, rank_episodes
+from hrc_learn.demos.quality.repair import (
     Decision,
     decide,
     decisions_path,
@@ -22,7 +23,6 @@ from hrc_learn.demos.quality.decisions import (
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.quality.ranking import log_dimensionless_jerk, rank_episodes
 from hrc_learn.teleoperation.curation_page import CurationPage
 
 NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]

@@ -10,8 +10,8 @@ from lerobot_folders import read_info, rewrite, write_info
 from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetError, ImageReader, load_demos, load_images, videos
-from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.images import jpeg
+from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.videos import decode_image, read_segments
 
 

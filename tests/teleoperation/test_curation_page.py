@@ -16,8 +16,8 @@ from websockets.sync.client import connect
 
 from hrc_learn.demos import load_demos
 from hrc_learn.demos.images import load_images
-from hrc_learn.demos.quality.decisions import read_decisions
 from hrc_learn.demos.quality.ranking import rank_episodes
+from hrc_learn.demos.quality.repair import read_decisions
 from hrc_learn.demos.videos import decode_image
 from hrc_learn.teleoperation.curation_page import CurationPage
 from hrc_learn.teleoperation.gate import AddressConfig

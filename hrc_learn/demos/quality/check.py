@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
 from hrc_learn.demos.quality import consistency_checks as consistency
 from hrc_learn.demos.quality import episode_checks, structure_checks
@@ -21,7 +19,9 @@ from hrc_learn.demos.read.columns import (
     replaced_roles,
 )
 from hrc_learn.demos.read.contract import infer_contract
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quantities
+from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
 from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import (

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from hrc_learn.demos.format.dataset_files import open_parquet, read_table
-from hrc_learn.demos.format.dataset_folder import recorded_statistics
-from hrc_learn.demos.format.metadata import (
+from hrc_learn.demos.quality.episode_edits import EpisodeEdit
+from hrc_learn.demos.read.dataset_files import open_parquet, read_table
+from hrc_learn.demos.read.dataset_folder import recorded_statistics
+from hrc_learn.demos.read.metadata import (
     INDEX_FEATURES,
     NUMERIC,
     Sidecar,
@@ -18,18 +19,9 @@ from hrc_learn.demos.format.metadata import (
     episode_statistics,
     image_statistics,
 )
-from hrc_learn.demos.quality.episode_edits import EpisodeEdit
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
-from hrc_learn.demos.videos import (
-    Segments,
-    VideoSegment,
-    decode_image,
-    image_at,
-    subsampled,
-    video_keys,
-)
-from hrc_learn.demos.write.episode import (
+from hrc_learn.demos.recorded_episode import (
     TIME_KEY,
     RecordingHeader,
     StagedEpisode,
@@ -37,6 +29,14 @@ from hrc_learn.demos.write.episode import (
     index_columns,
     to_table,
     write_episode,
+)
+from hrc_learn.demos.videos import (
+    Segments,
+    VideoSegment,
+    decode_image,
+    image_at,
+    subsampled,
+    video_keys,
 )
 
 _NO_TASK = "unnamed task"

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issues import Issue, warning
 from hrc_learn.demos.read.columns import ColumnMapping
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.profiles import (
     ColumnProfile,
     EpisodeProfile,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issues import Issue
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.quantities import (
     ORIENTATION_ROLES,

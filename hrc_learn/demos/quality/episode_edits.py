@@ -11,11 +11,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.filters import trim_rest
-from hrc_learn.demos.format.dataset_folder import EpisodeEntry
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.preprocessing import linear, nearest_frames
 from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
 from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, select_quantities
 from hrc_learn.demos.read.profiles import is_discrete, profile_columns
 from hrc_learn.demos.read.quantities import is_hand

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
 from hrc_learn.demos.issues import DatasetError, Issue, aligned
 from hrc_learn.demos.preprocessing import resting
 from hrc_learn.demos.quality.check import check_dataset
 from hrc_learn.demos.quality.episode_checks import motion_sketch
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
 from hrc_learn.demos.read.frames import each_or_fault
 from hrc_learn.demos.read.source import open_demos
 

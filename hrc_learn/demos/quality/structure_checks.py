@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from hrc_learn.demos.format.dataset_files import INFO_PATH, open_parquet, read_json
-from hrc_learn.demos.format.dataset_folder import (
+from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, plain_text, warning
+from hrc_learn.demos.quality.consistency_checks import FeatureProfiles
+from hrc_learn.demos.read.dataset_files import INFO_PATH, open_parquet, read_json
+from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
     count_faults,
@@ -22,10 +24,8 @@ from hrc_learn.demos.format.dataset_folder import (
     read_info,
     read_tasks,
 )
-from hrc_learn.demos.format.metadata import SIDECAR_PATH, Feature, read_features
-from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, plain_text, warning
-from hrc_learn.demos.quality.consistency_checks import FeatureProfiles
 from hrc_learn.demos.read.frames import RawFrames, read_each, read_frames, require_rows
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, read_features
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.store import MANIFEST, changed_files
 

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hrc_learn.demos.format.dataset_files import is_inside, require_file
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
+from hrc_learn.demos.read.dataset_files import is_inside, require_file
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.videos import VideoSegment, image_at, read_segments, video_keys
 
 _MOST_FILES = 2000

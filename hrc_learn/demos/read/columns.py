@@ -9,9 +9,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.format.dataset_files import INFO_PATH
-from hrc_learn.demos.format.metadata import Feature, Sidecar
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.dataset_files import INFO_PATH
+from hrc_learn.demos.read.metadata import Feature, Sidecar
 from hrc_learn.demos.read.quantities import (
     INDEX_KEYS,
     ORIENTATION_ROLES,

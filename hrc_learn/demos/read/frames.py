@@ -9,10 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float64, Shaped
 
-from hrc_learn.demos.format.dataset_files import open_parquet, read_table, row_group_starts
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
+from hrc_learn.demos.read.dataset_files import open_parquet, read_table, row_group_starts
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.units import Quantities
 
 RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]

@@ -16,15 +16,6 @@ from hrc_learn.demos.demonstration import (
     DemonstrationSet,
     joint_columns,
 )
-from hrc_learn.demos.format.dataset_folder import (
-    DatasetFolder,
-    EpisodeEntry,
-    EpisodeFilter,
-    count_faults,
-    open_folder,
-    select_episodes,
-)
-from hrc_learn.demos.format.metadata import SIDECAR_PATH, Sidecar, read_sidecar
 from hrc_learn.demos.image_features import missing_note, only_feature, with_feature
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
 from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
@@ -35,12 +26,21 @@ from hrc_learn.demos.read.contract import (
     keep_contract,
     read_contract,
 )
+from hrc_learn.demos.read.dataset_folder import (
+    DatasetFolder,
+    EpisodeEntry,
+    EpisodeFilter,
+    count_faults,
+    open_folder,
+    select_episodes,
+)
 from hrc_learn.demos.read.frames import (
     RawEpisode,
     disk_runs,
     frame_timestamps,
     read_quantities,
 )
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar, read_sidecar
 from hrc_learn.demos.read.profiles import profile_episode
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
 from hrc_learn.demos.read.units import (

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from hrc_learn.demos.format.dataset_folder import EpisodeEntry
-from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry
+from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES, is_hand
 
 _DIMENSIONS: dict[str, dict[str, float]] = {

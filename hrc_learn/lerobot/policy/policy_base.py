@@ -16,7 +16,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from safetensors import SafetensorError
 from torch import Tensor
 
-from hrc_learn.demos.format.metadata import flatten_names
+from hrc_learn.demos.read.metadata import flatten_names
 from hrc_learn.lerobot.policy.action_encoding import (
     ActionEncoding,
     matched_columns,

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from hrc_learn.demos.format.dataset_folder import open_folder, select_episodes
+from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
 
 MOST = 256

@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.format.dataset_folder import (
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
     open_folder,
     recovery_advice,
     staging_folder,
 )
-from hrc_learn.demos.format.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
-from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.videos import CameraRecorder, Image, video_features
-from hrc_learn.demos.write.episode import (
+from hrc_learn.demos.read.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
+from hrc_learn.demos.recorded_episode import (
     Episode,
     EpisodeBuffer,
     RecordedColumn,
@@ -35,7 +34,8 @@ from hrc_learn.demos.write.episode import (
     to_table,
     write_episode,
 )
-from hrc_learn.demos.write.recovery import begin, discard, finish
+from hrc_learn.demos.recording_recovery import begin, discard, finish
+from hrc_learn.demos.videos import CameraRecorder, Image, video_features
 from hrc_learn.store import DATASET, Claim
 
 

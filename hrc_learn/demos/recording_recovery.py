@@ -11,10 +11,10 @@ import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hrc_learn.demos.format.dataset_folder import recovery_advice, staging_folder
+from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.write.assembly import assemble
-from hrc_learn.demos.write.episode import staged_paths
+from hrc_learn.demos.read.dataset_folder import recovery_advice, staging_folder
+from hrc_learn.demos.recorded_episode import staged_paths
 from hrc_learn.store import (
     DATASET,
     BusyError,

@@ -9,7 +9,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Literal
 
-from hrc_learn.demos.format.dataset_files import (
+from hrc_learn.demos.issues import DatasetError, Issue
+from hrc_learn.demos.read.dataset_files import (
     INFO_PATH,
     integer,
     path_in,
@@ -17,8 +18,7 @@ from hrc_learn.demos.format.dataset_files import (
     read_json_lines,
     read_rows,
 )
-from hrc_learn.demos.format.metadata import QUANTILES, Feature, Statistics, read_features
-from hrc_learn.demos.issues import DatasetError, Issue
+from hrc_learn.demos.read.metadata import QUANTILES, Feature, Statistics, read_features
 from hrc_learn.store import resolved, settle
 
 _FASTEST = 1e6

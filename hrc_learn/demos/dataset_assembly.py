@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrc_learn.demos.format.dataset_files import open_parquet, read_table, write_parquet
-from hrc_learn.demos.format.dataset_folder import episode_lists, open_folder
-from hrc_learn.demos.format.metadata import (
+from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
+from hrc_learn.demos.read.dataset_folder import episode_lists, open_folder
+from hrc_learn.demos.read.metadata import (
     CHUNK_SIZE,
     DATA_PATH,
     EPISODES_PATH,
@@ -27,13 +27,13 @@ from hrc_learn.demos.format.metadata import (
     read_sidecar,
     write_tasks,
 )
-from hrc_learn.demos.videos import Segments, VideoSegment, video_path
-from hrc_learn.demos.write.episode import (
+from hrc_learn.demos.recorded_episode import (
     RecordingHeader,
     StagedEpisode,
     episode_number,
     read_episode,
 )
+from hrc_learn.demos.videos import Segments, VideoSegment, video_path
 
 _PACKED = 256
 """Rows of the list of episodes held as Python objects, which take fifty times their size."""

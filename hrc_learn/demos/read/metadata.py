@@ -22,8 +22,8 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Shaped, UInt8
 
-from hrc_learn.demos.format.dataset_files import INFO_PATH, write_parquet
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.dataset_files import INFO_PATH, write_parquet
 from hrc_learn.store import read_json
 
 NUMERIC = ("float", "int", "uint", "bool")

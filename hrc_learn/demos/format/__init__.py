@@ -1,1 +1,0 @@
-"""Format of LeRobot datasets: metadata, files and videos."""

@@ -1,1 +1,0 @@
-"""Recording demonstrations as LeRobot datasets."""
