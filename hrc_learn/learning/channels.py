@@ -34,12 +34,14 @@ CLASSES = {
 
 
 class LazyMap[S, T](Sequence[T]):
-    """Lazy map of a sequence: an item is computed when it is accessed by its index."""
+    """Lazy map of a sequence: an item is computed when it is accessed."""
 
     def __init__(self, items: Sequence[S], function: Callable[[S], T]):
         self._items, self._function = items, function
 
     def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return LazyMap(self._items[index], self._function)
         return self._function(self._items[index])
 
     def __len__(self) -> int:
