@@ -30,7 +30,6 @@ from hrc_learn.experiments.table_objects import (
     draw_object_poses,
     points_to_see,
 )
-from hrc_learn.protocols import Human
 from hrc_learn.sim import (
     CameraChange,
     CameraKind,
@@ -66,16 +65,10 @@ from hrc_learn.skills.receiving import Receiving
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import (
-    CombinedInput,
-    DrawnInterval,
-    ForceMapping,
-    InteractionForceConfig,
-    ScriptedDrawing,
     ScriptedForce,
     ScriptedPerturbation,
     random_pulls,
 )
-from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.vision import CameraModel
 
@@ -115,8 +108,6 @@ class CollaborationScenario:
     forces: Sequence[ScriptedForce] | Literal["random"] = NULL_SPACE_FORCES
     """Forces of the person on the elbow, in time since the robot waits for them; or forces at
     random moments of the whole job."""
-    mapping: ForceMapping = DEFAULT_MAPPING
-    """Mapping of these forces to the joints."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     """Configuration of the job."""
@@ -128,8 +119,6 @@ class CollaborationScenario:
     """A worker comes to the table unannounced and reaches under the arm."""
     handover: bool = False
     """A person hands over the last object."""
-    drawings: tuple[DrawnInterval, ...] = ()
-    """Regions, targets and rotations that a scripted person draws, in the time of the run."""
     page: PageConfig | None = None
     """Serves a page on which people push and draw too, in real time; None: no page."""
 
@@ -241,7 +230,6 @@ def simulate_collaboration(
         workplace.robot.chain,
         pulls if scenario.forces == "random" else scenario.forces,
         0.0 if scenario.forces == "random" else None,
-        InteractionForceConfig(mapping=scenario.mapping),
     )
     stage = _Stage(workplace, scenario, plant, seed, rng)
     world, items = stage.world, workplace.scene.objects
@@ -269,12 +257,9 @@ def simulate_collaboration(
             model = change.applied(eyes.model, points_to_see(workplace, world), rng)
             eyes.change(world.time, model)
 
-    human: Human = person
-    if scenario.drawings:
-        human = CombinedInput(person, ScriptedDrawing(scenario.drawings))
     with simulated_cell(
         world,
-        human=human,
+        human=person,
         sensor=MarkerSensor(eyes, workplace.scene.marker_ids),
         config=scenario.cell,
         access=access,

@@ -9,7 +9,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
@@ -191,35 +191,21 @@ class RunOptions:
     """Port of the dashboard, with --serve."""
     film: bool = True
     """Make a film of the run, in the folder and in the report."""
-    verbose: bool = False
-    """Print all measured values, not just the first."""
     overwrite: bool = False
     """Replace an earlier run in that folder."""
     json: Path | None = None
     """File for the measured values."""
 
-    @classmethod
-    def of(cls, args: object) -> "RunOptions":
-        """Options of a command line with fields of the same names."""
-        return cls(**{option.name: getattr(args, option.name) for option in fields(cls)})
-
 
 def run_experiment[Run](
-    experiment: Experiment[Run],
-    options: RunOptions,
-    *,
-    configuration: Mapping[str, object] | None = None,
-    command: str = "",
+    experiment: Experiment[Run], options: RunOptions, *, command: str = ""
 ) -> int:
     """Run an experiment and its trials, write and print the results.
 
     Args:
         experiment: Experiment to run.
         options: Repetition and outputs.
-        configuration: Configuration for the report; by default the options and the settings of
-            the experiment.
-        command: Command that repeats the experiment; by default the command line of this
-            process.
+        command: Command that repeats the experiment, for the report.
 
     Returns:
         Exit status: 0, or 1 if the run failed or a bound was missed. A run whose physics failed
@@ -232,9 +218,7 @@ def run_experiment[Run](
 
     if options.trials < 0:
         raise ValueError(f"--trials must not be negative, but is {options.trials}.")
-    if configuration is None:
-        configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
-    command = command or shlex.join(["python", *sys.argv])
+    configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
     console, study = Console(), experiment.study()
     # Next to the folder, which exists only when all is done: interrupted trials resume.
     trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
@@ -257,7 +241,7 @@ def run_experiment[Run](
         trial_file.unlink()
     if options.json is not None:
         write_json(options.json, results.values)
-    show_measurements(results.table, options.verbose)
+    show_measurements(results.table)
     if trials:
         console.print(Summary.of(trials).table(study.title))
     _print_outputs(options.out, results, run_film is not None)

@@ -27,7 +27,6 @@ from hrc_learn.sim import CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.teleoperation import DrawnInterval
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import (
@@ -69,8 +68,6 @@ class GraspingExperiment:
     """Imperfections of arm, calibration, camera and object."""
     camera: CameraKind = "synthetic"
     config: GraspingConfig = field(default_factory=GraspingConfig)
-    drawings: tuple[DrawnInterval, ...] = ()
-    """Regions and targets that a scripted person draws during the grasp."""
     page: PageConfig | None = None
     """Serves a page on which people draw and pull the arm too, in real time; None: no page."""
     robot: ArmChoice = field(default_factory=ArmChoice)
@@ -89,7 +86,6 @@ class GraspingExperiment:
             camera=self.camera,
             config=self.config,
             rng=np.random.default_rng([seed, 1]),
-            drawings=self.drawings,
             page=self.page,
             access=access_by(self.arm, workplace.robot),
             observer=observer,

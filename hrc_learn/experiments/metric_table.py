@@ -57,9 +57,6 @@ class Metric[Run]:
     """True if the table of the report has the row; the JSON file always has it."""
     detail: Callable[[Run], str] = lambda run: ""
     """Detail for the reason when an essential bound was missed."""
-    resolution: float | None = None
-    """Resolution at which the value is shown; None: that of its unit in `RESOLUTIONS`. Files
-    hold the value in full."""
 
     def __post_init__(self) -> None:
         if self.at_most is not None and self.at_least is not None:
@@ -77,9 +74,7 @@ class Metric[Run]:
             target=self.at_most if self.at_least is None else self.at_least,
             at_least=self.at_least is not None,
             claim=self.claim,
-            resolution=(
-                RESOLUTIONS.get(self.unit, 0.0) if self.resolution is None else self.resolution
-            ),
+            resolution=RESOLUTIONS.get(self.unit, 0.0),
         )
 
     def of_part[Whole](
@@ -102,7 +97,6 @@ class Metric[Run]:
             essential=self.essential and bounded,
             listed=self.listed,
             detail=lambda whole: self.detail(part(whole)),
-            resolution=self.resolution,
         )
 
 

@@ -2,14 +2,12 @@
 
 import inspect
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.teleoperation import (
@@ -28,13 +26,8 @@ def default_of(function, name):
     return inspect.signature(function).parameters[name].default
 
 
-def field_default(cls, name):
-    return next(field.default for field in fields(cls) if field.name == name)
-
-
 def test_every_part_has_the_same_default():
     assert default_of(force_to_nullspace_input, "mapping") == DEFAULT_MAPPING
-    assert field_default(CollaborationExperiment, "mapping") == DEFAULT_MAPPING
     for forces in (InteractionForceConfig(), PageConfig().forces):
         assert forces.mapping == DEFAULT_MAPPING
 
