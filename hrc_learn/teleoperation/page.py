@@ -44,7 +44,7 @@ from hrc_learn.teleoperation.page_operator import (
     gizmo_command,
 )
 from hrc_learn.teleoperation.page_operator import PageHuman as PageHuman
-from hrc_learn.teleoperation.page_scene import Gizmos, PageScene
+from hrc_learn.teleoperation.page_scene import PageScene
 from hrc_learn.teleoperation.page_sockets import (
     PageSockets,
     guarded_viser,
@@ -75,8 +75,6 @@ class PageConfig(AddressConfig):
     """Draw the arm with its meshes; otherwise as capsules, with which a browser without a
     graphics processor draws twice as many frames in AR.
     """
-    twin: tuple[float, float, float] = (-0.1, 1.3, 0.0)
-    """Position of the virtual twin relative to the arm [m]."""
     touch_points: tuple[Point, ...] = ((0.4, 0.0, 0.0), (0.7, 0.0, 0.0), (0.4, 0.3, 0.0))
     """Points of the real workplace, in the base frame, that a person in a headset touches to
     lay the virtual arm over the real one [m]; three at least, well apart."""
@@ -180,27 +178,20 @@ class Page:
         self.url, self.watch_url = self.address.link(), self.address.link(watch=True)
         self.headset_url = self.address.link("/xr") if headset else ""
         self._wake = Event()
-        self._held_gizmos, self._turn = HeldGizmos(self._wake.set), AddedTurn()
-        self._hands = HeadsetHands(self._held_gizmos, self._turn, self._links, guides=guides)
-        self._scene = PageScene(self._server, bodies, boxes, config.twin)
-        self._gizmos = Gizmos(
-            self._server,
-            self._scene,
-            self._held_gizmos,
-            self._links,
-            self._turn,
-            guides=guides,
-            turns=draws,
+        self._held_gizmos = held = HeldGizmos(self._wake.set, self._links)
+        self._turn = turn = AddedTurn()
+        self._hands = HeadsetHands(held, turn, guides=guides)
+        self._scene = PageScene(
+            self._server, bodies, boxes, held, turn, guides=guides, turns=draws
         )
         self._panel = Panel(
             self._server,
             boxes,
             config.forces,
             self.human.request,
-            self._scene.show_twin,
-            self._gizmos.let_turn,
+            self._scene,
             task,
-            self._turn,
+            turn,
             guides=guides,
             draws=draws,
         )
@@ -334,10 +325,9 @@ class Page:
             links, feedback = self._links(), self.human.feedback
             assert links is not None
             colour = followed_colour(feedback.followed)
-            self._scene.move(*self._poses, links.position.numpy())
+            self._scene.move(*self._poses, links)
             self._scene.point(command.arrows, colour, command.held)
             self._scene.show_region(self._status.region)
-            self._gizmos.follow(links[-1])
             if panel:
                 people = self.control.people
                 self._panel.refresh(self._status, command.nullspace_input, self._rate(), people)

@@ -47,13 +47,19 @@ class HeldGizmos:
     Safe to use from several threads. A holder is whatever tells two browsers apart.
     """
 
-    def __init__(self, changed: Callable[[], object] = lambda: None) -> None:
+    def __init__(
+        self,
+        changed: Callable[[], object] = lambda: None,
+        links: Callable[[], Pose | None] = lambda: None,
+    ) -> None:
         """Start without held gizmos.
 
         Args:
             changed: Callback for gizmos taken, dragged or released.
+            links: Present frames of the arm (see `SerialChain.link_poses`); None before the arm
+                is known.
         """
-        self._changed = changed
+        self._changed, self.links = changed, links
         self._held: dict[tuple[Hashable, str], HeldGizmo] = {}
         self._lock = Lock()
 
@@ -62,6 +68,24 @@ class HeldGizmos:
         with self._lock:
             self._held[holder, handle] = held
         self._changed()
+
+    def grab(
+        self,
+        holder: Hashable,
+        handle: str,
+        joint: int | None,
+        start: Float[np.ndarray, "3"],
+        pointer: Float[np.ndarray, "3"],
+    ) -> None:
+        """Begin to hold a link, or the end effector, at a point of the base frame [m]."""
+        links = self.links()
+        if links is None:
+            return
+        if joint is None:
+            held_at = start - links[-1].position.numpy()
+        else:
+            held_at = links[joint - 1].inverse().apply(torch.from_numpy(start)).numpy()
+        self.take(holder, handle, HeldGizmo(joint=joint, held_at=held_at, pointer=pointer))
 
     def move(
         self,
@@ -178,7 +202,6 @@ class HeadsetHands:
         self,
         held: HeldGizmos,
         turn: AddedTurn,
-        links: Callable[[], Pose | None],
         *,
         guides: bool,
     ):
@@ -187,10 +210,9 @@ class HeadsetHands:
         Args:
             held: Record of held gizmos.
             turn: Rotation that a hand adds to the end effector's orientation.
-            links: Frames of the arm as they are now; None before the arm is known.
             guides: True if the end effector can be held.
         """
-        self._held, self._turn, self._links, self._guides = held, turn, links, guides
+        self._held, self._turn, self._guides = held, turn, guides
         self._grips: dict[str, Grip] = {}
         self._tracked: Mapping[str, TrackedHand] = {}
         self._noted = False
@@ -207,7 +229,7 @@ class HeadsetHands:
             MessageError: It holds a joint that the arm does not have.
         """
         self._tracked = {seen.hand: seen for seen in hands.tracked}
-        links = self._links()
+        links = self._held.links()
         if links is None:
             return
         now = {
@@ -221,7 +243,7 @@ class HeadsetHands:
         for hand, grip in now.items():
             before = self._grips.get(hand)
             if before is None or (before.joint, before.start) != (grip.joint, grip.start):
-                self._take(grip, links)
+                self._take(grip, len(links.position))
             else:
                 self._held.move(_HOLDER, hand, np.array(grip.pointer))
             if grip.joint is None and grip.orientation is not None:
@@ -234,20 +256,13 @@ class HeadsetHands:
         """
         self._noted, self._tracked = False, {}
 
-    def _take(self, grip: Grip, links: Pose) -> None:
-        start = torch.tensor(grip.start, dtype=torch.float64)
-        if grip.joint is None:
-            held_at = start - links[-1].position
-            if grip.orientation is not None:
-                self._turn.take((_HOLDER, grip.hand), _AT_REST)
-        elif grip.joint < len(links.position):
-            held_at = links[grip.joint - 1].inverse().apply(start)
-        else:
+    def _take(self, grip: Grip, joints: int) -> None:
+        if grip.joint is not None and grip.joint >= joints:
             raise MessageError(f"the arm has no joint {grip.joint}")
-        gizmo = HeldGizmo(
-            joint=grip.joint, held_at=held_at.numpy(), pointer=np.array(grip.pointer)
-        )
-        self._held.take(_HOLDER, grip.hand, gizmo)
+        if grip.joint is None and grip.orientation is not None:
+            self._turn.take((_HOLDER, grip.hand), _AT_REST)
+        start, pointer = np.array(grip.start), np.array(grip.pointer)
+        self._held.grab(_HOLDER, grip.hand, grip.joint, start, pointer)
 
 
 class PageHuman(Human):

@@ -5,18 +5,16 @@ them: links, knobs and the end effector's gizmo.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Collection, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.headset import (
-    END_EFFECTOR_PARTS,
     PEDESTAL,
     body_meshes,
     body_shape,
@@ -27,20 +25,9 @@ from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
 # viser is imported when a page is opened, and not before.
 if TYPE_CHECKING:
-    from viser import ClientHandle as ClientHandle
-    from viser import FrameHandle as FrameHandle
-    from viser import IcosphereHandle as IcosphereHandle
-    from viser import MeshHandle as MeshHandle
-    from viser import SceneClickEvent as SceneClickEvent
-    from viser import SceneNodeDragEvent as SceneNodeDragEvent
-    from viser import SceneRectSelectEvent as SceneRectSelectEvent
     from viser import ViserServer as ViserServer
-
-    Holdable = MeshHandle | IcosphereHandle
 else:
-    # What checks annotations while the program runs must find something.
-    ClientHandle = FrameHandle = IcosphereHandle = MeshHandle = Holdable = ViserServer = Any
-    SceneClickEvent = SceneNodeDragEvent = SceneRectSelectEvent = Any
+    ViserServer = Any  # for what checks annotations while the program runs
 
 
 def in_loop[Event](callback: Callable[[Event], object]) -> Callable[[Event], Any]:
@@ -64,29 +51,37 @@ def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 
 
 _KNOBS = (2, 4, 6)
 """Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
-_PERSON = rgba(PERSON)[:3]
 
 
 _TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
-"""Opacity of the virtual twin."""
+"""Colour of the virtual twin, translucent."""
+_TWIN_AT = (-0.1, 1.3, 0.0)
+"""Position of the virtual twin relative to the arm [m]."""
+_PARENTS = ("", "/twin")
+_BASE_AXES = (1.0, 0.0, 0.0, 0.0)  # unit quaternion (wxyz)
 
 
-class _DrawnBody(NamedTuple):
-    """A body on the page."""
-
-    frame: FrameHandle
-    meshes: Sequence[MeshHandle]
+def _held(body: Body) -> bool:
+    return held_joint(body) != "nothing"
 
 
 class PageScene:
-    """Draws bodies where they are, once as the arm itself and once as its twin."""
+    """Bodies where they are, once as the arm and once as its twin, and the mouse on them.
+
+    Callbacks are coroutines: the browser's messages then come in their order, and in viser's
+    event loop.
+    """
 
     def __init__(
         self,
         server: ViserServer,
         bodies: Sequence[Body],
         boxes: Sequence[Box],
-        twin: tuple[float, float, float],
+        held: HeldGizmos,
+        turn: AddedTurn,
+        *,
+        guides: bool,
+        turns: bool,
     ):
         """Draw everything once.
 
@@ -94,23 +89,23 @@ class PageScene:
             server: Server of the page.
             bodies: Moving bodies with their shapes.
             boxes: Fixed boxes.
-            twin: Position of the virtual twin relative to the arm [m].
+            held: Record of held gizmos.
+            turn: Rotation added by the rings of the end effector's gizmo.
+            guides: True if the end effector can be held and has a gizmo.
+            turns: True if its gizmo has rings even where it cannot be held.
         """
-        self._scene = server.scene
-        self.twin = np.array(twin)
-        self._scene.add_frame("/twin", position=twin, show_axes=False)
-        self._bodies = tuple(bodies)
-        self._own = [self._draw("", body) for body in bodies]
+        self._scene, self._held, self._turn, self._guides = server.scene, held, turn, guides
+        self._absolute = False
+        self._twin = self._scene.add_frame("/twin", position=_TWIN_AT, show_axes=False)
         # Objects that are carried have no twin: what matters is what can be held.
-        self._copies = [
-            self._draw("/twin", body)
-            if body.name.startswith("link") or body.name in END_EFFECTOR_PARTS
-            else None
+        self._frames = [
+            [self._draw(parent, body) for parent in _PARENTS if not parent or _held(body)]
             for body in bodies
         ]
-        self._knobs = {joint: self._draw_knob("", joint) for joint in _KNOBS}
-        self._twin_knobs = {joint: self._draw_knob("/twin", joint) for joint in _KNOBS}
-        for box in boxes:
+        self._knobs = {
+            joint: [self._draw_knob(parent, joint) for parent in _PARENTS] for joint in _KNOBS
+        }
+        for box in (*boxes, PEDESTAL):
             self._draw_box(box)
         self._surroundings(server)
         self._arrows = None
@@ -123,49 +118,42 @@ class PageScene:
             thickness=0.003,
             visible=False,
         )
-
-    def holdables(self) -> Iterator[tuple[Holdable, int | None, np.ndarray]]:
-        """All that can be held: node, joint (None: end effector), offset from the arm [m]."""
-        here = np.zeros(3)
-        for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
-            joint = held_joint(body)
-            if joint != "nothing":
-                yield from ((mesh, joint, here) for mesh in own.meshes)
-                if copy is not None:
-                    yield from ((mesh, joint, self.twin) for mesh in copy.meshes)
-        for joint in _KNOBS:
-            yield self._knobs[joint], joint, here
-            yield self._twin_knobs[joint], joint, self.twin
+        self._gizmo = self._add_gizmo() if guides or turns else None
+        server.on_client_disconnect(self._release)
 
     def move(
         self,
         positions: Float[np.ndarray, "bodies 3"],
         orientations: Float[np.ndarray, "bodies 4"],
-        joints: Float[np.ndarray, "links 3"],
+        links: Pose,
     ) -> None:
         """Put everything where it is.
 
         Args:
             positions: Positions of the bodies [m].
             orientations: Orientations of the bodies (wxyz).
-            joints: Origins of the arm's frames, for the knobs [m].
+            links: Frames of the arm, for the knobs and the end effector's gizmo.
         """
-        nodes = zip(self._own, self._copies, positions, orientations, strict=True)
-        for own, copy, position, orientation in nodes:
-            for node in (own, copy):
-                if node is not None:
-                    node.frame.position, node.frame.wxyz = position, orientation
-        for knobs in (self._knobs, self._twin_knobs):
-            for joint, knob in knobs.items():
-                knob.position = joints[joint - 1]
+        for frames, position, orientation in zip(
+            self._frames, positions, orientations, strict=True
+        ):
+            for frame in frames:
+                frame.position, frame.wxyz = position, orientation
+        for joint, knobs in self._knobs.items():
+            for knob in knobs:
+                knob.position = links.position[joint - 1].numpy()
+        gizmo = self._gizmo
+        if gizmo is None or self._turn.holder is not None:
+            return
+        if all(name != gizmo.name for _, name in self._held.held()):
+            gizmo.position = links.position[-1].numpy()
+            # Without rotation it moves along the axes of the base.
+            turned = links.orientation[-1].numpy() if self._absolute else _BASE_AXES
+            gizmo.wxyz = turned
 
     def show_twin(self, visible: bool) -> None:
         """Show or hide the twin."""
-        for copy in self._copies:
-            if copy is not None:
-                copy.frame.visible = visible
-        for knob in self._twin_knobs.values():
-            knob.visible = visible
+        self._twin.visible = visible
 
     def show_region(self, region: DrawnRegion | None) -> None:
         """Show the region to which a controller takes the end effector; None: there is none."""
@@ -175,6 +163,18 @@ class PageScene:
         self._region.visible = region is not None
         if region is not None:
             self._region.points = box_edges(region.half_size) + np.array(region.centre)
+
+    def let_turn(self, rings: bool, absolute: bool) -> None:
+        """Set the rings of the end effector's gizmo.
+
+        Args:
+            rings: True if it has rings to turn it by.
+            absolute: True if the end effector takes its gizmo's orientation; otherwise what the
+                rings are turned by is added to its orientation.
+        """
+        self._absolute = absolute
+        if self._gizmo is not None:
+            self._gizmo.disable_rotations = not rings
 
     def point(
         self,
@@ -193,8 +193,8 @@ class PageScene:
             now = colour if joint in held else PERSON
             if now != before:
                 self._knob_colours[joint] = now
-                for knobs in (self._knobs, self._twin_knobs):
-                    knobs[joint].color = rgba(now)[:3]
+                for knob in self._knobs[joint]:
+                    knob.color = rgba(now)[:3]
         if self._arrows is not None and not len(arrows):
             self._arrows.remove()
             self._arrows = None
@@ -211,14 +211,14 @@ class PageScene:
                 head_length=0.05,
             )
 
-    def _draw(self, parent: str, body: Body) -> _DrawnBody:
-        path = f"{parent}/arm/{body.name}"
+    def _draw(self, parent: str, body: Body) -> Any:
+        path, joint = f"{parent}/arm/{body.name}", held_joint(body)
         frame = self._scene.add_frame(
             path, position=body.position[0], wxyz=body.orientation[0], show_axes=False
         )
         shapes = {_TWIN: body_shape(body)} if parent else body_meshes(body)
-        meshes = [
-            self._scene.add_mesh_simple(
+        for k, ((red, green, blue, opacity), mesh) in enumerate(shapes.items()):
+            node = self._scene.add_mesh_simple(
                 f"{path}/{k}",
                 mesh.vertices,
                 mesh.faces,
@@ -227,19 +227,55 @@ class PageScene:
                 flat_shading=False,
                 cast_shadow=not parent,
             )
-            for k, ((red, green, blue, opacity), mesh) in enumerate(shapes.items())
-        ]
-        return _DrawnBody(frame, meshes)
+            if joint != "nothing":
+                self._connect(node, joint, parent)
+        return frame
 
-    def _draw_knob(self, parent: str, joint: int) -> IcosphereHandle:
-        return self._scene.add_icosphere(
+    def _draw_knob(self, parent: str, joint: int) -> Any:
+        knob = self._scene.add_icosphere(
             f"{parent}/knobs/joint{joint}",
             radius=0.078,
             subdivisions=2,
-            color=_PERSON,
+            color=rgba(PERSON)[:3],
             opacity=0.9,
             cast_shadow=False,
         )
+        self._connect(knob, joint, parent)
+        return knob
+
+    def _add_gizmo(self) -> Any:
+        guides = self._guides
+        gizmo = self._scene.add_transform_controls(
+            "/end_effector",
+            scale=0.2,
+            disable_axes=not guides,
+            disable_sliders=not guides,
+            disable_rotations=guides,
+            depth_test=False,
+        )
+        gizmo.on_update(self._gizmo_dragged if guides else self._gizmo_turned)
+        return gizmo
+
+    async def _release(self, client: Any) -> None:
+        """Forget a client that has left."""
+        self._held.release_all(client.client_id)
+        self._turn.release(client.client_id)
+
+    def _connect(self, node: Any, joint: int | None, parent: str) -> None:
+        if joint is None and not self._guides:
+            return
+        offset = np.array(_TWIN_AT if parent else (0.0, 0.0, 0.0))
+
+        @node.on_drag
+        async def dragged(event: Any) -> None:
+            pointer = np.array(event.end_position) - offset
+            if event.phase == "start":
+                start = np.array(event.start_position) - offset
+                self._held.grab(event.client_id, node.name, joint, start, pointer)
+            elif event.phase == "update":
+                self._held.move(event.client_id, node.name, pointer)
+            else:
+                self._held.release(event.client_id, node.name)
 
     def _draw_box(self, box: Box) -> None:
         r, g, b, opacity = box.colour
@@ -266,138 +302,10 @@ class PageScene:
         self._scene.add_grid(
             "/floor", width=6.0, height=6.0, cell_size=0.25, position=(0.0, 0.5, -0.72)
         )
-        self._draw_box(PEDESTAL)
         server.initial_camera.position = _CAMERA
         server.initial_camera.look_at = _LOOK_AT
         server.initial_camera.fov = 0.9
         server.on_client_connect(_step_back)
-
-
-_CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)
-_ASPECT = 1.2  # of a view at which cabinet and twin are both in it
-
-
-async def _step_back(client: ClientHandle) -> None:
-    """Let a camera stand back whose view is narrow, as a phone's is: what is seen stays."""
-    aspect = client.camera.aspect
-    if aspect < _ASPECT:
-        look_at = np.array(_LOOK_AT)
-        # Its position takes along what it looks at.
-        client.camera.position = look_at + _ASPECT / aspect * (np.array(_CAMERA) - look_at)
-        client.camera.look_at = _LOOK_AT
-
-
-_BASE_AXES = (1.0, 0.0, 0.0, 0.0)  # unit quaternion (wxyz)
-
-
-class Gizmos:
-    """Lets people hold links, knobs and the end effector's gizmo with the mouse.
-
-    Callbacks are coroutines: the browser's messages then come in their order, and in viser's
-    event loop.
-    """
-
-    def __init__(
-        self,
-        server: ViserServer,
-        scene: PageScene,
-        held_gizmos: HeldGizmos,
-        links: Callable[[], Pose | None],
-        turn: AddedTurn,
-        *,
-        guides: bool = True,
-        turns: bool = False,
-    ):
-        """Connect the gizmos to the scene.
-
-        Args:
-            server: Server of the page.
-            scene: Scene with the bodies that can be held.
-            held_gizmos: Record of held gizmos.
-            links: Present frames of the arm (see `SerialChain.link_poses`); None before the arm
-                is known.
-            turn: Rotation added by the rings of the end effector's gizmo.
-            guides: True if the end effector can be held and has a gizmo.
-            turns: True if its gizmo has rings even where it cannot be held.
-        """
-        self._held_gizmos, self._links, self._turns = held_gizmos, links, False
-        self._turn = turn
-        for node, joint, offset in scene.holdables():
-            if guides or joint is not None:
-                self._connect(node, joint, offset)
-        self._gizmo = None
-        if guides or turns:
-            self._gizmo = server.scene.add_transform_controls(
-                "/end_effector",
-                scale=0.2,
-                disable_axes=not guides,
-                disable_sliders=not guides,
-                disable_rotations=guides,
-                depth_test=False,
-            )
-            self._gizmo.on_update(self._gizmo_dragged if guides else self._gizmo_turned)
-        server.on_client_disconnect(self._release)
-
-    def follow(self, pose: Pose) -> None:
-        """Keep the end effector's gizmo at the end effector while it is not held."""
-        gizmo = self._gizmo
-        if gizmo is None or self._turn.holder is not None:
-            return
-        if any(name == gizmo.name for _, name in self._held_gizmos.held()):
-            return
-        gizmo.position = pose.position.numpy()
-        # Without rotation it moves along the axes of the base.
-        gizmo.wxyz = pose.orientation.numpy() if self._turns else _BASE_AXES
-
-    def let_turn(self, rings: bool, absolute: bool) -> None:
-        """Say what rings the end effector's gizmo has.
-
-        Args:
-            rings: True if it has rings to turn it by.
-            absolute: True if the end effector takes its gizmo's orientation; otherwise what the
-                rings are turned by is added to its orientation.
-        """
-        self._turns = absolute
-        if self._gizmo is not None:
-            self._gizmo.disable_rotations = not rings
-
-    async def _release(self, client: ClientHandle) -> None:
-        """Forget a client that has left."""
-        self._held_gizmos.release_all(client.client_id)
-        self._turn.release(client.client_id)
-
-    def _connect(
-        self, node: Holdable, joint: int | None, offset: Float[np.ndarray, "3"]
-    ) -> None:
-        @node.on_drag
-        async def dragged(event: SceneNodeDragEvent) -> None:
-            pointer = np.array(event.end_position) - offset
-            if event.phase == "start":
-                held = np.array(event.start_position) - offset
-                self._take(event.client_id, node.name, joint, held, pointer)
-            elif event.phase == "update":
-                self._held_gizmos.move(event.client_id, node.name, pointer)
-            else:
-                self._held_gizmos.release(event.client_id, node.name)
-
-    def _take(
-        self,
-        holder: int,
-        name: str,
-        joint: int | None,
-        held: Float[np.ndarray, "3"],
-        pointer: Float[np.ndarray, "3"],
-    ) -> None:
-        links = self._links()
-        if links is None:
-            return
-        if joint is None:
-            held_at = held - links[-1].position.numpy()
-        else:
-            held_at = links[joint - 1].inverse().apply(torch.from_numpy(held)).numpy()
-        self._held_gizmos.take(
-            holder, name, HeldGizmo(joint=joint, held_at=held_at, pointer=pointer)
-        )
 
     async def _gizmo_dragged(self, event: Any) -> None:
         name, pointer = event.target.name, event.target.position.copy()
@@ -405,12 +313,12 @@ class Gizmos:
             return
         if event.phase == "start":
             held = HeldGizmo(joint=None, held_at=np.zeros(3), pointer=pointer)
-            self._held_gizmos.take(event.client_id, name, held)
+            self._held.take(event.client_id, name, held)
         elif event.phase == "update":
-            self._held_gizmos.move(event.client_id, name, pointer, event.target.wxyz.copy())
+            self._held.move(event.client_id, name, pointer, event.target.wxyz.copy())
         else:
-            self._held_gizmos.release(event.client_id, name)
-        if not self._turns:
+            self._held.release(event.client_id, name)
+        if not self._absolute:
             await self._gizmo_turned(event)
 
     async def _gizmo_turned(self, event: Any) -> None:
@@ -422,3 +330,17 @@ class Gizmos:
             self._turn.move(event.client_id, event.target.wxyz.copy())
         else:
             self._turn.release(event.client_id)
+
+
+_CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)
+_ASPECT = 1.2  # of a view at which cabinet and twin are both in it
+
+
+async def _step_back(client: Any) -> None:
+    """Let a camera stand back whose view is narrow, as a phone's is: what is seen stays."""
+    aspect = client.camera.aspect
+    if aspect < _ASPECT:
+        look_at = np.array(_LOOK_AT)
+        # Its position takes along what it looks at.
+        client.camera.position = look_at + _ASPECT / aspect * (np.array(_CAMERA) - look_at)
+        client.camera.look_at = _LOOK_AT

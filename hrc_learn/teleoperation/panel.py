@@ -17,7 +17,7 @@ from hrc_learn.teleoperation.devices import DIRECTIONS, OPEN, KeyboardState
 from hrc_learn.teleoperation.gate.messages import Gripper, Message, Region, Target, Task
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.page_operator import AddedTurn
-from hrc_learn.teleoperation.page_scene import ViserServer, in_loop
+from hrc_learn.teleoperation.page_scene import PageScene, ViserServer, in_loop
 from hrc_learn.teleoperation.region_editor import RegionEditor
 from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed_colour
 
@@ -172,16 +172,15 @@ def felt_words(feedback: Feedback) -> list[str]:
     return felt
 
 
-def interventions_html(status: PageStatus, more: Sequence[str], latest: str) -> str:
+def interventions_html(status: PageStatus, latest: str) -> str:
     """Interventions of the safety filter, as HTML.
 
     Args:
         status: Status of the session.
-        more: Kinds of interventions since the last refresh.
-        latest: Kind of the latest intervention; empty if there was none.
+        latest: Kind of the latest intervention, shown in red; empty if there was none.
     """
     rows = [
-        f'<tr style="{f"color:{VERMILION};font-weight:600" if name in more else ""}">'
+        f'<tr style="{f"color:{VERMILION};font-weight:600" if name == latest else ""}">'
         f"<td>{html.escape(name.replace('_', ' '))}</td>"
         f'<td style="text-align:right">{count}</td></tr>'
         for name, count in status.interventions.items()
@@ -194,8 +193,9 @@ def interventions_html(status: PageStatus, more: Sequence[str], latest: str) -> 
     )
     table = "".join(rows) or nothing
     table += contacts if status.contacts else ""
-    words = f"Safety filter, steps; latest: {latest}" if latest else "Safety filter"
-    return _block(words, f'<table style="width:100%;border-spacing:0">{table}</table>')
+    return _block(
+        "Safety filter, steps", f'<table style="width:100%;border-spacing:0">{table}</table>'
+    )
 
 
 def _block(title: str, content: str) -> str:
@@ -219,7 +219,6 @@ LONGEST_TEXT = 200
 """Characters that a text typed on the page may have."""
 
 _ICONS: dict[str, Any] = {"start": "player-record", "stop": "player-stop"}
-_MAPPINGS = {"velocity (paper's)": "pinv", "spring": "transpose"}
 _KEYS = {"i": "away", "k": "back", "j": "left", "l": "right", "u": "up", "o": "down"}
 
 
@@ -236,8 +235,7 @@ class Panel:
         boxes: Sequence[Box],
         forces: InteractionForceConfig,
         request: Callable[[Request], None],
-        show_twin: Callable[[bool], None],
-        let_turn: Callable[[bool, bool], None],
+        scene: PageScene,
         task: str,
         turn: AddedTurn,
         *,
@@ -251,9 +249,7 @@ class Panel:
             boxes: Furniture that targets may be marked on.
             forces: Initial gains of gizmos.
             request: Receives what buttons ask for.
-            show_twin: Shows or hides the twin.
-            let_turn: Callback that sets whether the end effector's gizmo can be turned, and
-                whether the end effector turns as it stands (see `Gizmos.let_turn`).
+            scene: Scene, whose twin and gizmo the panel sets.
             task: Description of the task.
             turn: Rotation added by the rings of the end effector's gizmo.
             guides: True if the person guides the end effector and records.
@@ -282,12 +278,9 @@ class Panel:
             self._safety = gui.add_html("")
         with gui.add_folder("Arm"):
             if guides:
-                self._add_end_effector(let_turn)
+                self._add_end_effector(scene)
             twin = gui.add_checkbox("Virtual twin", True, hint="Hold it instead of the arm.")
-            twin.on_update(in_loop(lambda _: show_twin(twin.value)))
-            first = next(word for word, m in _MAPPINGS.items() if m == forces.mapping)
-            pulls = tuple(_MAPPINGS)
-            self._mapping = gui.add_dropdown("A pull is a", pulls, initial_value=first)
+            twin.on_update(in_loop(lambda _: scene.show_twin(twin.value)))
             self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
         if draws:
             with gui.add_folder("Region, target and turn"):
@@ -312,7 +305,7 @@ class Panel:
             group.on_click(in_loop(lambda event, of=requests: request(of[event.target.value])))
             self._keep = self._keep or group  # the first: save and discard
 
-    def _add_end_effector(self, let_turn: Callable[[bool, bool], None]) -> None:
+    def _add_end_effector(self, scene: PageScene) -> None:
         """Move the end effector by keys, turn it, open and close it."""
         coarse = self._coarse = self._gui.add_checkbox(
             "Coarse orientation rule",
@@ -325,7 +318,7 @@ class Panel:
 
         async def chosen(_: object) -> None:
             fine.disabled = not coarse.value
-            let_turn(fine.value or not coarse.value, not coarse.value)
+            scene.let_turn(fine.value or not coarse.value, not coarse.value)
 
         coarse.on_update(chosen)
         fine.on_update(chosen)
@@ -394,11 +387,8 @@ class Panel:
     @property
     def forces(self) -> InteractionForceConfig:
         """Gains and bounds of gizmos."""
-        mapping: Any = _MAPPINGS[self._mapping.value]
         scale, base = self._strength.value / 100, self._initial_forces
-        return replace(
-            base, mapping=mapping, rate=scale * base.rate, stiffness=scale * base.stiffness
-        )
+        return replace(base, rate=scale * base.rate, stiffness=scale * base.stiffness)
 
     def fits(self, uuid: str, updates: Mapping[str, Any]) -> bool:
         """True if a browser may set a control of the panel to a value.
@@ -459,7 +449,5 @@ class Panel:
             self._turn_text.content = _turn_words(self._turn.vector)
         counts, seen = status.interventions, self._seen
         more = [name for name, count in counts.items() if count > seen.get(name, 0)]
-        self._seen = dict(counts)
-        if more:
-            self._latest = more[-1]
-        self._safety.content = interventions_html(status, more, self._latest)
+        self._seen, self._latest = dict(counts), more[-1] if more else self._latest
+        self._safety.content = interventions_html(status, self._latest)

@@ -13,8 +13,6 @@ from jaxtyping import Float
 from hrc_learn.geometry import Box, quaternion
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.page_scene import (
-    SceneClickEvent,
-    SceneRectSelectEvent,
     ViserServer,
     box_edges,
     in_loop,
@@ -256,7 +254,7 @@ class RegionEditor:
         self._draw.disabled = True
 
         @self._scene.on_rect_select()
-        async def drawn(event: SceneRectSelectEvent) -> None:
+        async def drawn(event: Any) -> None:
             self._scene.remove_rect_select_callback(drawn)
             self._draw.disabled = False
             footprint = self._footprint(event)
@@ -265,7 +263,7 @@ class RegionEditor:
                 height = 2 * self._region.half_size[2]
                 self.reshape(region_over(footprint, bottom, height))
 
-    def _footprint(self, event: SceneRectSelectEvent) -> Float[np.ndarray, "4 3"] | None:
+    def _footprint(self, event: Any) -> Float[np.ndarray, "4 3"] | None:
         """Projections of the midpoints of a rectangle's edges on the table."""
         (left, top), (right, bottom) = event.screen_min, event.screen_max
         x, y = (left + right) / 2, (top + bottom) / 2
@@ -281,7 +279,7 @@ class RegionEditor:
         self._mark_next_button.disabled = True
 
         @self._scene.on_click()
-        async def clicked(event: SceneClickEvent) -> None:
+        async def clicked(event: Any) -> None:
             self._scene.remove_click_callback(clicked)
             self._mark_next_button.disabled = False
             point = self._surface(np.array(event.ray_origin), np.array(event.ray_direction))

@@ -5,7 +5,7 @@ Success is read from MuJoCo's contacts and poses.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,10 +19,7 @@ from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections, World, open_camera
 from hrc_learn.sim.cameras import hidden_markers
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import (
-    PositionServo,
-    PositionServoConfig,
-)
+from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.skills.grasping import CLOSED, OPEN
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.teleoperation.scripted_demonstrations import (
@@ -30,37 +27,7 @@ from hrc_learn.teleoperation.scripted_demonstrations import (
     placing_expert,
 )
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
-from hrc_learn.vision import CameraModel, ImageNoise, SyntheticCamera
-
-
-class Scenario(ABC):
-    """Task shared by the demonstrator and the learned policy."""
-
-    workplace: Workplace
-
-    @property
-    @abstractmethod
-    def task(self) -> str:
-        """Description of the task."""
-
-    @property
-    @abstractmethod
-    def duration(self) -> float:
-        """Duration of a demonstration [s]."""
-
-    @abstractmethod
-    def begin(self, world: World, rng: np.random.Generator) -> Human:
-        """Set up the scene, and return a demonstrator for it.
-
-        Args:
-            world: World of the workplace; its clock starts at zero.
-            rng: Random source of the objects' poses and of the person's tremor.
-        """
-
-    @abstractmethod
-    def succeeded(self, world: World) -> bool:
-        """True if the task is done."""
-
+from hrc_learn.vision import CameraModel, ImageNoise, Marker, SyntheticCamera
 
 _RELEASE = 1.5  # time for the fingers to open [s]
 _REACH = (0.10, 0.08, 0.0)  # largest distance of the object from the middle of the table [m]
@@ -71,7 +38,7 @@ _TREMOR = 2e-4  # amplitude of the end effector's tremor while it grasps [m]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Placing(Scenario):
+class Placing:
     """Put the object in the gripper on a shelf, and let go."""
 
     workplace: Workplace = field(default_factory=Workplace)
@@ -82,6 +49,7 @@ class Placing(Scenario):
 
     @property
     def task(self) -> str:
+        """Description of the task."""
         return f"place the box on the {self.shelf} shelf"
 
     @property
@@ -104,7 +72,7 @@ class Placing(Scenario):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grasping(Scenario):
+class Grasping:
     """Take an object that lies at random on the table, and lift it."""
 
     workplace: Workplace = field(default_factory=Workplace)
@@ -148,6 +116,14 @@ class Grasping(Scenario):
         item = self.workplace.scene.objects[0]
         bottom = world.object_pose(item.name)[2, 3] - max(item.half_size)
         return world.holds(item.name) and bool(bottom > 0.5 * _HEIGHT)
+
+
+Scenario = Placing | Grasping
+"""Task shared by the demonstrator and the learned policy.
+
+`begin(world, rng)` sets up the scene and returns a demonstrator for it; the clock of the world
+starts at zero. `succeeded(world)` is true if the task is done.
+"""
 
 
 class SequencedInput(Human):
@@ -276,14 +252,7 @@ class ScenarioRun:
     @cached_property
     def _sensor(self) -> MarkerSensor:
         """Marker detector of the fixed camera, which sees the object only."""
-        scene = self.scenario.workplace.scene
-        marker = scene.objects[0].marker
-
-        def poses() -> dict[int, np.ndarray]:
-            return {marker.id: self.world.marker_poses()[marker.id]}
-
-        camera = SyntheticCamera(self.camera, [marker], poses, rng=self._noise)
-        return MarkerSensor(camera, scene.marker_ids)
+        return self._sensor_of(self.scenario.workplace.scene.objects[0].marker, self._noise)
 
     def tool_pixel(self) -> Float[np.ndarray, "2"] | None:
         """Pixel (u, v) of the tool's marker in the fixed camera; None: not in view."""
@@ -294,13 +263,24 @@ class ScenarioRun:
         plate = self.scenario.workplace.scene.arm.marker
         if plate is None:
             raise ValueError("the arm of this scene carries no marker: leave out its pixel.")
-        marker = plate.marker
+        return self._sensor_of(
+            plate.marker,
+            self._tool_noise,
+            lambda: hidden_markers(self.world, self.camera, [plate.marker]),
+        )
+
+    def _sensor_of(
+        self,
+        marker: Marker,
+        rng: np.random.Generator,
+        hidden: Callable[[], Set[int]] = frozenset,
+    ) -> MarkerSensor:
         camera = SyntheticCamera(
             self.camera,
             [marker],
             lambda: {marker.id: self.world.marker_poses()[marker.id]},
-            rng=self._tool_noise,
-            hidden=lambda: hidden_markers(self.world, self.camera, [marker]),
+            rng=rng,
+            hidden=hidden,
         )
         return MarkerSensor(camera, [marker.id])
 

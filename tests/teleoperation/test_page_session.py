@@ -174,7 +174,7 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
     page = beside._page
     human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
     cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
-    elbow, wrist = page._scene._knobs[4], page._scene._knobs[6]
+    elbow, wrist = page._scene._knobs[4][0], page._scene._knobs[6][0]
     far = panda.link_poses(cell.joints).position[3].numpy() + np.array([0.0, 0.02, 0.0])
     held = HeldGizmo(joint=4, held_at=np.zeros(3), pointer=far)
     page.control.join("somebody")
@@ -202,7 +202,7 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
     )
     human.tell(told)
     until(lambda: elbow.color == rgba(VERMILION)[:3])
-    assert page._scene._twin_knobs[4].color == elbow.color
+    assert page._scene._knobs[4][1].color == elbow.color
     assert wrist.color == rgba(PERSON)[:3]
     until(lambda: "joint 4 is at its limit" in page._panel._told.content)
     until(lambda: arrow_colour() == rgba(VERMILION)[:3])
