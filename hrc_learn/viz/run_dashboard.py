@@ -156,9 +156,13 @@ class RunStream:
             send_poses(self._stream, time, body, at)
         self._send_path(run, ends)
         if run.worker_nearest is not None:
-            self._send_nearest(time, run.worker_nearest, at)
+            red = [palette.rgba(palette.LIMIT)]
+            line = rr.LineStrips3D.from_fields(radii=[0.004], colors=red)
+            self._send_pairs("world/worker_distance", line, time, run.worker_nearest, at)
         if run.push is not None:
-            self._send_push(time, run.push, at)
+            orange = [palette.rgba(palette.PERSON)]
+            arrow = rr.Arrows3D.from_fields(radii=[0.012], colors=orange)
+            self._send_pairs("world/push", arrow, time, run.push, at)
         if run.active_region is not None:
             self._send_region(run, run.active_region, first)
         if run.camera is not None:
@@ -201,35 +205,21 @@ class RunStream:
         counts = known.astype(int)
         self._stream.send_columns(path, seconds(run.time[at]), columns.partition(counts))
 
-    def _send_nearest(
+    def _send_pairs(
         self,
+        path: str,
+        look: rr.AsComponents,
         time: Float[np.ndarray, " time"],
-        nearest: Float[np.ndarray, "time 2 3"],
+        pairs: Float[np.ndarray, "time 2 3"],
         at: Int[np.ndarray, " chosen"],
     ) -> None:
-        """Send the line between the nearest points of robot and worker."""
-        path, colours = "world/worker_distance", [palette.rgba(palette.LIMIT)]
-        self._still.send(
-            path, None, lambda: rr.LineStrips3D.from_fields(radii=[0.004], colors=colours)
-        )
-        known = np.isfinite(nearest[at]).all(axis=(1, 2))
-        columns = rr.LineStrips3D.columns(strips=list(nearest[at][known]))
-        self._stream.send_columns(path, seconds(time[at]), columns.partition(known.astype(int)))
-
-    def _send_push(
-        self,
-        time: Float[np.ndarray, " time"],
-        push: Float[np.ndarray, "time 2 3"],
-        at: Int[np.ndarray, " chosen"],
-    ) -> None:
-        """Send an arrow at the point of the arm that the person pushes."""
-        path, colours = "world/push", [palette.rgba(palette.PERSON)]
-        self._still.send(
-            path, None, lambda: rr.Arrows3D.from_fields(radii=[0.012], colors=colours)
-        )
-        known = np.isfinite(push[at]).all(axis=(1, 2))
-        start, end = push[at][known].swapaxes(0, 1)
+        """Send lines or arrows between pairs of points, where these are known."""
+        self._still.send(path, None, lambda: look)
+        known = np.isfinite(pairs[at]).all(axis=(1, 2))
+        start, end = pairs[at][known].swapaxes(0, 1)
         columns = rr.Arrows3D.columns(origins=start, vectors=end - start)
+        if isinstance(look, rr.LineStrips3D):
+            columns = rr.LineStrips3D.columns(strips=list(pairs[at][known]))
         self._stream.send_columns(path, seconds(time[at]), columns.partition(known.astype(int)))
 
     def _send_phases(self, run: RunRecording) -> None:
