@@ -7,6 +7,7 @@ scripted demonstrations, which need the simulator, in modules of their own.
 from hrc_learn.teleoperation.devices import CombinedInput as CombinedInput
 from hrc_learn.teleoperation.devices import InputFilter as InputFilter
 from hrc_learn.teleoperation.devices import InputFilterConfig as InputFilterConfig
+from hrc_learn.teleoperation.hand_guiding import ForceMapping as ForceMapping
 from hrc_learn.teleoperation.hand_guiding import HandGuidedArm as HandGuidedArm
 from hrc_learn.teleoperation.hand_guiding import HandGuidingConfig as HandGuidingConfig
 from hrc_learn.teleoperation.hand_guiding import (
@@ -16,6 +17,7 @@ from hrc_learn.teleoperation.hand_guiding import (
     force_to_nullspace_input as force_to_nullspace_input,
 )
 from hrc_learn.teleoperation.hand_guiding import gizmo_nullspace_input as gizmo_nullspace_input
+from hrc_learn.teleoperation.hand_guiding import guiding_twist as guiding_twist
 from hrc_learn.teleoperation.scripted_expert import DrawnInterval as DrawnInterval
 from hrc_learn.teleoperation.scripted_expert import GuidedPath as GuidedPath
 from hrc_learn.teleoperation.scripted_expert import ScriptedDrawing as ScriptedDrawing
