@@ -26,9 +26,7 @@ type Scalars = ArrayLike
 """One number per primitive, (*batch): durations [s], gains, time steps [s]."""
 type Times = Real[Tensor, "... _T"] | Real[np.ndarray, "... _T"] | Nested
 """Times [s], (T,) for the whole batch or (*batch, T)."""
-type Row = Real[Tensor, "_T"] | Real[np.ndarray, "_T"]
-"""Samples of one coordinate, (T,)."""
-type Points = Real[Tensor, "... _T _D"] | Real[np.ndarray, "... _T _D"] | Row | Nested
+type Points = ArrayLike
 """Samples over time, (*batch, T, D); (T,) is taken as D = 1."""
 type Vectors = Real[Tensor, "... _D"] | Real[np.ndarray, "... _D"] | Nested
 """One vector per primitive, (*batch, D)."""
@@ -158,6 +156,21 @@ def positive(name: str, value: Scalars, like: Tensor) -> Float[Tensor, "*batch"]
     return tensor
 
 
+def check_not_negative(name: str, value: Tensor | float | int) -> None:
+    """Raise ValueError unless all numbers are finite and not negative.
+
+    Tensors on another device than the CPU are not read.
+    """
+    if isinstance(value, Tensor):
+        if not value.is_cpu or not readable(value):
+            return
+        good = bool(((value >= 0) & (value < math.inf)).all())
+    else:
+        good = 0 <= value < math.inf
+    if not good:
+        raise ValueError(f"{name} must be finite and not negative, got {value}")
+
+
 def seconds(time: Times, device: torch.device) -> Float[Tensor, "*batch T"]:
     """Times [s] since the start of a motion (float64).
 
@@ -181,11 +194,13 @@ def normalised_time(
         ValueError: Bad times, or a batch shape that does not match the durations.
     """
     time = seconds(time, duration.device)
-    if time.ndim > 1 and duration.ndim and not _can_broadcast(time.shape[:-1], duration.shape):
+    try:
+        broadcast_shapes(time.shape[:-1], duration.shape)
+    except (ValueError, RuntimeError):
         raise ValueError(
             f"time has shape {tuple(time.shape)}, but there are {tuple(duration.shape)} "
             f"durations: time must be (T,) or {(*duration.shape, time.shape[-1])}"
-        )
+        ) from None
     # Identical grids collapse to one, which needs one response matrix for the whole batch.
     if readable(time, duration) and not (time.requires_grad or duration.requires_grad):
         time, duration = _collapse_identical(time, 1), _collapse_identical(duration, 0)
@@ -203,12 +218,6 @@ def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[T
     # The tolerance keeps rounding from adding a sample past the end.
     last = math.ceil(duration.max().item() / dt * (1 - 1e-7))
     return dt * torch.arange(last + 1, dtype=torch.float64, device=duration.device)
-
-
-def _can_broadcast(one: tuple[int, ...], other: tuple[int, ...]) -> bool:
-    """True if the two shapes broadcast."""
-    sizes = zip(reversed(one), reversed(other), strict=False)
-    return all(a == b or 1 in (a, b) for a, b in sizes)
 
 
 def _collapse_identical(values: Tensor, ndim: int) -> Tensor:

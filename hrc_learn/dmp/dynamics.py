@@ -292,6 +292,10 @@ class PeriodicBasis:
         """Normalised times c_i at which the basis functions peak (float64)."""
         return torch.arange(self.count, dtype=torch.float64) / self.count
 
+    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """Bells psi_i at normalised time `s`, not normalised."""
+        return self._exponents(s).exp()
+
     def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
         """Forcing term per unit of each weight at normalised time `s`."""
         return torch.softmax(self._exponents(s), dim=-1)

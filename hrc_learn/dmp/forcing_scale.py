@@ -7,14 +7,13 @@
 - `"amplitude"`: the range of each coordinate in the demonstration. Weights are dimensionless,
   so scaled demonstrations have the same ones; defined for g = y_0.
 - `"rotation"`: rotation and dilation with the displacement from start to goal, for positions in
-  space; see `RotationScaling`.
+  space; see `_rotated`.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -46,21 +45,35 @@ class Demonstrated:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scaling(ABC):
+class Scaling:
     """Linear map of the forcing term, determined by start and goal.
 
     It accepts tensors, or arrays with `xp=numpy`, so that fits, rollouts, steps and the
     `Stepper` use one definition.
     """
 
+    name: str = "none"
+    """Key of `SCALINGS`."""
     columns: int | None = None
     """Number of leading coordinates that are scaled; None: all."""
-    name: ClassVar[str]
-    depends_on_boundary: ClassVar[bool] = False
-    """True if a new start or goal changes the map; the motion is not linear in them then."""
-    turns: ClassVar[bool] = False
-    """True if the map rotates: weights are in the frame of the demonstration, and the start
-    velocity is scaled too."""
+
+    def __post_init__(self):
+        if self.name not in SCALINGS:
+            raise ValueError(
+                f"unknown scaling {self.name!r}; choose from {', '.join(SCALINGS)}"
+            )
+
+    @property
+    def depends_on_boundary(self) -> bool:
+        """True if a new start or goal changes the map, which makes the motion nonlinear."""
+        return self.name in ("paper", "rotation")
+
+    @property
+    def turns(self) -> bool:
+        """True if the map rotates: weights are in the frame of the demonstration, and the start
+        velocity is scaled too.
+        """
+        return self.name == "rotation"
 
     def scale(
         self,
@@ -79,22 +92,24 @@ class Scaling(ABC):
             reference: The demonstration.
             xp: `torch` for tensors, `numpy` for arrays.
         """
-        k = self.columns
+        k, scale = self.columns, SCALINGS[self.name]
         if k is None:
-            return self._scale(values, start, goal, reference, xp)
-        ends = start[..., :k], goal[..., :k]
-        scaled = self._scale(values[..., :k], *ends, reference.leading(k), xp)
+            return scale(values, goal - start, reference, xp)
+        displacement = goal[..., :k] - start[..., :k]
+        scaled = scale(values[..., :k], displacement, reference.leading(k), xp)
         others = values[..., k:]
         others = xp.broadcast_to(others, (*scaled.shape[:-1], others.shape[-1]))
         return xp.concatenate([scaled, others], -1)
 
     def unscale(self, values: Tensor, reference: Demonstrated) -> Tensor:
         """Inverse of `scale` for the start and goal of the demonstration."""
+        if self.name == "none":
+            return values
         # There every scaling is a factor per coordinate.
         ones = torch.ones_like(values[..., :1, :])
         return values / self.scale(ones, reference.start, reference.goal, reference)
 
-    def check(  # noqa: B027  any motion will do unless a scaling says otherwise
+    def check(
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
     ) -> None:
         """Check that demonstrations, on a flat batch, can be scaled.
@@ -107,73 +122,30 @@ class Scaling(ABC):
         Raises:
             ValueError: A demonstration ends too close to its start for this scaling.
         """
-
-    @abstractmethod
-    def _scale(
-        self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
-    ) -> Any:
-        """Scale all given coordinates."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class NoScaling(Scaling):
-    """Weights are accelerations."""
-
-    name: ClassVar[str] = "none"
-
-    def unscale(self, values: Tensor, reference: Demonstrated) -> Tensor:
-        """Return the values unchanged."""
-        return values
-
-    def _scale(
-        self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
-    ) -> Any:
-        return values
-
-
-@dataclass(frozen=True, kw_only=True)
-class AmplitudeScaling(Scaling):
-    """Scaling by the range of each coordinate."""
-
-    name: ClassVar[str] = "amplitude"
-
-    def _scale(
-        self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
-    ) -> Any:
-        return values * reference.amplitude[..., None, :]
-
-
-@dataclass(frozen=True, kw_only=True)
-class PaperScaling(Scaling):
-    """Scaling by g - y_0, coordinate by coordinate (paper eq. (eq_tf))."""
-
-    name: ClassVar[str] = "paper"
-    depends_on_boundary: ClassVar[bool] = True
-
-    def check(
-        self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
-    ) -> None:
-        """Raise ValueError for a coordinate that ends where it started."""
+        if not self.depends_on_boundary:
+            return
         shown = reference.leading(self.columns)
-        displacement = shown.goal - shown.start
-        singular = displacement.abs() < MINIMUM_DISPLACEMENT * shown.amplitude
+        offset, size = (shown.goal - shown.start).abs(), shown.amplitude
+        divisor = "goal - start"
+        if self.turns:
+            if offset.shape[-1] < 2:
+                raise ValueError(
+                    "scaling 'rotation' needs 2 coordinates or more: one cannot turn"
+                )
+            offset, size = offset.norm(dim=-1, keepdim=True), size.amax(-1, keepdim=True)
+            divisor = "the distance from start to goal"
+        singular = offset < MINIMUM_DISPLACEMENT * size
         if singular.any():
             i, j = singular.nonzero()[0].tolist()
             name = f"column {j}" if names is None else names[j]
             raise ValueError(
-                f"{demo_label(i, batch)}scaling 'paper' divides by goal - start, which is "
-                f"{displacement[i, j].item():.2g} for {name}. Use scaling='none' or "
-                "'amplitude'."
+                f"{demo_label(i, batch)}scaling {self.name!r} divides by {divisor}, which is "
+                f"{offset[i, j].item():.2g}{'' if self.turns else f' for {name}'}. Use "
+                "scaling='none' or 'amplitude'."
             )
 
-    def _scale(
-        self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
-    ) -> Any:
-        return values * (goal - start)[..., None, :]
 
-
-@dataclass(frozen=True, kw_only=True)
-class RotationScaling(Scaling):
+def _rotated(values: Any, displacement: Any, reference: Demonstrated, xp: ModuleType) -> Any:
     """Rotation and dilation with the displacement from start to goal, in 2 dimensions or more.
 
     c R, with c = |g - y_0| / |g_0 - y_0| and R the rotation from a, the direction of the
@@ -186,39 +158,13 @@ class RotationScaling(Scaling):
     which it is approached, and its derivative grows as 1 / |a + b| on the way; both stay
     finite.
     """
-
-    name: ClassVar[str] = "rotation"
-    depends_on_boundary: ClassVar[bool] = True
-    turns: ClassVar[bool] = True
-
-    def check(
-        self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
-    ) -> None:
-        """Raise ValueError for a motion that ends where it started, or has one coordinate."""
-        shown = reference.leading(self.columns)
-        displacement = shown.goal - shown.start
-        if displacement.shape[-1] < 2:
-            raise ValueError("scaling 'rotation' needs 2 coordinates or more: one cannot turn")
-        distance = displacement.norm(dim=-1)
-        singular = distance < MINIMUM_DISPLACEMENT * shown.amplitude.amax(-1)
-        if singular.any():
-            i = int(singular.nonzero()[0])
-            raise ValueError(
-                f"{demo_label(i, batch)}scaling 'rotation' divides by the distance from start "
-                f"to goal, which is {distance[i].item():.2g}. Use scaling='none' or "
-                "'amplitude'."
-            )
-
-    def _scale(
-        self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
-    ) -> Any:
-        shown = reference.goal - reference.start
-        length = _squared(shown) ** 0.5
-        a, displacement = shown / length, (goal - start) / length
-        growth = _squared(displacement).clip(min=NO_DIRECTION) ** 0.5
-        # Two reflections make a rotation by twice the angle between their normals.
-        turned = _reflected(_reflected(values, a), _bisector(a, displacement / growth, xp))
-        return turned * growth[..., None, :]
+    shown = reference.goal - reference.start
+    length = _squared(shown) ** 0.5
+    a, displacement = shown / length, displacement / length
+    growth = _squared(displacement).clip(min=NO_DIRECTION) ** 0.5
+    # Two reflections make a rotation by twice the angle between their normals.
+    turned = _reflected(_reflected(values, a), _bisector(a, displacement / growth, xp))
+    return turned * growth[..., None, :]
 
 
 def _bisector(a: Any, b: Any, xp: ModuleType) -> Any:
@@ -240,10 +186,15 @@ def _squared(vectors: Any) -> Any:
     return (vectors * vectors).sum(-1)[..., None]
 
 
-SCALINGS: dict[str, type[Scaling]] = {
-    scaling.name: scaling
-    for scaling in (NoScaling, PaperScaling, AmplitudeScaling, RotationScaling)
+SCALINGS: dict[str, Callable[[Any, Any, Demonstrated, ModuleType], Any]] = {
+    "none": lambda values, displacement, reference, xp: values,
+    "paper": lambda values, displacement, reference, xp: values * displacement[..., None, :],
+    "amplitude": lambda values, displacement, reference, xp: (
+        values * reference.amplitude[..., None, :]
+    ),
+    "rotation": _rotated,
 }
+"""Scaling of values (*batch, K, D) by name, for a displacement from start to goal."""
 
 
 def find_scaling(scaling: str | Scaling, columns: int | None = None) -> Scaling:
@@ -252,8 +203,4 @@ def find_scaling(scaling: str | Scaling, columns: int | None = None) -> Scaling:
     Raises:
         ValueError: Unknown scaling.
     """
-    if isinstance(scaling, Scaling):
-        return scaling
-    if scaling not in SCALINGS:
-        raise ValueError(f"unknown scaling {scaling!r}; choose from {', '.join(SCALINGS)}")
-    return SCALINGS[scaling](columns=columns)
+    return scaling if isinstance(scaling, Scaling) else Scaling(name=scaling, columns=columns)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hrc_learn.dmp._arguments import Points, Times, positive, to_tensor
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP
+from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP, log_density
 from hrc_learn.dmp.samples import padded
 
 DURATIONS = 31
@@ -160,12 +160,7 @@ class InteractionPrimitive:
         spread = model.spread.view(*model.mean.shape, -1)[: self.observed]
         seen = ~values.isnan().flatten()
         root = torch.einsum("gnm,hmr->gnhr", rows, spread).flatten(1, 2)[:, seen] / noise
-        z = ((values - mean).flatten(1)[:, seen] / noise)[..., None]
-        # By Woodbury's identity, without the terms common to all kinds and durations.
-        factor = torch.linalg.cholesky(root.mT @ root + torch.eye(root.shape[-1]).to(root))
-        part = torch.linalg.solve_triangular(factor, root.mT @ z, upper=False)
-        square = z.square().sum((-2, -1)) - part.square().sum((-2, -1))
-        return -square / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return log_density(((values - mean).flatten(1)[:, seen]) / noise, root)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

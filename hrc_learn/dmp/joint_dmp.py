@@ -9,14 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import (
-    Mask,
-    Points,
-    Scalars,
-    Times,
-    Vectors,
-    positive,
-)
+from hrc_learn.dmp._arguments import Mask, Points, Scalars, Times, Vectors, positive
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.dynamics import Basis, GaussianBasis, SpringDamper
 from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling, find_scaling
@@ -28,13 +21,7 @@ from hrc_learn.dmp.motion_primitive import (
     via_columns,
 )
 from hrc_learn.dmp.response import Response, response_of
-from hrc_learn.dmp.samples import (
-    Samples,
-    check_samples,
-    padded,
-    smoothed,
-    warn_of_few_samples,
-)
+from hrc_learn.dmp.samples import Samples, check_samples, padded, smoothed, warn_of_few_samples
 from hrc_learn.dmp.solvers import REGULARIZATION, fit_samples
 from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.model_files import SavedModel

@@ -21,7 +21,9 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     broadcast_shapes,
+    check_not_negative,
     checked_vector,
+    finite,
     fits_numpy,
     normalised_time,
     positive,
@@ -29,7 +31,7 @@ from hrc_learn.dmp._arguments import (
 )
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.dynamics import Basis, SpringDamper, basis_config, restored_basis
-from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_scaling
+from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling, find_scaling
 from hrc_learn.dmp.response import Response, response_of
 from hrc_learn.dmp.samples import FitReport, check_precision
 from hrc_learn.dmp.trajectory import Trajectory
@@ -123,10 +125,10 @@ class LinearPrimitive(nn.Module):
         if weights.shape[-1] != basis.count:
             raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
         check_precision(weights.dtype)
-        if isinstance(weights, nn.Parameter) or not weights.requires_grad:
-            self.weights = (
-                weights if isinstance(weights, nn.Parameter) else nn.Parameter(weights)
-            )
+        if isinstance(weights, nn.Parameter):
+            self.weights = weights
+        elif not weights.requires_grad:
+            self.weights = nn.Parameter(weights)
         else:
             # A parameter is a leaf, through which no gradient would flow on.
             self.register_buffer("weights", weights)
@@ -142,32 +144,19 @@ class LinearPrimitive(nn.Module):
         self.response = response_of(spring, basis, approach)
 
     def extra_repr(self) -> str:
-        """Columns, basis, duration, scaling and residual."""
+        """Columns, basis, scaling and residual."""
         *batch, D, N = self.weights.shape
         names = "" if self.joint_names is None else f" ({', '.join(self.joint_names)})"
-        low, high = (f"{x.item():.4g}" for x in self.duration.detach().aminmax())
-        parts = [
-            *([f"batch {tuple(batch)}"] if batch else []),
-            f"{D} columns [{self.units}]{names}",
-            f"{N} functions of {type(self.basis).__name__}",
-            f"{low} s" if low == high else f"{low} to {high} s",
-            f"scaling {self.scaling!r}",
-        ]
-        if self.fit_report is not None:
-            parts.append(f"NRMSE {self.fit_report.nrmse.max().item():.2g}")
-        return ", ".join(parts)
+        error = "" if self.fit_report is None else f", NRMSE {self.fit_report.nrmse.max():.2g}"
+        return (
+            f"batch {tuple(batch)}, {D} columns [{self.units}]{names}, {N} functions of "
+            f"{type(self.basis).__name__}, scaling {self.scaling!r}{error}"
+        )
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
         # Checked before any tensor changes, because `half` could not be undone.
         check_precision(fn(self.weights.detach().reshape(-1)[:1]).dtype)
         return super()._apply(fn, recurse)
-
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *arguments: Any) -> None:
-        # The number of timestamps may differ; all other shapes must agree.
-        timestamps = state_dict.get(f"{prefix}timestamps")
-        if timestamps is not None and timestamps.shape != self.timestamps.shape:
-            self.timestamps = self.timestamps.new_empty(timestamps.shape)
-        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     @property
     def scaling(self) -> str:
@@ -293,7 +282,7 @@ class LinearPrimitive(nn.Module):
             None where NumPy does not apply, or for a wrong value, which the other path reports.
         """
         weights = self.weights
-        if weights.ndim != 2 or duration.ndim or not isinstance(self.forcing_scale, NoScaling):
+        if weights.ndim != 2 or duration.ndim or self.scaling != "none":
             return None
         # Attribute access on a module takes three times as long.
         own: Any = self._buffers.get
@@ -348,11 +337,14 @@ class LinearPrimitive(nn.Module):
         Arguments are those of `MotionPrimitive.step`, in columns: `external_acceleration`
         [1/s^2], (*batch, D), is added to the motion.
         """
+        if not isinstance(dt, float):
+            dt = to_tensor(dt, torch.float64, state.duration.device)
+        check_not_negative("dt", dt)
         if (
             isinstance(dt, float)
             and goal is goal_filter is external_acceleration is None
             and phase_stopping is forcing_gain is None
-            and isinstance(self.forcing_scale, NoScaling)
+            and self.scaling == "none"
         ):
             fast = closed_loop_step.uncoupled_step(state, dt, self.response, self.weights)
             if fast is not None:
@@ -363,12 +355,15 @@ class LinearPrimitive(nn.Module):
         # Duration of the motion at the pace of this step.
         duration, pace = state.duration, torch.ones_like(state.pace)
         if phase_stopping is not None:
-            slower = 1 + self._as_tensor(phase_stopping)
+            slower = self._as_tensor(phase_stopping)
+            check_not_negative("phase_stopping", slower)
+            slower = 1 + slower
             duration, pace = duration * slower, pace / slower
         push = None
         if external_acceleration is not None:
             # Second derivatives by s are tau^2 times those by t.
-            push = self._as_tensor(external_acceleration) * state.duration[..., None] ** 2
+            push = finite("coupling", self._as_tensor(external_acceleration))
+            push = push * state.duration[..., None] ** 2
         attractor = target if goal_filter is None else state.goal
         return closed_loop_step.step(
             state,
@@ -506,7 +501,7 @@ class LinearPrimitive(nn.Module):
         return scale
 
     def _scaled(self, values: Tensor, start: Tensor, goal: Tensor) -> Tensor:
-        if isinstance(self.forcing_scale, NoScaling):
+        if self.scaling == "none":
             return values  # before the attribute look-ups, which take as long as a step
         return self.forcing_scale.scale(values, start, goal, self.demonstrated())
 
@@ -515,18 +510,16 @@ class LinearPrimitive(nn.Module):
         return Demonstrated(start=self.start, goal=self.goal, amplitude=self.amplitude)
 
     def _scaled_weights(self, start: Tensor, goal: Tensor) -> Tensor:
-        if isinstance(self.forcing_scale, NoScaling):
+        if self.scaling == "none":
             return self.weights
         return self._scaled(self.weights.mT, start, goal).mT
 
-    def _normalised_step(self, dt: Scalars, duration: Tensor) -> Tensor | float:
+    def _normalised_step(self, dt: Tensor | float, duration: Tensor) -> Tensor | float:
         """Step ds in float64; a plain number if possible, which takes a tenth of the time."""
         if isinstance(dt, float):
             (known,) = closed_loop_step.host_values(duration)
             if isinstance(known, float):
                 return dt / known
-        else:
-            dt = to_tensor(dt, dtype=torch.float64, device=duration.device)
         return duration.double().reciprocal() * dt
 
     def _as_tensor(self, value: Scalars | Vectors) -> Tensor:

@@ -30,6 +30,7 @@ from hrc_learn.dmp._arguments import (
 )
 from hrc_learn.dmp.dynamics import GaussianBasis, SpringDamper, balanced_units
 from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.probabilistic_dmp import log_density
 from hrc_learn.dmp.ragged_times import spring_rows
 from hrc_learn.dmp.response import Response, response_of
 from hrc_learn.dmp.trajectory import Trajectory, output
@@ -108,13 +109,6 @@ class MotionHead(nn.Module):
         self.register_buffer("goal_centre", centre)
         modes = _modes(self.response).to(self.amplitude)
         self.register_buffer("modes", modes, persistent=False)
-
-    def extra_repr(self) -> str:
-        """Columns, functions and parameters."""
-        return (
-            f"{self.columns} columns, {self.modes.shape[0]} functions, "
-            f"{self.n_parameters} parameters, of which {self.n_timing} of timing"
-        )
 
     @property
     def n_linear(self) -> int:
@@ -479,14 +473,9 @@ class MotionDistribution:
         mean, root = self._moments(time)
         y = to_tensor(position, mean.dtype, mean.device)
         deviation = positive("noise", noise, mean)
-        # By Woodbury's identity in the whitened parameters, in units of the noise.
-        z = (y - mean).flatten(-2)[..., None] / deviation
-        root = root.flatten(-3, -2) / deviation
-        factor = torch.linalg.cholesky(root.mT @ root + torch.eye(root.shape[-1]).to(root))
-        part = torch.linalg.solve_triangular(factor, root.mT @ z, upper=False)
-        square = z.square().sum((-2, -1)) - part.square().sum((-2, -1))
-        size = z.shape[-2] * (deviation.log() + math.log(2 * math.pi) / 2)
-        return -square / 2 - size - _log_diagonal(factor)
+        z = (y - mean).flatten(-2) / deviation
+        size = z.shape[-1] * deviation.log()
+        return log_density(z, root.flatten(-3, -2) / deviation) - size
 
     def position(self, time: Times) -> tuple[Tensor, Tensor]:
         """Mean and standard deviation at times [s], (*batch, T, D) each."""

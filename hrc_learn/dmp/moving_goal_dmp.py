@@ -155,10 +155,7 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         return state.motion, state.goal_velocity
 
     def _boundary(
-        self,
-        given: Boundary,
-        duration: Tensor,
-        end_velocity: Vectors | None = None,
+        self, given: Boundary, duration: Tensor, end_velocity: Vectors | None = None
     ) -> tuple[Boundary, Tensor]:
         """Start and rate relative to the goal whose motion leads to `end_velocity`."""
         motion = self.motion

@@ -265,7 +265,8 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         """
         motion, E = self.motion, self.error_columns
         values = columns.position, columns.rate, motion.second_derivative(columns)
-        turned = orientation_error.retarget(*(x[..., E] for x in values), old, new)
+        error, error_rate, curve = (x[..., E] for x in values)
+        turned = orientation_error.retarget(error, error_rate, curve, old, new)
         position, rate, second = (
             _with_columns(x, E, part) for x, part in zip(values, turned, strict=True)
         )

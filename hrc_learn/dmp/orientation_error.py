@@ -126,7 +126,8 @@ def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4
     shaped = q.ndim > 0 and q.shape[-1] == 4
     # Far from one on purpose: it tells quaternions from zeros and from Euler angles. A tracer
     # cannot look at values.
-    if not (shaped and (not readable(q) or (q.norm(dim=-1) > 0.5).all())):
+    norm = q.norm(dim=-1) if shaped else q
+    if not (shaped and (not readable(q) or ((norm > 0.5) & (norm < torch.inf)).all())):
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
     return quaternion.normalize(q)
 

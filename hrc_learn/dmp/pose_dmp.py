@@ -192,11 +192,7 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
 
 
 def pose_columns(
-    time: Times,
-    position: Points,
-    error: Tensor,
-    body: Points | None,
-    mask: Mask | None,
+    time: Times, position: Points, error: Tensor, body: Points | None, mask: Mask | None
 ) -> Float[Tensor, "*B T columns"]:
     """Checked samples of position, error and body in one tensor, in the dtype of the position.
 

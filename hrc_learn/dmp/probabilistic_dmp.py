@@ -20,12 +20,7 @@ from hrc_learn.dmp._arguments import Points, Scalars, Times, Vectors, seconds, t
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import MotionPrimitive, ViaOptions
-from hrc_learn.dmp.orientation_error import (
-    intrinsic_mean,
-    nearest_turn,
-    reference_of,
-    to_error,
-)
+from hrc_learn.dmp.orientation_error import intrinsic_mean, nearest_turn, reference_of, to_error
 from hrc_learn.dmp.via_points import ViaPoints
 from hrc_learn.geometry import Pose
 
@@ -265,12 +260,7 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         return replace(self, mean=moved, spread=remaining)
 
     def log_prob(
-        self,
-        time: Times,
-        value: Points | Pose,
-        *,
-        noise: float,
-        **options: Unpack[ViaOptions],
+        self, time: Times, value: Points | Pose, *, noise: float, **options: Unpack[ViaOptions]
     ) -> Float[Tensor, ""]:
         """Log density of values observed at times (n,) with this sensor noise.
 
@@ -281,11 +271,8 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         motion = self.primitive.motion
         mean, root = self._observe(motion.response.evaluate(via.s)[:, 0])
         seen = ~via.position.isnan().reshape(-1)
-        diagonal = torch.full_like(mean[seen], noise**2)
-        observed = torch.distributions.LowRankMultivariateNormal(
-            mean[seen], root[seen], diagonal
-        )
-        return observed.log_prob(via.position.reshape(-1)[seen])
+        z = (via.position.reshape(-1) - mean)[seen] / noise
+        return log_density(z, root[seen] / noise) - len(z) * math.log(noise)
 
     def _via(
         self,
@@ -310,6 +297,17 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     def _with_coordinates(self, x: Float[Tensor, "*batch D M"]) -> P:
         motion = self.primitive.motion
         return self.primitive.with_motion(motion.with_coordinates(x))
+
+
+def log_density(
+    z: Float[Tensor, "*batch n"], root: Float[Tensor, "*batch n rank"]
+) -> Float[Tensor, "*batch"]:
+    """Log density of a Gaussian with covariance I + root root', by Woodbury's identity."""
+    factor = torch.linalg.cholesky(root.mT @ root + torch.eye(root.shape[-1]).to(root))
+    part = torch.linalg.solve_triangular(factor, root.mT @ z[..., None], upper=False)
+    square = z.square().sum(-1) - part.square().sum((-2, -1))
+    size = z.shape[-1] * math.log(2 * math.pi)
+    return -(square + size) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 def _linear_coordinates(primitives: LinearPrimitive) -> Float[Tensor, "*batch D M"]:

@@ -35,10 +35,7 @@ the time of a million; a GPU is kept busy within a gigabyte."""
 
 
 def motion(
-    response: Response,
-    s: Float[Tensor, "B T"],
-    coordinates: Float[Tensor, "B D M"],
-    order: int,
+    response: Response, s: Float[Tensor, "B T"], coordinates: Float[Tensor, "B D M"], order: int
 ) -> Float[Tensor, "B T D"]:
     """Derivative of y by s on ragged times; differentiable in times and coordinates.
 

@@ -19,12 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import fits_numpy
-from hrc_learn.dmp.dynamics import (
-    Basis,
-    SpringDamper,
-    approach_state,
-    minimum_jerk_curve,
-)
+from hrc_learn.dmp.dynamics import Basis, SpringDamper, approach_state, minimum_jerk_curve
 
 GAUSS_POINTS = 12
 """Points of Gauss-Legendre quadrature on a piece, on which no basis function changes much."""
@@ -71,9 +66,7 @@ def impulse(
 
 
 def accumulate(
-    propagate: Propagate,
-    knots: Float[Tensor, "K"],
-    increments: Float[Tensor, "K_less_1 2 N"],
+    propagate: Propagate, knots: Float[Tensor, "K"], increments: Float[Tensor, "K_less_1 2 N"]
 ) -> Float[Tensor, "K 2 N"]:
     """States at the knots, from rest at the first, from the increment of each piece.
 
@@ -225,7 +218,7 @@ class Response:
             spring: Gains.
             basis: Basis of the forcing term.
             approach: Fraction of the motion over which start and goal act along a minimum-jerk
-                curve, see `spring.py`; 0: they act through the spring alone, as in the paper.
+                curve, see `dynamics.py`; 0: they act through the spring alone, as in the paper.
         """
         if not 0 <= approach <= 1 or (approach and basis.periodic):
             raise ValueError(

@@ -309,10 +309,7 @@ def _check_count(mask: Bool[Tensor, "B T"], complete: bool, batch: Sequence[int]
 
 
 def _check_finite(
-    name: str,
-    values: Float[Tensor, "B D T"],
-    mask: Bool[Tensor, "B T"],
-    batch: Sequence[int],
+    name: str, values: Float[Tensor, "B D T"], mask: Bool[Tensor, "B T"], batch: Sequence[int]
 ) -> Tensor:
     """Values with masked NaN and infinities zeroed; ValueError if a valid sample holds one."""
     # A finite sum of finite values proves them all finite, short of overflow: look twice.

@@ -1,11 +1,8 @@
 """One primitive fitted to any number of demonstrations, with one in memory at a time.
 
-Least squares over any number of rows: the rows [A B] of min |A X - B|^2 enter through the
-triangular factor R of their QR decomposition, because the solution depends on R'R = [A B]'[A B]
-alone. Factors of different rows are stacked and factored again, in any order and from any
-process (TSQR; Demmel et al. 2012, "Communication-optimal parallel and sequential QR and LU
-factorizations"). Summing the products A'A would be as easy, but would square the condition
-number and with it the rounding error.
+The rows [A B] of min |A X - B|^2 enter through their products [A B]'[A B], which add up in any
+order and over any number of processes. The columns of A are orthonormal on an even grid, so
+that squaring them loses no digits.
 """
 
 from collections.abc import Sequence
@@ -17,74 +14,16 @@ from torch import Tensor
 
 from hrc_learn import distributed
 from hrc_learn.dmp._arguments import Points, Times
-from hrc_learn.dmp.dynamics import GaussianBasis, SpringDamper, balanced_units
+from hrc_learn.dmp.dynamics import GaussianBasis, SpringDamper
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.response import Response, response_of
 from hrc_learn.dmp.samples import Samples, check_samples
-from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
+from hrc_learn.dmp.solvers import REGULARIZATION, normal_products, solve_normal
 
+STRONG_RIDGE = 1e-5
+"""Ridge where the samples do not determine all functions: its square is well above rounding."""
 TIMESTAMPS = 1000
 """Samples of the default rollout, because the demonstrations have no common grid."""
-
-
-@dataclass(frozen=True, eq=False)
-class LeastSquares:
-    """Accumulated rows of min |A X - B|^2."""
-
-    factor: Float[Tensor, "n_and_k n_and_k"]
-    """R, upper triangular up to the signs of its rows (float64)."""
-    unknowns: int
-    """n, the number of columns of A; the remaining columns are those of B."""
-    rows: int
-    """Number of rows so far."""
-
-    @staticmethod
-    def empty(unknowns: int, targets: int) -> "LeastSquares":
-        """Problem without rows, with n unknowns and k columns of B."""
-        size = unknowns + targets
-        return LeastSquares(torch.zeros(size, size, dtype=torch.float64), unknowns, 0)
-
-    def with_rows(
-        self, A: Float[Tensor, "rows n"], B: Float[Tensor, "rows k"]
-    ) -> "LeastSquares":
-        """Problem with additional rows."""
-        new = torch.cat([A, B], dim=1).double()
-        factor = _triangle(torch.cat([self.factor, new]))
-        return LeastSquares(factor, self.unknowns, self.rows + len(new))
-
-    def over_processes(self) -> "LeastSquares":
-        """Problem with the rows of all processes, identical in each of them."""
-        if distributed.count() == 1:
-            return self
-        rows = distributed.sum_over_processes(torch.tensor(self.rows))
-        factor = _triangle(torch.cat(distributed.gather(self.factor)))
-        return LeastSquares(factor, self.unknowns, int(rows))
-
-    @property
-    def design(self) -> Float[Tensor, "n n"]:
-        """Square root of A'A, with the singular values and column norms of A."""
-        return self.factor[: self.unknowns, : self.unknowns]
-
-    def solve(self, unit: Float[Tensor, "n"]) -> Float[Tensor, "n k"]:
-        """Minimise |A X - B|^2 + (r sigma)^2 |X / unit|^2, r the default ridge of a fit.
-
-        Args:
-            unit: Unit of each unknown; sigma is the largest singular value of A times unit.
-        """
-        n = self.unknowns
-        inverse = ridge_inverse(self.design * unit, REGULARIZATION)
-        return unit[:, None] * (inverse @ self.factor[:n, n:])
-
-    def residual(self, X: Float[Tensor, "n k"]) -> Float[Tensor, "k"]:
-        """Root mean square of A X - B over all rows, for each column."""
-        n = self.unknowns
-        error = self.factor[:, :n] @ X - self.factor[:, n:]
-        # R'R equals the product over all rows, so norms are equal too.
-        return error.norm(dim=0) / max(self.rows, 1) ** 0.5
-
-
-def _triangle(rows: Float[Tensor, "rows n"]) -> Float[Tensor, "n n"]:
-    return torch.linalg.qr(rows, mode="r").R
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,17 +66,19 @@ def fit_shared(
     if not len(demonstrations):
         raise ValueError("there are no demonstrations to learn from")
     response = response_of(SpringDamper(), GaussianBasis(count=n_basis))
-    problem, sums = _accumulate(demonstrations, response)
-    mean = sums / len(demonstrations)
+    products, sums, rows = _accumulate(demonstrations, response)
     # The start velocity is one more unknown after the weights.
-    unit = balanced_units(response.basis, problem.design, others=1)
-    X = problem.solve(unit)
+    n = n_basis + 1
+    X, square, undetermined = solve_normal(response, n, products, REGULARIZATION)
+    if undetermined.any():
+        X, square, _ = solve_normal(response, n, products, STRONG_RIDGE)
+    mean = sums / len(demonstrations)
     start, goal, amplitude, duration = mean[0], mean[1], mean[2], mean[3, 0]
     primitive = JointDMP(
-        weights=X[:-1].mT.contiguous(),
+        weights=X[0, :, :-1].contiguous(),
         start=start,
         goal=goal,
-        start_velocity=X[-1] / duration,
+        start_velocity=X[0, :, -1] / duration,
         duration=duration,
         amplitude=torch.where(amplitude > 0, amplitude, 1.0),
         timestamps=torch.linspace(0, 1, TIMESTAMPS, dtype=torch.float64),
@@ -149,30 +90,32 @@ def fit_shared(
     return SharedFit(
         primitive=primitive,
         demonstrations=len(demonstrations),
-        samples=problem.rows,
-        rmse=problem.residual(X),
+        samples=rows,
+        rmse=(square[0] / rows).sqrt(),
     )
 
 
 def _accumulate(
     demonstrations: Sequence[tuple[Times, Points]], response: Response
-) -> tuple[LeastSquares, Float[Tensor, "4 D"]]:
-    """Rows of all processes, and sums of start, goal, range and duration."""
-    N, D = response.basis.count, None
-    problem, sums = None, None
+) -> tuple[Float[Tensor, "1 m m"], Float[Tensor, "4 D"], int]:
+    """Products of all processes, sums of start, goal, range and duration, and sample count."""
+    D, rows, products, sums = 0, 0, None, None
     for i, (time, position) in distributed.local_items(demonstrations):
         samples = _checked(i, time, position)
-        D = samples.position.shape[1]
-        problem = problem or LeastSquares.empty(N + 1, D)
-        sums = torch.zeros(4, D, dtype=torch.float64) if sums is None else sums
-        problem = problem.with_rows(*_equations(samples, response))
-        ends = [samples.first[0], samples.last[0], samples.span[0]]
-        sums = sums + torch.stack([*ends, samples.duration.expand(D)]).double()
+        D, rows = samples.position.shape[1], rows + samples.s.shape[1]
+        ends = torch.stack([samples.first, samples.last], 1).double()
+        own = normal_products(response, samples, ends)
+        products = own if products is None else products + own
+        last = [samples.span[0], samples.duration.expand(D)]
+        values = torch.stack([*ends[0], *last]).double()
+        sums = values if sums is None else sums + values
     # A process without demonstrations contributes zeros, for as many coordinates as the others.
-    D = int(max(distributed.gather(torch.tensor(D or 0))))
-    problem = problem or LeastSquares.empty(N + 1, D)
-    sums = torch.zeros(4, D, dtype=torch.float64) if sums is None else sums
-    return problem.over_processes(), distributed.sum_over_processes(sums)
+    D, m = int(max(distributed.gather(torch.tensor(D)))), response.size - 2
+    if products is None or sums is None:
+        products = torch.zeros(1, m + D, m + D, dtype=torch.float64)
+        sums = torch.zeros(4, D, dtype=torch.float64)
+    total = distributed.sum_over_processes
+    return total(products), total(sums), int(total(torch.tensor(rows)))
 
 
 def _checked(index: int, time: Times, position: Points) -> Samples:
@@ -183,13 +126,3 @@ def _checked(index: int, time: Times, position: Points) -> Samples:
     if samples.batch:
         raise ValueError(f"demonstration {index}: position must be (T, D), without a batch")
     return samples
-
-
-def _equations(
-    samples: Samples, response: Response
-) -> tuple[Float[Tensor, "T n"], Float[Tensor, "T D"]]:
-    """Rows of A X = B for the weights and start velocity of one demonstration."""
-    N = response.basis.count
-    H = response.evaluate(samples.s[0])[:, 0]
-    ends = torch.stack([samples.first[0], samples.last[0]]).double()
-    return H[:, : N + 1], samples.position[0].mT.double() - H[:, N + 1 :] @ ends

@@ -23,9 +23,6 @@ SAMPLES_PER_FUNCTION = 20
 WELL_POSED = 1e-3
 """Bound on the ratio of the smallest to the largest diagonal entry of a Cholesky factor; at
 1e-8, half of the digits of float64 are lost."""
-NORM_ITERATIONS = 4
-"""Iterations for the largest singular value. The next one is a third of it, so the error falls
-to a percent within two iterations."""
 type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
 """Weights and start velocity dy/ds."""
 
@@ -55,9 +52,7 @@ def fit_samples(
     start_rate = position.new_empty(position.shape[:2])
     remaining = torch.ones(len(position), dtype=torch.bool)
     if method == "trajectory" and not response.basis.periodic:
-        weights, start_rate, remaining = _fit_ragged(
-            response, samples, position, rate, regularization
-        )
+        weights, start_rate, remaining = _fit_ragged(response, samples, rate, regularization)
     for i in remaining.nonzero()[:, 0].tolist():
         valid = samples.mask[i]
         one_rate = None if rate is None else rate[i, :, valid]
@@ -71,65 +66,93 @@ def fit_samples(
 def _fit_ragged(
     response: Response,
     samples: Samples,
-    position: Float[Tensor, "B D T"],
     rate: Float[Tensor, "B D T"] | None,
     regularization: float,
 ) -> tuple[Float[Tensor, "B D N"], Float[Tensor, "B D"], Bool[Tensor, "B"]]:
     """Least squares on the trajectory for all demonstrations at once, on ragged times.
 
-    The normal equations are written in columns that are orthonormal on an even grid: if the
-    samples determine all functions, squaring them loses no digits.
-
     Returns:
         Weights, start velocity dy/ds, and a flag for each demonstration that leaves functions
         undetermined; its other results must not be used.
     """
-    N, fit_rate = response.basis.count, rate is None
-    n = N + fit_rate
-    s, M, D = samples.s, response.size, position.shape[1]
-    mixing, sigma, directions = _orthonormal_columns(response, n, s.device)
-    products = s.new_empty(len(s), M + D, M + D)
-    for part in chunks(s):
-        # One motion for each column, at the times of all demonstrations.
-        columns = motion(response, s[part].reshape(1, -1), mixing.mT[None], 0)
-        columns = columns.view(*s[part].shape, M)
-        if not samples.complete:
-            columns *= samples.mask[part][..., None]
-        columns = torch.cat([columns, position[part].mT], dim=-1)
-        products[part] = columns.mT @ columns
-    gram, right = products[:, :M, :M], products[:, :M, M:]
     known = [samples.first.double(), samples.last.double()]
     if rate is not None:
         first = samples.mask.long().argmax(-1)[:, None, None]
         known.insert(0, torch.take_along_dim(rate, first, -1)[..., 0])
-    right = right[:, :n] - gram[:, :n, n:] @ torch.stack(known, 1)
-    A = gram[:, :n, :n]
-    # The ridge is relative to the largest singular value of the balanced weights, found by
-    # power iteration from that of the even grid.
-    v, norm = directions[:1].expand(len(A), -1), A.new_zeros(len(A), 1)
-    for _ in range(NORM_ITERATIONS):
-        v = (A @ (v @ directions.mT * sigma)[..., None])[..., 0] * sigma @ directions
-        norm = v.norm(dim=-1, keepdim=True)
-        v = v / norm
-    A = A + torch.diag_embed(regularization**2 * norm / sigma**2)
-    factor, failed = torch.linalg.cholesky_ex(A)
-    diagonal = factor.diagonal(dim1=-2, dim2=-1)
-    undetermined = (failed > 0) | ~(diagonal.amin(-1) > WELL_POSED * diagonal.amax(-1))
-    unknown = (mixing[:n, :n] @ torch.cholesky_solve(right, factor)).mT
+    products = normal_products(response, samples, torch.stack(known, 1))
+    n = response.size - len(known)
+    unknown, _, undetermined = solve_normal(response, n, products, regularization)
     if rate is None:
         return unknown[..., :-1], unknown[..., -1], undetermined
     return unknown, known[0], undetermined
 
 
+def normal_products(
+    response: Response, samples: Samples, known: Float[Tensor, "B k D"]
+) -> Float[Tensor, "B m m"]:
+    """Products for `solve_normal`; those of several demonstrations may be added.
+
+    Args:
+        response: Response of the primitive, with a basis that is not periodic.
+        samples: Demonstrations.
+        known: The last k coordinates: start velocity dy/ds if it is known, start, and goal.
+
+    Returns:
+        Products, over the valid samples, of the first n columns and of what is left of the
+        positions. The columns are orthonormal on an even grid: if the samples determine all
+        functions, squaring them loses no digits.
+    """
+    s, M = samples.s, response.size
+    n = M - known.shape[1]
+    mixing, _ = _orthonormal_columns(response, n, s.device)
+    products = []
+    for part in chunks(s):
+        # One motion for each column, at the times of all demonstrations.
+        columns = motion(response, s[part].reshape(1, -1), mixing.mT[None], 0)
+        columns = columns.view(*s[part].shape, M)
+        left = samples.position[part].double().mT - columns[..., n:] @ known[part]
+        columns = torch.cat([columns[..., :n], left], dim=-1)
+        if not samples.complete:
+            columns *= samples.mask[part][..., None]
+        products.append(columns.mT @ columns)
+    return torch.cat(products)
+
+
+def solve_normal(
+    response: Response, n: int, products: Float[Tensor, "B m m"], regularization: float
+) -> tuple[Float[Tensor, "B D n"], Float[Tensor, "B D"], Bool[Tensor, "B"]]:
+    """Solve normal equations for the first n coordinates.
+
+    Args:
+        response: Response of the primitive.
+        n: Number of unknown coordinates.
+        products: From `normal_products`.
+        regularization: Ridge, relative to the largest singular value of the balanced columns.
+
+    Returns:
+        Unknown coordinates, squared residuals, and a flag where functions are undetermined.
+    """
+    mixing, sigma = _orthonormal_columns(response, n, products.device)
+    gram, right = products[:, :n, :n], products[:, :n, n:]
+    # The first column has the largest singular value.
+    ridge = regularization**2 * gram[:, :1, 0] * (sigma[0] / sigma) ** 2
+    factor, failed = torch.linalg.cholesky_ex(gram + torch.diag_embed(ridge))
+    diagonal = factor.diagonal(dim1=-2, dim2=-1)
+    undetermined = (failed > 0) | ~(diagonal.amin(-1) > WELL_POSED * diagonal.amax(-1))
+    z = torch.cholesky_solve(right, factor)
+    square = products.diagonal(dim1=-2, dim2=-1)[:, n:] - (z * (2 * right - gram @ z)).sum(1)
+    return (mixing[:n, :n] @ z).mT, square.clamp(min=0), undetermined
+
+
 @lru_cache(maxsize=16)
 def _orthonormal_columns(
     response: Response, n: int, device: torch.device
-) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"], Float[Tensor, "n n"]]:
+) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"]]:
     """Replacement of the first n columns by ones that are orthonormal on an even grid.
 
     Returns:
-        Coordinates of each column, those after n unchanged; singular values of the balanced
-        design matrix; and its right singular vectors in rows.
+        Coordinates of each column, those after n unchanged, and the singular values of the
+        balanced design matrix.
     """
     N = response.basis.count
     count = SAMPLES_PER_FUNCTION * N + 1
@@ -139,7 +162,7 @@ def _orthonormal_columns(
     _, sigma, Vh = torch.linalg.svd(H[:, :n] * unit, full_matrices=False)
     mixing = torch.eye(H.shape[1]).to(H)
     mixing[:n, :n] = unit[:, None] * Vh.mT / sigma
-    return mixing, sigma, Vh
+    return mixing, sigma
 
 
 def _fit(

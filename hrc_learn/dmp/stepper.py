@@ -201,6 +201,11 @@ class Stepper:
             phase_stopping: The clock runs slower by the factor 1 + this.
             goal_body: New goal of the body of a pose.
         """
+        if not (0 <= dt < math.inf and 0 <= phase_stopping < math.inf):
+            raise ValueError(
+                f"dt and phase_stopping must be finite and not negative, got {dt} and "
+                f"{phase_stopping}"
+            )
         if goal is not None or goal_body is not None:
             state = self._retargeted(state, goal, goal_body)
         s, y, before, scale, start, goal_columns, displacement, duration, _, reference = state
@@ -221,7 +226,7 @@ class Stepper:
         rest = goal_columns
         if coupling is not None:
             # At the equilibrium the spring balances the push.
-            push = coupling * (duration**2 / self._spring.stiffness)
+            push = _finite("coupling", coupling) * (duration**2 / self._spring.stiffness)
             rest = goal_columns.copy()
             rest[: len(push)] += push
         y = numpy_step(E, y, before, after, rest)
@@ -235,16 +240,18 @@ class Stepper:
     ) -> StepperState:
         """State on the way to a new goal; value and velocity stay."""
         if state.reference is None:
+            goal = _finite("goal", goal)
             return state._replace(goal=goal, scale=self._scale(state.start, goal))
         columns = state.goal.copy()
         if goal_body is not None:
-            columns[BODY] = goal_body
+            columns[BODY] = _finite("goal_body", goal_body)
         state = state._replace(goal=columns)
         if goal is None:
             return state
         if isinstance(goal, Pose):
-            columns[POSITION] = np.asarray(goal.position)
+            columns[POSITION] = _finite("goal", np.asarray(goal.position))
             goal = np.asarray(goal.orientation)
+        _finite("goal", goal)
         errors = self._dmp.error_columns
         new = _reference_of(self._shown.goal[errors], goal)
         y = state.y.copy()
@@ -285,6 +292,13 @@ def can_step(dmp: Any) -> bool:
 
 def _array(x: Tensor) -> Float64[np.ndarray, "..."]:
     return x.detach().cpu().to(torch.float64, copy=True).numpy()
+
+
+def _finite(name: str, values: np.ndarray) -> np.ndarray:
+    # For so few numbers Python's sum takes a third of the time.
+    if not math.isfinite(sum(values.tolist())):
+        raise ValueError(f"{name} must be finite, got {values}")
+    return values
 
 
 # Orientation errors in NumPy: `orientation_error.py` for one orientation at a time.

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -140,33 +140,6 @@ class CameraReference:
             )
         camera = _camera_of(demonstrations, image_size)
         return _reference(camera, demonstrations, margin * largest, window)
-
-    def content(self) -> dict[str, Any]:
-        """The fields as JSON values."""
-        return asdict(self)
-
-    @staticmethod
-    def from_content(content: dict[str, Any]) -> CameraReference:
-        """Reference from the fields returned by `content`.
-
-        Raises:
-            ValueError: A field is missing or has a wrong type.
-        """
-        try:
-            camera = MarkerCamera(**_numbers(content["camera"]))
-            return CameraReference(**{**_numbers({**content, "camera": 0.0}), "camera": camera})
-        except (KeyError, TypeError, AttributeError) as error:
-            raise ValueError(
-                f"a camera reference needs camera, threshold, window, lower and upper: {error}."
-            ) from error
-
-
-def _numbers(content: dict[str, Any]) -> dict[str, Any]:
-    """The fields as floats, with tuples for JSON lists."""
-    return {
-        name: tuple(map(float, value)) if isinstance(value, list | tuple) else float(value)
-        for name, value in content.items()
-    }
 
 
 def _reference(

@@ -291,10 +291,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         return replace(learned, key=state.key)
 
     def advance(
-        self,
-        key: KeyFrame,
-        measurement: Measurement,
-        theta: Float[Tensor, "*batch K"],
+        self, key: KeyFrame, measurement: Measurement, theta: Float[Tensor, "*batch K"]
     ) -> tuple[KeyFrame, MotionSample]:
         """Compare with the key frame, and move it here once the tool is `min_step` away.
 

@@ -9,7 +9,7 @@ the pixels that the policy sees to what they were if the camera still stood ther
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -35,6 +35,7 @@ from hrc_learn.lerobot.arm_values import HAND, MARKER, PIXELS
 from hrc_learn.lerobot.policy.training_samples import read_episodes
 from hrc_learn.lerobot.smoothing import PREPROCESSOR, read_pipeline
 from hrc_learn.lerobot.smoothing.action_limits import write_json
+from hrc_learn.store import json_text, parse_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CAMERA_WATCH = "hrc_learn_camera_watch"
@@ -49,7 +50,7 @@ class CameraWatchStep(ProcessorStep):
     """
 
     reference: dict[str, Any]
-    """Camera reference as returned by `CameraReference.content`."""
+    """Fields of a `CameraReference`."""
     fps: float
     """Calls a second [1/s]."""
     pose_columns: list[int]
@@ -79,7 +80,8 @@ class CameraWatchStep(ProcessorStep):
                 raise ValueError(
                     f"{name} must be those of {', '.join(wanted)}, got {len(columns)} of them."
                 )
-        reference = CameraReference.from_content(self.reference)
+        text = json_text(self.reference)
+        reference = parse_json(text, CameraReference, "reference of the camera watch")
         self._watch = CameraCorrection(reference) if self.correct else CameraWatch(reference)
         self._plane = ObjectPlane(height=self.object_height)
         self._calls = 0
@@ -193,7 +195,7 @@ def add_camera_watch(
         seen = torch.stack([x[0, object_columns] for x in states])
         height = ObjectPlane.fit(reference, torch.stack(lowest).numpy(), seen.numpy()).height
     step = CameraWatchStep(
-        reference=reference.content(),
+        reference=asdict(reference),
         fps=fps,
         pose_columns=pose_columns,
         marker_columns=marker_columns,

@@ -5,19 +5,24 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from demo_motions import arm_motion
+from demo_motions import arm_motion, turning_motion
 from dmp_oracle import solve
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
     GaussianBasis,
     JointDMP,
+    MovingGoalDMP,
+    OrientationDMP,
+    PoseDMP,
     SplineBasis,
     SpringDamper,
+    Stepper,
     continue_motion,
     response_of,
 )
 from hrc_learn.dmp.closed_loop_step import host_values
+from hrc_learn.geometry import Pose
 
 
 @pytest.mark.parametrize("n_steps", [1, 20, 400])
@@ -177,8 +182,9 @@ def test_a_filtered_goal_solves_the_equation(n_steps, spring):
 
 def test_curvature_is_the_derivative_of_the_rate():
     dmp = primitive()
-    state = dmp.step(dmp.initial_state(), 0.7)
-    ahead, behind = (dmp.step(state, dt) for dt in (1e-5, -1e-5))
+    behind = dmp.step(dmp.initial_state(), 0.7)
+    state = dmp.step(behind, 1e-5)
+    ahead = dmp.step(state, 1e-5)
     numeric = (ahead.rate - behind.rate) / 1e-5
     torch.testing.assert_close(numeric, dmp.second_derivative(state), rtol=1e-5, atol=1e-4)
 
@@ -398,3 +404,42 @@ def test_a_step_that_the_fast_way_is_not_for_goes_the_other():
         with torch.no_grad():
             plain = dmp.step(dmp.step(dmp.initial_state(), 0.4), 0.3)
         torch.testing.assert_close(plain.position, derived.position.detach())
+
+
+def pose_of(position):
+    turned = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    return Pose(torch.as_tensor(position, dtype=torch.float64), turned)
+
+
+@pytest.mark.parametrize("kind", ["joint", "orientation", "pose", "moving goal"])
+def test_steps_refuse_what_no_loop_means(kind):
+    """Numbers that are no numbers, and time that runs backwards, in the loop of every kind."""
+    time, position = arm_motion(n_joints=4, moving_start=True)
+    turning = turning_motion()[1]
+    dmp = {
+        "joint": lambda: JointDMP.fit(time, position, 12),
+        "orientation": lambda: OrientationDMP.fit(time, turning, 12),
+        "pose": lambda: PoseDMP.fit(time, position[:, :3], turning, 12),
+        "moving goal": lambda: MovingGoalDMP.fit(time, position, 12),
+    }[kind]()
+    loops = [dmp] if kind == "moving goal" else [dmp, Stepper(dmp)]
+    nan = float("nan")
+    bad_goal = {
+        "orientation": np.full(4, nan),
+        "pose": pose_of([nan, 0.0, 0.0]),
+    }.get(kind, np.full(4, nan))
+    push = {"orientation": 3, "pose": 3}.get(kind, 4)
+    for loop in loops:
+        state = loop.initial_state()
+        for wrong in (
+            {"dt": -0.5},
+            {"dt": nan},
+            {"dt": 0.01, "phase_stopping": -2.0},
+            {"dt": 0.01, "phase_stopping": nan},
+            {"dt": 0.01, "coupling": np.full(push, nan)},
+            {"dt": 0.01, "goal": bad_goal},
+        ):
+            if loop is not dmp and "coupling" in wrong and kind == "orientation":
+                continue  # a stepper pushes joints and positions only
+            with pytest.raises(ValueError, match=r"finite|unit quaternions"):
+                loop.step(state, **wrong)

@@ -207,14 +207,6 @@ def test_gradients_reach_weights_that_are_a_leaf():
     assert kept.weights is dmp.weights
 
 
-def test_state_of_a_demonstration_of_another_length():
-    time, position, _ = demonstrations()
-    long = JointDMP.fit(time[0], position[0], 8)
-    short = JointDMP.fit(time[0, :40], position[0, :40], 8)
-    long.load_state_dict(short.state_dict())
-    torch.testing.assert_close(long.rollout().position, short.rollout().position)
-
-
 def test_forward_derivatives():
     dmp = fit_kind(JointDMP)[0]
     one = torch.ones((), dtype=torch.float64)

@@ -16,7 +16,7 @@ from torch.autograd import gradcheck
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, PoseDMP, Stepper, mean_primitive
-from hrc_learn.dmp.forcing_scale import SCALINGS, RotationScaling, find_scaling
+from hrc_learn.dmp.forcing_scale import SCALINGS, find_scaling
 from hrc_learn.geometry import Pose
 
 quick = settings(max_examples=30, deadline=None)
@@ -283,7 +283,7 @@ def test_the_other_coordinates_are_left_alone(scaling):
 
 @pytest.mark.parametrize("columns", [None, 2])
 def test_a_saved_primitive_is_the_same(tmp_path, columns):
-    scaling = RotationScaling(columns=columns)
+    scaling = find_scaling("rotation", columns)
     dmp = JointDMP.fit(TIME, POSITION, 8, scaling=scaling)
     dmp.save(tmp_path / "saved")
     loaded = JointDMP.load(tmp_path / "saved")

@@ -3,8 +3,6 @@
 The camera that is moved is OpenCV's.
 """
 
-import json
-
 import cv2
 import numpy as np
 import pytest
@@ -24,6 +22,7 @@ from hrc_learn.jacobian import (
     camera_placements,
 )
 from hrc_learn.jacobian.camera_motion import from_moved, refined_twist
+from hrc_learn.store import json_text, parse_json
 
 IMAGE, FPS, MARKER = (1440, 1080), 25.0, np.array([0.0, 0.06, 0.03])
 ROTATION, SHIFT = np.array([np.pi - 0.2, 0.1, 0.05]), np.array([-0.4, 0.05, 1.1])
@@ -193,10 +192,9 @@ def test_frames_out_of_order_and_without_numbers_are_refused(reference):
 
 
 def test_a_reference_survives_json(reference):
-    again = CameraReference.from_content(json.loads(json.dumps(reference.content())))
-    assert again == reference
-    with pytest.raises(ValueError, match="upper"):
-        CameraReference.from_content({"camera": reference.content()["camera"]})
+    assert parse_json(json_text(reference), CameraReference, "a camera") == reference
+    with pytest.raises(ValueError, match="threshold"):
+        parse_json(json_text({"camera": reference.camera}), CameraReference, "a camera")
 
 
 def test_one_demonstration_is_not_enough(demonstrations):
