@@ -19,9 +19,6 @@ class DMPContract:
     """Bound on the error of the default rollout, in the unit of `distance`."""
     fast_gradients = False
     """Whether gradients are checked along one random direction instead of all."""
-    maps_over_durations = True
-    """Whether `torch.vmap` may, and finite differences of gradients: not if how many steps are
-    taken depends on the duration."""
 
     def demonstrate(self, seed, n_samples=300):
         """Arguments of `fit` for one demonstration, samples along dim 0; time first."""
@@ -228,18 +225,16 @@ class DMPContract:
             return torch.cat([x.flatten() for x in outputs.values()])
 
         with shapes_unchecked():
-            if self.maps_over_durations:
-                looped = torch.stack([path(duration, goal) for duration in durations])
-                mapped = torch.func.vmap(path, in_dims=(0, None))(durations, goal)
-                torch.testing.assert_close(mapped, looped)
+            looped = torch.stack([path(duration, goal) for duration in durations])
+            mapped = torch.func.vmap(path, in_dims=(0, None))(durations, goal)
+            torch.testing.assert_close(mapped, looped)
             ends = durations[0].clone().requires_grad_(), goal.detach().clone().requires_grad_()
             directions = torch.ones_like(ends[0]), 0.1 * torch.ones_like(goal)
             _, forward = torch.func.jvp(path, ends, directions)
             by_duration, by_goal = torch.autograd.functional.jacobian(path, ends)
             backward = by_duration + by_goal.flatten(1) @ directions[1].flatten()
             torch.testing.assert_close(forward, backward, rtol=1e-8, atol=1e-8)
-            if self.maps_over_durations:
-                assert gradgradcheck(path, ends, atol=1e-4, rtol=1e-3, fast_mode=True)
+            assert gradgradcheck(path, ends, atol=1e-4, rtol=1e-3, fast_mode=True)
 
     @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
     def test_a_gpu_does_what_the_cpu_does(self):

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import broadcast_shapes, fits_numpy, readable
+from hrc_learn.dmp._arguments import fits_numpy, readable
 from hrc_learn.dmp.dynamics import SpringDamper, approach_state
 from hrc_learn.dmp.response import Response
 
@@ -59,45 +59,6 @@ class DMPState:
 
 
 torch.export.register_dataclass(DMPState, serialized_type_name="hrc_learn.dmp.DMPState")
-
-
-def initial_state(
-    response: Response,
-    weights: Float[Tensor, "*#batch D N"],
-    start: Float[Tensor, "*#batch D"],
-    goal: Float[Tensor, "*#batch D"],
-    rate: Float[Tensor, "*#batch D"],
-    duration: Float[Tensor, "*#batch"],
-) -> DMPState:
-    """State at the start of a motion.
-
-    Args:
-        response: Response of the primitive.
-        weights: Weights of the unscaled forcing term.
-        start: y_0.
-        goal: g.
-        rate: dy/ds.
-        duration: Duration [s].
-    """
-    batch = broadcast_shapes(
-        weights.shape[:-2], *(x.shape[:-1] for x in (start, goal, rate)), duration.shape
-    )
-    start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
-    duration = duration.expand(batch)
-    s = torch.zeros_like(duration, dtype=torch.float64)
-    # Copies, because an export takes one tensor in two fields for one input.
-    return DMPState(
-        position=start.clone(),
-        rate=rate,
-        start=start,
-        goal=goal,
-        displacement=goal - start,
-        target=goal.clone(),
-        duration=duration,
-        pace=torch.ones_like(duration),
-        s=s,
-        forced=response.forced.to(s.device)(s).to(start) @ weights.mT,
-    )
 
 
 def step(
@@ -233,21 +194,6 @@ def uncoupled_step(
     )
 
 
-def second_derivative(
-    state: DMPState,
-    response: Response,
-    weights: Float[Tensor, "*#batch D N"],
-    scale: Callable[[Tensor], Tensor],
-) -> Float[Tensor, "*batch D"]:
-    """Second derivative y'' by s at a state, without coupling."""
-    force = response.basis.forcing(state.s)[..., None, :].to(weights) @ weights.mT
-    force = scale(force)[..., 0, :]
-    if response.approach:
-        curve = response.approach_force(state.s).to(force)[..., None]
-        force = force + state.displacement * curve
-    return response.spring.acceleration(state.position - state.goal, state.rate) + force
-
-
 def _propagators(
     spring: SpringDamper, ds: Tensor | float, coast: Tensor | float
 ) -> tuple[Tensor, Tensor | None]:
@@ -344,18 +290,18 @@ def continue_motion(
         raise ValueError(
             "a motion can be continued only with approach=0: it needs no start then"
         )
-    tau = duration.double()[..., None]
-    now, ahead = elapsed.double()[..., None] / tau, time.double() / tau
-    count = response.basis.count
-    forced = response.evaluate(torch.cat([now, now + ahead], dim=-1))[..., :2, :count]
-    free = response.spring.propagator(ahead)
-    w, tau = weights.double().mT, tau[..., None]
-    x = torch.stack([position.double(), velocity.double() * tau[..., 0]], dim=-2)
-    # (*batch, 1 + T, 2, D), relative to the goal, for each row of the state.
-    caused = (forced.flatten(-3, -2) @ w).unflatten(-2, (-1, 2))
-    g = goal.double()[..., None, :]
-    rest = torch.cat([g, torch.zeros_like(g)], dim=-2)
-    offset = x - rest - caused[..., 0, :, :]
-    state = caused[..., 1:, :, :] + free @ offset[..., None, :, :]
-    y, rate = state.unbind(dim=-2)
-    return (y + g).to(weights), (rate / tau).to(weights)
+    tau, g = duration.double(), goal.double()
+    now = (elapsed.double() / tau)[..., None]
+    ahead = time.double() / tau[..., None]
+    # From rest at the goal.
+    ends = torch.stack([torch.zeros_like(g), g, g], dim=-1)
+    x = torch.cat([weights.double(), ends], dim=-1)
+
+    def moved(s: Tensor) -> Float[Tensor, "*batch S 2 D"]:
+        H = response.evaluate(s)[..., :2, :]
+        return (H.flatten(-3, -2) @ x.mT).unflatten(-2, (-1, 2))
+
+    state = torch.stack([position.double(), velocity.double() * tau[..., None]], dim=-2)
+    offset = state[..., None, :, :] - moved(now)
+    y, rate = (moved(now + ahead) + response.spring.propagator(ahead) @ offset).unbind(-2)
+    return y.to(weights), (rate / tau[..., None, None]).to(weights)

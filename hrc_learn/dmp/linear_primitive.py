@@ -317,8 +317,24 @@ class LinearPrimitive(nn.Module):
         """State at the start of a motion with this duration [s], for `step_columns`."""
         start, goal, rate = self.resolve_boundary(boundary, duration)
         self._check_batches(rate=rate, start=start, goal=goal, duration=duration)
-        return closed_loop_step.initial_state(
-            self.response, self.weights, start, goal, rate, duration
+        ends = (x.shape[:-1] for x in (start, goal, rate))
+        batch = broadcast_shapes(self.weights.shape[:-2], *ends, duration.shape)
+        start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
+        duration = duration.expand(batch)
+        s = torch.zeros_like(duration, dtype=torch.float64)
+        forced = self.response.forced.to(s.device)(s).to(start)
+        # Copies, because an export takes one tensor in two fields for one input.
+        return DMPState(
+            position=start.clone(),
+            rate=rate,
+            start=start,
+            goal=goal,
+            displacement=goal - start,
+            target=goal.clone(),
+            duration=duration,
+            pace=torch.ones_like(duration),
+            s=s,
+            forced=forced @ self.weights.mT,
         )
 
     def step_columns(
@@ -406,8 +422,13 @@ class LinearPrimitive(nn.Module):
 
     def second_derivative(self, state: DMPState) -> Float[Tensor, "*batch D"]:
         """Second derivative d^2 y / ds^2 at a state without coupling."""
-        scale = self._scaling_between(state.start, state.goal, None)
-        return closed_loop_step.second_derivative(state, self.response, self.weights, scale)
+        response = self.response
+        force = response.basis.forcing(state.s)[..., None, :].to(self.weights)
+        force = self._scaled(force @ self.weights.mT, state.start, state.goal)[..., 0, :]
+        if response.approach:
+            curve = response.approach_force(state.s).to(force)[..., None]
+            force = force + state.displacement * curve
+        return self.spring.acceleration(state.position - state.goal, state.rate) + force
 
     def start_rate(
         self, start: Float[Tensor, "*#batch D"], goal: Float[Tensor, "*#batch D"]

@@ -8,7 +8,7 @@ table of polynomials.
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 from typing import Any
@@ -34,51 +34,6 @@ SMALL_MATRIX_CORES = {"SkylakeX", "Cooperlake", "SapphireRapids"}
 processors with AVX-512, including AMD's."""
 MINIMUM_ROWS = 4
 """Rows from which those kernels beat one flat product of all motions."""
-
-type Propagate = Callable[[Tensor], Tensor]
-"""Maps times (*batch) to transition matrices (*batch 2 2)."""
-type Forcing = Callable[[Tensor], Tensor]
-"""Maps times (*batch) to the forcing of each basis function (*batch N)."""
-
-
-def impulse(
-    propagate: Propagate,
-    forcing: Forcing,
-    start: Float[Tensor, "pieces"],
-    length: Float[Tensor, ""],
-) -> Float[Tensor, "pieces 2 N"]:
-    """State (y, y') at start + length caused by the forcing since `start`, by quadrature.
-
-    Args:
-        propagate: Transition matrix of the spring.
-        forcing: Forcing of each basis function.
-        start: Start of each piece.
-        length: Length of the pieces.
-    """
-    nodes, weights = (
-        torch.from_numpy(x).to(start) for x in np.polynomial.legendre.leggauss(GAUSS_POINTS)
-    )
-    u = length[..., None] * ((1 + nodes) / 2)
-    kernel = (
-        propagate(length[..., None] - u)[..., 1] * (length[..., None] / 2 * weights)[..., None]
-    )
-    return kernel.mT @ forcing(start[:, None] + u)
-
-
-def accumulate(
-    propagate: Propagate, knots: Float[Tensor, "K"], increments: Float[Tensor, "K_less_1 2 N"]
-) -> Float[Tensor, "K 2 N"]:
-    """States at the knots, from rest at the first, from the increment of each piece.
-
-    A parallel prefix sum (Hillis and Steele 1986) with log2(K) steps.
-    """
-    state = torch.cat([torch.zeros_like(increments[:1]), increments])
-    stride = 1
-    while stride < len(knots):
-        E = propagate(knots[stride:] - knots[:-stride])
-        state = torch.cat([state[:stride], state[stride:] + E @ state[:-stride]])
-        stride *= 2
-    return state
 
 
 def chebyshev_points() -> Float[Tensor, "P"]:
@@ -325,7 +280,7 @@ class Response:
 
     def _integrate(self) -> PiecewisePolynomial:
         """Integrate all basis functions to the end of the forcing, or over one period."""
-        propagate, forcing = self.spring.propagator, self.basis.forcing
+        propagate = self.spring.propagator
         interval = min(self.basis.smooth_interval, self.spring.smooth_interval)
         if self.basis.knot_spacing is not None:
             interval = self.basis.knot_spacing / math.ceil(self.basis.knot_spacing / interval)
@@ -333,10 +288,14 @@ class Response:
         n_pieces = math.ceil(self.basis.horizon / interval - 1e-9)
         knots = interval * torch.arange(n_pieces + 1, dtype=torch.float64)
         points = interval * chebyshev_points()
-        increments = torch.stack(
-            [impulse(propagate, forcing, knots[:-1], point) for point in points], dim=1
-        )
-        state = accumulate(propagate, knots, increments[:, -1])
+        increments = torch.stack([self._impulse(knots[:-1], point) for point in points], dim=1)
+        # States at the knots, from rest at the first: a parallel prefix sum (Hillis and Steele
+        # 1986) with log2(K) steps.
+        state, stride = torch.nn.functional.pad(increments[:, -1], (0, 0, 0, 0, 1, 0)), 1
+        while stride < len(knots):
+            E = propagate(knots[stride:] - knots[:-stride])
+            state = torch.cat([state[:stride], state[stride:] + E @ state[:-stride]])
+            stride *= 2
         if self.basis.periodic:
             # The start to which a period returns: x = E x + (state from rest).
             E = propagate(knots[-1])
@@ -345,6 +304,17 @@ class Response:
         # On each piece: the motion from its first knot, and the forcing since then.
         values = propagate(points) @ state[:-1, None] + increments
         return PiecewisePolynomial.interpolate(values, interval, self.basis.periodic)
+
+    def _impulse(
+        self, start: Float[Tensor, "pieces"], length: Float[Tensor, ""]
+    ) -> Float[Tensor, "pieces 2 N"]:
+        """State (y, y') at start + length that the forcing since `start` causes."""
+        nodes, weights = (
+            torch.from_numpy(x).to(start) for x in np.polynomial.legendre.leggauss(GAUSS_POINTS)
+        )
+        u = length * ((1 + nodes) / 2)
+        kernel = self.spring.propagator(length - u)[..., 1] * (length / 2 * weights)[:, None]
+        return kernel.mT @ self.basis.forcing(start[:, None] + u)
 
 
 class _StateAt(torch.autograd.Function):

@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hrc_learn.dmp.dynamics import minimum_jerk_curve
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.response import Response
 
@@ -26,6 +25,11 @@ OUTSIDE = 1e-9
 Gaussians, only the few nearest to the ends of the window exceed it."""
 RIDGE = 1e-7
 """Ridge that keeps weights with equal effect small, relative to the largest."""
+QUINTIC = torch.tensor(
+    [[0, 0, 0, 10, -15, 6], [0, 1, 0, -6, 8, -3], [0, 0, 0, -4, 7, -3]], dtype=torch.float64
+)
+"""Coefficients of Hermite's quintics without second derivatives at the ends of [0, 1]: for the
+change of the value, and for the rates at the start and the end."""
 DEPENDENT = 1e-12
 """Relative singular value below which a constraint follows from the others."""
 
@@ -224,15 +228,13 @@ def piecewise_quintic(
     )
     L = t1 - t0
     u = (s[:, None] - t0) / L
-    m, slope, curvature = minimum_jerk_curve(u)
-    change, w0, w1 = y1 - y0, v0 * L, v1 * L
-    # Hermite's quintic without second derivatives at its ends: m(u) for the change of the
-    # value, and one polynomial for each of the two rates.
-    position = y0 + change * m
-    position = position + w0 * (u - u**3 * (6 - 8 * u + 3 * u**2))
-    position = position - w1 * u**3 * (4 - 7 * u + 3 * u**2)
-    velocity = change * slope + w0 * (1 - u**2 * (18 - 32 * u + 15 * u**2))
-    velocity = velocity - w1 * u**2 * (12 - 28 * u + 15 * u**2)
-    acceleration = change * curvature - w0 * u * (36 - 96 * u + 60 * u**2)
-    acceleration = acceleration - w1 * u * (24 - 84 * u + 60 * u**2)
-    return torch.stack([position, velocity / L, acceleration / L**2], dim=-2)
+    terms = y1 - y0, v0 * L, v1 * L
+    curves, coefficients = [], QUINTIC.to(u)
+    for order in range(3):
+        powers = u[..., None] ** torch.arange(coefficients.shape[-1], device=u.device)
+        shapes = powers @ coefficients.mT
+        value = sum(term * shapes[..., k] for k, term in enumerate(terms))
+        curves.append((y0 + value if order == 0 else value) / L**order)
+        exponents = torch.arange(1, coefficients.shape[-1]).to(u)
+        coefficients = coefficients[:, 1:] * exponents
+    return torch.stack(curves, dim=-2)
