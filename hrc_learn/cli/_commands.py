@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from importlib import import_module, metadata
 from typing import Any, NoReturn
 
-from hrc_learn.cli import arguments, arm_arguments
+from hrc_learn.cli import arguments
 from hrc_learn.cli._run import parse, status_of
 
 
@@ -40,9 +40,9 @@ class Command:
 
 
 COMMANDS: dict[str, Command] = {
-    "demo": Command("experiment_commands.demo", arm_arguments.Demo),
-    "run": Command("experiment_commands.run", arm_arguments.Run, ("experiment",)),
-    "record": Command("record_command.record", arm_arguments.Record, ("scenario",)),
+    "demo": Command("experiment_commands.demo", arguments.Demo),
+    "run": Command("experiment_commands.run", arguments.Run, ("experiment",)),
+    "record": Command("record_command.record", arguments.Record, ("scenario",)),
     "import": Command("conversion_commands.import_arrays", arguments.Import, ("files",)),
     "show": Command("dashboard_commands.show", arguments.Show, ("dataset",)),
     "check": Command("dataset_commands.check", arguments.Check, ("dataset",)),
@@ -58,8 +58,8 @@ COMMANDS: dict[str, Command] = {
     "evaluate": Command("evaluate_command.evaluate", arguments.Evaluate, ("model", "dataset")),
     "smooth": Command("smooth_command.smooth", arguments.Smooth, ("checkpoint",)),
     "report": Command("dashboard_commands.report", arguments.Report, ("runs",)),
-    "page": Command("page_command.page", arm_arguments.ServePage),
-    "serve": Command("serve_command.serve", arm_arguments.Serve),
+    "page": Command("loop_commands.page", arguments.ServePage),
+    "serve": Command("loop_commands.serve", arguments.Serve),
 }
 """Commands by the words typed after `hrc`."""
 

@@ -14,8 +14,15 @@ from rich.console import Console
 from hrc_learn.cli._ledger import Ledger
 from hrc_learn.cli._run import command_line, refuse_existing
 from hrc_learn.cli._settings import with_settings
-from hrc_learn.cli.arguments import FitImageJacobian, FitPrimitives
-from hrc_learn.cli.arm_arguments import Demo, Record, Run, WithImperfections, WithRobot
+from hrc_learn.cli.arguments import (
+    Demo,
+    FitImageJacobian,
+    FitPrimitives,
+    Record,
+    Run,
+    WithImperfections,
+    WithRobot,
+)
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment, Pulls
 from hrc_learn.experiments.collaboration_trial import Disturbances
 from hrc_learn.experiments.experiment import (

@@ -9,7 +9,7 @@ from rich.progress import Progress, track
 
 from hrc_learn.cli._run import configuration, write_values
 from hrc_learn.cli._settings import with_settings
-from hrc_learn.cli.arm_arguments import Record
+from hrc_learn.cli.arguments import Record
 from hrc_learn.experiments.simulated_cell import SIMULATED
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import PhysicsError, World, open_camera

@@ -27,7 +27,7 @@ from hrc_learn.hardware import (
 )
 from hrc_learn.hardware.arm_process import StoppableArm
 from hrc_learn.kinematics import SerialChain, fr3, panda
-from hrc_learn.protocols import Camera, OpenedArm
+from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.failures import TaskFailedError
@@ -123,25 +123,6 @@ def opened_arm(site: ArmSite) -> Iterator[StoppableArm]:
     )
     with FrankaArm(site.ip, site.chain, config) as arm:
         yield arm
-
-
-@contextmanager
-def opened_site(site: ArmSite, workplace: Workplace) -> Iterator[tuple[World, OpenedArm]]:
-    """Connected arm, and a simulated world of its assumed surroundings, which follows the arm.
-
-    The caller keeps the time: `advance` takes none.
-
-    Args:
-        site: Arm and driver.
-        workplace: Assumed surroundings.
-    """
-    believed = World(workplace.scene)
-    with opened_arm(site) as arm:
-        believed.follow(arm.read())
-        yield (
-            believed,
-            OpenedArm(arm=arm, gripper=arm, advance=lambda _time: believed.follow(arm.read())),
-        )
 
 
 type Task = Callable[[WorkCell, Callable[[Plan], None]], str]

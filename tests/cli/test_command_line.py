@@ -18,7 +18,7 @@ from clean_sets import SETS, write_set
 from commands import done, hrc
 
 from hrc_learn import cli
-from hrc_learn.cli import arguments, arm_arguments
+from hrc_learn.cli import arguments
 from hrc_learn.cli._commands import COMMANDS
 from hrc_learn.cli._settings import with_settings
 from hrc_learn.dmp.forcing_scale import SCALINGS
@@ -100,9 +100,8 @@ def test_help_lists_every_option(name):
     assert not [option for option in cli.commands()[name] if f"--{option}" not in output]
 
 
-@pytest.mark.parametrize("module", [arguments, arm_arguments])
-def test_every_option_is_explained(module):
-    for cls in ast.walk(ast.parse(inspect.getsource(module))):
+def test_every_option_is_explained():
+    for cls in ast.walk(ast.parse(inspect.getsource(arguments))):
         if isinstance(cls, ast.ClassDef):
             for field_, after in pairwise([*cls.body, None]):
                 assert not isinstance(field_, ast.AnnAssign) or isinstance(after, ast.Expr)
@@ -121,7 +120,7 @@ def test_the_same_option_has_the_same_name_and_type(name):
 @pytest.mark.parametrize(
     ("alias", "known"),
     [
-        (arm_arguments.Shelf, Workplace().shelf_names()),
+        (arguments.Shelf, Workplace().shelf_names()),
         (arguments.Channel, CHANNELS),
         (arguments.Scaling, SCALINGS),
     ],

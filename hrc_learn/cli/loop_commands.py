@@ -1,0 +1,323 @@
+"""`hrc page` and `hrc serve`: loops at a fixed rate on a simulated or a real arm."""
+
+import os
+
+# More threads would only wait for each other within a control step.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from hrc_learn.cli._run import configuration, write_values
+from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli.arguments import Serve, ServePage, WithDriver
+from hrc_learn.controller import (
+    GRIPPER_DOWN,
+    INITIAL_IMAGE_JACOBIAN,
+    INTERVENTIONS,
+    AdaptiveController,
+    ControllerConfig,
+    Goals,
+    Observation,
+    SafetyConfig,
+)
+from hrc_learn.demos import DatasetWriter
+from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
+from hrc_learn.experiments.real_arm import ArmSite, opened_arm
+from hrc_learn.experiments.simulated_cell import access_by
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.hardware import ending_at_rest
+from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
+from hrc_learn.kinematics import ArmChoice, SerialChain
+from hrc_learn.protocols import Human, OpenedArm
+from hrc_learn.sim import MovingBodies, SceneConfig, World
+from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
+from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
+from hrc_learn.teleoperation.gate import qr_code
+from hrc_learn.teleoperation.haptic_device import HapticDevice
+from hrc_learn.teleoperation.headset import BUILD
+from hrc_learn.teleoperation.page import Page, PageConfig
+from hrc_learn.teleoperation.page_session import (
+    FEATURES,
+    PageSession,
+    PageSessionConfig,
+    counted,
+    place_targets,
+)
+
+SWITCH_INTERVAL = 0.0005
+"""Longest time for which a thread of the page holds the interpreter [s]."""
+FRAME_TIME = 0.032
+"""Time between images of `hrc serve` [s]."""
+CENTRE = (0.35, 0.35, 0.35)
+"""Centre of the box that the tool moves in, in `hrc serve` [m]."""
+PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
+
+
+def _access(
+    args: WithDriver, site: ArmSite, world: World, safety: SafetyConfig
+) -> tuple[Callable[[], AbstractContextManager[OpenedArm]], SafetyConfig]:
+    """Connection to a real arm, which the world follows, or to the arm of the world.
+
+    Returns:
+        Function that connects, and the configuration of the safety filter for this arm.
+    """
+    if args.drives_real_arm():
+        site = replace(site, driver=args.arm, ip=args.ip)
+        return partial(_real_arm, site, world), site.cell_config().safety
+    access = access_by(args.arm, world.arm.robot)
+    delay = safety.delay + access.delay
+    braking = min(safety.braking, access.dynamics)
+    return partial(access.open, world), replace(safety, delay=delay, braking=braking)
+
+
+@contextmanager
+def _real_arm(site: ArmSite, world: World) -> Iterator[OpenedArm]:
+    with opened_arm(site) as arm:
+        world.follow(arm.read())
+        yield OpenedArm(arm=arm, gripper=arm, advance=lambda _time: world.follow(arm.read()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PageSettings:
+    """Settings of the page, the recording session and a real arm."""
+
+    page: PageConfig
+    session: PageSessionConfig = field(default_factory=PageSessionConfig)
+    site: ArmSite = field(default_factory=ArmSite)
+
+
+def page(args: ServePage) -> None:
+    """Serve the page and run the control loop until the person finishes."""
+    settings = _PageSettings(page=PageConfig(host=args.host, port=args.port))
+    settings = with_settings(args.config, settings)
+    guiding = settings.session.guiding
+    torch.set_num_threads(1)
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    robot, console = ArmChoice(args.robot, tip=args.tip).work_arm(), Console()
+    workplace = Workplace.of(robot)
+    world = World(workplace.scene)
+    connect, safety = _access(args, settings.site, world, guiding.safety)
+    if args.arm != "sim" and not args.drives_real_arm():
+        world.hold(workplace.scene.objects[0].name, workplace.home_joints().numpy())
+    writer = DatasetWriter(
+        args.out,
+        fps=settings.session.fps,
+        robot_type=robot.name,
+        joint_names=robot.chain.joint_names,
+        features=FEATURES,
+        frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
+        details={
+            "demonstrated by": "a person at the page",
+            "recorded with": configuration(args),
+        },
+    )
+    recorder = DemonstrationRecorder(writer, lambda: page.task, chain=robot.chain)
+    stands = [*workplace.scene.boxes(), *place_targets(workplace)]
+    try:
+        # The recorder is closed last, so that an open demonstration is kept in any case.
+        with recorder, connect() as opened:
+            bodies = MovingBodies(world)
+            drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
+            config = replace(settings.session, guiding=replace(guiding, safety=safety))
+            with (
+                _opened_device(args.device, robot.chain) as devices,
+                Page(robot.chain, drawn, stands, settings.page, task=args.task) as page,
+            ):
+                session = PageSession(
+                    workplace,
+                    page,
+                    recorder,
+                    world,
+                    opened=None if args.arm == "sim" else opened,
+                    inputs=devices,
+                    config=config,
+                )
+                _announce(console, page)
+                figures = _run_page(session, page, guiding.dt, args.duration)
+    finally:
+        if saved := recorder.status.saved:
+            console.print(f"{args.out}: {counted(saved)}", soft_wrap=True)
+    if not saved:
+        console.print("No demonstration was saved, so there is no dataset")
+    write_values(args.json, {**figures, "episodes": saved})
+
+
+def _announce(console: Console, page: Page) -> None:
+    """Print the addresses of the page, with the secret that opens it."""
+    console.print(f"Page at [bold]{page.url}[/]", soft_wrap=True)
+    console.print(f"To watch only: [bold]{page.watch_url}[/]", soft_wrap=True)
+    if page.headset_url:
+        console.print(f"For headsets and phones: [bold]{page.headset_url}[/]", soft_wrap=True)
+    else:
+        console.print(f"No client for headsets: build it with [bold]{BUILD}[/] in a checkout")
+    if page.address.scheme == "https":
+        console.print("Anyone with this address can move the arm:")
+        console.print(qr_code(page.url))
+
+
+@contextmanager
+def _opened_device(device: str, chain: SerialChain) -> Iterator[tuple[Human, ...]]:
+    """The additional input device, if any."""
+    if device == "haptic":
+        with HapticDevice.open(chain) as haptic:
+            yield (haptic,)
+    elif device == "gamepad":
+        yield (Gamepad.open(chain),)
+    else:
+        yield (TerminalKeyboard.open(chain),) if device == "keyboard" else ()
+
+
+def _run_page(
+    session: PageSession, page: Page, dt: float, duration: float | None
+) -> dict[str, float | int]:
+    """Run the loop at the rate of the arm and return its figures."""
+    rate, steps = Rate(dt), 0
+    try:
+        with ending_at_rest(session.arm.stop):
+            while page.alive and not session.finished:
+                session.step()
+                steps += 1
+                if duration is not None and steps * dt >= duration:
+                    break
+                rate.wait()
+    except KeyboardInterrupt:
+        print()
+    return {"steps": steps, "missed_ticks": rate.missed, "latest_s": rate.latest}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ServeSettings:
+    """Settings of a real arm."""
+
+    site: ArmSite = field(default_factory=ArmSite)
+
+
+def serve(args: Serve) -> None:
+    """Run the loop and print its latencies."""
+    if not (args.duration > 0 and args.rate > 0):
+        raise ValueError("--duration and --rate must be positive")
+    if args.rate < (slowest := SafetyConfig().rate):
+        raise ValueError(
+            f"--rate must be at least {slowest:g}, the minimum of the safety filter"
+        )
+    torch.set_num_threads(1)
+    dt = 1 / args.rate
+    site = with_settings(args.config, _ServeSettings()).site
+    camera, robot = _camera(), ArmChoice(args.robot, tip=args.tip).work_arm()
+    scene = SceneConfig(timestep=dt)
+    world = World(replace(scene, arm=replace(scene.arm, robot=robot)))
+    world.reset(robot.chain.ready.numpy())
+    connect, safety = _access(args, site, world, SafetyConfig())
+    controller, observation = _controller(robot.chain, camera, dt, safety)
+    began = time.perf_counter()
+    if args.step == "eager":
+        runner = EagerRunner(controller, observation)
+    else:
+        runner = open_step(controller, observation)
+    opened = time.perf_counter() - began
+    with connect() as arm:
+        steps = round(args.duration * args.rate)
+        measured = _run_serve(runner, arm, robot.chain, camera, dt, steps)
+    figures = {"open_s": opened} | measured
+    counts = runner.state("safety.counts")
+    figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
+    for name, value in figures.items():
+        Console().print(f"{name:22} {value:.4g}", highlight=False)
+    write_values(args.json, figures)
+
+
+def _camera() -> PinholeCamera:
+    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    return PinholeCamera.above(
+        centre,
+        height=centre.new_tensor(1.1),
+        roll=centre.new_tensor(0.5),
+        tilt=centre.new_tensor(0.2),
+        bearing=centre.new_tensor(1.0),
+        marker=centre.new_tensor((0.05, 0.0, -0.08)),
+    )
+
+
+def _controller(
+    chain: SerialChain, camera: PinholeCamera, dt: float, safety: SafetyConfig
+) -> tuple[AdaptiveController, Observation]:
+    """The controller, and an observation with every field that the loop sets."""
+    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
+    target, _ = camera.project(Pose(centre + centre.new_tensor((0.03, -0.02, 0.0)), down))
+    J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
+    network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
+    controller = AdaptiveController(
+        chain,
+        KalmanEstimator(network),
+        Goals.at(centre, down, target),
+        config=ControllerConfig(safety=safety),
+    )
+    q = chain.ready
+    observation = Observation(
+        joint_position=q,
+        feature=target,
+        feature_visible=torch.tensor(False),
+        feature_new=torch.tensor(False),
+        image_joint_position=q,
+        nullspace_input=torch.zeros_like(q),
+        # A tensor, so that one compiled step serves all rates.
+        dt=torch.tensor(dt, dtype=torch.float64),
+    )
+    return controller, observation
+
+
+def _run_serve(
+    runner: StepRunner,
+    opened: OpenedArm,
+    chain: SerialChain,
+    camera: PinholeCamera,
+    dt: float,
+    steps: int,
+) -> dict[str, float | int]:
+    """Run the loop; returns its latencies and the last image error."""
+    arm, observation = opened.arm, runner.observation
+    target = observation["feature"].copy()
+    frame_steps = max(1, round(FRAME_TIME / dt))
+    took, late = np.empty(steps), np.empty(steps)
+    observation["joint_position"][:] = arm.read().joint_position
+    runner.step()  # the first step is slower than all others
+    runner.start(arm.read().joint_position)
+    rate = Rate(dt)
+    with ending_at_rest(lambda: arm.command(np.zeros(len(chain.joint_names)))):
+        for k in range(steps):
+            began = time.perf_counter()
+            observation["joint_position"][:] = arm.read().joint_position
+            arm.command(runner.step())
+            took[k] = time.perf_counter() - began
+            opened.advance(dt)
+            observation["feature_new"][...] = k % frame_steps == 0
+            if k % frame_steps == 0:
+                q = arm.read().joint_position
+                feature, visible = camera.project(chain.forward(torch.from_numpy(q)))
+                observation["feature"][:] = feature.numpy()
+                observation["feature_visible"][...] = bool(visible)
+                observation["image_joint_position"][:] = q
+            late[k] = rate.wait()
+    figures: dict[str, float | int] = {
+        "steps": steps,
+        "missed_ticks": rate.missed,
+        "missed_percent": 100 * rate.missed / (steps + rate.missed),
+    }
+    for name, seconds in (("step", took), ("late", late)):
+        values = 1e6 * np.percentile(seconds, PERCENTILES)
+        for percentile, value in zip(PERCENTILES, values, strict=True):
+            figures[f"{name}_p{percentile:g}_us"] = float(value)
+    figures["pixel_error"] = float(np.linalg.norm(observation["feature"] - target))
+    return figures
