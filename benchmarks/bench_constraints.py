@@ -33,7 +33,7 @@ from hrc_learn.controller import (
     SafetyConfig,
     WayMakingConfig,
 )
-from hrc_learn.controller.way_making import way_making_velocity
+from hrc_learn.controller.task_pace import way_making_velocity
 from hrc_learn.deploy import EagerRunner, open_step
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda

@@ -30,7 +30,6 @@ from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import StoppedByPersonError, WorkCell, WorkCellConfig, joint_line
-from hrc_learn.skills.path_following import follow_path
 from hrc_learn.teleoperation import Touch, TouchConfig
 from hrc_learn.teleoperation.scripted_expert import ScriptedForce
 
@@ -134,7 +133,7 @@ def push(where: Literal["elbow", "hand"], seed: int, args: Args) -> dict[str, An
     try:
         for end in (far, home):
             speed = 1.875 * float((far - home).abs().max()) / TIME
-            follow_path(cell, joint_line(cell.joints, end, speed, config.dt).numpy())
+            cell.follow_path(joint_line(cell.joints, end, speed, config.dt).numpy())
     except StoppedByPersonError as error:
         stopped = str(error)
     elbow, hand = aside(cell)

@@ -20,7 +20,6 @@ from hrc_learn.skills.arm_motion import (
     joint_line,
     joints_near,
 )
-from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.grasping import (
     CLOSING_TIME,
     DESCENT_SPEED,
@@ -31,6 +30,7 @@ from hrc_learn.skills.grasping import (
 )
 from hrc_learn.skills.pick_and_place import RELEASE_TIME, PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan, plan_candidates
+from hrc_learn.skills.work_cell import BlockedPathError
 
 # Time of servoing above the object, the median of grasping (docs/benchmarks/experiments.md)
 # [s].

@@ -14,7 +14,6 @@ from hrc_learn.experiments.simulated_cell import SIMULATED
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import PhysicsError, World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import (
     ANGLE_FEATURE,
@@ -22,6 +21,7 @@ from hrc_learn.skills.visual_skill import (
     OBJECT_FEATURE,
     OBJECT_FEATURE_NAMES,
 )
+from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import Frame
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,

@@ -41,7 +41,7 @@ from hrc_learn.controller.resolved_rate import (
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
-from hrc_learn.controller.way_making import WayMakingConfig, way_making_velocity
+from hrc_learn.controller.task_pace import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import ArrayLike, is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement

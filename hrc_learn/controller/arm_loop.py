@@ -45,8 +45,13 @@ from hrc_learn.controller.null_space_motion import (
 from hrc_learn.controller.path_law import PathLaw
 from hrc_learn.controller.pose_tracking import PoseTracking, twist_of
 from hrc_learn.controller.safety_state import SafetyReport
-from hrc_learn.controller.task_pace import TaskPace, closes_in, fraction_of_motion, people_bind
-from hrc_learn.controller.way_making import way_making_velocity
+from hrc_learn.controller.task_pace import (
+    TaskPace,
+    closes_in,
+    fraction_of_motion,
+    people_bind,
+    way_making_velocity,
+)
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import JointLimits, SerialChain
 from hrc_learn.pytree import apply_where

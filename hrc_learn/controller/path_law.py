@@ -17,8 +17,8 @@ from hrc_learn.controller.arm_loop_state import (
     PathState,
     WantedMotion,
 )
-from hrc_learn.controller.direct_return import DirectReturn
 from hrc_learn.controller.joint_path import (
+    DirectReturn,
     begins_aside,
     changed_rate,
     deviation_ratio,

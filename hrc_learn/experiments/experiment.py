@@ -19,8 +19,7 @@ from hrc_learn.experiments.simulated_cell import UNOBSERVED, LiveView, Observer,
 from hrc_learn.experiments.trials import Trial, TrialRun, repeat
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import MotionLog, PhysicsError, World
-from hrc_learn.skills.failures import TaskFailedError
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz.report import (
     FILM,

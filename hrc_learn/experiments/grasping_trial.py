@@ -29,11 +29,10 @@ from hrc_learn.sim import (
 from hrc_learn.sim.imperfections import DrawnImperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.vision import CameraModel

@@ -25,10 +25,9 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.pick_and_place import place_along
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, Plan, PlanningSpace
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 SPACES: dict[PlanningSpace, str] = {"pose": "task space", "joint": "joint space"}

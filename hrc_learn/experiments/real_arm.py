@@ -30,14 +30,12 @@ from hrc_learn.kinematics import SerialChain, fr3, panda
 from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, as_load, joint_plan
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
-from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, PickAndPlaceConfig, place_along
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.teleoperation import ScriptedDrawing, Touch
 from hrc_learn.viz.run_dashboard import record_run
@@ -181,7 +179,7 @@ def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: f
         home = joint_plan(cell, cell.joints, workplace.home_joints())
         cell.begin_phase(HOME)
         check(home)
-        follow_path(cell, home.path)
+        cell.follow_path(home.path)
         plan = skill.plan(cell.joints, goal, space="pose", dt=cell.config.dt, speed=speed)
         check(plan)
         place_along(cell, plan, goal, workplace.lowering(item.half_size))

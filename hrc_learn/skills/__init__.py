@@ -5,10 +5,6 @@ from hrc_learn.skills.arm_motion import PositionServoConfig as PositionServoConf
 from hrc_learn.skills.arm_motion import StraightLine as StraightLine
 from hrc_learn.skills.arm_motion import joint_line as joint_line
 from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
-from hrc_learn.skills.failures import BlockedPathError as BlockedPathError
-from hrc_learn.skills.failures import MissedGraspError as MissedGraspError
-from hrc_learn.skills.failures import StoppedByPersonError as StoppedByPersonError
-from hrc_learn.skills.failures import TaskFailedError as TaskFailedError
 from hrc_learn.skills.grasping import Grasping as Grasping
 from hrc_learn.skills.grasping import GraspingConfig as GraspingConfig
 from hrc_learn.skills.grasping import GraspResult as GraspResult
@@ -16,7 +12,6 @@ from hrc_learn.skills.marker_sensor import DelayedChannel as DelayedChannel
 from hrc_learn.skills.marker_sensor import LatencyConfig as LatencyConfig
 from hrc_learn.skills.marker_sensor import MarkerObservation as MarkerObservation
 from hrc_learn.skills.marker_sensor import MarkerSensor as MarkerSensor
-from hrc_learn.skills.path_following import follow_path as follow_path
 from hrc_learn.skills.pick_and_place import Phase as Phase
 from hrc_learn.skills.pick_and_place import PickAndPlace as PickAndPlace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig as PickAndPlaceConfig
@@ -33,5 +28,9 @@ from hrc_learn.skills.task_workplace import Workplace as Workplace
 from hrc_learn.skills.visual_servoing import VisualServo as VisualServo
 from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
 from hrc_learn.skills.visual_skill import VisualTarget as VisualTarget
+from hrc_learn.skills.work_cell import BlockedPathError as BlockedPathError
+from hrc_learn.skills.work_cell import MissedGraspError as MissedGraspError
+from hrc_learn.skills.work_cell import StoppedByPersonError as StoppedByPersonError
+from hrc_learn.skills.work_cell import TaskFailedError as TaskFailedError
 from hrc_learn.skills.work_cell import WorkCell as WorkCell
 from hrc_learn.skills.work_cell import WorkCellConfig as WorkCellConfig

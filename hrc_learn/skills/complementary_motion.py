@@ -17,8 +17,7 @@ from hrc_learn.controller.arm_loop_state import (
     ArmReading,
     FollowPath,
 )
-from hrc_learn.controller.direct_return import DirectReturn
-from hrc_learn.controller.joint_path import NARROW, JointPaths
+from hrc_learn.controller.joint_path import NARROW, DirectReturn, JointPaths
 from hrc_learn.controller.null_space_motion import (
     Clearance,
     YieldingConfig,
@@ -27,7 +26,7 @@ from hrc_learn.controller.null_space_motion import (
 from hrc_learn.kinematics import JointLimits, SerialChain
 from hrc_learn.protocols import ArmState, Human
 from hrc_learn.skills.arm_motion import joints_near
-from hrc_learn.skills.person_feedback import PersonFeedback
+from hrc_learn.skills.step_report import PersonFeedback
 
 # Longest step of the loop between two actions of the policy [s].
 _STEP = 0.01

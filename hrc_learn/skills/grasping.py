@@ -20,14 +20,17 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator
 from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.failures import BlockedPathError, MissedGraspError, TaskFailedError
-from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig, no_perspective
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
 from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import (
+    BlockedPathError,
+    MissedGraspError,
+    TaskFailedError,
+    WorkCell,
+)
 
 OPEN, CLOSED = 0.08, 0.0
 """Commanded gripper widths [m]: the full stroke; and zero, which squeezes the object."""
@@ -357,11 +360,11 @@ class Grasping:
                 q for q in postures if self._free(here, q, clearance) and self._free(q, home)
             )
             if (via := next(reachable, None)) is not None:
-                follow_path(self._cell, joint_plan(self._cell, here, via).path)
+                self._cell.follow_path(joint_plan(self._cell, here, via).path)
                 break
         plan = joint_plan(self._cell, self._cell.joints, home)
         self._check(plan)
-        follow_path(self._cell, plan.path)
+        self._cell.follow_path(plan.path)
 
     def _free(
         self,

@@ -22,7 +22,6 @@ from enum import StrEnum
 from typing import Literal
 
 from hrc_learn.geometry import Pose
-from hrc_learn.skills.failures import BlockedPathError, MissedGraspError, TaskFailedError
 from hrc_learn.skills.grasping import (
     DESCENT_SPEED,
     OPEN,
@@ -34,13 +33,17 @@ from hrc_learn.skills.grasping import (
     raised,
 )
 from hrc_learn.skills.marker_sensor import longest_occlusion
-from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
 from hrc_learn.skills.receiving import Receipt, Receiving
 from hrc_learn.skills.servo_target import ServoTarget
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import (
+    BlockedPathError,
+    MissedGraspError,
+    TaskFailedError,
+    WorkCell,
+)
 
 Mishap = Literal[
     "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
@@ -165,7 +168,7 @@ def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> floa
         Time at which it started to put down [s].
     """
     cell.begin_phase(Phase.TRANSFER)
-    follow_path(cell, plan.path)
+    cell.follow_path(plan.path)
     # The arm lags behind: at the end of the path it is not quite there.
     cell.move_straight(goal)
     cell.begin_phase(Phase.RELEASE)
@@ -291,7 +294,7 @@ class PickAndPlace:
         posture = robot.inverse(receiving.wait, near=self._workplace.hover_joints())
         plan = joint_plan(self._cell, self._cell.joints, posture)
         self._check(plan)
-        follow_path(self._cell, plan.path)
+        self._cell.follow_path(plan.path)
         self._cell.begin_phase(Phase.RECEIVE)
         try:
             receiving.receive(job.item)
@@ -376,11 +379,11 @@ class PickAndPlace:
             job.failure = f"transfer: all paths to the {job.shelf} shelf stayed blocked"
             return Phase.PUT_BACK
         job.plan = plan
-        tracked = follow_path(
-            self._cell, plan.path, until=lambda: not holds(self._cell, job.item)
+        tracked = self._cell.follow_path(
+            plan.path, until=lambda: not holds(self._cell, job.item)
         )
         if tracked < len(plan.path):
-            follow_path(self._cell, plan.path[:tracked][::-1])
+            self._cell.follow_path(plan.path[:tracked][::-1])
             return self._start_over(job, "dropped object", "lost on the way to the shelf")
         self._cell.move_straight(plan.goal)
         return Phase.RELEASE
@@ -419,7 +422,7 @@ class PickAndPlace:
         """Retreat along the same path, which was free before."""
         assert job.plan is not None
         self._cell.begin_phase(Phase.RETREAT)
-        follow_path(self._cell, job.plan.path[::-1])
+        self._cell.follow_path(job.plan.path[::-1])
         return Phase.OVER
 
     def _put_back(self, job: PickPlaceJob) -> Phase:
@@ -430,7 +433,7 @@ class PickAndPlace:
         self._cell.begin_phase(Phase.PUT_BACK)
         plan = joint_plan(self._cell, self._cell.joints, self._workplace.hover_joints())
         self._check(plan)
-        follow_path(self._cell, plan.path)
+        self._cell.follow_path(plan.path)
         self._cell.move_straight(raised(job.picked_up, self._config.grasping.lift))
         self._cell.move_straight(job.picked_up, speed=DESCENT_SPEED)
         self._grasping.start_over()

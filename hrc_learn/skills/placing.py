@@ -33,8 +33,8 @@ from hrc_learn.kinematics import (
 )
 from hrc_learn.regions import JointRegion
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.task_workplace import CollisionChecker, Workplace
+from hrc_learn.skills.work_cell import BlockedPathError
 
 PlanningSpace = Literal["joint", "pose"]
 

@@ -17,7 +17,6 @@ from torch import Tensor
 from hrc_learn.dmp import InteractionEstimate, InteractionPrimitive
 from hrc_learn.geometry import Pose
 from hrc_learn.protocols import PersonObservation, PersonTracker
-from hrc_learn.skills.failures import MissedGraspError
 from hrc_learn.skills.grasping import (
     CLOSED,
     CLOSING_TIME,
@@ -27,7 +26,7 @@ from hrc_learn.skills.grasping import (
     move_fingers,
 )
 from hrc_learn.skills.task_workplace import GraspObject
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
 HAND_OVER = "hand over"
 """Name of the kind of movement to respond to."""

@@ -27,12 +27,20 @@ from hrc_learn.controller.joint_path import changed_rate
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import Measurement
 from hrc_learn.protocols import HumanInput
-from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsState
-from hrc_learn.skills.failures import MissedGraspError
-from hrc_learn.skills.marker_angle import AngleServo, AngleState, MarkerAngle
-from hrc_learn.skills.marker_sensor import MarkerConsistency, MarkerObservation
-from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.marker_sensor import (
+    AngleServo,
+    AngleState,
+    MarkerAngle,
+    MarkerConsistency,
+    MarkerObservation,
+)
+from hrc_learn.skills.servo_target import (
+    DrawnGoals,
+    DrawnGoalsState,
+    ServoTarget,
+    VisualServoConfig,
+)
+from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 # Fractions of the probe's height, tried until its upper end is well within the image.

@@ -34,7 +34,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.skills.marker_angle import MarkerAngle
+from hrc_learn.skills.marker_sensor import MarkerAngle
 from hrc_learn.store import Metres, Pixels, read_json, write_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 

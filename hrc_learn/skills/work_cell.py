@@ -32,22 +32,22 @@ from hrc_learn.log import Event, StepLog
 from hrc_learn.protocols import Arm, ArmState, Feedback, Gripper, Human, HumanInput
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import StraightLine
-from hrc_learn.skills.cell_log import (
-    NO_VISION,
-    motion_columns,
-    report_columns,
-    separation_columns,
-    servo_columns,
-)
-from hrc_learn.skills.failures import BlockedPathError, StoppedByPersonError, TaskFailedError
 from hrc_learn.skills.marker_sensor import (
     DelayedDetection,
     LatencyConfig,
     MarkerObservation,
     MarkerSensor,
 )
-from hrc_learn.skills.person_feedback import PersonFeedback, contact_force
 from hrc_learn.skills.person_watch import NEAR_PEOPLE, PersonWatch, WatchedPeople
+from hrc_learn.skills.step_report import (
+    NO_VISION,
+    PersonFeedback,
+    contact_force,
+    motion_columns,
+    report_columns,
+    separation_columns,
+    servo_columns,
+)
 
 # Time for joints to return at the end of a path [s].
 _LONGEST_RETURN = 5.0
@@ -62,6 +62,22 @@ _AVERAGED, _GETTING_UNDER_WAY = 5, 25
 # gripper leaves. Time in which an arm that is stopped comes to rest [s].
 _LEAVING, _COMING_TO_REST = 1.0, 1.0
 _STILL = torch.zeros(6, dtype=torch.float64)
+
+
+class TaskFailedError(RuntimeError):
+    """A task failed; the message says in which phase and why."""
+
+
+class MissedGraspError(TaskFailedError):
+    """A grasp failed; another attempt may succeed."""
+
+
+class StoppedByPersonError(TaskFailedError):
+    """A person or a contact has stopped the arm; it is at rest."""
+
+
+class BlockedPathError(TaskFailedError):
+    """A planned motion would collide, or leave the limits of the arm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -391,8 +407,42 @@ class WorkCell:
                 return before[0]
         return None
 
-    def follow(self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool]) -> int:
-        """Follow a joint path; see `follow_path`."""
+    def follow_path(
+        self,
+        path: Float[np.ndarray, "steps joints"],
+        until: Callable[[], bool] = lambda: False,
+    ) -> int:
+        """Move the joints along a path sampled at the control step, yielding to the person.
+
+        While a person pushes, the end effector keeps to the poses of the path, and the null
+        space yields. The path waits where the arm, pushed aside, cannot follow: where it would
+        meet something, before a singularity of the path, and where the joints might not find
+        back. After a push the joints return to the path, at its end too, or stay off it
+        (`WorkCellConfig.after_push`).
+
+        Args:
+            path: Joint positions [rad].
+            until: Asked before each step whether to stop there.
+
+        Returns:
+            Number of samples that were tracked.
+
+        Raises:
+            BlockedPathError: The arm, pushed aside, does not find back to a path that waits.
+            TaskFailedError: A person holds the arm aside for longer than `longest_wait` while
+                the path waits, or blocks it for as long.
+        """
+        if not len(path):
+            return 0
+        self.plan = path
+        try:
+            return self._follow(path, until)
+        finally:
+            self.plan = None
+
+    def _follow(
+        self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool]
+    ) -> int:
         paths = JointPaths.of(self.chain, [path], self.config.dt)
         request = FollowPath(paths=paths, path=torch.tensor(0))
         self._state = self._loop.begin_path(self._state, self.joints, request)

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from hrc_learn.demos import DatasetError, DatasetWriter
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Request
-from hrc_learn.skills.person_feedback import contact_force
+from hrc_learn.skills.step_report import contact_force
 from hrc_learn.teleoperation.hand_guiding import Frame
 
 STILL = 0.005

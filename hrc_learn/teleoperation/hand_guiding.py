@@ -22,7 +22,7 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import Arm, ArmState, Human, HumanInput
 from hrc_learn.regions import PositionRegion
-from hrc_learn.skills.person_feedback import PersonFeedback, filter_hindrance
+from hrc_learn.skills.step_report import PersonFeedback, filter_hindrance
 
 ForceMapping = Literal["transpose", "pinv"]
 DEFAULT_MAPPING: ForceMapping = "transpose"

@@ -18,9 +18,9 @@ from hrc_learn.kinematics import Arm, SerialChain, coarse_orientation, gripper_d
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
+from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import DATASET, replacing
 from hrc_learn.teleoperation.hand_guiding import Frame, HandGuidedArm, HandGuidingConfig
 from hrc_learn.teleoperation.scripted_expert import (

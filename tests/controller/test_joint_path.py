@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.controller.direct_return import DirectReturn
 from hrc_learn.controller.joint_path import (
+    DirectReturn,
     JointPaths,
     may_not_return,
     nears_singularity,

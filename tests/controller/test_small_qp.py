@@ -8,7 +8,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller.small_qp import least_change
+from hrc_learn.controller.constraint_layer import least_change
 
 DOUBLE = torch.float64
 

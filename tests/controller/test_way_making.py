@@ -19,7 +19,7 @@ from hrc_learn.controller import (
     SafetyConfig,
     WayMakingConfig,
 )
-from hrc_learn.controller.way_making import way_making_velocity
+from hrc_learn.controller.task_pace import way_making_velocity
 from hrc_learn.jacobian import FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 

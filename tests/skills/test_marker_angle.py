@@ -12,7 +12,7 @@ import torch
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import gripper_down
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
-from hrc_learn.skills.marker_angle import AngleDemonstration, AngleServo, MarkerAngle
+from hrc_learn.skills.marker_sensor import AngleDemonstration, AngleServo, MarkerAngle
 from hrc_learn.vision import CameraModel, Marker, angle
 
 MARKER = Marker(7, 0.048)

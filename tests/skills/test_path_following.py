@@ -14,7 +14,6 @@ from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.skills import TaskFailedError, WorkCellConfig, joint_line
-from hrc_learn.skills.path_following import follow_path
 
 PUSH = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
 
@@ -27,7 +26,7 @@ def cell():
 def test_the_joints_move_along_a_path_as_fast_as_it_runs(cell):
     far = torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3, -0.3], dtype=torch.float64)
     path = joint_line(panda.ready, panda.ready + far, speed=0.3, dt=0.01).numpy()
-    assert follow_path(cell, path) == len(path)
+    assert cell.follow_path(path) == len(path)
     commanded = cell.log["command_velocity"]
     # The slope of a minimum jerk motion, by its polynomial (Flash and Hogan 1985).
     duration = 1.875 * 0.3 / 0.3  # its peak is 15/8 of its mean speed
@@ -41,14 +40,14 @@ def test_the_joints_move_along_a_path_as_fast_as_it_runs(cell):
 def test_a_path_of_one_sample_or_none_leaves_the_arm_where_it_is(cell):
     here = cell.joints.numpy()
     for samples in (1, 0):
-        assert follow_path(cell, np.repeat(here[None], samples, axis=0)) == samples
+        assert cell.follow_path(np.repeat(here[None], samples, axis=0)) == samples
     np.testing.assert_array_equal(cell.joints, here)
 
 
 def test_a_path_is_left_when_its_end_is_told(cell):
     far = torch.full((7,), 0.1, dtype=torch.float64)
     path = joint_line(panda.ready, panda.ready + far, speed=0.3, dt=0.01).numpy()
-    assert follow_path(cell, path, until=lambda: len(cell.log) == 12) == 12
+    assert cell.follow_path(path, until=lambda: len(cell.log) == 12) == 12
 
 
 def pushed_along(path, push, seconds, **options):
@@ -62,7 +61,7 @@ def pushed_along(path, push, seconds, **options):
 
     cell = cell_with(arm, Person(), **options)
     with shapes_unchecked():  # hundreds of steps: three times as long checked
-        follow_path(cell, path)
+        cell.follow_path(path)
     return cell
 
 
@@ -135,7 +134,7 @@ def test_nobody_pushes_joints_so_far_that_they_do_not_find_back(
     error = straight * null + np.sqrt(1 - straight**2) * first
     path = cell.joints.numpy()[None] + error
     jacobian = cell.jacobian
-    follow_path(cell, path, until=lambda: len(cell.log) > 50)
+    cell.follow_path(path, until=lambda: len(cell.log) > 50)
     led = null_projection(jacobian, torch.from_numpy(cell.log["command_velocity"][50]))
     share = share if farther else 1.0
     assert float(led @ push / (push @ push)) == pytest.approx(share, abs=0.1)
@@ -154,7 +153,7 @@ def test_who_pushes_is_told_that_a_path_which_waits_leads_the_joints_back():
     cell = cell_with(ObedientArm(panda.ready.numpy()), Person())
     cell.hold_pose(0.5)
     path = np.repeat(cell.joints.numpy()[None] + (FAR_ASIDE + 0.1) * null, 100, axis=0)
-    follow_path(cell, path, until=lambda: len(cell.log) > 120)
+    cell.follow_path(path, until=lambda: len(cell.log) > 120)
     followed, velocity = cell.log["followed"], cell.log["joint_velocity"] @ null
     assert followed[49] == pytest.approx(1.0, abs=0.01)
     assert velocity[49] < -0.1
@@ -195,7 +194,7 @@ def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
 
     cell, path = cell_with(Stuck(panda.ready.numpy())), transfer()
     with shapes_unchecked():
-        assert follow_path(cell, path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
+        assert cell.follow_path(path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
     assert abs(float(cell.joints[0]) - path[-1, 0]) > 0.5
     assert len(cell.log) == len(path)
 

@@ -14,8 +14,8 @@ from hrc_learn.kinematics import GraspedBox, panda
 from hrc_learn.protocols import HINDRANCES, ArmState, Human, HumanInput, PersonObservation
 from hrc_learn.sim import ArmModelConfig, whole_arm
 from hrc_learn.skills import WorkCell
-from hrc_learn.skills.person_feedback import Hindrances, PersonFeedback
 from hrc_learn.skills.person_watch import PersonWatch
+from hrc_learn.skills.step_report import Hindrances, PersonFeedback
 
 Q = panda.ready
 

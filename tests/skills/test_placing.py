@@ -18,8 +18,8 @@ from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.learning.primitive_fitting import fit_primitives
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.failures import BlockedPathError, TaskFailedError
 from hrc_learn.skills.placing import PlacingSkill, check_plan, plan_candidates
+from hrc_learn.skills.work_cell import BlockedPathError, TaskFailedError
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,
     demonstrate_placing,

@@ -12,8 +12,8 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import gripper_down
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import ObjectConfig
-from hrc_learn.skills.failures import MissedGraspError
 from hrc_learn.skills.receiving import MovementWatch, Receiving, ReceivingConfig
+from hrc_learn.skills.work_cell import MissedGraspError
 
 PARTS = ("pelvis", "hand_right")
 RATE, REST = 30.0, np.array([0.2, 0.8, 0.1])

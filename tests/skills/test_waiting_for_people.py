@@ -16,7 +16,6 @@ from hrc_learn.protocols import HumanInput, PersonObservation
 from hrc_learn.sim import whole_arm
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_line
-from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.teleoperation import ScriptedPerturbation
 
@@ -88,7 +87,7 @@ def follow(cell):
     """A path that turns the arm about its base."""
     goal = panda.ready.clone()
     goal[0] += 0.8
-    follow_path(cell, joint_line(panda.ready, goal, speed=0.8, dt=0.01).numpy())
+    cell.follow_path(joint_line(panda.ready, goal, speed=0.8, dt=0.01).numpy())
 
 
 def straight(cell):
@@ -159,7 +158,7 @@ def test_an_arm_that_moves_away_rests_by_the_time_that_somebody_catches_up_with_
     goal = panda.ready.clone()
     goal[0] += 0.8
     path = joint_line(panda.ready, goal, speed=0.8, dt=0.01).numpy()
-    follow_path(cell, path, until=lambda: cell.time >= visitor._end)
+    cell.follow_path(path, until=lambda: cell.time >= visitor._end)
     apart, speed = distances(cell, visitor), np.linalg.norm(cell.log["joint_velocity"], axis=1)
     assert speed.max() > 0.5
     assert apart[-1] < 0.05

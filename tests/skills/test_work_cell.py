@@ -13,7 +13,6 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_line
-from hrc_learn.skills.path_following import follow_path
 
 
 @pytest.fixture
@@ -217,7 +216,7 @@ def test_an_arm_whose_delay_is_known_keeps_to_its_path(straight):
             else:
                 far = torch.tensor([-0.9, 0.3, 0.1, 0.3, -0.1, 0.3, -0.3]).double()
                 path = joint_line(panda.ready, panda.ready + far, speed=0.4, dt=0.01)
-                follow_path(cell, path.numpy())
+                cell.follow_path(path.numpy())
         hand = panda.forward(torch.from_numpy(cell.log["joint_position"])).position
         away = hand - torch.from_numpy(cell.log["goal_position"])
         return float(away.norm(dim=-1).max())

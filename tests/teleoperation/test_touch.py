@@ -15,7 +15,6 @@ from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import StoppedByPersonError, WorkCell, WorkCellConfig, joint_line
-from hrc_learn.skills.path_following import follow_path
 from hrc_learn.teleoperation import CombinedInput, Touch, TouchConfig
 from hrc_learn.teleoperation.touch import TorqueBias, evidence_of_none, explain
 
@@ -148,7 +147,7 @@ def there_and_back(cell, duration=3.0):
     speed = 1.875 * 0.3 / duration
     for end in (far, cell.joints.clone()):
         path = joint_line(cell.joints, end, speed=speed, dt=0.01).numpy()
-        follow_path(cell, path)
+        cell.follow_path(path)
 
 
 def off_path(cell):
