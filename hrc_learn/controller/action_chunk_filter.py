@@ -105,7 +105,7 @@ class ActionChunkFilter(nn.Module):
         _check(limits, dt)
         self.dt = dt
         limits = replace(limits, acceleration=_reduced_acceleration(limits, dt))
-        self.barrier = LimitBarrier(limits, margin=0.0, rate=1 / dt, jerk_limited=True)
+        self.barrier = LimitBarrier(limits, margin=0.0, rate=1 / dt)
         A, j = _USABLE * limits.acceleration, _USABLE * limits.jerk
         self.register_buffer("braking_acceleration", A)
         self.register_buffer("braking_jerk", j)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,7 +17,6 @@ from hrc_learn.controller.feedback import (
     BlendingState,
     Feedback,
     VisionBlending,
-    analytic_descent,
     approach_velocity,
     effective_goals,
     next_task_level,
@@ -67,9 +66,6 @@ class ControllerConfig:
     """Cap on the linear speed of the tool during a joint-space approach [m/s]."""
     approach_angular_speed: float = 2.0
     """Cap on the angular speed of the tool during a joint-space approach [rad/s]."""
-    jacobian: Literal["geometric", "analytic"] = "geometric"
-    """Metric that maps gradients to tool motion. The analytic Jacobian uses rates of the
-    rotation vector, which differ from angular velocity the more, the further the tool turns."""
     command_delay: float = 0.0
     """Time from a command until the arm follows it, servo lag included [s]. The joint velocity
     is computed at the joint positions predicted for that time."""
@@ -105,10 +101,6 @@ class ControllerConfig:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
-        if self.jacobian not in ("geometric", "analytic"):
-            raise ValueError(
-                f"jacobian must be 'geometric' or 'analytic', but is {self.jacobian!r}"
-            )
         if not self.drift_compensation_rate >= 0:
             raise ValueError(
                 "drift_compensation_rate must not be negative, but is "
@@ -249,11 +241,6 @@ class AdaptiveController(nn.Module):
                 f"the goals control the whole tool pose, which needs six joints, but the "
                 f"arm has {n}: control its position and axis, Goals.at(..., "
                 f"task='position+axis'), which leaves a null space of {left}, or its position"
-            )
-        if task != "pose" and self.config.jacobian == "analytic":
-            raise ValueError(
-                f"the analytic Jacobian needs goals of the whole orientation: for {task!r} use "
-                "ControllerConfig(jacobian='geometric')"
             )
 
     def initial_state(
@@ -422,8 +409,6 @@ class AdaptiveController(nn.Module):
     ) -> _Motion:
         """Joint velocity of the law, with drift compensation while a person acts."""
         descent = s
-        if self.config.jacobian == "analytic":
-            descent = analytic_descent(s, pose.orientation)
         d, rate = self._nullspace_input(observation), self.config.drift_compensation_rate
         xi_q = self.joint_region.gradient(q)
         if goals.rest is not None:

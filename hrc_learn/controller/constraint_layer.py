@@ -97,11 +97,10 @@ def least_change(
         index=torch.zeros_like(lower[..., :1], dtype=torch.int64),
         multiplier=nothing[..., :1],
     )
-    if early_exit:
-        now = _solve_unfinished(now, rows, lower, upper, steps)
-    else:
-        for _ in range(steps):
-            now = _next(now, rows, lower, upper)
+    for _ in range(steps):
+        if early_exit and bool(_solved(now, rows, lower, upper).all()):
+            break
+        now = _next(now, rows, lower, upper)
     return LeastChange(now.y, now.side * now.dual, _solved(now, rows, lower, upper))
 
 
@@ -110,28 +109,6 @@ def none_binds(
 ) -> Bool[Tensor, "*batch"]:
     """True where the origin is within the limits of `least_change`, for any rows."""
     return torch.maximum(lower, -upper).amax(-1) <= _TOLERANCE
-
-
-def _solve_unfinished(
-    now: _Step, rows: Tensor, lower: Tensor, upper: Tensor, steps: int
-) -> _Step:
-    """Take steps with those elements of a batch that are not solved yet."""
-    if steps == 0:
-        return now
-    waiting = ~_solved(now, rows, lower, upper)
-    if not bool(waiting.any()):
-        return now
-    if bool(waiting.all()):
-        return _solve_unfinished(_next(now, rows, lower, upper), rows, lower, upper, steps - 1)
-    # Only the unsolved elements are computed.
-    part = _Step(**{name: value[waiting] for name, value in vars(now).items()})
-    limits = rows.expand(*now.operators.shape[:-1], -1)[waiting], lower[waiting], upper[waiting]
-    part = _solve_unfinished(part, *limits, steps)
-    merged = {}
-    for name, value in vars(now).items():
-        merged[name] = value.clone()
-        merged[name][waiting] = getattr(part, name)
-    return _Step(**merged)
 
 
 def _solved(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tensor, "*batch"]:

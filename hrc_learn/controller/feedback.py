@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from hrc_learn.controller.interface import Goals, Observation
 from hrc_learn.controller.resolved_rate import excess_speed
-from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import is_number
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import PostureRegion
@@ -258,25 +258,6 @@ def _excess_rate(
     distance = torch.linalg.vector_norm(error, dim=-1, keepdim=True)
     allowed = vision_rate * distance + _LEAST_PIXEL_RATE
     return (speed / allowed).clamp(min=1)
-
-
-def analytic_descent(
-    s: Float[Tensor, "*batch 6"], orientation: Float[Tensor, "*batch 4"]
-) -> Float[Tensor, "*batch 6"]:
-    """Twist B B^T s, for which J^+ (B B^T s) = J_A^+ (J_sA^T xi_x + xi_rA).
-
-    With r_dot = B^-1 twist, B = diag(I, J_l(phi)) for the rotation vector phi of the tool, the
-    analytic Jacobian is J_A = B^-1 J, so J_A^+ = J^+ B, and a gradient over r is B^T times one
-    over small motions of the tool. Both laws use the s of the geometric form; they differ in
-    the metric that maps a gradient to a motion.
-
-    Args:
-        s: J_s_hat^T xi_x + xi_r of the geometric form.
-        orientation: Orientation of the tool.
-    """
-    phi = quaternion.log(orientation)
-    turn = quaternion.left_jacobian(phi, quaternion.left_jacobian_transposed(phi, s[..., 3:]))
-    return torch.cat([s[..., :3], turn], dim=-1)
 
 
 def potential_rate(

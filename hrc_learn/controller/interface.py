@@ -119,12 +119,6 @@ class Goals:
             self, position=replace(self.position, centre=centre, half_size=half_size)
         )
 
-    def turned_to(self, orientation: Float[Tensor, "*#batch 4"]) -> Goals:
-        """The goals with another tool orientation, where orientation is controlled."""
-        if self.orientation is None:
-            return self
-        return replace(self, orientation=replace(self.orientation, goal=orientation))
-
     def aimed_at(self, target: Float[Tensor, "*#batch rows"]) -> Goals:
         """The goals with another target in the image [px]."""
         return replace(self, vision=replace(self.vision, target=target))

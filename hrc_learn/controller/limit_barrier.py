@@ -30,7 +30,7 @@ class LimitBarrier(nn.Module):
 
     To brake, a joint ramps its acceleration a down to -A. Braking *at once* with A, but from
     v_hat instead of v, takes a distance that is longer by (a + A)^3/(6 j^2). So one curve h is
-    safe for every a. Without a jerk limit v_hat = v.
+    safe for every a.
 
     The set is invariant in discrete time. Assume that step k starts inside the set with
     v_hat_k, that the joint moves by v_k dt, and that the next acceleration is
@@ -92,7 +92,7 @@ class LimitBarrier(nn.Module):
     twice_acceleration: Tensor
     """2 A of Q [rad/s^2]."""
     reserve: Tensor
-    """v_hat - v at a = 0, which is A^2/(2 j) [rad/s]; zero without a jerk limit."""
+    """v_hat - v at a = 0, which is A^2/(2 j) [rad/s]."""
 
     def __init__(
         self,
@@ -100,7 +100,6 @@ class LimitBarrier(nn.Module):
         *,
         margin: float,
         rate: float,
-        jerk_limited: bool,
         rests_outside: bool = False,
         delay: float = 0.0,
         jitter: float = 0.0,
@@ -112,16 +111,14 @@ class LimitBarrier(nn.Module):
             margin: Distance kept from every position limit [rad]; wider where
                 position-dependent velocity limits require it.
             rate: Fastest decay of the remaining distance [1/s].
-            jerk_limited: True if the acceleration changes by at most j dt in a step.
             rests_outside: True if a joint outside its limits may rest there.
             delay: Time until the joints follow a command [s].
             jitter: Largest relative excess of a step over its dt.
         """
         super().__init__()
         self.rests_outside = rests_outside
-        self.jerk_limited = jerk_limited
         A, j = limits.acceleration, limits.jerk
-        reserve = A**2 / (2 * j) if jerk_limited else torch.zeros_like(A)
+        reserve = A**2 / (2 * j)
         slowest, decay_time = A / (1 + jitter), torch.full_like(A, 1 / rate)
         margins = torch.full_like(A, margin)
         if limits.velocity_offset is not None and limits.deceleration is not None:
@@ -170,8 +167,7 @@ class LimitBarrier(nn.Module):
         # it may approach the wall from the same distance inside. |delta| keeps the root real.
         square = torch.addcmul(self.knee_square, self.twice_acceleration, delta.abs())
         speed = torch.copysign(square.sqrt() - self.knee, delta)
-        if self.jerk_limited:
-            speed = speed - self.reserve  # v_hat = v + A^2/(2 j) at a = 0
+        speed = speed - self.reserve  # v_hat = v + A^2/(2 j) at a = 0
         if self.rests_outside:
             speed = speed.clamp(min=0)
         most = (1 - 2 * _ROUNDING * torch.finfo(self.velocity.dtype).eps) * self.velocity
@@ -255,21 +251,16 @@ class LimitBarrier(nn.Module):
             dt: Step [s], one for all arms or one for each.
         """
         A, _ = self.usable(dt)
-        if self.jerk_limited:
-            allowed = self.acceleration_bounds(velocity, bounds, dt)
-            reachable = self._reachable_acceleration(acceleration, dt)
-            lowest, highest = (a.clamp(*allowed).clamp(*reachable) for a in (-A, A))
-            return velocity + dt * lowest, velocity + dt * highest
-        lower, upper = velocity - A * dt, velocity + A * dt
-        return bounds[0].clamp(lower, upper), bounds[1].clamp(lower, upper)
+        allowed = self.acceleration_bounds(velocity, bounds, dt)
+        reachable = self._reachable_acceleration(acceleration, dt)
+        lowest, highest = (a.clamp(*allowed).clamp(*reachable) for a in (-A, A))
+        return velocity + dt * lowest, velocity + dt * highest
 
 
 # Velocity that ramps of the acceleration may add while the arm eases off, as a fraction of the
 # velocity limits at a cap of 1 m/s: it decides how gently the arm eases off. It falls with the
 # square of the cap, as the turning of the links does that gentle braking has to allow for.
 _RAMP = 0.005
-# Jerk [rad/s^3] in place of an infinite one, of which differences would be NaN.
-_NO_LIMIT = 1e9
 
 
 @final
@@ -308,7 +299,7 @@ class SpeedBarrier(nn.Module):
     deceleration: Tensor
     """A/kappa [rad/s^2], at which joints ease off."""
     jerk: Tensor
-    """j [rad/s^3]; huge without a jerk limit."""
+    """j [rad/s^3]."""
     fade: Tensor
     """tau, time in which the braking fades out at its end [s]."""
     decay: Tensor
@@ -325,8 +316,6 @@ class SpeedBarrier(nn.Module):
         """
         super().__init__()
         A, j = joints.acceleration, joints.jerk
-        if not joints.jerk_limited:
-            j = torch.full_like(j, _NO_LIMIT)
         gentle = min(cap, 1.0) * (2 * _RAMP * j * joints.velocity).sqrt()
         # A joint that may not move has a velocity limit of zero.
         deceleration = torch.minimum(A, gentle).clamp(min=1e-3 * A)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, final, runtime_checkable
+from typing import NamedTuple, final
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,7 +24,7 @@ from hrc_learn.controller.safety_state import (
     SafetyState,
 )
 from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number
-from hrc_learn.kinematics import JointLimits, MotionLimits, SerialChain
+from hrc_learn.kinematics import MotionLimits, SerialChain
 from hrc_learn.pytree import pytree
 
 # Smallest relative excess, or change of a joint velocity [rad/s], reported as an intervention.
@@ -43,16 +43,6 @@ _SHORTEST_STEP = 1e-3
 # Fraction of the velocity limits by which a measured velocity may differ from the one of a
 # start: encoders at 1 kHz err by some hundredths of a radian per second.
 _START_ERROR = 0.03
-
-
-@runtime_checkable
-class HasLimits(Protocol):
-    """An arm or a kinematic chain with joint limits."""
-
-    @property
-    def limits(self) -> JointLimits:
-        """Joint limits."""
-        ...
 
 
 class _Inputs(NamedTuple):
@@ -100,7 +90,7 @@ class SafetyFilter(nn.Module):
     fades in time for the velocity to arrive without overshoot, so stops and resumes are smooth.
     """
 
-    def __init__(self, limits: MotionLimits | HasLimits, config: SafetyConfig | None = None):
+    def __init__(self, limits: MotionLimits | SerialChain, config: SafetyConfig | None = None):
         """Prepare the filter.
 
         Args:
@@ -123,7 +113,6 @@ class SafetyFilter(nn.Module):
             rate=config.rate,
             delay=config.delay,
             jitter=config.jitter,
-            jerk_limited=config.jerk_limited,
             rests_outside=True,
         )
         self.speed_barrier = SpeedBarrier(self.barrier, config.tcp_speed)
@@ -421,7 +410,7 @@ class SafetyFilter(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The velocity nearest to a target within limits of acceleration and jerk.
 
-        With a jerk limit, the wanted acceleration is the largest fraction of change/dt, alike
+        The wanted acceleration is the largest fraction of change/dt, alike
         for all joints, with which they keep their acceleration limits and can still fade it out
         in time:  a dt + a^2/(2 j) <= change.
 
@@ -437,14 +426,6 @@ class SafetyFilter(nn.Module):
         acceleration, jerk = barrier.usable(dt)
         change = (target - state.velocity) / dt
         excess = _excess(change, acceleration)
-        if not self.config.jerk_limited:
-            v = torch.addcdiv(state.velocity, change * dt, excess.clamp(min=1))
-            if bounds is not None:
-                # The acceleration limit comes last: the arm could not brake harder anyway.
-                v = v.clamp(*bounds)
-            reach = acceleration * dt
-            v = v.clamp(state.velocity - reach, state.velocity + reach)
-            return v, _acts(excess), torch.zeros_like(_acts(excess))
         # a = change/s with the root s of a dt + a^2/(2 j) = change dt, which fades out in time.
         fading = (1 + torch.sqrt(1 + 2 * _excess(change, jerk * dt))) / 2
         v, excess_j = self._accelerated(given, change / torch.maximum(excess, fading), bounds)
@@ -471,11 +452,9 @@ class SafetyFilter(nn.Module):
 
     def _easing(self, given: _Inputs) -> Tensor:
         """The velocity with which the arm brakes as the speed barrier assumes [rad/s]."""
-        v, dt = given.state.velocity, given.dt
-        T = self.speed_barrier.braking_time(v).clamp(min=dt)
-        if self.config.jerk_limited:
-            return self._accelerated(given, -v / T, given.bounds)[0]
-        return self._limit_acceleration(given, v * (1 - dt / T), given.bounds)[0]
+        v = given.state.velocity
+        T = self.speed_barrier.braking_time(v).clamp(min=given.dt)
+        return self._accelerated(given, -v / T, given.bounds)[0]
 
     @property
     def _exits_early(self) -> bool:
@@ -561,12 +540,11 @@ class SafetyFilter(nn.Module):
     ) -> tuple[SafetyState, SafetyReport]:
         """The next state, and the report."""
         before = given.state
-        # Of the rounded velocities: errors do not add up, and a check finds the same.
-        acceleration = (v - before.velocity) / given.dt
         too_fast = torch.where(excess > _REPORTED, before.too_fast + before.dt, 0.0)
         state = SafetyState(
             velocity=v,
-            acceleration=acceleration if self.config.jerk_limited else before.acceleration,
+            # Of the rounded velocities: errors do not add up, and a check finds the same.
+            acceleration=(v - before.velocity) / given.dt,
             position=given.joint_position + v * given.dt,
             dt=before.dt,
             fresh=torch.zeros_like(before.fresh),

@@ -35,8 +35,6 @@ class SafetyConfig:
     by up to 1.2 % of the limit (in MuJoCo)."""
     rate: float = 5.0
     """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
-    jerk_limited: bool = True
-    """True if joint jerk is limited, which starts to matter below 4 ms a step."""
     braking: float = 1.0
     """Fraction of the acceleration and jerk limits that the arm's driver uses, in (0, 1].
     franky plans with its `dynamics` factor, 0.3 by default in our adapter."""
@@ -82,7 +80,7 @@ class SafetyState:
     velocity: Float[Tensor, "*batch n"]
     """Velocity of the last step [rad/s]."""
     acceleration: Float[Tensor, "*batch n"]
-    """Acceleration of the last step [rad/s^2]; zero where jerk is not limited."""
+    """Acceleration of the last step [rad/s^2]."""
     position: Float[Tensor, "*batch n"]
     """Predicted joint positions [rad], used while the measurement is invalid."""
     dt: Float[Tensor, "*batch"]

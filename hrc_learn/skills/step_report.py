@@ -1,4 +1,4 @@
-"""Reports of a control step: feedback to the person who guides an arm, and columns of the log."""
+"""Reports of a control step: feedback to the person who guides an arm, and the log."""
 
 import math
 from collections.abc import Iterable, Mapping

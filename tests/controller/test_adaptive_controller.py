@@ -213,31 +213,3 @@ def test_bad_settings_are_refused():
         ControllerConfig(null_damping=0.0)
     with pytest.raises(ValueError, match="drift_compensation_rate must not be negative"):
         ControllerConfig(drift_compensation_rate=-1.0)
-
-
-def test_the_analytic_law_is_that_of_the_analytic_jacobian():
-    """J_A as the derivative of (position, rotation vector) over the joints, by autograd."""
-    rng = sampling.generator(19)
-    config = replace(ControllerConfig.paper(), jacobian="analytic")
-    controller, _ = grasping(rng=rng, config=config)
-    q = POSTURE + 0.2 * torch.randn(7, generator=rng, dtype=DOUBLE)
-    feature = torch.tensor([640.0, 500.0], dtype=DOUBLE)
-    command, _ = controller.step(controller.initial_state(q), observe(q, feature=feature))
-
-    goals, pose = controller.goals, panda.forward(q)
-    J_A = torch.autograd.functional.jacobian(lambda q: panda.forward(q).vector(), q)
-    J = panda.jacobian(q)
-    # The same motion of the tool in both coordinates: J = B J_A.
-    B = J @ torch.linalg.pinv(J_A)
-    J_s = controller.estimator.network(pose) @ B
-    orientation = replace(goals.orientation, coordinates="rotation_vector")
-    xi_r = torch.cat(
-        [
-            goals.position.gradient(pose.position),
-            orientation.gradient(pose.orientation),
-        ]
-    )
-    u = -torch.linalg.pinv(J_A) @ (J_s.mT @ goals.vision.gradient(feature) + xi_r)
-    torch.testing.assert_close(command.twist, J @ u)
-    with shapes_unchecked(), pytest.raises(ValueError, match="'geometric' or 'analytic'"):
-        ControllerConfig(jacobian="other")

@@ -49,7 +49,7 @@ def test_braking_stays_in_the_set_and_short_of_the_limit(
 def test_the_bounds_on_acceleration_reach_the_edge_of_the_set():
     """Put back into v_hat they give the bound on velocity, plus the reserve."""
     rng = sampling.generator()
-    barrier = LimitBarrier(LIMITS, margin=0.02, rate=5.0, jerk_limited=True)
+    barrier = LimitBarrier(LIMITS, margin=0.02, rate=5.0)
     q = sampling.within(LIMITS.lower, LIMITS.upper, 50, rng=rng)
     lower, upper = bounds = barrier.velocity_bounds(q)
     unit = torch.rand(50, 7, generator=rng, dtype=torch.float64)

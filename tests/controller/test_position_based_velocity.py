@@ -29,7 +29,7 @@ CONFIGS = {
     "default": SafetyConfig(),
     "no margins": SafetyConfig(margin=0.0, velocity_margin=0.0, rate=100.0),
     "driver of a real arm": SafetyConfig(braking=0.3, delay=0.03, jitter=0.3),
-    "strong and slow": SafetyConfig(rate=1.0, jerk_limited=False),
+    "strong and slow": SafetyConfig(rate=1.0),
 }
 # Which libfranka takes off its limits.
 TOLERANCE = 1e-3

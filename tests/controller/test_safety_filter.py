@@ -88,33 +88,12 @@ def assert_limits_kept(q: Tensor, before: SafetyState, state: SafetyState, dt: f
     torch.testing.assert_close(state.acceleration, a, rtol=0, atol=1e-9)
 
 
-@shapes_unchecked()  # for speed
-def test_without_a_jerk_limit_the_others_hold():
-    safety = SafetyFilter(LIMITS, SafetyConfig(jerk_limited=False))
-    q = inside(40, seed=2)
-    state = safety.initial_state(q)
-    most = 0.0
-    for _ in range(300):
-        before = state.velocity
-        v, state, _ = safety.step(state, q, 50 * torch.sign(q - LIMITS.middle), 0.002)
-        q = q + v * 0.002
-        assert (v.abs() <= LIMITS.velocity).all()
-        a = (v - before) / 0.002
-        most = max(most, a.abs().amax().item())
-        assert (a.abs() <= LIMITS.acceleration * (1 + 1e-9)).all()
-        assert LIMITS.contain(q).all()
-    assert most > 10
-    assert (state.acceleration == 0).all()
-
-
 @pytest.mark.parametrize("side", [1, -1])
-@pytest.mark.parametrize("jerk_limited", [True, False])
 @shapes_unchecked()  # for speed
-def test_beyond_a_limit_it_brakes_as_hard_as_the_arm_can_and_no_harder(jerk_limited, side):
+def test_beyond_a_limit_it_brakes_as_hard_as_the_arm_can_and_no_harder(side):
     """Pushed across its limits at full speed, no admissible motion keeps them: those of
     acceleration and jerk hold all the same, the joints come to rest, and back when asked to."""
-    dt, config = 0.001, SafetyConfig(jerk_limited=jerk_limited)
-    safety = SafetyFilter(LIMITS, config)
+    dt, safety = 0.001, SafetyFilter(LIMITS)
     wall = LIMITS.upper if side > 0 else LIMITS.lower
     q = wall + side * 0.05
     state = safety.initial_state(q, side * 0.9 * LIMITS.velocity)
@@ -130,9 +109,8 @@ def test_beyond_a_limit_it_brakes_as_hard_as_the_arm_can_and_no_harder(jerk_limi
         a = (v - before.velocity) / dt
         hardest = torch.maximum(hardest, -side * a)
         assert (a.abs() <= LIMITS.acceleration * (1 + 1e-9)).all()
-        if jerk_limited:
-            change = (a - before.acceleration).abs()
-            assert (change <= LIMITS.jerk * dt * (1 + 1e-9)).all()
+        change = (a - before.acceleration).abs()
+        assert (change <= LIMITS.jerk * dt * (1 + 1e-9)).all()
     torch.testing.assert_close(hardest, LIMITS.acceleration)
     assert LIMITS.contain(q)
 
@@ -160,10 +138,9 @@ def test_a_stop_and_a_resume_are_smooth(dt: float):
         torch.testing.assert_close(v, target, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("jerk_limited", [True, False])
-def test_it_stops_short_of_the_limit_by_the_margin(jerk_limited: bool):
-    """With a jerk limit also by the room it takes to start braking."""
-    config = SafetyConfig(margin=0.05, jerk_limited=jerk_limited)
+def test_it_stops_short_of_the_limit_by_the_margin():
+    """And by the room it takes to start braking."""
+    config = SafetyConfig(margin=0.05)
     safety = SafetyFilter(LIMITS, config)
     q = READY
     state = safety.initial_state(q)
@@ -171,7 +148,7 @@ def test_it_stops_short_of_the_limit_by_the_margin(jerk_limited: bool):
         for _ in range(2000):
             v, state, _ = safety.step(state, q, 9 * torch.ones(7, dtype=torch.float64), 0.004)
             q = q + v * 0.004
-    v_hat = LIMITS.acceleration**2 / (2 * LIMITS.jerk) * jerk_limited
+    v_hat = LIMITS.acceleration**2 / (2 * LIMITS.jerk)
     room = v_hat / config.rate + v_hat**2 / (2 * LIMITS.acceleration)
     torch.testing.assert_close(q, LIMITS.upper - 0.05 - room, rtol=0, atol=1e-6)
 
@@ -191,15 +168,12 @@ HALTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("jerk_limited", [True, False])
 @pytest.mark.parametrize("depth", [-0.2, -0.001, 0.001, 0.0215])
 @pytest.mark.parametrize("halt", HALTS)
 @shapes_unchecked()  # for speed
-def test_outside_its_limits_a_stopped_arm_rests_and_returns_when_asked(
-    halt, depth, jerk_limited
-):
+def test_outside_its_limits_a_stopped_arm_rests_and_returns_when_asked(halt, depth):
     """Past the limits, within the margin, and nearer to it than it takes to start braking."""
-    safety = SafetyFilter(LIMITS, SafetyConfig(jerk_limited=jerk_limited))
+    safety = SafetyFilter(LIMITS)
     q, dt = (
         torch.where(torch.arange(7) % 2 == 0, LIMITS.lower + depth, LIMITS.upper - depth),
         0.004,
@@ -317,7 +291,7 @@ def test_interventions_are_counted_by_kind():
 
 @pytest.mark.parametrize(("beyond", "flagged"), [(1e-13, False), (1e-3, True)])
 def test_rounding_is_no_intervention(beyond: float, flagged: bool):
-    """Commands are often led exactly along a limit: here of position, and of acceleration."""
+    """Commands are often led exactly along a limit."""
     safety, dt = SafetyFilter(LIMITS), 0.002
     q = READY.clone()
     q[1] = LIMITS.upper[1] - 0.1
@@ -326,11 +300,6 @@ def test_rounding_is_no_intervention(beyond: float, flagged: bool):
     steady = safety.initial_state(q, u.clone())
     _, _, report = safety.step(steady, q, u, dt)
     assert bool(report.acted("position")) == flagged
-    u = LIMITS.acceleration * dt * (1 + beyond)
-    _, _, report = SafetyFilter(LIMITS, SafetyConfig(jerk_limited=False)).step(
-        safety.initial_state(READY), READY, u, dt
-    )
-    assert bool(report.acted("acceleration")) == flagged
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, 0.3])

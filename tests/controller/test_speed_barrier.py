@@ -85,10 +85,9 @@ def test_a_cap_that_falls_too_fast_is_reported_until_it_is_kept():
     assert not any(times[10 + too_long :])
 
 
-@pytest.mark.parametrize("limited", [True, False])
-def test_a_start_from_the_measured_motion_continues_it(limited):
+def test_a_start_from_the_measured_motion_continues_it():
     """Also where the caller said that the arm rests: then the report says so."""
-    safety, dt = SafetyFilter(panda, SafetyConfig(jerk_limited=limited)), 0.002
+    safety, dt = SafetyFilter(panda), 0.002
     v0 = 0.9 * panda.limits.velocity
     told = safety.initial_state(READY, v0, torch.zeros_like(v0))
     wrong = safety.initial_state(READY)

@@ -22,8 +22,8 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, Touch, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.skills.placing import PlaceCorrection
+from hrc_learn.skills.work_cell import TaskFailedError
 
 WORKPLACE = Workplace()
 SHELVES = WORKPLACE.shelf_names()

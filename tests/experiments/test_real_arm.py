@@ -16,8 +16,8 @@ from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.skills.grasping import as_load, joint_plan
+from hrc_learn.skills.work_cell import TaskFailedError
 
 pytest.importorskip("franky")
 pytest.importorskip("franky_sim")
