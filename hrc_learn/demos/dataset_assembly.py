@@ -9,24 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from hrc_learn.demos.read import metadata
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
 from hrc_learn.demos.read.dataset_folder import episode_lists, open_folder
-from hrc_learn.demos.read.metadata import (
-    CHUNK_SIZE,
-    DATA_PATH,
-    EPISODES_PATH,
-    FILE_SIZE_MB,
-    SIDECAR_PATH,
-    VIDEO_PATH,
-    Sidecar,
-    combined_statistics,
-    data_schema,
-    dump_json,
-    info_content,
-    place,
-    read_sidecar,
-    write_tasks,
-)
 from hrc_learn.demos.recorded_episode import (
     RecordingHeader,
     StagedEpisode,
@@ -68,7 +53,7 @@ def assemble(
     if earlier is not None:
         _carry_over(earlier, listed, cameras)
         # Details and contract kept with the earlier dataset also hold for the longer one.
-        before = read_sidecar(earlier)
+        before = metadata.read_sidecar(earlier)
         details = before.details | sidecar.details
         sidecar = replace(sidecar, details=details, contract=before.contract)
     listed.tasks |= dict.fromkeys(tasks)
@@ -76,7 +61,9 @@ def assemble(
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
     segments = iter(videos)
     for file, group in enumerate(_by_size(paths), start=listed.data_files):
-        for staged in _write_frames(target / place(DATA_PATH, file), header, group):
+        for staged in _write_frames(
+            target / metadata.place(metadata.DATA_PATH, file), header, group
+        ):
             listed.add(staged, file, next(segments))
     _write_metadata(target, header, listed, sidecar)
 
@@ -117,8 +104,8 @@ class _EpisodeList:
             "episode_index": self.episodes,
             "tasks": list(staged.tasks),
             "length": length,
-            "data/chunk_index": file // CHUNK_SIZE,
-            "data/file_index": file % CHUNK_SIZE,
+            "data/chunk_index": file // metadata.CHUNK_SIZE,
+            "data/file_index": file % metadata.CHUNK_SIZE,
             "dataset_from_index": self.frames,
             "dataset_to_index": self.frames + length,
         }
@@ -137,13 +124,13 @@ class _EpisodeList:
         """Place the file of a segment, once for all episodes in it."""
         if (key, segment.file) not in self._placed:
             number = self.videos.get(key, 0)
-            path = self.target / place(VIDEO_PATH, number, video_key=key)
+            path = self.target / metadata.place(metadata.VIDEO_PATH, number, video_key=key)
             _put(segment.file, path, link=self._link)
             self.videos[key], self._placed[key, segment.file] = number + 1, number
         number = self._placed[key, segment.file]
         return {
-            f"videos/{key}/chunk_index": number // CHUNK_SIZE,
-            f"videos/{key}/file_index": number % CHUNK_SIZE,
+            f"videos/{key}/chunk_index": number // metadata.CHUNK_SIZE,
+            f"videos/{key}/file_index": number % metadata.CHUNK_SIZE,
             f"videos/{key}/from_timestamp": segment.start,
             f"videos/{key}/to_timestamp": segment.stop,
         }
@@ -177,7 +164,7 @@ def _count_files(table: pa.Table, kind: str) -> int:
     chunks, files = (
         table.column(f"{kind}/{part}_index").to_pylist() for part in ("chunk", "file")
     )
-    return 1 + max(c * CHUNK_SIZE + f for c, f in zip(chunks, files, strict=True))
+    return 1 + max(c * metadata.CHUNK_SIZE + f for c, f in zip(chunks, files, strict=True))
 
 
 def _write_frames(
@@ -185,7 +172,7 @@ def _write_frames(
 ) -> Iterator[StagedEpisode]:
     """Write a data file, one row group per episode."""
     path.parent.mkdir(exist_ok=True)
-    schema = data_schema(read_episode(group[0]).table.schema, header.features)
+    schema = metadata.data_schema(read_episode(group[0]).table.schema, header.features)
     with pq.ParquetWriter(path, schema, write_page_checksum=True) as writer:
         for staged in map(read_episode, group):
             writer.write_table(staged.table.cast(schema))
@@ -197,7 +184,7 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
     group, size = [], 0
     for path in paths:
         size += path.stat().st_size
-        if group and size > FILE_SIZE_MB * 2**20:
+        if group and size > metadata.FILE_SIZE_MB * 2**20:
             yield group
             group, size = [], path.stat().st_size
         group.append(path)
@@ -205,12 +192,12 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _write_metadata(
-    target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: Sidecar
+    target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: metadata.Sidecar
 ) -> None:
     table, tasks = listed.table(), list(listed.tasks)
-    write_tasks(target / "meta/tasks.parquet", tasks)
-    write_parquet(table, target / EPISODES_PATH)
-    content = info_content(
+    metadata.write_tasks(target / "meta/tasks.parquet", tasks)
+    write_parquet(table, target / metadata.EPISODES_PATH)
+    content = metadata.info_content(
         header.features,
         header.fps,
         header.robot_type,
@@ -218,7 +205,7 @@ def _write_metadata(
         frames=listed.frames,
         tasks=len(tasks),
     )
-    dump_json(target / "meta/info.json", content)
+    metadata.dump_json(target / "meta/info.json", content)
     stacked: dict[str, dict[str, np.ndarray]] = {}
     for name in table.column_names:
         column = table.column(name)
@@ -226,9 +213,9 @@ def _write_metadata(
         if name.startswith("stats/") and not column.null_count:
             key, _, statistic = name.removeprefix("stats/").rpartition("/")
             stacked.setdefault(key, {})[statistic] = np.array(column.to_pylist())
-    dump_json(target / "meta/stats.json", combined_statistics(stacked))
-    if sidecar != Sidecar():
-        dump_json(target / SIDECAR_PATH, sidecar)
+    metadata.dump_json(target / "meta/stats.json", metadata.combined_statistics(stacked))
+    if sidecar != metadata.Sidecar():
+        metadata.dump_json(target / metadata.SIDECAR_PATH, sidecar)
 
 
 def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> None:

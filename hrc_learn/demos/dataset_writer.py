@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_folder import (
@@ -16,24 +17,6 @@ from hrc_learn.demos.read.dataset_folder import (
     staging_folder,
 )
 from hrc_learn.demos.read.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
-from hrc_learn.demos.recorded_episode import (
-    Episode,
-    EpisodeBuffer,
-    RecordedColumn,
-    RecordingHeader,
-    StagedEpisode,
-    columns_for,
-    complete,
-    describe_difference,
-    encode,
-    episode_path,
-    index_columns,
-    lerobot_features,
-    require_valid,
-    sidecar_of,
-    to_table,
-    write_episode,
-)
 from hrc_learn.demos.recording_recovery import begin, discard, finish
 from hrc_learn.demos.videos import CameraRecorder, Image, video_features
 from hrc_learn.store import DATASET, Claim
@@ -112,9 +95,9 @@ class DatasetWriter:
         self.features = {key: tuple(names) for key, names in (features or {}).items()}
         self._frames_of_poses = dict(frames or {})
         self._details = dict(details or {})
-        self._columns: list[RecordedColumn] = []
+        self._columns: list[recorded.RecordedColumn] = []
         self._task: str | None = None
-        self._buffer = EpisodeBuffer(self.joint_names, self.features)
+        self._buffer = recorded.EpisodeBuffer(self.joint_names, self.features)
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0
         self.episodes = 0
@@ -249,19 +232,19 @@ class DatasetWriter:
         """
         if self._video_features:
             raise RuntimeError("a draft holds no images: save episodes instead")
-        buffer = EpisodeBuffer(self.joint_names, self.features)
+        buffer = recorded.EpisodeBuffer(self.joint_names, self.features)
         for values in frames:
             buffer.append(values)
         _, staged = self._staged(buffer.arrays(), task, self._tasks.get(task, len(self._tasks)))
-        write_episode(episode_path(self._staging, self.episodes), staged)
+        recorded.write_episode(recorded.episode_path(self._staging, self.episodes), staged)
 
     def discard_draft(self) -> None:
         """Delete the draft, if any."""
-        episode_path(self._staging, self.episodes).unlink(missing_ok=True)
+        recorded.episode_path(self._staging, self.episodes).unlink(missing_ok=True)
 
     def discard_episode(self) -> None:
         """Delete the open episode, if any."""
-        self._task, self._buffer = None, EpisodeBuffer(self.joint_names, self.features)
+        self._task, self._buffer = None, recorded.EpisodeBuffer(self.joint_names, self.features)
         self._images.discard()
 
     def finalize(self) -> Path:
@@ -314,19 +297,19 @@ class DatasetWriter:
             raise RuntimeError("no episode is open: call start_episode(task) first")
         return self._task
 
-    def _save(self, episode: Episode, task: str) -> int:
+    def _save(self, episode: recorded.Episode, task: str) -> int:
         number = self._tasks.get(task, len(self._tasks))
         self._columns, staged = self._staged(episode, task, number)
         self._tasks[task] = number
         staged.statistics.update(self._images.finish(self.episodes))
-        write_episode(episode_path(self._staging, self.episodes), staged)
+        recorded.write_episode(recorded.episode_path(self._staging, self.episodes), staged)
         self._saved_frames += len(staged.table)
         self.episodes += 1
         return self.episodes - 1
 
     def _staged(
-        self, episode: Episode, task: str, number: int
-    ) -> tuple[list[RecordedColumn], StagedEpisode]:
+        self, episode: recorded.Episode, task: str, number: int
+    ) -> tuple[list[recorded.RecordedColumn], recorded.StagedEpisode]:
         """Columns of an episode, and the episode ready to be written.
 
         Args:
@@ -336,43 +319,45 @@ class DatasetWriter:
         """
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
-        episode = complete(episode, self.fps)
-        columns = columns_for(episode.keys(), self.joint_names, self.features)
+        episode = recorded.complete(episode, self.fps)
+        columns = recorded.columns_for(episode.keys(), self.joint_names, self.features)
         try:
             if self._columns and columns != self._columns:
                 first = [column.given for column in self._columns]
-                raise ValueError(describe_difference(episode.keys(), first))
-            require_valid(episode)
+                raise ValueError(recorded.describe_difference(episode.keys(), first))
+            recorded.require_valid(episode)
         except ValueError as error:
             raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
-        values = encode(columns, episode) | index_columns(
+        values = recorded.encode(columns, episode) | recorded.index_columns(
             self.fps, self.episodes, self._saved_frames, np.full(len(episode["time"]), number)
         )
         header = self._header(columns)
         if self._earlier is not None:
             _require_same_columns(self._earlier, header)
-        staged = StagedEpisode(
+        staged = recorded.StagedEpisode(
             header=header,
             tasks=[task],
             statistics=episode_statistics(values),
-            table=to_table(values, header.features),
+            table=recorded.to_table(values, header.features),
         )
         return columns, staged
 
-    def _header(self, columns: Sequence[RecordedColumn]) -> RecordingHeader:
-        return RecordingHeader(
+    def _header(self, columns: Sequence[recorded.RecordedColumn]) -> recorded.RecordingHeader:
+        return recorded.RecordingHeader(
             fps=self.fps,
             robot_type=self.robot_type,
             features={
-                **lerobot_features(columns),
+                **recorded.lerobot_features(columns),
                 **self._video_features,
                 **INDEX_FEATURES,
             },
-            sidecar=sidecar_of(columns, self.joint_names, self._frames_of_poses, self._details),
+            sidecar=recorded.sidecar_of(
+                columns, self.joint_names, self._frames_of_poses, self._details
+            ),
         )
 
 
-def _require_same_columns(folder: DatasetFolder, header: RecordingHeader) -> None:
+def _require_same_columns(folder: DatasetFolder, header: recorded.RecordingHeader) -> None:
     theirs, ours = folder.info["features"], header.features
     differing = [key for key in theirs | ours if theirs.get(key) != ours.get(key)]
     if differing:

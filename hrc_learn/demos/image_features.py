@@ -84,7 +84,11 @@ class FeatureCache:
                 episode=episode,
             )
         table = read_table(open_parquet(self._folder, path.name, episode), str(path))
-        u, v, visible = (to_numpy(table.column(c))[:, 0] for c in ("u", "v", "visible"))
+
+        def fault(row: int, message: str) -> DatasetError:
+            return DatasetError(message, file=path, episode=episode, frame=row)
+
+        u, v, visible = (to_numpy(table[c], fault)[:, 0] for c in ("u", "v", "visible"))
         if len(u) != frames:
             raise DatasetError(
                 f"{self.name} has {len(u)} frames, the episode {frames}: run hrc extract again",

@@ -62,14 +62,6 @@ class ImageReader:
         """Cameras whose images of an episode exist."""
         return tuple(key for key in self.cameras if self._exists(episode, key))
 
-    def length(self, episode: int) -> int:
-        """Number of frames of an episode.
-
-        Raises:
-            DatasetError: There is no such episode.
-        """
-        return self._entry(episode).length
-
     def size(self, camera: str) -> tuple[int, int]:
         """Declared height and width of a camera's images [px].
 
@@ -114,7 +106,7 @@ class ImageReader:
                 damaged, or lacks an image of one of these frames.
         """
         keys = self.cameras if cameras is None else tuple(cameras)
-        entry = self._entry(episode)
+        entry = self.entry(episode)
         wanted = range(entry.length) if frames is None else frames
         if not keys or not len(wanted):
             return {}
@@ -151,7 +143,7 @@ class ImageReader:
         Raises:
             DatasetError: As in `read`.
         """
-        entry = self._entry(episode)
+        entry = self.entry(episode)
         wanted = range(entry.length) if frames is None else frames
         if camera not in self.cameras:
             raise DatasetError(
@@ -168,7 +160,12 @@ class ImageReader:
         else:
             yield from self._from_video(entry, camera, wanted, size)
 
-    def _entry(self, episode: int) -> EpisodeEntry:
+    def entry(self, episode: int) -> EpisodeEntry:
+        """An episode of the dataset.
+
+        Raises:
+            DatasetError: There is no such episode.
+        """
         if episode not in self._entries:
             raise DatasetError(
                 f"there is no such episode; the dataset has {len(self._entries)}",
@@ -272,7 +269,7 @@ def _thumbnails(
     reader: ImageReader, demo: Demonstration, camera: str, most: int
 ) -> StampedImages | DatasetError:
     """Thumbnails of one camera, or the error of its video."""
-    last = reader.length(demo.episode) - 1
+    last = reader.entry(demo.episode).length - 1
     # Evenly spread, and never more than the frames there are.
     count = min(last + 1, most, 1 + int(demo.duration * _THUMBNAIL_RATE))
     frames = sorted({*np.linspace(0, last, count).astype(int).tolist()})

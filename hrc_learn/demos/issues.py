@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -53,8 +53,6 @@ class Issue:
     severity: float = 0.0
     """Size of the fault, comparable among issues of one kind."""
     level: Literal["error", "warning"] = "error"
-    check: str = ""
-    """Name of the check that found it; "" for errors raised while reading."""
 
     @property
     def kind(self) -> tuple[str, str]:
@@ -151,13 +149,13 @@ class ValidationReport:
         return None
 
     def run[**P](
-        self, name: str, check: Callable[P, Iterable[Issue]], *args: P.args, **kwargs: P.kwargs
+        self, check: Callable[P, Iterable[Issue]], *args: P.args, **kwargs: P.kwargs
     ) -> None:
-        """Run a check and file its issues under the name of the check."""
+        """Run a check and file its issues."""
 
         def collect() -> None:
             for issue in check(*args, **kwargs):
-                self.add(replace(issue, check=name))
+                self.add(issue)
 
         self.attempt(collect)
 

@@ -106,7 +106,7 @@ def test_one_row_group_an_episode(tmp_path):
 
 
 def test_large_recordings_are_cut_into_files_between_episodes(tmp_path, monkeypatch):
-    monkeypatch.setattr("hrc_learn.demos.dataset_assembly.FILE_SIZE_MB", 0.02)
+    monkeypatch.setattr("hrc_learn.demos.read.metadata.FILE_SIZE_MB", 0.02)
     motions = record(tmp_path / "set", lengths=(60, 60, 60))
     assert len(list((tmp_path / "set/data/chunk-000").iterdir())) > 1
     for demo, q in zip(load_demos(tmp_path / "set"), motions, strict=True):

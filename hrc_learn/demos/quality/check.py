@@ -31,36 +31,36 @@ from hrc_learn.demos.read.units import (
     units_from_episodes,
 )
 
-METADATA_CHECKS: dict[str, Callable[[DatasetFolder], Iterable[Issue]]] = {
-    "statistics exist": structure_checks.statistics_exist,
-    "task texts": structure_checks.task_texts,
-    "component names": structure_checks.component_names,
-    "offsets": structure_checks.offsets,
-    "unlisted files": structure_checks.unlisted_files,
-    "checksums": structure_checks.unchanged_files,
-}
-RAW_EPISODE_CHECKS: dict[
-    str, Callable[[DatasetFolder, EpisodeEntry, RawFrames], Iterable[Issue]]
-] = {
-    "indices": structure_checks.indices,
-    "finite values": episode_checks.finite_values,
-    "repetitions": episode_checks.repetitions,
-    "episode length": episode_checks.episode_length,
-    "stamps": episode_checks.recorded_stamps,
-}
-MOTION_CHECKS: dict[str, Callable[[MotionRecord], Iterable[Issue]]] = {
-    "motion present": episode_checks.motion_present,
-    "rest at the ends": episode_checks.rest_at_ends,
-    "spikes and jumps": episode_checks.spikes_and_jumps,
-    "joint speeds": episode_checks.joint_speeds,
-    "copied commands": episode_checks.copied_commands,
-}
-CONSISTENCY_CHECKS: dict[str, Callable[[consistency.FeatureProfiles], Iterable[Issue]]] = {
-    "holds": consistency.holds,
-    "noise": consistency.noise,
-    "switches": consistency.switches,
-    "exchanged columns": consistency.exchanged_columns,
-}
+METADATA_CHECKS: tuple[Callable[[DatasetFolder], Iterable[Issue]], ...] = (
+    structure_checks.statistics_exist,
+    structure_checks.task_texts,
+    structure_checks.component_names,
+    structure_checks.offsets,
+    structure_checks.unlisted_files,
+    structure_checks.unchanged_files,
+)
+RAW_EPISODE_CHECKS: tuple[
+    Callable[[DatasetFolder, EpisodeEntry, RawFrames], Iterable[Issue]], ...
+] = (
+    structure_checks.indices,
+    episode_checks.finite_values,
+    episode_checks.repetitions,
+    episode_checks.episode_length,
+    episode_checks.recorded_stamps,
+)
+MOTION_CHECKS: tuple[Callable[[MotionRecord], Iterable[Issue]], ...] = (
+    episode_checks.motion_present,
+    episode_checks.rest_at_ends,
+    episode_checks.spikes_and_jumps,
+    episode_checks.joint_speeds,
+    episode_checks.copied_commands,
+)
+CONSISTENCY_CHECKS: tuple[Callable[[consistency.FeatureProfiles], Iterable[Issue]], ...] = (
+    consistency.holds,
+    consistency.noise,
+    consistency.switches,
+    consistency.exchanged_columns,
+)
 
 
 def check_dataset(
@@ -89,8 +89,8 @@ def check_dataset(
     folder = read_metadata(report.path, report)
     if folder is None:
         return report
-    for name, check in METADATA_CHECKS.items():
-        report.run(name, check, folder)
+    for check in METADATA_CHECKS:
+        report.run(check, folder)
     parse_mapping(mapping or {}, folder.features)
     if speed_limits:
         _require_limits(folder, mapping, speed_limits)
@@ -131,8 +131,8 @@ def _first_pass(
 ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
     """Run the checks that need no units, fill in the profiles, and give the quantities."""
     for entry, frames in read_sound_episodes(folder, report):
-        for name, check in RAW_EPISODE_CHECKS.items():
-            report.run(name, check, folder, entry, frames)
+        for check in RAW_EPISODE_CHECKS:
+            report.run(check, folder, entry, frames)
         report.episodes += 1
         report.frames += entry.length
         found = None
@@ -168,24 +168,22 @@ def _check_content(
     )
     for fault in faults:
         report.add_error(fault)
-    report.run("guesses", _guesses, columns, decisions if profiles else {})
-    report.run("joint sets", _joint_sets, columns)
+    report.run(_guesses, columns, decisions if profiles else {})
+    report.run(_joint_sets, columns)
     entries = {entry.index: entry for entry in folder.episodes}
     features = [*consistency.feature_profiles(folder, entries, profiles)]
     usual = _usual_motion(columns, decisions, {f.key: f for f in features})
     doubtful = {fault.episode for fault in faults}
     _check_motions(folder, report, columns, decisions, speed_limits, usual, doubtful)
-    report.run("column ranges", consistency.column_ranges, features)
-    report.run("statistics fit", structure_checks.statistics_fit, folder, features)
-    report.run("episode lengths", consistency.lengths, [entries[i] for i in profiles])
-    report.run(
-        "command tracking", consistency.command_tracking, folder, columns, entries, profiles
-    )
+    report.run(consistency.column_ranges, features)
+    report.run(structure_checks.statistics_fit, folder, features)
+    report.run(consistency.lengths, [entries[i] for i in profiles])
+    report.run(consistency.command_tracking, folder, columns, entries, profiles)
     for feature in features:
-        report.run("sizes", consistency.sizes, feature)
-        for name, check in CONSISTENCY_CHECKS.items():
+        report.run(consistency.sizes, feature)
+        for check in CONSISTENCY_CHECKS:
             if len(feature.entries) >= consistency.FEWEST:
-                report.run(name, check, feature)
+                report.run(check, feature)
     report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
     if dataset.contract is not None:
         overruled = replaced_roles(mapping) | {*units}
@@ -227,18 +225,18 @@ def _check_motions(
             speed_limits=speed_limits,
             usual=usual,
         )
-        report.run("orientations", episode_checks.orientation_values, episode)
+        report.run(episode_checks.orientation_values, episode)
         if entry.index not in doubtful:
             if "time" in scaled:
                 stamps = (entry, "time", episode.time, folder.fps)
-                report.run("true stamps", episode_checks.stamps, *stamps)
+                report.run(episode_checks.stamps, *stamps)
             # Stamps that do not increase are reported as such; speeds make no sense then.
-            for name, check in MOTION_CHECKS.items() if episode.is_ordered else ():
-                report.run(name, check, episode)
+            for check in MOTION_CHECKS if episode.is_ordered else ():
+                report.run(check, episode)
         if episode.motion is not None:
             span = float(np.ptp(episode.motion, axis=0).max())
             sketches.append((entry, motion_sketch(episode.motion), span))
-    report.run("duplicates", episode_checks.duplicates, sketches)
+    report.run(episode_checks.duplicates, sketches)
 
 
 def _usual_motion(

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.quality.episode_edits import EpisodeEdit
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import recorded_statistics
@@ -21,15 +22,6 @@ from hrc_learn.demos.read.metadata import (
 )
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
-from hrc_learn.demos.recorded_episode import (
-    TIME_KEY,
-    RecordingHeader,
-    StagedEpisode,
-    episode_number,
-    index_columns,
-    to_table,
-    write_episode,
-)
 from hrc_learn.demos.videos import (
     Segments,
     VideoSegment,
@@ -77,7 +69,7 @@ class ColumnRewriter:
         self._task_index = {index: n for n, index in enumerate(sorted(folder.tasks))}
         self.tasks = self._task_texts()
         self._add_time = "time" not in dataset.columns.selections and fps is None
-        self._header = RecordingHeader(
+        self._header = recorded.RecordingHeader(
             fps=float(fps or folder.fps),
             robot_type=folder.robot_type or "unknown",
             features=self._features(),
@@ -120,13 +112,13 @@ class ColumnRewriter:
             elif feature.dtype != "video" or key in self._cameras:
                 features[key] = declared[key]
         if self._add_time:
-            features[TIME_KEY] = {"dtype": "float64", "shape": [1], "names": ["time"]}
+            features[recorded.TIME_KEY] = {"dtype": "float64", "shape": [1], "names": ["time"]}
         return {**features, **INDEX_FEATURES}
 
     def _sidecar(self, old: Sidecar, given: Mapping[str, str]) -> Sidecar:
         columns, units = dict(old.columns), {**old.units, **given}
         if self._add_time and columns:
-            columns["time"] = SidecarColumn(key=TIME_KEY, names=("time",))
+            columns["time"] = SidecarColumn(key=recorded.TIME_KEY, names=("time",))
             units["time"] = "s"
         return replace(old, columns=columns, units=units)
 
@@ -177,9 +169,13 @@ class ColumnRewriter:
     def stage(self, path: Path, edit: EpisodeEdit, frames_before: int) -> None:
         """Write one episode to a file of the new dataset's staging folder."""
         tasks = self._tasks(edit)
-        values = edit.frames | {TIME_KEY: edit.time[:, None]} if self._add_time else edit.frames
-        values = values | index_columns(
-            self._header.fps, episode_number(path), frames_before, tasks
+        values = (
+            edit.frames | {recorded.TIME_KEY: edit.time[:, None]}
+            if self._add_time
+            else edit.frames
+        )
+        values = values | recorded.index_columns(
+            self._header.fps, recorded.episode_number(path), frames_before, tasks
         )
         features = self._header.features
         numeric = {key: values[key] for key in features if key in values}
@@ -187,13 +183,13 @@ class ColumnRewriter:
         statistics = self._numeric_statistics(numeric)
         for key in (*self._cameras, *self._image_columns):
             statistics[key] = self._image_statistics(edit, key, others.get(key))
-        write_episode(
+        recorded.write_episode(
             path,
-            StagedEpisode(
+            recorded.StagedEpisode(
                 header=self._header,
                 tasks=[self.tasks[i] for i in dict.fromkeys(tasks.tolist())],
                 statistics=statistics,
-                table=to_table(numeric, features, others),
+                table=recorded.to_table(numeric, features, others),
             ),
         )
 

@@ -19,7 +19,6 @@ from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
     count_faults,
-    dataset_folder,
     read_episodes,
     read_info,
     read_tasks,
@@ -51,7 +50,9 @@ def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
     episodes = report.attempt(lambda: read_episodes(root, info))
     if episodes is None:
         return None
-    folder = dataset_folder(root, info, features, episodes, tasks)
+    folder = DatasetFolder(
+        root=root, info=info, features=features, episodes=episodes, tasks=tasks
+    )
     report.attempt(lambda: [report.add_error(fault) for fault in count_faults(folder)])
     return folder
 
@@ -81,7 +82,7 @@ def _sound_keys(
     parquet = open_parquet(folder.root, file, entries[0].index)
     rows, schema = parquet.metadata.num_rows, parquet.schema_arrow
     report.attempt(lambda: require_rows(file, entries, rows, folder.promised_rows[file]))
-    report.run("declared columns", _column_faults, folder, file, schema, report)
+    report.run(_column_faults, folder, file, schema, report)
     numeric = [key for key, feature in folder.features.items() if feature.numeric]
     return [key for key in numeric if schema.names.count(key) == 1], rows
 

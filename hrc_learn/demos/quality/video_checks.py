@@ -76,11 +76,10 @@ def _check_camera(
             if not is_inside(folder.root, name):
                 raise DatasetError("leads out of the dataset: it is not followed")
             stream = _read_stream(path)
-            report.run("video size and rate", _size_and_rate, folder, stream, place)
-            report.run("video length", _length, folder, shown, stream, place)
+            report.run(_size_and_rate, folder, stream, place)
+            report.run(_length, folder, shown, stream, place)
             if number % every == 0:
-                for issue in _images(folder, shown, place):
-                    report.add(issue)
+                report.run(_images, folder, shown, place)
         except DatasetError as error:
             report.add(Issue(message=error.issue.message, episode=first, **place))
             continue
@@ -197,6 +196,5 @@ def _images(folder: DatasetFolder, shown: Shown, place: dict[str, Any]) -> Itera
             yield warning(
                 message=f"shows {blank} at the beginning, in the middle and at the end",
                 episode=entry.index,
-                check="video images",
                 **place,
             )

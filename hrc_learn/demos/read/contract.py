@@ -27,7 +27,7 @@ from hrc_learn.demos.read.metadata import (
 )
 from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, is_discrete
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES, is_hand, joint_of
-from hrc_learn.demos.read.units import UnitDecision, comes_in
+from hrc_learn.demos.read.units import UnitDecision, units_of
 from hrc_learn.store import Count, new_file
 
 _QUANTITIES = {
@@ -92,7 +92,7 @@ class ComponentContract:
         """Unit of the component if it is read as this quantity; "" if unknown."""
         if self.quantity == role:
             return self.unit or ROLES[role].unit
-        return self.unit if comes_in(role, self.unit) else ""
+        return self.unit if self.unit in units_of(role) else ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partialmethod
 from itertools import accumulate
@@ -74,15 +74,27 @@ class DatasetFolder:
     """Metadata of a dataset, in one form for every version."""
 
     root: Path
-    version: str
-    fps: float
-    robot_type: str | None
+    info: dict
+    """Content of `meta/info.json`."""
     features: dict[str, Feature]
     episodes: tuple[EpisodeEntry, ...]
     tasks: dict[int, str]
     """Task text by index."""
-    info: dict
-    """Content of `meta/info.json`."""
+
+    @property
+    def version(self) -> str:
+        """Version of the format, such as "v3.0"."""
+        return str(self.info["codebase_version"])
+
+    @property
+    def fps(self) -> float:
+        """Nominal frame rate [1/s]."""
+        return float(self.info["fps"])
+
+    @property
+    def robot_type(self) -> str | None:
+        """Name of the robot."""
+        return self.info.get("robot_type")
 
     @property
     def is_v3(self) -> bool:
@@ -122,28 +134,12 @@ def open_folder(path: str | Path) -> DatasetFolder:
     """
     root = Path(path)
     info = read_info(root)
-    return dataset_folder(
-        root, info, read_features(info), read_episodes(root, info), read_tasks(root, info)
-    )
-
-
-def dataset_folder(
-    root: Path,
-    info: dict,
-    features: dict[str, Feature],
-    episodes: Iterable[EpisodeEntry],
-    tasks: dict[int, str],
-) -> DatasetFolder:
-    """`DatasetFolder` from its parts, as `open_folder` and the check read them."""
     return DatasetFolder(
         root=root,
-        version=str(info["codebase_version"]),
-        fps=float(info["fps"]),
-        robot_type=info.get("robot_type"),
-        features=features,
-        episodes=tuple(episodes),
-        tasks=tasks,
         info=info,
+        features=read_features(info),
+        episodes=read_episodes(root, info),
+        tasks=read_tasks(root, info),
     )
 
 
@@ -212,14 +208,14 @@ def recovery_advice(root: Path) -> str:
     return f"`{command}`, or hrc_learn.demos.recover_dataset({str(root)!r}),"
 
 
-def read_episodes(root: Path, info: dict) -> list[EpisodeEntry]:
+def read_episodes(root: Path, info: dict) -> tuple[EpisodeEntry, ...]:
     """Episodes in the order of their indices.
 
     Raises:
         DatasetError: The list of episodes is missing or damaged.
     """
     read = _episodes_v3 if generation(info["codebase_version"]) == 3 else _episodes_v2
-    return sorted(read(root, info), key=lambda entry: entry.index)
+    return tuple(sorted(read(root, info), key=lambda entry: entry.index))
 
 
 def episode_lists(root: Path) -> list[str]:

@@ -101,12 +101,13 @@ def _read_batch(
     table = read_table(parquet, file, keys, rows)
     columns = {}
     for key in table.column_names:
-        try:
-            columns[key] = to_numpy(table.column(key))
-        except (BadRowError, pa.ArrowException, TypeError) as error:
-            row = rows.start + (error.row if isinstance(error, BadRowError) else 0)
-            entry = next(e for e in entries if e.start <= row < e.start + e.length)
-            raise entry.error(str(error), frame=row - entry.start, key=key) from error
+
+        def fault(row: int, message: str, key: str = key) -> DatasetError:
+            place = row + rows.start
+            entry = next(e for e in entries if e.start <= place < e.start + e.length)
+            return entry.error(message, frame=place - entry.start, key=key)
+
+        columns[key] = to_numpy(table.column(key), fault)
         feature, width = folder.features.get(key), columns[key].shape[1]
         if feature is not None and len(columns[key]) and width != feature.width:
             raise DatasetError(
@@ -327,54 +328,48 @@ def frame_timestamps(
     return time
 
 
-class BadRowError(ValueError):
-    """A row without a usable value; `row` counts from the start of the table."""
-
-    def __init__(self, row: int, message: str):
-        super().__init__(message)
-        self.row = row
-
-
-def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
+def to_numpy(
+    column: pa.ChunkedArray, fault: Callable[[int, str], DatasetError]
+) -> Shaped[np.ndarray, "rows components"]:
     """Values of a Parquet column in their own type, nested lists flattened.
 
+    Args:
+        column: Numbers, or lists of equally many numbers.
+        fault: Error of a row without a usable value, from its number and a message.
+
     Raises:
-        BadRowError: A value is missing, or rows differ in their number of components.
+        DatasetError: A value is missing, or rows differ in their number of components.
     """
     try:
         array = pa.concat_arrays(column.chunks or [pa.array([], column.type)])
-    except pa.ArrowException as error:
-        raise BadRowError(0, f"cannot be read: {error}") from error
+    except (pa.ArrowException, TypeError) as error:
+        raise fault(0, f"cannot be read: {error}") from error
     rows = len(array)
     while True:
         if array.null_count:
             at = int(np.flatnonzero(_without_pandas(array.is_null()))[0])
-            raise BadRowError(at * rows // len(array), "holds no value (null)")
+            raise fault(at * rows // len(array), "holds no value (null)")
         if isinstance(array, pa.ExtensionArray):
             array = array.storage
         elif pa.types.is_fixed_size_list(array.type):
             array = array.flatten()
         elif pa.types.is_list(array.type) or pa.types.is_large_list(array.type):
-            array = _flatten_ragged(array, rows)
+            widths = _without_pandas(array.value_lengths())
+            differing = np.flatnonzero(widths != widths[0]) if len(widths) else []
+            if len(differing):
+                row = int(differing[0]) * rows // len(array)
+                found, expected = int(widths[differing[0]]), int(widths[0])
+                raise fault(row, f"holds {found} components, the first row {expected}")
+            array = array.flatten()
         else:
             break
     kinds = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
     if not any(is_kind(array.type) for is_kind in kinds):
-        raise BadRowError(0, f"holds {array.type}, not numbers")
+        raise fault(0, f"holds {array.type}, not numbers")
     values = _without_pandas(array)
     if rows and len(values) % rows:
-        raise BadRowError(0, f"{len(values)} numbers cannot be divided among {rows} frames")
+        raise fault(0, f"{len(values)} numbers cannot be divided among {rows} frames")
     return values.reshape(rows, len(values) // rows if rows else 0)
-
-
-def _flatten_ragged(array: pa.Array, rows: int) -> pa.Array:
-    widths = _without_pandas(array.value_lengths())
-    differing = np.flatnonzero(widths != widths[0]) if len(widths) else []
-    if len(differing):
-        row = int(differing[0]) * rows // len(array)
-        found, expected = int(widths[differing[0]]), int(widths[0])
-        raise BadRowError(row, f"holds {found} components, the first row {expected}")
-    return array.flatten()
 
 
 def _without_pandas(array: pa.Array) -> Shaped[np.ndarray, " values"]:

@@ -89,7 +89,7 @@ def unit_factor(role: str, unit: str) -> float:
         raise DatasetError(
             f"units are given for the unknown quantity {role!r}; known are {', '.join(ROLES)}"
         )
-    options = _options(role)
+    options = units_of(role)
     if unit not in options:
         raise DatasetError(
             f"{role} does not come in {unit!r}; known units are {', '.join(options)}"
@@ -97,12 +97,7 @@ def unit_factor(role: str, unit: str) -> float:
     return options[unit]
 
 
-def comes_in(role: str, unit: str) -> bool:
-    """True if a known quantity comes in a unit."""
-    return unit in _options(role)
-
-
-def _options(role: str) -> dict[str, float]:
+def units_of(role: str) -> dict[str, float]:
     """Units of a quantity with their factors."""
     own = ROLES[role].unit
     options = next(units for units in _DIMENSIONS.values() if own in units)
@@ -177,7 +172,7 @@ def _following(role: str, leader: UnitDecision) -> UnitDecision:
     velocity = role.endswith("velocity")
     unit = leader.unit + "/s" if velocity else leader.unit
     # A position given as a fraction of its range does not tell the unit of the velocity.
-    followed = leader.unit != "1" and comes_in(role, unit)
+    followed = leader.unit != "1" and unit in units_of(role)
     return UnitDecision(
         role=role,
         unit=unit if followed else ROLES[role].unit,
