@@ -182,43 +182,6 @@ class PaddedDemonstrations:
     command_position: Float[Tensor, "demos frames joints"] | None = None
     command_velocity: Float[Tensor, "demos frames joints"] | None = None
 
-    def to(
-        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> "PaddedDemonstrations":
-        """Move every field to a device; a dtype changes the fields of real numbers."""
-        moved = {
-            f.name: tensor.to(device, dtype if tensor.is_floating_point() else None)
-            for f in fields(self)
-            if (tensor := getattr(self, f.name)) is not None
-        }
-        return PaddedDemonstrations(**moved)
-
-
-def pad(demonstrations: Sequence[Demonstration]) -> PaddedDemonstrations:
-    """Batch of demonstrations, the last rows of shorter ones repeated (float64)."""
-    lengths = np.array([len(demo) for demo in demonstrations])
-    longest = int(lengths.max())
-
-    def repeat_last(array: np.ndarray) -> np.ndarray:
-        return np.concatenate([array, np.repeat(array[-1:], longest - len(array), axis=0)])
-
-    def continue_time(demo: Demonstration) -> np.ndarray:
-        time = demo.time
-        step = time[-1] - time[-2] if len(time) > 1 else 1 / demo.fps
-        return np.concatenate([time, time[-1] + step * np.arange(1, longest - len(time) + 1)])
-
-    common = set.intersection(*(set(demo.recorded) for demo in demonstrations)) - {"time"}
-    stacked = {
-        name: np.stack([repeat_last(getattr(demo, name)) for demo in demonstrations])
-        for name in common
-    }
-    stacked["time"] = np.stack([continue_time(demo) for demo in demonstrations])
-    return PaddedDemonstrations(
-        mask=torch.from_numpy(np.arange(longest) < lengths[:, None]),
-        length=torch.from_numpy(lengths),
-        **{name: torch.from_numpy(array) for name, array in stacked.items()},
-    )
-
 
 class DemonstrationSet(Sequence[Demonstration]):
     """Demonstrations of one robot, in the order they were read.
@@ -312,4 +275,19 @@ class DemonstrationSet(Sequence[Demonstration]):
         """
         if not self._demonstrations:
             raise ValueError("an empty set of demonstrations has no padded form")
-        return pad(self._demonstrations)
+        lengths = np.array([len(demo) for demo in self])
+        longest = int(lengths.max())
+        common = set.intersection(*(set(demo.recorded) for demo in self))
+        stacked: dict[str, list[np.ndarray]] = {name: [] for name in common}
+        for demo in self:
+            behind = longest - len(demo)
+            step = demo.time[-1] - demo.time[-2] if len(demo) > 1 else 1 / demo.fps
+            for name, rows in stacked.items():
+                array = getattr(demo, name)
+                rows.append(np.concatenate([array, np.repeat(array[-1:], behind, axis=0)]))
+            stacked["time"][-1][len(demo) :] += step * np.arange(1, behind + 1)
+        return PaddedDemonstrations(
+            mask=torch.from_numpy(np.arange(longest) < lengths[:, None]),
+            length=torch.from_numpy(lengths),
+            **{name: torch.from_numpy(np.stack(rows)) for name, rows in stacked.items()},
+        )

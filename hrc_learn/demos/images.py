@@ -60,7 +60,13 @@ class ImageReader:
 
     def available(self, episode: int) -> tuple[str, ...]:
         """Cameras whose images of an episode exist."""
-        return tuple(key for key in self.cameras if self._exists(episode, key))
+        segments = self._segments.get(episode, {})
+        return tuple(
+            key
+            for key in self.cameras
+            if self._folder.features[key].dtype == "image"
+            or (key in segments and segments[key].file.is_file())
+        )
 
     def size(self, camera: str) -> tuple[int, int]:
         """Declared height and width of a camera's images [px].
@@ -79,12 +85,6 @@ class ImageReader:
         first = feature.shape[0] in (1, 3, 4) and feature.shape[2] not in (1, 3, 4)
         height, width = feature.shape[1:] if first else feature.shape[:2]
         return int(height), int(width)
-
-    def _exists(self, episode: int, key: str) -> bool:
-        if self._folder.features[key].dtype == "image":
-            return True
-        segment = self._segments.get(episode, {}).get(key)
-        return segment is not None and segment.file.is_file()
 
     def read(
         self,

@@ -73,8 +73,6 @@ def test_padding_holds_the_end_and_lets_time_go_on(lengths):
         torch.testing.assert_close(row[: len(demo)], torch.from_numpy(demo.joint_position))
         assert (row[len(demo) :] == row[len(demo) - 1]).all()
     assert padded.orientation is None
-    assert padded.to(dtype=torch.float32).time.dtype == torch.float32
-    assert padded.to(dtype=torch.float32).mask.dtype == torch.bool
 
 
 def test_what_one_demonstration_lacks_is_not_stacked():

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
+from hrc_learn.demos.issues import Issue, ValidationReport, warning
 from hrc_learn.demos.quality import consistency_checks as consistency
 from hrc_learn.demos.quality import episode_checks, structure_checks
 from hrc_learn.demos.quality.episode_checks import MotionRecord, UsualMotion, motion_sketch
@@ -92,10 +92,10 @@ def check_dataset(
     for check in METADATA_CHECKS:
         report.run(check, folder)
     parse_mapping(mapping or {}, folder.features)
-    if speed_limits:
-        _require_limits(folder, mapping, speed_limits)
-    report.attempt(lambda: check_videos(folder, report))
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
+    if dataset is not None:
+        _require_limits(dataset, speed_limits or {})
+    report.attempt(lambda: check_videos(folder, report))
     if dataset is None:
         for _ in _first_pass(folder, report, None, {}):
             pass
@@ -105,18 +105,13 @@ def check_dataset(
     return report
 
 
-def _require_limits(
-    folder: DatasetFolder, mapping: MappingSpec | None, speed_limits: Mapping[str, float | int]
-) -> None:
+def _require_limits(dataset: OpenedDataset, speed_limits: Mapping[str, float | int]) -> None:
     """Raise ValueError if a limit has no joint, or is not positive."""
-    try:
-        names = OpenedDataset.of(folder, mapping).columns.joint_names
-    except DatasetError:
-        return  # reported with the columns
+    names = dataset.columns.joint_names
     for name, limit in speed_limits.items():
         if name not in names:
             raise ValueError(
-                f"speed_limits: {folder.root} has no joint {name!r}; there are "
+                f"speed_limits: {dataset.folder.root} has no joint {name!r}; there are "
                 f"{', '.join(names) or 'none'}"
             )
         if not limit > 0:

@@ -65,8 +65,6 @@ class EpisodeQuality:
     """Number of the cluster of similar episodes; -1 for none."""
     place: tuple[float, float] | None = None
     """First two principal components: similar episodes are close on this map."""
-    resembles: int | None = None
-    """Index of an episode that this one nearly repeats."""
     start: int = 0
     """First frame of the motion; the arm rests before."""
     stop: int = 0
@@ -309,8 +307,7 @@ def _compare(
         near = neighbours[number][distances[number] < _SAME * usual]
         earlier = [indices[i] for i in near if indices[i] < index]
         if earlier:
-            quality.resembles = min(earlier)
-            quality.doubt(_REPEAT, f"nearly repeats episode {quality.resembles}")
+            quality.doubt(_REPEAT, f"nearly repeats episode {min(earlier)}")
 
 
 def _principal_components(

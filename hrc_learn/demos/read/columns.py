@@ -27,8 +27,7 @@ MappingSpec = Mapping[str, str | Sequence[str] | None]
 """Role -> columns: a feature ("observation.qpos"), a range of one ("observation.state[0:7]"),
 or component names (["j1.pos", "observation.state/j2.pos"]); None leaves the role out."""
 
-_RANGE = re.compile(r"(.+)\[(?:(\d{1,9})|(\d{0,9}):(\d{0,9}))\]")
-_ANY_RANGE = re.compile(r"(.+)\[[^\[\]]*\]")
+_RANGE = re.compile(r"(.+)\[([^\[\]]*)\]")
 _STATE_KEYS = ("observation.state", "observation.states", "state", "states")
 _ACTION_KEYS = ("action", "actions")
 _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_velocity"}
@@ -199,7 +198,7 @@ def _feature_range(
     role: str, text: str, features: Mapping[str, Feature]
 ) -> list[tuple[str, int]]:
     """Columns of a whole feature ("key") or of a part of it ("key[2:5]", "key[3]")."""
-    match = None if text in features else _ANY_RANGE.fullmatch(text)
+    match = None if text in features else _RANGE.fullmatch(text)
     key = match[1] if match else text
     if key not in features:
         raise DatasetError(
@@ -211,13 +210,10 @@ def _feature_range(
     width = features[key].width
     first, stop = 0, width
     if match:
-        bounds = _RANGE.fullmatch(text)
-        if bounds is None:
-            first = stop = 0
-        elif bounds[2]:
-            first, stop = int(bounds[2]), int(bounds[2]) + 1
-        else:
-            first, stop = int(bounds[3] or 0), int(bounds[4] or width)
+        low, colon, high = match[2].partition(":")
+        digits = all(bound.isdecimal() and len(bound) < 10 for bound in (low, high) if bound)
+        first = int(low or 0) if digits and (low or colon) else width
+        stop = first + 1 if not colon else int(high or width) if digits else 0
     if not first < stop <= width:
         raise DatasetError(
             f"mapping takes {role} from {text!r}, which is no range of its {width} components: "

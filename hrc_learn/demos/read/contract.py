@@ -346,9 +346,6 @@ def _describe(
     if not fit > _FOLLOWS:
         return part
     sign = int(np.sign(slope))
-    if role == "joint_velocity":
-        evidence = f"slope {slope:.2f} against differences of the position, R2 {fit:.2f}"
-        return replace(part, sign=sign, evidence=evidence)
     evidence = (
         f"state follows it with slope {slope:.2f}, R2 {fit:.2f}, "
         f"same delay in {agreeing} of {len(tracked)} episodes"

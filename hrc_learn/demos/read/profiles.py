@@ -92,8 +92,8 @@ class EpisodeProfile:
     columns: dict[str, ColumnProfile]
     """Profile of each feature."""
     tracking: dict[str, Tracking] = field(default_factory=dict)
-    """Tracking by role: `command_position` against the joints, `command_velocity` and
-    `joint_velocity` against the joint rates, `rates` for position commands against rates."""
+    """Tracking by role: `command_position` against the joints, `command_velocity` against the
+    joint rates, `rates` for position commands against rates."""
 
 
 def profile_columns(
@@ -180,12 +180,6 @@ def gain_over(tracking: Tracking, delay: int) -> float:
     return float(1 - residual.min() / other) if other > _NEGLIGIBLE else 0.0
 
 
-def _standardized(values: np.ndarray) -> np.ndarray:
-    """Components of mean 0 and variance 1; 0 where nothing moves."""
-    centered = values - values.mean(0)
-    return centered / np.maximum(centered.std(0), 1e-12)
-
-
 def _correlations(
     command: Float64[np.ndarray, "frames components"],
     state: Float64[np.ndarray, "frames components"],
@@ -197,7 +191,11 @@ def _correlations(
     rests in its window.
     """
     inner = len(state) - 2 * reach
-    late, early = _standardized(state[reach : reach + inner]), _standardized(command)
+    # Of mean 0 and variance 1; 0 where nothing moves.
+    late, early = (
+        (values - values.mean(0)) / np.maximum(values.std(0), 1e-12)
+        for values in (state[reach : reach + inner], command)
+    )
     windows = np.lib.stride_tricks.sliding_window_view(early, inner, axis=0)
     product = np.einsum("dcn,nc->dc", windows, late) / inner
     # Mean and variance of all windows from running sums.
@@ -254,7 +252,7 @@ def track(
 
 
 def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
-    """Tracking of commands and joint velocities in one episode, as in `EpisodeProfile`.
+    """Tracking of commands in one episode, as in `EpisodeProfile`.
 
     Args:
         quantities: Values by role.
@@ -268,7 +266,6 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
         "command_position": (quantities.get("command_position"), joints),
         "rates": (quantities.get("command_position"), rates),
         "command_velocity": (quantities.get("command_velocity"), rates),
-        "joint_velocity": (quantities.get("joint_velocity"), rates),
     }
     for name, (given, followed) in pairs.items():
         if given is not None and given.shape == followed.shape:
