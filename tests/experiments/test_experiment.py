@@ -93,6 +93,7 @@ def errors(count, spread=0.01):
 @pytest.fixture
 def work(tmp_path, capsys):
     def run(experiment, folder="run", **options):
+        options = {"film": False} | options
         chosen = RunOptions(out=tmp_path / folder, json=tmp_path / "values.json", **options)
         status = run_experiment(experiment, chosen, command="throw")
         values = json.loads((tmp_path / "values.json").read_text())
@@ -102,7 +103,7 @@ def work(tmp_path, capsys):
 
 
 def test_a_new_experiment_is_run_repeated_and_reported(work):
-    status, values, folder, shown = work(ThrowExperiment(), trials=4)
+    status, values, folder, shown = work(ThrowExperiment(), trials=4, film=True)
     assert status == 0
     assert "throwing" in shown.out
     assert values["trials"] == values["throws"] == 4
@@ -176,7 +177,7 @@ def test_failed_trials_do_not_fail_the_run_unless_a_metric_bounds_them(work):
 
 
 def test_a_stopped_repetition_goes_on(tmp_path, work, monkeypatch):
-    options = RunOptions(out=tmp_path / "run", trials=3)
+    options = RunOptions(out=tmp_path / "run", trials=3, film=False)
     run, seeds = ThrowExperiment.run, []
 
     def stopped(self, seed, observer=UNOBSERVED):
