@@ -27,7 +27,6 @@ SHOWN = {
     "grasping": (
         "servoing_time_from_the_remote_start_s",
         "grasp_offset_mm",
-        "object_tilt_in_the_hand_deg",
     ),
     "collaboration": ("end_effector_deviation_mm", "grasp_offset_mm", "place_error_mm"),
 }

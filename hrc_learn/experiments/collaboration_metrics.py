@@ -13,9 +13,7 @@ from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.people_in_run import worker_contacts
 from hrc_learn.experiments.run_measures import (
     Deviation,
-    Hold,
     grasp_offset,
-    hold,
     limit_violations,
     place_angle,
     spans,
@@ -25,7 +23,7 @@ from hrc_learn.experiments.run_measures import (
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.sim import Touch
 from hrc_learn.sim.hand_over import HandOver, Reach
-from hrc_learn.skills.pick_and_place import HOME, RELEASE, Mishap, PickPlaceJob
+from hrc_learn.skills.pick_and_place import RELEASE, Mishap, PickPlaceJob
 from hrc_learn.skills.receiving import Receipt
 
 _CONTACTS = {
@@ -84,18 +82,6 @@ _GRASPING: Sequence[Metric[CollaborationRun]] = (
         at_most=5.0,
     ),
     Metric("grasp offset", lambda run: max(_grasp_offsets(run), default=None), "mm"),
-    Metric(
-        "object tilt in the hand",
-        lambda run: max((np.rad2deg(h.tilt) for h in _holds(run)), default=None),
-        "deg",
-        at_most=3.0,
-    ),
-    Metric(
-        "slip in the hand",
-        lambda run: max((1e3 * h.slip for h in _holds(run)), default=None),
-        "mm",
-        at_most=3.0,
-    ),
 )
 
 _SAFETY: Sequence[Metric[CollaborationRun]] = (
@@ -186,11 +172,6 @@ _HAND_OVER: Sequence[Metric[CollaborationRun]] = (
         "mm",
     ),
     Metric(
-        "hand-over place, error after the movement",
-        _handed(lambda receipt, _, plan: _distance(receipt.refined, plan.place)),
-        "mm",
-    ),
-    Metric(
         "time until the object was held",
         _handed(lambda receipt, reach, _: receipt.taken - reach.begin),
         "s",
@@ -247,7 +228,6 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("trials, end effector deviation (95 %)", p95("end_effector_deviation_mm"), "mm"),
     Metric("trials, elbow moved (median)", median("elbow_moved_mm"), "mm"),
     Metric("trials, grasp offset (95 %)", p95("grasp_offset_mm"), "mm"),
-    Metric("trials, object tilt in the hand (95 %)", p95("object_tilt_in_the_hand_deg"), "deg"),
     Metric("trials, place error (95 %)", p95("place_error_mm"), "mm"),
     Metric("trials, place tilt (95 %)", p95("place_tilt_deg"), "deg"),
     Metric("trials, cycle time (median)", median("cycle_time_s"), "s"),
@@ -308,18 +288,6 @@ def _grasp_offsets(run: CollaborationRun) -> list[float]:
             offset = grasp_offset(log, run.motion, run.world, pick.item.name, descents[-1])
             offsets.append(1e3 * offset)
     return offsets
-
-
-def _holds(run: CollaborationRun) -> list[Hold]:
-    """Stability of each object in the hand, from the end of the lift until its release."""
-    log, holds = run.cell.log, []
-    for pick in run.picks:
-        carried = [s for s in spans(log, HOME) if pick.span[0] <= s[0] < pick.span[1]]
-        released = [t for t, _ in spans(log, RELEASE) if pick.span[0] <= t < pick.span[1]]
-        if carried and released:
-            times = carried[-1][0], released[-1]
-            holds.append(hold(log, run.motion, run.world, pick.item.name, *times))
-    return holds
 
 
 def _placed(run: CollaborationRun) -> tuple[float | None, float | None]:

@@ -13,12 +13,9 @@ from torch import Tensor
 from hrc_learn.experiments.grasping_trial import GraspingRun
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.run_measures import (
-    Hold,
     grasp_offset,
-    hold,
     limit_violations,
     span,
-    spans,
     true_tool,
     unwanted_contacts,
 )
@@ -86,15 +83,6 @@ def lift(run: GraspingRun) -> float:
     return float(run.world.object_pose(run.item.name)[2, 3] - run.scene.object_pose[2, 3])
 
 
-def _hold(run: GraspingRun) -> Hold | None:
-    """Stability of the object in the hand after the lift; None if it was never lifted."""
-    homes = [t for t, _ in spans(run.cell.log, "home")]
-    if run.result is None or not homes:
-        return None
-    log, item = run.cell.log, run.item.name
-    return hold(log, run.motion, run.world, item, homes[-1], math.inf)
-
-
 def jacobian_errors(run: GraspingRun) -> tuple[float, float]:
     """Relative errors of the linear image Jacobian as vision starts, and at descent.
 
@@ -150,18 +138,6 @@ def grasping_metrics() -> list[Metric[GraspingRun]]:
             "grasp offset", lambda run: 1e3 * Descent.of(run).offset, "mm", at_most=GRASP_OFFSET
         ),
         Metric(
-            "object tilt in the hand",
-            lambda run: None if (held := _hold(run)) is None else math.degrees(held.tilt),
-            "deg",
-            at_most=3.0,
-        ),
-        Metric(
-            "slip in the hand",
-            lambda run: None if (held := _hold(run)) is None else 1e3 * held.slip,
-            "mm",
-            at_most=3.0,
-        ),
-        Metric(
             "angle to the demonstrated approach at descent",
             lambda run: math.degrees(Descent.of(run).angle),
             "deg",
@@ -208,13 +184,6 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("grasps, pixel error (95 %)", p95(_PIXELS), "px"),
     Metric("grasps, grasp offset (median)", median("grasp_offset_mm"), "mm"),
     Metric("grasps, grasp offset (95 %)", p95("grasp_offset_mm"), "mm", at_most=6.0),
-    Metric(
-        "grasps, object tilt in the hand (95 %)",
-        p95("object_tilt_in_the_hand_deg"),
-        "deg",
-        at_most=3.0,
-    ),
-    Metric("grasps, slip in the hand (95 %)", p95("slip_in_the_hand_mm"), "mm", at_most=3.0),
 )
 """Metrics of grasps in random scenes."""
 

@@ -310,13 +310,3 @@ def _spread(key: str, kind: str) -> Statistic:
         return None if spread is None else getattr(spread, kind)
 
     return statistic
-
-
-def largest(key: str) -> Statistic:
-    """Largest value; NaN, which meets no bound, if a trial did not measure the value."""
-    return lambda trials: float(column(trials, key).max())
-
-
-def total(key: str) -> Statistic:
-    """Sum over all trials; NaN as in `largest`."""
-    return lambda trials: float(column(trials, key).sum())

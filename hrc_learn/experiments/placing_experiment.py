@@ -19,10 +19,10 @@ from hrc_learn.demos import Demonstration, load_demos
 from hrc_learn.experiments.experiment import Study
 from hrc_learn.experiments.metric_table import Metric, evaluate
 from hrc_learn.experiments.placing_metrics import (
+    TRIAL_METRICS,
     PlacingOutcome,
     PlacingRun,
     placing_metrics,
-    random_start_metrics,
     run_metrics,
 )
 from hrc_learn.experiments.placing_trial import (
@@ -222,7 +222,7 @@ class PlacingExperiment:
         return Study(
             title="Placing on each shelf from random starts",
             trial=RandomStart(self),
-            metrics=random_start_metrics(self._shelves),
+            metrics=TRIAL_METRICS,
             text="Every joint of the start is drawn about home; planned in task space.",
         )
 

@@ -1,5 +1,6 @@
 """Metrics of placings: outcome of each, values of a run, statistics over random starts."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -8,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
-from hrc_learn.experiments.metric_table import Metric, column, largest, total
+from hrc_learn.experiments.metric_table import Metric, p95, success_rate
 from hrc_learn.experiments.placing_trial import SPACES, SimulatedPlacing, demonstrated_path
 from hrc_learn.experiments.run_measures import limit_violations, place_angle
 from hrc_learn.experiments.run_recorder import demonstrated_joints
@@ -22,8 +23,6 @@ DEVIATION_MM, PLACE_ERROR_MM, PLACE_TILT_DEG = 12.0, 3.0, 3.0
 """Bounds of a good placing. Approach paths planned in task space deviate by 2 mm, those planned
 in joint space with a shifted goal by 100 mm. Errors are those of the object on its board."""
 
-# Of 50 placings from random starts one may fail.
-_FRACTION = 0.98
 # Largest dimensionless jerk of a reproduction relative to the demonstration.
 _JERK = 1e-2
 
@@ -136,14 +135,6 @@ class PlacingRun:
 type ByShelf = Mapping[str, PlacingOutcome]
 
 
-def _millimetres(outcome: PlacingOutcome) -> float:
-    return 1e3 * outcome.place_error
-
-
-def _degrees(outcome: PlacingOutcome) -> float:
-    return float(np.rad2deg(outcome.place_tilt))
-
-
 def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
     """Metrics of one placing on each of the shelves."""
 
@@ -160,9 +151,19 @@ def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
     return [
         *(metric for shelf in shelves for metric in _shelf_metrics(shelf)),
         Metric(
-            "place error", worst(_millimetres), "mm", at_most=PLACE_ERROR_MM, essential=True
+            "place error",
+            worst(lambda o: 1e3 * o.place_error),
+            "mm",
+            at_most=PLACE_ERROR_MM,
+            essential=True,
         ),
-        Metric("place tilt", worst(_degrees), "deg", at_most=PLACE_TILT_DEG, essential=True),
+        Metric(
+            "place tilt",
+            worst(lambda o: math.degrees(o.place_tilt)),
+            "deg",
+            at_most=PLACE_TILT_DEG,
+            essential=True,
+        ),
         Metric(
             "joint limit violations", count(lambda o: o.violations), at_most=0, essential=True
         ),
@@ -195,21 +196,26 @@ def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
 
 
 def _shelf_metrics(shelf: str) -> list[Metric[ByShelf]]:
-    metrics = (
-        Metric[PlacingOutcome](
-            "approach-path deviation",
-            lambda outcome: 1e3 * outcome.deviation,
+    return [
+        Metric(
+            f"{shelf} shelf, approach-path deviation",
+            lambda outcomes: 1e3 * outcomes[shelf].deviation,
             "mm",
             at_most=DEVIATION_MM,
             claim="similar paths towards the goals",
             essential=True,
         ),
-        Metric[PlacingOutcome]("contacts", lambda outcome: len(outcome.contacts)),
-        Metric("place error", _millimetres, "mm", listed=False),
-        Metric("place tilt", _degrees, "deg", listed=False),
-        Metric[PlacingOutcome]("placed", lambda outcome: int(outcome.placed), listed=False),
-    )
-    return [metric.of_part(lambda run: run[shelf], f"{shelf} shelf, ") for metric in metrics]
+        Metric(f"{shelf} shelf, contacts", lambda outcomes: len(outcomes[shelf].contacts)),
+    ]
+
+
+TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
+    # Of 50 trials one may fail.
+    Metric("random starts, success rate", success_rate, at_least=0.98),
+    Metric("random starts, place error (95 %)", p95("place_error_mm"), "mm"),
+    Metric("random starts, place tilt (95 %)", p95("place_tilt_deg"), "deg"),
+)
+"""Metrics of placings from random starts."""
 
 
 def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
@@ -234,7 +240,7 @@ def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
         *(
             replace(
                 m.of_part(lambda run: run.outcomes["joint"], joint_space, bounded=False),
-                listed=m.listed and "shelf," in m.name,
+                listed="shelf," in m.name,
             )
             for m in table
         ),
@@ -246,49 +252,3 @@ def _joint_rmse(run: PlacingRun) -> float:
     done = run.reproduction
     demonstrated = demonstrated_joints(run.demonstration, done.time / done.time[-1])
     return float(np.rad2deg(np.sqrt(np.square(done.joint_position - demonstrated).mean())))
-
-
-def random_start_metrics(shelves: Sequence[str]) -> list[Metric[Sequence[Trial]]]:
-    """Metrics of placings from random starts."""
-
-    def by_shelf(trials: Sequence[Trial], key: str) -> np.ndarray:
-        return np.array([column(trials, f"{shelf}_shelf_{key}") for shelf in shelves])
-
-    metrics: Sequence[Metric[Sequence[Trial]]] = (
-        Metric("placings", lambda trials: len(trials) * len(shelves)),
-        Metric(
-            "fraction without contact",
-            lambda trials: float((by_shelf(trials, "contacts") == 0).mean()),
-            at_least=_FRACTION,
-        ),
-        Metric(
-            "fraction that stands on its shelf",
-            lambda trials: float((by_shelf(trials, "placed") == 1).mean()),
-            at_least=_FRACTION,
-        ),
-        Metric("joint limit violations", total("joint_limit_violations"), at_most=0),
-        Metric(
-            f"fraction within {PLACE_ERROR_MM:g} mm and {PLACE_TILT_DEG:g} deg of its place",
-            lambda trials: float(
-                (
-                    (by_shelf(trials, "place_error_mm") <= PLACE_ERROR_MM)
-                    & (by_shelf(trials, "place_tilt_deg") <= PLACE_TILT_DEG)
-                ).mean()
-            ),
-            at_least=_FRACTION,
-        ),
-        Metric(
-            "place error (median)",
-            lambda trials: float(np.nanmedian(by_shelf(trials, "place_error_mm"))),
-            "mm",
-        ),
-        Metric("largest place error", largest("place_error_mm"), "mm"),
-        Metric("largest place tilt", largest("place_tilt_deg"), "deg"),
-        Metric(
-            "largest approach-path deviation",
-            lambda trials: float(by_shelf(trials, "approach_path_deviation_mm").max()),
-            "mm",
-            at_most=DEVIATION_MM,
-        ),
-    )
-    return [metric.of_part(lambda trials: trials, "random starts, ") for metric in metrics]

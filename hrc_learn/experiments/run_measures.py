@@ -210,39 +210,6 @@ def worker_distance(motion: MotionLog, steps: int) -> Float[np.ndarray, " time"]
     return np.array([pair.distance for pair in motion.nearest(steps)])
 
 
-class Hold(NamedTuple):
-    """Stability of an object in the hand while it was carried."""
-
-    tilt: float
-    """Largest angle from the intended orientation in the hand [rad]."""
-    slip: float
-    """Displacement between the fingers [m]."""
-
-
-def hold(
-    log: LoggedSteps, motion: MotionLog, world: World, name: str, start: float, end: float
-) -> Hold:
-    """Compare the pose of an object in the hand at two times.
-
-    Args:
-        log: Log of the run.
-        motion: True poses of everything that moved.
-        world: World of the run.
-        name: Name of the object.
-        start: Time after lifting [s].
-        end: Time before the release [s]; at most the end of the run.
-    """
-    steps = np.searchsorted(log["time"], [start, end]).clip(max=len(log) - 1)
-    tool, item = true_tool(motion, world, len(log)), body_poses(motion, name, len(log))
-    hand, held = tool[torch.from_numpy(steps)], item[torch.from_numpy(steps)]
-    back = quaternion.conjugate(hand.orientation)
-    offset = quaternion.rotate(back, held.position - hand.position)
-    return Hold(
-        tilt=float(box_angle(quaternion.multiply(back, held.orientation), _IN_HAND).max()),
-        slip=float((offset[1] - offset[0]).norm()),
-    )
-
-
 def grasp_offset(
     log: LoggedSteps, motion: MotionLog, world: World, name: str, descent: float
 ) -> float:

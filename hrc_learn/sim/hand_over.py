@@ -74,7 +74,7 @@ class HandOver:
     leaving: Float[np.ndarray, "2"]
     """Final position of the worker [m]."""
     speeds: HumanSpeeds
-    """His."""
+    """Speeds of the worker."""
 
     def starting(self, time: float) -> HandOver:
         """The same, later by a time [s]."""

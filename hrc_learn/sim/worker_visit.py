@@ -82,7 +82,7 @@ class WorkerVisit:
     """Key postures, joined by minimum-jerk motions."""
 
     worker: Worker
-    """Whose body it is."""
+    """Body of the worker."""
     time: Float[np.ndarray, " poses"]
     """Times of the key postures [s]; the worker rests before the first and after the last."""
     poses: Float[np.ndarray, "poses 10"]

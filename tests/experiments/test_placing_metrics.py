@@ -10,14 +10,12 @@ from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.placing_metrics import (
     PlacingOutcome,
     placing_metrics,
-    random_start_metrics,
 )
 from hrc_learn.experiments.placing_trial import (
     demonstrated_shelf,
     random_start,
     taught_correction,
 )
-from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, Touch, World
@@ -27,7 +25,6 @@ from hrc_learn.skills.work_cell import TaskFailedError
 
 WORKPLACE = Workplace()
 SHELVES = WORKPLACE.shelf_names()
-WITHIN = "fraction within 3 mm and 3 deg of its place"
 GOOD = PlacingOutcome(
     deviation=2e-3,
     place_error=1e-4,
@@ -38,21 +35,6 @@ GOOD = PlacingOutcome(
     jerk=1e-5,
     placed=True,
 )
-
-
-def trial(seed, **changes):
-    """A trial in which the upper shelf differs."""
-    outcomes = dict.fromkeys(SHELVES, GOOD) | {"upper": replace(GOOD, **changes)}
-    values = evaluate(placing_metrics(SHELVES), outcomes).values
-    return Trial(seed=seed, values=values)
-
-
-def random_starts(trials):
-    return evaluate(random_start_metrics(SHELVES), trials).table
-
-
-def missed(table):
-    return {m.name.removeprefix("random starts, ") for m in table if m.ok is False}
 
 
 def faults(**changes):
@@ -89,33 +71,6 @@ def test_what_is_only_wanted_is_missed_but_no_fault(changes):
     evaluation = evaluate(placing_metrics(SHELVES), outcomes)
     assert [m.ok for m in evaluation.table].count(False) == 1
     assert evaluation.faults == ()
-
-
-def test_good_trials_miss_nothing():
-    table = random_starts([trial(k) for k in range(10)])
-    assert missed(table) == set()
-    values = {m.name: m.value for m in table}
-    assert values["random starts, placings"] == 30
-
-
-def test_one_contact_in_fifty_placings_is_allowed_and_two_are_not():
-    good = [trial(k) for k in range(20)]
-    touched = [trial(20 + k, contacts=(TOUCH,)) for k in range(2)]
-    assert missed(random_starts([*good, touched[0]])) == set()
-    assert missed(random_starts([*good, *touched])) == {"fraction without contact"}
-
-
-def test_a_trial_that_was_given_up_keeps_no_target():
-    trials = [trial(0), Trial(seed=1, values={}, failure="no free start")]
-    assert WITHIN in missed(random_starts(trials))
-
-
-def test_one_place_in_fifty_may_be_missed_and_two_may_not():
-    good = [trial(k) for k in range(20)]
-    for changes in ({"place_error": 0.0031}, {"place_tilt": 0.06}):
-        off = [trial(20 + k, **changes) for k in range(2)]
-        assert missed(random_starts([*good, off[0]])) == set()
-        assert missed(random_starts([*good, *off])) == {WITHIN}
 
 
 def test_the_demonstrated_shelf_is_where_the_end_effector_ended():
