@@ -2,7 +2,6 @@
 
 import shlex
 from dataclasses import asdict, dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from hrc_learn.cli._run import command_line, configuration, refuse_repeats, writ
 from hrc_learn.cli._settings import with_settings
 from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
 from hrc_learn.cli.arguments import FitImageJacobian, FitPrimitives
-from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos, thumbnails
+from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.jacobian import (
     CellErrors,
@@ -66,10 +65,8 @@ def fit_primitives(args: FitPrimitives) -> None:
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(source)} demonstrations"):
             fitted, metrics = _learn(args, source, demos, folder)
-        missing = _draw(fitted, args, source, demos, metrics, folder)
+        _draw(fitted, args, metrics, folder)
         _finish(args, metrics, folder)
-    for image in missing:
-        print(f"left out: {image}")
     if (args.folder / PAGE).is_file():
         print(f"Report: {shlex.quote(str(args.folder / PAGE))}")
         print(f"Dashboard: {show_command(args.folder)}")
@@ -218,32 +215,19 @@ def _spread(fitted: FittedPrimitives, channel: str) -> float:
     return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
 
 
-_IMAGED_DEMOS, _IMAGES = 3, 30
-"""Demonstrations with images, and images per camera. Few, as a video is decoded up to each."""
-
-
 def _draw(
     fitted: FittedPrimitives,
     args: FitPrimitives,
-    source: DemonstrationSource,
-    demos: DemonstrationSet,
     metrics: dict[str, float],
     folder: Path,
-) -> list[str]:
-    """Write report and recording of the fit, unless only orientations were learned.
-
-    Returns:
-        One line for each image that could not be read.
-    """
+) -> None:
+    """Write report and recording of the fit, unless only orientations were learned."""
     if set(fitted.each) == {"orientation"}:
-        return []
-    images, missing = thumbnails(source.folder, demos[:_IMAGED_DEMOS], _IMAGES)
-    episodes = [demo.episode for demo in demos]
-    shown = fit_recording(fitted, f"Fit of {args.dataset.name}", episodes, images)
+        return
+    shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
     record_fit(folder / "fit.rrd", shown)
     rows = primitive_rows(metrics)
     write_report(folder, fit_report(shown, rows, configuration(args), command_line()))
-    return missing
 
 
 def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:
@@ -329,15 +313,7 @@ def _write(
             figure = learning_figure(held_out, skill.learned.best, "px")
             figure.savefig(folder / "learning.png", dpi=120)
         title = f"Image Jacobian from {args.dataset.name}"
-        seen, missing = thumbnails(demos.folder, islice(demos, _IMAGED_DEMOS), 2)
-        ends = {
-            f"End of episode {episode}, {camera}": files[-1]
-            for episode, cameras in seen.items()
-            for camera, (_, files) in cameras.items()
-        }
-        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title, ends))
-    for line in missing:
-        console.print(f"note: {line}")
+        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
     rows = image_jacobian_rows(metrics)
     show_values(f"Image Jacobian from {args.dataset}", metrics, rows)
     print(f"Model in {shlex.quote(str(args.folder))}")

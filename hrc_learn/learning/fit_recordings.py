@@ -14,7 +14,6 @@ from hrc_learn.kinematics.franka import panda_bodies
 from hrc_learn.learning.primitive_fitting import FittedPrimitives
 from hrc_learn.learning.visual_servo_fitting import Demonstrations, feature_trajectories
 from hrc_learn.log import JointRanges
-from hrc_learn.log.recordings import Seen
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
@@ -22,7 +21,7 @@ from hrc_learn.viz import (
     FitRecording,
     LearningRecording,
 )
-from hrc_learn.viz.figures import fit_joints_figure, residual_figure, seen_figure
+from hrc_learn.viz.figures import fit_joints_figure, residual_figure
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, software_versions
 
 
@@ -79,19 +78,12 @@ def _shown(demo: Demonstration, is_panda: bool, images: Mapping) -> Demonstratio
     )
 
 
-def fit_recording(
-    fitted: FittedPrimitives,
-    title: str,
-    episodes: Sequence[int] = (),
-    images: Mapping[int, Seen] | None = None,
-) -> FitRecording:
+def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
     """Recording of demonstrations and reproductions, of the joints or else the position.
 
     Args:
         fitted: Primitives of the demonstrations.
         title: Title of the recording.
-        episodes: Episode numbers of the demonstrations.
-        images: Camera images by episode.
 
     Raises:
         ValueError: Neither joints nor positions were learned.
@@ -130,8 +122,6 @@ def fit_recording(
         reproduction_paths=reproduced,
         residual=residual,
         unit="rad" if channel == "joint" else "m",
-        episodes=tuple(episodes),
-        images=images or {},
     )
 
 
@@ -141,7 +131,7 @@ def fit_report(
     configuration: Mapping[str, object],
     command: str,
 ) -> Report:
-    """Report of a fit: measured values, camera images and reproductions.
+    """Report of a fit: measured values and reproductions.
 
     Args:
         fit: Recording of demonstrations and reproductions.
@@ -149,22 +139,13 @@ def fit_report(
         configuration: Options of the fit.
         command: Command line that repeats the fit.
     """
-    sections = []
-    if fit.images:
-        caption = "Images of the first camera, one demonstration per row."
-        sections.append(
-            Section(
-                heading="Demonstrations",
-                figures=[Picture("demonstrations", seen_figure(fit.images), caption)],
-            )
-        )
     moved = "joints" if fit.unit == "rad" else "position"
     caption = "The first four demonstrations and their reproductions."
     figures = [Picture(moved, fit_joints_figure(fit), caption)]
     if fit.residual:
         caption = "Held-out error by number of basis functions, and the selected number."
         figures.append(Picture("n_basis", residual_figure(fit), caption))
-    sections.append(Section(heading="Reproductions", figures=figures))
+    sections = [Section(heading="Reproductions", figures=figures)]
     basis = "" if fit.n_basis is None else f" of {fit.n_basis} basis functions"
     return Report(
         title=fit.title,
@@ -185,7 +166,6 @@ def learning_recording(
     skill: VisualServoSkill,
     demos: Demonstrations,
     title: str,
-    images: Mapping[str, bytes] | None = None,
 ) -> LearningRecording:
     """Recording of the fit of an image Jacobian.
 
@@ -193,7 +173,6 @@ def learning_recording(
         skill: Skill that was just fitted.
         demos: Its demonstrations, of which the first are drawn.
         title: Title of the recording.
-        images: JPEG files by title.
 
     Raises:
         ValueError: The skill was loaded, and its held-out errors are unknown.
@@ -211,7 +190,6 @@ def learning_recording(
         if learned is None
         else np.stack([_places(state.neurons, height) for state in learned.rounds]),
         paths=paths,
-        images=images or {},
     )
 
 

@@ -210,24 +210,14 @@ class FitRecording:
     reproduction_paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
     """Tool centre point of each reproduction [m]."""
     joint_limits: JointRanges | None = None
-    boxes: tuple[Box, ...] = ()
     residual: Mapping[int, float] = field(default_factory=dict)
     """Normalised RMS error of the fit for each number of basis functions tried."""
     n_basis: int | None = None
     """Number of basis functions used."""
     unit: str = "rad"
     """Unit of the joints: "rad", or "m" for positions."""
-    episodes: tuple[int, ...] = ()
-    """Episode of each demonstration in its dataset, if known."""
-    images: Mapping[int, Seen] = field(default_factory=dict)
-    """Camera images by episode."""
 
     def __post_init__(self) -> None:
-        if self.episodes and len(self.episodes) != len(self.demos):
-            raise ValueError(
-                f"episodes names {len(self.episodes)} episodes for {len(self.demos)} "
-                "demonstrations; give one for each."
-            )
         if not len(self.time) == len(self.demos) == len(self.reproductions) > 0:
             raise ValueError(
                 "time, demos and reproductions must hold one array a demonstration, but hold "
@@ -329,8 +319,6 @@ class LearningRecording:
     """Centres of the neurons in each round [m]."""
     paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
     """Paths of the end effector in demonstrations [m]."""
-    images: Mapping[str, bytes] = field(default_factory=dict)
-    """JPEG files by their titles."""
 
     def __post_init__(self) -> None:
         rounds = len(self.centers)

@@ -6,7 +6,6 @@ take the recording that the dashboards take, and raise ValueError where it lacks
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import pairwise, product
 from typing import Any
 
@@ -22,7 +21,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from hrc_learn.geometry import Box
 from hrc_learn.log import JointRanges, RunRecording
-from hrc_learn.log.recordings import FitRecording, Seen
+from hrc_learn.log.recordings import FitRecording
 from hrc_learn.viz import palette
 
 STYLE: dict[Any, Any] = {
@@ -335,44 +334,6 @@ def residual_figure(fit: FitRecording) -> Figure:
         axes.set_title("Error of the primitive on the demonstrations")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
-
-
-def seen_figure(seen: Mapping[int, Seen], most: int = 6, columns: int = 5) -> Figure:
-    """Images of the first camera in the first demonstrations, from start to end.
-
-    Args:
-        seen: Camera images by episode.
-        most: Largest number of episodes, one row each.
-        columns: Images per episode, evenly spaced in time.
-
-    Raises:
-        ValueError: If there are no images.
-    """
-    rows = [(episode, *next(iter(saw.items()))) for episode, saw in seen.items() if saw]
-    rows = rows[:most]
-    if not rows:
-        raise ValueError("seen is empty: there are no images of demonstrations.")
-    with matplotlib.rc_context(STYLE):
-        height, width = _decoded(rows[0][2][1][0]).shape[:2]
-        tall = WIDTH / columns * height / width + 0.22  # with its heading [inch]
-        figure = Figure(figsize=(WIDTH, tall * len(rows)))
-        grid = figure.subplots(len(rows), columns, squeeze=False)
-        for line, (episode, camera, (time, files)) in zip(grid, rows, strict=True):
-            at = np.linspace(0, len(files) - 1, columns).round().astype(int)
-            for axes, k in zip(line, at, strict=True):
-                axes.imshow(_decoded(files[k]))
-                axes.set_axis_off()
-                axes.set_title(f"{time[k]:.1f} s", fontsize=8)
-            line[0].set_title(f"Episode {episode}, {camera}, {time[at[0]]:.1f} s", fontsize=8)
-    return figure
-
-
-def _decoded(file: bytes) -> np.ndarray:
-    """A JPEG file as an image."""
-    from PIL import Image
-
-    with Image.open(BytesIO(file)) as image:
-        return np.asarray(image)
 
 
 def workspace_figure(

@@ -17,7 +17,6 @@ from hrc_learn.log.recordings import (
     DemonstrationTrace,
     FitRecording,
     LearningRecording,
-    Seen,
 )
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import (
@@ -33,7 +32,6 @@ from hrc_learn.viz.panels import (
 )
 from hrc_learn.viz.rerun_stream import (
     StaticShapes,
-    boxes,
     dashboard,
     frame_view,
     markdown_table,
@@ -117,14 +115,9 @@ class _Camera:
 
 
 def _cameras(demo: DemonstrationTrace) -> list[_Camera]:
-    return _at(f"episode_{demo.episode}", demo.images)
-
-
-def _at(root: str, seen: Seen) -> list[_Camera]:
-    """Cameras of a demonstration, with entities below a root path."""
     return [
-        _Camera(f"{root}/cameras/{slug(name)}", name, time, images)
-        for name, (time, images) in seen.items()
+        _Camera(f"episode_{demo.episode}/cameras/{slug(name)}", name, time, images)
+        for name, (time, images) in demo.images.items()
     ]
 
 
@@ -250,20 +243,12 @@ def record_fit(path: str | os.PathLike[str], fit: FitRecording, *, most: int = 6
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
     if every := [*fit.demo_paths, *fit.reproduction_paths]:
         name = "Paths: demonstrations (grey), reproductions (blue, dots: now)"
-        eye = frame_view(np.concatenate(every), base=bool(fit.boxes))
+        eye = frame_view(np.concatenate(every), base=False)
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
     pages: list[rrb.Container] = [tab_view(tab) for tab in tabs]
-    cameras: list[_Camera] = []
-    for i, episode in enumerate(fit.episodes[:most]):
-        if seen := fit.images.get(episode):
-            here = _at(f"demonstration_{i + 1}", seen)
-            pages[i] = _below_images(pages[i], tabs[i].title, here)
-            cameras += here
     right = rrb.Tabs(contents=pages, active_tab=0)
     layout = dashboard(left, [right], row_shares=(1, 1), column_shares=(2, 3))
     with rrd_file(path, fit.title, layout) as stream:
-        if fit.boxes:
-            stream.log("world/scene", boxes(fit.boxes), static=True)
         for name, paths, colour, radius in (
             ("demonstrations", fit.demo_paths, palette.DEMO, 0.004),
             ("reproductions", fit.reproduction_paths, palette.RUN_ON_DARK, 0.002),
@@ -272,7 +257,6 @@ def record_fit(path: str | os.PathLike[str], fit: FitRecording, *, most: int = 6
                 _send_strips(stream, name, paths, colour, radius)
         for i, (time, line) in enumerate(zip(fit.time, fit.reproduction_paths, strict=False)):
             _send_dot(stream, str(i + 1), time, line, palette.RUN_ON_DARK)
-        _send_images(stream, cameras)
         send_summary(stream, _fitted(fit))
         for tab, time in zip(tabs, fit.time, strict=False):
             send_tab(stream, time, tab)
@@ -346,19 +330,10 @@ def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -
         name = "End effector (grey), neurons (orange)"
         eye = frame_view(np.concatenate(every), base=False)
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
-    pages: list[rrb.Container] = [tab_view(tab)] if tab.plots else []
-    if learning.images:
-        seen = [
-            rrb.Spatial2DView(origin=f"/{_image(name)}", name=name) for name in learning.images
-        ]
-        pages.append(rrb.Grid(*seen, grid_columns=2, name="Images"))
-    right = [rrb.Tabs(contents=pages, active_tab=0)] if len(pages) > 1 else pages
+    right = [tab_view(tab)] if tab.plots else []
     layout = dashboard(left, right, row_shares=(3, 2), timeline=ROUND)
     with rrd_file(path, learning.title, layout) as stream:
         send_summary(stream, _learned(learning))
-        for name, image in learning.images.items():
-            still = rr.EncodedImage(contents=image, media_type="image/jpeg")
-            stream.log(_image(name), still, static=True)
         if learning.paths:
             _send_strips(stream, "demonstrations", learning.paths, palette.DEMO, 0.0008)
         _send_neurons(stream, learning.centers)
@@ -369,10 +344,6 @@ def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -
             dot = rr.SeriesPoints(names=kept.names, colors=kept.colours, marker_sizes=[6.0])
             stream.log(kept.path, dot, static=True)
             send_rows(stream, _rounds(np.array([learning.best])), kept)
-
-
-def _image(name: str) -> str:
-    return f"images/{slug(name)}"
 
 
 def learning_tab(learning: LearningRecording) -> Tab:

@@ -2,15 +2,11 @@
 
 import json
 import math
-from io import BytesIO
 
 import numpy as np
 import pytest
 from commands import done
-from PIL import Image
-from rrd_reading import Rrd
 
-from hrc_learn.demos import DatasetWriter
 from hrc_learn.learning.channels import ReproductionError
 from hrc_learn.viz.report import read_report
 
@@ -52,35 +48,6 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     assert (tmp_path / "evaluation" / "pose.png").stat().st_size > 1000
     # The same demonstrations fail a demand that none can meet.
     done("evaluate", "--model", model, "--dataset", poses, "--most-nrmse", 1e-9, status=1)
-
-
-def test_a_fit_shows_what_the_cameras_saw_and_lists_what_it_cannot_show(tmp_path):
-    root, model = tmp_path / "set", tmp_path / "model"
-    with DatasetWriter(root, 20, "any", ["a"], cameras={"front": (64, 96)}) as writer:
-        for _ in range(2):
-            writer.start_episode("look")
-            for k in range(40):
-                image = np.full((64, 96, 3), 6 * k, np.uint8)
-                writer.add_frame(joint_position=[np.sin(0.05 * k)], images={"front": image})
-            writer.save_episode()
-    _, second = sorted((root / "videos").glob("**/*.mp4"))
-    second.write_bytes(second.read_bytes()[:200])
-    outcome = done("fit", "--dataset", root, "--out", model, "--n-basis", 10)
-    assert "left out: " in outcome.output
-    assert second.name in outcome.output
-    assert str(model / "report.html") in outcome.output.replace("\n", "")
-    recording = Rrd(model / "fit.rrd")
-    assert {e for e in recording.entities if "cameras" in e} == {
-        "demonstration_1/cameras/front"
-    }
-    pictures = {p.name: p for p in read_report(model).pictures}
-    assert list(pictures) == ["demonstrations", "joints"]
-    seen = np.asarray(Image.open(BytesIO(pictures["demonstrations"].png())).convert("L"))
-    middle = seen[len(seen) * 2 // 3]  # five images in a row, from dark to bright
-    shades = [np.median(part) for part in np.array_split(middle, 5)]
-    # Ten images of 40 frames, and five of these.
-    frames = np.linspace(0, 39, 10).astype(int)[[0, 2, 4, 7, 9]]
-    np.testing.assert_allclose(shades, 6 * frames, atol=4)
 
 
 def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):

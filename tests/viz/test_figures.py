@@ -152,24 +152,3 @@ def test_boxes_are_cut_to_the_surroundings_of_the_paths():
     (part,) = near((tall, far), np.zeros((1, 3)))
     assert part.centre == (0.0, 0.0, 0.0)
     assert part.half_size == pytest.approx((0.1, 0.1, 0.22))
-
-
-def test_what_a_camera_saw_is_a_row_an_episode_from_start_to_end():
-    def jpeg(shade: int) -> bytes:
-        file = BytesIO()
-        Image.new("RGB", (48, 32), (shade, shade, shade)).save(file, "JPEG")
-        return file.getvalue()
-
-    shades = [20 * k for k in range(9)]
-    files = tuple(map(jpeg, shades))
-    seen = {k: {"front": (np.linspace(0, 4, 9), files)} for k in range(8)}
-    figure = figures.seen_figure({9: {}} | seen, most=2, columns=3)
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
-    assert titles == [
-        *("Episode 0, front, 0.0 s", "2.0 s", "4.0 s"),
-        *("Episode 1, front, 0.0 s", "2.0 s", "4.0 s"),
-    ]
-    drawn = [np.asarray(axes.get_images()[0].get_array()).mean() for axes in figure.axes]
-    np.testing.assert_allclose(drawn, [0, 80, 160] * 2, atol=3)
-    with pytest.raises(ValueError, match="there are no images"):
-        figures.seen_figure({9: {}})

@@ -139,21 +139,6 @@ def test_the_summary_lists_every_residual(tmp_path):
         assert line in text.splitlines()
 
 
-def test_images_are_above_the_curves_of_their_demonstration(tmp_path):
-    time = np.array([0.0, 0.5])
-    images = {7: {"front": (time, (b"a", b"b"))}, 9: {"front": (time, (b"c", b"d"))}}
-    fit = sample_fit(episodes=(5, 7, 9), images=images)
-    record_fit(tmp_path / "fit.rrd", fit, most=2)
-    rrd = Rrd(tmp_path / "fit.rrd")
-    cameras = [entity for entity in rrd.entities if "/cameras/" in entity]
-    assert cameras == ["demonstration_2/cameras/front"]
-    blobs = rrd.column(cameras[0], "EncodedImage:blob")
-    assert [bytes(blob[0]) for blob in blobs] == [b"a", b"b"]
-    np.testing.assert_allclose(rrd.time(cameras[0]), time)
-    with pytest.raises(ValueError, match="2 episodes for 3 demonstrations"):
-        sample_fit(episodes=(5, 7))
-
-
 @pytest.mark.parametrize("most", [1, 2, 10])
 def test_only_the_first_demonstrations_get_a_tab(tmp_path, most):
     record_fit(tmp_path / "fit.rrd", sample_fit(), most=most)
@@ -221,13 +206,6 @@ def test_a_fit_without_rounds_has_no_curves(tmp_path):
     assert not {e for e in rrd.entities if e.startswith(("learning", "world/neurons"))}
     ((text,),) = rrd.column("summary", "TextDocument:text", static=True)
     assert "Round" not in text
-
-
-def test_images_stand_still_whatever_the_round(tmp_path):
-    rrd = recorded(tmp_path, images={"End of episode 3": b"jpeg", "Start": b"other"})
-    blob = rrd.column("images/End_of_episode_3", "EncodedImage:blob", static=True)
-    assert bytes(blob[0][0]) == b"jpeg"
-    assert not {e for e in recorded(tmp_path).entities if e.startswith("images")}
 
 
 @pytest.mark.parametrize(
