@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, final
 
 import torch
 from torch import Tensor
+from torch.fx import Graph, Node
 from torch.utils import _pytree
 
-from hrc_learn.deploy._inductor import tuned_for
 from hrc_learn.deploy.package import PackedStep, StepObservation, Steppable, describe, machine
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.store import Claim, new_file
@@ -49,7 +49,8 @@ def export_step(
         NoCompilerError: There is neither a package nor a C++ compiler.
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
-    folder = folder or _default_folder()
+    if folder is None:
+        folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hrc_learn"
     step = PackedStep(controller, observation)
     program = None
     try:
@@ -120,17 +121,6 @@ def _require_compiler() -> None:
         cpp_builder.get_cpp_compiler()
     except exc.InvalidCxxCompiler as error:
         raise NoCompilerError("no C++ compiler found: install g++, or set CXX") from error
-
-
-def _default_folder() -> Path:
-    home = Path.home()
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
-    elif sys.platform == "darwin":
-        base = home / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME", home / ".cache"))
-    return base / "hrc_learn"
 
 
 # Sources of a compiled step, all hashed: equal hashes mean equal compiled code.
@@ -223,3 +213,131 @@ def _source_hash() -> bytes:
             if path.is_file():
                 digest.update(str(path.relative_to(_ROOT)).encode() + path.read_bytes())
     return digest.digest()
+
+
+# Memory layout of compiled steps. Inductor has no public option for the layout of results, so
+# three of its private functions, and a limit, are replaced during a compilation. They exist in
+# all versions of torch that pyproject.toml allows; tests/deploy/test_inductor.py watches them.
+
+# Stack memory that a step may use [bytes]: allocations there are free, while those of torch
+# cost more than the arithmetic. Threads commonly have 8 MB.
+_STACK = 2**20
+_CAT, _PERMUTE = torch.ops.aten.cat.default, torch.ops.aten.permute.default
+
+
+@contextmanager
+def tuned_for(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
+    """Context in which inductor compiles fast code for a step of a batch.
+
+    Args:
+        batch: Sizes of the batch, the leading axes of tensors; empty for one arm.
+
+    Yields:
+        Options to compile with.
+    """
+    from torch._inductor.codegen import cpp_wrapper_cpu_array_ref as wrapper
+
+    options: dict[str, Any] = {"aot_inductor.allow_stack_allocation": True}
+    with ExitStack() as stack:
+        stack.enter_context(_replaced(wrapper, "MAX_STACK_ALLOCATION_SIZE", _STACK))
+        if batch:
+            stack.enter_context(_batch_last(list(batch)))
+            options["post_grad_custom_post_pass"] = cat_batch_last(list(batch))
+        yield options
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """Context in which one attribute of a class or module is replaced."""
+    # Not getattr, which would bind a classmethod: the original object has to be restored.
+    before = vars(owner)[name]
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, before)
+
+
+@contextmanager
+def _batch_last(batch: list[int]) -> Iterator[None]:
+    """Context in which tensors with leading batch axes have the batch last in memory.
+
+    Then the innermost loops run over the batch, a vector register of elements at a time. By
+    default inductor keeps the batch first in memory, and transposes again and again.
+    """
+    from torch._inductor import ir
+
+    view = ir.View.create
+    plain, preferred = ir.FlexibleLayout.__init__, ir.ComputedBuffer.get_fill_order
+
+    def lay_out(
+        self: Any, device: Any, dtype: Any, size: Any, stride_order: Any = None, *more: Any
+    ) -> None:
+        if not stride_order and _leads(batch, size):
+            stride_order = _fill_order(len(batch), len(size))
+        plain(self, device, dtype, size, stride_order, *more)
+
+    def fill_order(self: Any) -> Any:
+        # Inductor would take the order of the buffer's inputs, and transpose.
+        size = self.get_size()
+        if isinstance(self.layout, ir.FlexibleLayout) and _leads(batch, size):
+            return _fill_order(len(batch), len(size))
+        return preferred(self)
+
+    def decided_view(x: Any, new_size: Sequence[Any]) -> Any:
+        # Inductor copies the strides of the viewed buffer, and may change those later: it
+        # treats every layout as undecided that does not have the last axis last.
+        if ir.is_storage_and_layout(x):
+            x.freeze_layout()
+        return view(x, new_size)
+
+    with (
+        _replaced(ir.FlexibleLayout, "__init__", lay_out),
+        _replaced(ir.ComputedBuffer, "get_fill_order", fill_order),
+        _replaced(ir.View, "create", staticmethod(decided_view)),
+    ):
+        yield
+
+
+def _leads(batch: Sequence[int], size: Sequence[Any]) -> bool:
+    """True if a size begins with the batch and does not end with it already."""
+    n = len(batch)
+    return list(size[:n]) == batch and list(size[-n:]) != batch
+
+
+def _fill_order(first: int, axes: int) -> list[int]:
+    """Axes from the fastest one: the first ones, then the others."""
+    return [*reversed(range(first)), *reversed(range(first, axes))]
+
+
+def cat_batch_last(batch: list[int]) -> Callable[[Graph], None]:
+    """Graph pass that permutes tensors before a concatenation, and its result back.
+
+    Inductor writes the parts directly into the result, whose layout cannot be set otherwise.
+    """
+
+    def permute(graph: Graph) -> None:
+        for node in graph.find_nodes(op="call_function", target=_CAT):
+            args: Any = node.args
+            parts, dim, *_ = *args, 0  # aten.cat leaves out a dim of zero
+            axes = range(node.meta["val"].ndim)
+            dim = axes[dim]
+            # Concatenation along the batch, or with the batch last already: nothing to gain.
+            if dim < len(batch) or not _leads(batch, node.meta["val"].shape):
+                continue
+            first, last = axes[: len(batch)], axes[len(batch) :]
+            with graph.inserting_before(node):
+                permuted = [_call(graph, _PERMUTE, x, [*last, *first]) for x in parts]
+                whole = _call(graph, _CAT, permuted, dim - len(batch))
+                back = _call(graph, _PERMUTE, whole, [*axes[len(last) :], *axes[: len(last)]])
+            node.replace_all_uses_with(back)
+            graph.erase_node(node)
+
+    return permute
+
+
+def _call(graph: Graph, function: Any, *args: Any) -> Node:
+    """New node, with the metadata of its result that inductor needs."""
+    node = graph.call_function(function, args)
+    node.meta["val"] = function(*_pytree.tree_map_only(Node, lambda x: x.meta["val"], args))
+    return node

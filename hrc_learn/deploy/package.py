@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -332,19 +331,7 @@ def _vector(text: str, batch: list[int], dtype: torch.dtype) -> Tensor:
 
 
 def _open(path: Path) -> tuple[Callable[[list[Tensor]], object], dict[str, str]]:
-    try:
-        loader = _fast_loader()(str(path), "model", False, 1, -1)
-        return loader.run, loader.get_metadata()
-    except (AttributeError, TypeError):
-        warnings.warn(
-            f"torch {torch.__version__} lacks the fast loader of packages: loading takes up to "
-            "half a minute, and each step some microseconds longer",
-            stacklevel=2,
-        )
-        model = torch._inductor.aoti_load_package(str(path))
-        return lambda vectors: model(*vectors), model.get_metadata()
-
-
-def _fast_loader() -> Any:
-    """Private loader of torch, ready in milliseconds; the public one probes compilers."""
-    return torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore
+    # Private, ready in milliseconds; torch's public loader probes compilers for half a minute.
+    loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore
+    package = loader(str(path), "model", False, 1, -1)
+    return package.run, package.get_metadata()

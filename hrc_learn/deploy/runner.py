@@ -256,11 +256,6 @@ class Rate:
         self._period, self._clock, self._sleep = period, clock, sleep
         self._next = clock() + period
 
-    @property
-    def missed_fraction(self) -> float:
-        """Fraction of skipped ticks, 0 to 1."""
-        return self.missed / max(1, self.ticks + self.missed)
-
     def wait(self) -> float:
         """Wait for the next tick; if several are due, all but one are missed.
 

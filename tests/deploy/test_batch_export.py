@@ -12,7 +12,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from unchecked import shapes_unchecked
 
 from hrc_learn.deploy import EagerRunner, PackageRunner, export_step
-from hrc_learn.deploy._inductor import cat_batch_last
+from hrc_learn.deploy.export import cat_batch_last
 from hrc_learn.deploy.package import load
 from hrc_learn.kinematics import panda
 

@@ -307,21 +307,6 @@ class TestPackage:
         with pytest.raises(ValueError, match=r"built for torch 2.*, but this is torch 1\.0"):
             load(package)
 
-    def test_without_the_fast_loader_the_public_one_serves(self, package, monkeypatch):
-        def missing():
-            raise AttributeError("no such loader")
-
-        monkeypatch.setattr(package_module, "_fast_loader", missing)
-        with pytest.warns(UserWarning, match="lacks the fast loader of packages"):
-            slow = load(package)
-        controller, observation = controller_and_observation()
-        step = PackedStep(controller, observation)
-        expected, actual = step.example(observation), step.example(observation)
-        with torch.no_grad():
-            step(*expected)
-        slow.run(list(actual))
-        torch.testing.assert_close(actual.state, expected.state, rtol=1e-12, atol=1e-9)
-
     def test_a_program_without_this_library_runs_it(self, package, tmp_path):
         blocked = (
             "import sys, runpy; sys.modules['hrc_learn'] = None; "
