@@ -34,7 +34,6 @@ from hrc_learn.kinematics.redundancy import arm_angle as arm_angle
 from hrc_learn.kinematics.redundancy import arm_angle_and_motion as arm_angle_and_motion
 from hrc_learn.kinematics.redundancy import null_space_projector as null_space_projector
 from hrc_learn.kinematics.redundancy import pseudo_inverse as pseudo_inverse
-from hrc_learn.kinematics.redundancy import singularity_damping as singularity_damping
 from hrc_learn.kinematics.registry import ArmChoice as ArmChoice
 from hrc_learn.kinematics.registry import MissingModelError as MissingModelError
 from hrc_learn.kinematics.registry import arm as arm

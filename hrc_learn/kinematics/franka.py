@@ -95,55 +95,21 @@ image.
 """
 
 
-def strictest(*vintages: JointLimits) -> JointLimits:
-    """Limits that keep all of the given ones, at every position.
-
-    The innermost limits of position, and of velocity the smallest offset whose curve stays
-    below all. With the distance w from the innermost limit to that of one vintage, d alike, its
-    curve and ours are nearest where its velocity limit is reached, so there they meet at
-
-        o = sqrt((velocity + o_k)^2 - 2 d w) - velocity.
-
-    Args:
-        vintages: Limits with the same velocity and deceleration.
-
-    Raises:
-        ValueError: Those differ.
-    """
-    first = vintages[0]
-    v, d = first.velocity, first.deceleration
-    if d is None or not all(
-        k.deceleration is not None
-        and torch.equal(k.deceleration, d)
-        and torch.equal(k.velocity, v)
-        for k in vintages
-    ):
-        raise ValueError(
-            "only vintages with the same limits of velocity and deceleration can be combined"
-        )
-    lower = torch.stack([k.lower for k in vintages]).amax(0)
-    upper = torch.stack([k.upper for k in vintages]).amin(0)
-    offsets = []
-    for k in vintages:
-        assert k.velocity_offset is not None
-        # The nearer of both sides, which asks for more.
-        w = torch.minimum(k.upper - upper, lower - k.lower)
-        offsets.append(((v + k.velocity_offset) ** 2 - 2 * d * w).sqrt() - v)
-    return JointLimits(
-        lower=lower,
-        upper=upper,
-        velocity=v,
-        acceleration=torch.stack([k.acceleration for k in vintages]).amin(0),
-        jerk=torch.stack([k.jerk for k in vintages]).amin(0),
-        torque=torch.stack([k.torque for k in vintages]).amin(0),
-        velocity_offset=torch.stack(offsets).amax(0),
-        deceleration=d,
-        vintage="the strictest of: " + "; ".join(k.vintage for k in vintages),
-    )
-
-
-FR3_LIMITS = strictest(*FR3_VINTAGES.values())
-"""Kept by every Research 3, whichever of these tables it has."""
+FR3_LIMITS = _limits(
+    "the strictest of: " + "; ".join(limits.vintage for limits in FR3_VINTAGES.values()),
+    lower=(-2.7501, -1.7918, -2.9007, -3.0481, -2.8101, 0.54092, -3.0196),
+    upper=(2.7501, 1.7918, 2.9007, -0.1458, 2.8101, 4.5205, 3.0196),
+    # With the distance w from here to the position limit of a vintage, d the deceleration and v
+    # the velocity, the curves meet where v is reached: sqrt((v + its offset)^2 - 2 d w) - v, of
+    # which these are the largest.
+    velocity_offset=(
+        *(0.37174598019283733, 0.21154196331256925, 0.2004999999999999, 0.31507506547958686),
+        *(0.3795562316551111, 0.36783379753482226, 0.36935518865171524),
+    ),
+    **_FR3,
+)
+"""The innermost position limits of all tables, and the smallest velocity offsets whose curves
+stay below all others: kept by every Research 3, whichever of these tables it has."""
 
 
 # Craig's modified Denavit-Hartenberg parameters, as published in Franka's "Robot and interface

@@ -24,7 +24,7 @@ def pseudo_inverse(
     """Right pseudo-inverse J^T (J J^T + damping^2 I)^-1.
 
     Without damping it inverts exactly wherever J has full rank, and fails or overflows where
-    it has not: pass `singularity_damping(J)` to be safe everywhere.
+    it has not.
 
     Args:
         J: Jacobian with at least as many joints as rows.
@@ -50,27 +50,6 @@ def null_space_projector(
     """
     eye = torch.eye(J.shape[-1], dtype=J.dtype, device=J.device)
     return eye - pseudo_inverse(J, damping) @ J
-
-
-def singularity_damping(
-    J: Float[Tensor, "*batch rows joints"], strength: float = SINGULAR_BELOW
-) -> Float[Tensor, "*batch"]:
-    """Damping that is exactly zero away from singularities and grows smoothly towards them.
-
-    damping^2 = strength^2 (1 - (sigma_min / 0.05)^2) below sigma_min = 0.05, else 0
-    (Maciejewski and Klein 1988, numerical filtering of the smallest singular value).
-
-    Args:
-        J: Jacobian.
-        strength: Damping at the singularity itself. With the default the gain of the
-            pseudo-inverse grows to 1 / 0.05 = 20 and from there falls in proportion to
-            sigma_min, to zero at the singularity.
-    """
-    smallest = torch.linalg.svdvals(J)[..., -1]
-    depth = torch.clamp_min(1 - torch.square(smallest / SINGULAR_BELOW), 0.0)
-    # The derivative of sqrt at zero is infinite: leave it out of the branch not chosen.
-    outside = depth == 0
-    return torch.where(outside, 0.0, strength * torch.sqrt(torch.where(outside, 1.0, depth)))
 
 
 _SHOULDER, _ELBOW, _WRIST = 1, 3, 5  # frames of joints 2, 4 and 6

@@ -12,7 +12,6 @@ from sampling import generator, within
 from torch.testing import assert_close
 
 from hrc_learn.kinematics import FR3_VINTAGES, JointLimits, fr3, panda
-from hrc_learn.kinematics.franka import strictest
 
 
 def everywhere(*batch: int) -> torch.Tensor:
@@ -107,16 +106,6 @@ def test_the_arm_keeps_the_limits_of_every_vintage_and_no_tighter_ones():
     for k in FR3_VINTAGES.values():
         assert bool((limits.lower >= k.lower).all())
         assert bool((limits.upper <= k.upper).all())
-
-
-def test_only_vintages_of_one_curve_are_combined():
-    with pytest.raises(ValueError, match="same limits of velocity and deceleration"):
-        strictest(fr3.limits, panda.limits)
-    with pytest.raises(ValueError, match="same limits of velocity and deceleration"):
-        strictest(panda.limits)
-    faster = replace(fr3.limits, velocity=2 * fr3.limits.velocity)
-    with pytest.raises(ValueError, match="same limits of velocity and deceleration"):
-        strictest(fr3.limits, faster)
 
 
 def test_an_offset_comes_with_a_deceleration():

@@ -11,7 +11,6 @@ from hrc_learn.kinematics import (
     null_space_projector,
     panda,
     pseudo_inverse,
-    singularity_damping,
 )
 
 
@@ -106,45 +105,3 @@ def test_damping_filters_singular_values(damping):
     assert_close(pseudo_inverse(J, damping), expected)
     assert_close(pseudo_inverse(J, torch.full((20,), damping, dtype=J.dtype)), expected)
     assert_close(null_space_projector(J, damping), torch.eye(7, dtype=J.dtype) - expected @ J)
-
-
-def test_damping_is_exactly_zero_away_from_singularities():
-    assert bool((singularity_damping(regular_jacobians(200)) == 0).all())
-
-
-def scaled_to(sigma_min):
-    U, S, Vh = torch.linalg.svd(regular_jacobians(), full_matrices=False)
-    S = torch.cat([S[:5], torch.tensor([sigma_min], dtype=S.dtype)])
-    return U @ torch.diag(S) @ Vh
-
-
-def test_damping_grows_smoothly_towards_a_singularity():
-    sigma = [0.0, 0.01, 0.02, 0.03, 0.04, 0.0499]
-    damping = torch.stack([singularity_damping(scaled_to(s)) for s in sigma])
-    expected = 0.05 * (1 - (torch.tensor(sigma, dtype=torch.float64) / 0.05) ** 2).sqrt()
-    assert_close(damping, expected, rtol=0, atol=1e-12)
-
-
-def test_gain_of_the_damped_inverse_falls_to_zero_at_a_singularity():
-    for sigma in (0.0, 1e-6, 0.01, 0.03, 0.049, 0.06):
-        J = scaled_to(sigma)
-        gains = torch.linalg.svdvals(pseudo_inverse(J, singularity_damping(J)))
-        largest = torch.linalg.svdvals(J)[:-1].reciprocal()
-        expected = sigma / 0.05**2 if sigma < 0.05 else 1 / sigma
-        expected = torch.cat([largest, torch.tensor([expected], dtype=J.dtype)])
-        # Damping takes a little from the other gains as well: at most 0.05^2 / sigma_5^2.
-        assert float(gains[0]) <= 1.001 * float(expected.max())
-        assert float((gains - expected[-1]).abs().min()) < 1e-6 * (1 + float(expected[-1]))
-
-
-def test_damped_inverse_survives_a_real_singularity():
-    J = singular_jacobian()
-    gain = torch.linalg.svdvals(pseudo_inverse(J, singularity_damping(J)))[0]
-    assert float(gain) < 20
-
-
-@pytest.mark.parametrize("sigma_min", [0.0, 0.03, 0.05, 0.4])
-def test_gradients_are_finite(sigma_min):
-    J = scaled_to(sigma_min).requires_grad_()
-    pseudo_inverse(J, singularity_damping(J)).sum().backward()
-    assert bool(J.grad.isfinite().all())
