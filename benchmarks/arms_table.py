@@ -47,9 +47,9 @@ from hrc_learn.sim.workplace import Workplace
 _BEGIN, _END = "<!-- arms:begin -->", "<!-- arms:end -->"
 _HEADER = (
     "| arm | maker | joints | reach [m] | largest difference from MuJoCo, Pinocchio "
-    "| poses found | ms a pose | self-collision: capsules, MuJoCo, missed "
-    "| servoing: done; steps beyond limits, self-contacts "
-    "| `hrc demo` |\n|---|---|---|---|---|---|---|---|---|---|"
+    "| poses found [%] | self-collision [%]: capsules, MuJoCo, missed "
+    "| servoing: done [%]; steps beyond limits, self-contacts "
+    "| `hrc demo`: grasp, placement [mm] |\n|---|---|---|---|---|---|---|---|---|"
 )
 _COLUMNS = _HEADER.splitlines()[0].count("|") - 1
 
@@ -107,7 +107,7 @@ def main(args: Args) -> None:
             f"| {name} | {maker_of(name)} | {measured['joints']:.0f} "
             f"| {measured['reach_m']:.2f} "
             f"| {_differences(measured)} "
-            f"| {100 * measured['inverse_found']:.1f} % | {measured['inverse_ms']:.0f} "
+            f"| {100 * measured['inverse_found']:.1f} "
             f"| {_percent(measured, 'capsules_touch', 'hulls_touch', 'missed')} "
             f"| {_servoing(name, measured, args)} | {_demo(name, args)} |"
         )
@@ -347,7 +347,7 @@ def _differences(measured: dict[str, float]) -> str:
 
 
 def _percent(measured: dict[str, float], *names: str) -> str:
-    return ", ".join(f"{100 * measured[name]:.0f} %" for name in names)
+    return ", ".join(f"{100 * measured[name]:.0f}" for name in names)
 
 
 def _row_before(name: str, args: Args) -> list[str]:
@@ -370,7 +370,7 @@ def _servoing(name: str, measured: dict[str, float], args: Args) -> str:
     if "servo_done" not in measured:
         return "out of reach"
     return (
-        f"{100 * measured['servo_done']:.1f} %; {measured['servo_violations']:.0f}, "
+        f"{100 * measured['servo_done']:.1f}; {measured['servo_violations']:.0f}, "
         f"{measured['servo_self_contacts']:.0f}"
     )
 
@@ -383,23 +383,20 @@ def _demo(name: str, args: Args) -> str:
         said = before[0].split("|")[-2].strip() if before else "not tried"
         return _refusal(name) or said if path is not None else said
     values = json.loads(path.read_text(encoding="utf-8"))
-    if values["success_rate"] < 1:
+    if values["success_rate"] < 1 or values["contacts"]:
         return "not done"
-    return (
-        f"grasped, {values['grasp_offset_mm']:.1f} mm off; "
-        f"placed, {values['place_error_mm']:.1f} mm off; {values['contacts']:.0f} contacts"
-    )
+    return f"{values['grasp_offset_mm']:.1f}, {values['place_error_mm']:.1f}"
 
 
 def _refusal(name: str) -> str:
     """Why the demo does not begin with an arm; empty where it does."""
     choice = ArmChoice(name)
     if len(arm(name).joint_names) < 6:
-        return "refused: it takes six joints"
+        return "five joints"
     try:
         Workplace.of(choice.work_arm())
     except UnreachableError:
-        return "refused: too small for the cell"
+        return "too small"
     return ""
 
 

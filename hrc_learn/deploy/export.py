@@ -271,11 +271,11 @@ def _batch_last(batch: list[int]) -> Iterator[None]:
     plain, preferred = ir.FlexibleLayout.__init__, ir.ComputedBuffer.get_fill_order
 
     def lay_out(
-        self: Any, device: Any, dtype: Any, size: Any, stride_order: Any = None, *more: Any
+        self: Any, device: Any, dtype: Any, size: Any, stride_order: Any = None, **more: Any
     ) -> None:
         if not stride_order and _leads(batch, size):
             stride_order = _fill_order(len(batch), len(size))
-        plain(self, device, dtype, size, stride_order, *more)
+        plain(self, device, dtype, size, stride_order, **more)
 
     def fill_order(self: Any) -> Any:
         # Inductor would take the order of the buffer's inputs, and transpose.
