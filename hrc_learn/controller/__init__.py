@@ -1,9 +1,5 @@
 """The adaptive controller and the safety filter behind it."""
 
-from hrc_learn.controller.action_chunk_filter import LIMIT_KINDS as LIMIT_KINDS
-from hrc_learn.controller.action_chunk_filter import ActionChunkFilter as ActionChunkFilter
-from hrc_learn.controller.action_chunk_filter import ActionChunkReport as ActionChunkReport
-from hrc_learn.controller.action_chunk_filter import ActionChunkState as ActionChunkState
 from hrc_learn.controller.adaptive_controller import AdaptiveController as AdaptiveController
 from hrc_learn.controller.adaptive_controller import ControllerConfig as ControllerConfig
 from hrc_learn.controller.adaptive_controller import ControllerState as ControllerState

@@ -106,7 +106,7 @@ class FrankaPanda(ArmRobot):
     """A Franka Panda commanded by positions, through its velocity interface.
 
     NOT RUN ON HARDWARE. Between an action and the arm stand, in this order: the limits of the
-    joints' motion (`ActionChunkFilter`), the safety filter with a cap on the speed of the tool,
+    joints' motion (`MotionFilter`), the safety filter with a cap on the speed of the tool,
     a watchdog that stops the arm when the loop falls silent, in a process of its own with the
     driver, and the driver, which ends every velocity by itself. Keep the stop button in hand.
 

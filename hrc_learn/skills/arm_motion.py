@@ -7,13 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller import (
-    ActionChunkFilter,
-    ActionChunkState,
-    SafetyConfig,
-    SafetyFilter,
-    SafetyState,
-)
+from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
+from hrc_learn.controller.motion_filter import MotionFilter, MotionState
 from hrc_learn.controller.resolved_rate import task_rate
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import SerialChain
@@ -114,7 +109,7 @@ class PositionServo:
     """Tracks joint positions by velocities within the limits.
 
     Targets that keep the limits are reached when the next one is due. Other targets are
-    tracked as `ActionChunkFilter` does, so that a jump of the target is none of the arm.
+    tracked as `MotionFilter` does, so that a jump of the target is none of the arm.
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.
@@ -152,17 +147,19 @@ class PositionServo:
             acceleration=self._filter.barrier.acceleration,
             jerk=self._filter.barrier.jerk,
         )
-        self._smoother = ActionChunkFilter(self.limits, dt)
+        names = ("velocity", "acceleration", "jerk", "lower", "upper")
+        limits = {name: getattr(self.limits, name).numpy() for name in names}
+        self._smoother = MotionFilter(dt, **limits)
         self.safety: SafetyState
-        self._motion: ActionChunkState
+        self._motion: MotionState
         self.restart()
 
     def restart(self) -> None:
         """Restart from the measured motion of the arm."""
         state = self._arm.read()
-        q, v = map(torch.from_numpy, (state.joint_position, state.joint_velocity))
-        self.safety = self._filter.initial_state(q, v)
-        self._motion = self._smoother.initial_state(q, v)
+        q, v = state.joint_position, state.joint_velocity
+        self.safety = self._filter.initial_state(torch.from_numpy(q), torch.from_numpy(v))
+        self._motion = MotionState.moving(q, v)
 
     def follow(
         self, target: Float[np.ndarray, " joints"]
@@ -176,19 +173,22 @@ class PositionServo:
             The reading of the arm that was used, and the commanded positions [rad]. The caller
             lets dt pass.
         """
-        state = self._arm.read()
-        q, before = torch.from_numpy(state.joint_position), self._motion
-        _, self._motion, _ = self._smoother(
-            torch.from_numpy(np.asarray(target, dtype=float))[None], before
+        state, before = self._arm.read(), self._motion
+        here, q = state.joint_position, torch.from_numpy(state.joint_position)
+        self._motion = self._smoother.step(before, np.asarray(target, dtype=float))
+        wanted = self._motion.velocity + self._config.gain * (before.position - here)
+        filtered, self.safety, _ = self._filter.step(
+            self.safety,
+            q,
+            torch.from_numpy(wanted),
+            self._dt,
+            jacobian=self._chain.jacobian(q),
         )
-        wanted = self._motion.velocity + self._config.gain * (before.position - q)
-        velocity, self.safety, _ = self._filter.step(
-            self.safety, q, wanted, self._dt, jacobian=self._chain.jacobian(q)
-        )
-        self._arm.command(velocity.numpy())
-        if float((before.position - q).abs().max()) > self._config.lag:
-            self._motion = self._smoother.initial_state(q + velocity * self._dt, velocity)
-        return state, self._motion.position.numpy()
+        velocity = filtered.numpy()
+        self._arm.command(velocity)
+        if np.abs(before.position - here).max() > self._config.lag:
+            self._motion = MotionState.moving(here + velocity * self._dt, velocity)
+        return state, self._motion.position
 
     def joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
         """Joint positions, near the commanded ones, with the end effector at a pose [rad].
@@ -196,4 +196,4 @@ class PositionServo:
         Args:
             pose: Pose of the end effector. If it is out of reach, the result only comes closer.
         """
-        return joints_near(self._chain, pose, self._motion.position).numpy()
+        return joints_near(self._chain, pose, torch.from_numpy(self._motion.position)).numpy()

@@ -15,6 +15,16 @@ import draccus
 import numpy as np
 from jaxtyping import Float
 
+try:
+    from hrc_learn.controller.motion_filter import MotionFilter, MotionState
+except ImportError:  # the distribution of this folder has a copy of that file
+    from .motion_filter import (  # pyright: ignore[reportMissingImports]
+        MotionFilter,
+        MotionState,
+    )
+
+__all__ = ["ActionLimits", "MotionFilter", "MotionState"]
+
 ACTION, STATE = "action", "observation.state"
 _UNUSUAL = 0.999
 """Quantile of the differences used as a limit; single glitches do not count."""
@@ -82,6 +92,22 @@ class ActionLimits:
         low = [-math.inf if x is None else x for x in self.lower]
         high = [math.inf if x is None else x for x in self.upper]
         return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+
+    def motion_filter(self, dt: float) -> MotionFilter:
+        """Filter that keeps positions, dt [s] apart, within these limits."""
+        velocity, acceleration, jerk = (
+            np.array(limit, dtype=np.float64)
+            for limit in (self.velocity, self.acceleration, self.jerk)
+        )
+        lower, upper = self.positions()
+        return MotionFilter(
+            dt,
+            velocity=velocity,
+            acceleration=acceleration,
+            jerk=jerk,
+            lower=lower,
+            upper=upper,
+        )
 
     def within(self, ranges: Mapping[str, Range]) -> ActionLimits:
         """The same with limits of position for the values that are named."""

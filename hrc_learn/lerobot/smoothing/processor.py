@@ -22,8 +22,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from .action_limits import ActionLimits, read_json, write_json
-from .motion_filter import LIMIT_KINDS, MotionFilter, MotionState
+from .action_limits import ActionLimits, MotionState, read_json, write_json
 
 WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
 PREPROCESSOR = "policy_preprocessor.json"
@@ -43,7 +42,6 @@ class Changes:
     Attributes:
         steps: Actions handed out.
         changed: Number of actions that were changed.
-        broken: Number of requested actions that would have violated each of `LIMIT_KINDS`.
         largest: Largest change of each value, in its unit.
     """
 
@@ -54,30 +52,20 @@ class Changes:
     def clear(self) -> None:
         """Start over."""
         self.steps = self.changed = 0
-        self.broken = np.zeros(len(LIMIT_KINDS), dtype=int)
         self.largest = np.zeros(len(self.names))
 
-    def add(
-        self, broken: Bool[np.ndarray, "*batch T 4"], change: Float[np.ndarray, "*batch T D"]
-    ) -> None:
-        """Count the changes of a chunk.
-
-        Args:
-            broken: True for each of `LIMIT_KINDS` that an action would have violated.
-            change: Difference between returned and requested action.
-        """
+    def add(self, change: Float[np.ndarray, "*batch D"]) -> None:
+        """Count the differences between returned and requested actions."""
         change = np.abs(change).reshape(-1, len(self.names))
         self.steps += len(change)
         self.changed += int((change > _SAME).any(-1).sum())
-        self.broken += broken.reshape(-1, len(LIMIT_KINDS)).sum(0)
         self.largest = np.maximum(self.largest, change.max(0))
 
     def __str__(self) -> str:
-        broken = ", ".join(f"{k} {n}" for k, n in zip(LIMIT_KINDS, self.broken, strict=True))
         most = int(self.largest.argmax())
         return (
             f"{self.changed} of {self.steps} actions changed, by at most "
-            f"{self.largest[most]:.4g} ({self.names[most]}); beyond the limits: {broken}"
+            f"{self.largest[most]:.4g} ({self.names[most]})"
         )
 
 
@@ -134,8 +122,7 @@ class SmoothActionsStep(ProcessorStep):
     a time, (batch, values), as lerobot-rollout and lerobot-eval hand them on, or whole chunks
     (batch, steps, values). A motion begins with the measured position and velocity, and anew
     where the robot is put; a chunk begins where the robot is on the one before. A value whose
-    measurement is not finite keeps its motion, and before the first finite one it is held. See
-    `MotionFilter`.
+    measurement is not finite keeps its motion, and before the first finite one it is held.
     """
 
     fps: float
@@ -158,7 +145,7 @@ class SmoothActionsStep(ProcessorStep):
     """Report of changes since the last reset."""
 
     def __post_init__(self) -> None:
-        self._filter = MotionFilter(ActionLimits(**self.get_config()), 1.0 / self.fps)
+        self._filter = ActionLimits(**self.get_config()).motion_filter(1.0 / self.fps)
         self._columns = np.array(self.state_columns)
         self._watch: weakref.ref[WatchStateStep] | None = None
         _ = self.watch
@@ -187,12 +174,12 @@ class SmoothActionsStep(ProcessorStep):
         asked = (action if whole else action.unsqueeze(-2)).detach().cpu().double().numpy()
         state, held = self._start(asked, whole)
         asked = np.where(held[:, None], state.position[:, None], asked)
-        broken, made = self._filter.broken(state, asked), []
+        made = []
         for k in range(asked.shape[-2]):
             state = self._filter.step(state, asked[..., k, :])
             made.append(state.position)
         self._state, chunk = state, np.stack(made, axis=-2)
-        self.changes.add(broken, np.nan_to_num(chunk - asked))
+        self.changes.add(np.nan_to_num(chunk - asked))
         # An acceleration takes three actions; with fewer the next chunk goes on from the state.
         self._chunk = chunk if whole and len(made) > 2 else None
         smooth = torch.from_numpy(chunk).to(action)

@@ -16,7 +16,7 @@ from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from .action_limits import ActionLimits
-from .motion_filter import ActionUpsampler
+from .upsampling import ActionUpsampler
 
 logger = logging.getLogger(__name__)
 

@@ -1,4 +1,7 @@
-"""A jerk-limited filter of positions, and the curve through actions for the motors."""
+"""Jerk-limited filter of positions, fast enough for a loop at the rate of the motors.
+
+Imports NumPy only: the distribution `lerobot-smooth` has a copy of this file.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,7 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float
-
-from .action_limits import ActionLimits
-
-LIMIT_KINDS = ("position", "velocity", "acceleration", "jerk")
-"""Limits that positions may break, in the order of the last axis of a report's flags."""
+from jaxtyping import Float
 
 # Fraction of the limits that a correction counts on; the motion followed needs the rest.
 _USABLE = 0.8
@@ -93,39 +91,43 @@ class MotionFilter:
     remains true, which is a set that braking with A, reached with j, never leaves. It takes a
     start in it: at rest, A^3/(8 j^2) + A^2 dt/(2 j) away from the limits of position. A is
     lowered where that would be more than a tenth of their range.
-
-    `hrc_learn.controller.ActionChunkFilter` is the same in PyTorch, for batches and gradients,
-    at three times the time for one position.
     """
 
-    def __init__(self, limits: ActionLimits, dt: float):
+    def __init__(
+        self,
+        dt: float,
+        *,
+        velocity: Float[np.ndarray, " D"],
+        acceleration: Float[np.ndarray, " D"],
+        jerk: Float[np.ndarray, " D"],
+        lower: Float[np.ndarray, " D"],
+        upper: Float[np.ndarray, " D"],
+    ):
         """Prepare for one sampling rate.
 
         Args:
-            limits: Limits of every value.
             dt: Time from one position to the next [s].
+            velocity: Limit of each value [1/s].
+            acceleration: [1/s^2].
+            jerk: [1/s^3].
+            lower: Lowest position, may be infinite.
+            upper: Highest position, may be infinite.
 
         Raises:
             ValueError: dt is not positive and finite.
         """
         if not 0 < dt < float("inf"):
             raise ValueError(f"dt must be positive and finite, but is {dt}")
-        lower, upper = limits.positions()
-        self.dt = dt
-        self.velocity = np.asarray(limits.velocity, dtype=np.float64)
-        self.jerk = np.asarray(limits.jerk, dtype=np.float64)
-        A = np.asarray(limits.acceleration, dtype=np.float64)
-        j, margin = self.jerk, 0.05 * (upper - lower)
+        self.dt, self.velocity, self.jerk = dt, velocity, jerk
+        j, margin = jerk, 0.05 * (upper - lower)
         # The larger of both terms of the way that braking needs at rest stays below the margin,
         # so that together they take at most a tenth of the range.
         ramped = np.minimum(np.cbrt(8 * j**2 * margin), np.sqrt(2 * j * margin / dt))
-        self.acceleration = np.minimum(A, ramped)
-        A = self.acceleration
-        self._lower, self._upper = lower, upper
+        self.acceleration = A = np.minimum(acceleration, ramped)
         self._walls = np.stack([-lower, upper])
         self._sides = np.array([[1.0], [-1.0]])
         self._knee, self._reserve = A * dt, A**2 / (2 * j)
-        self._fastest = self.velocity * (1 - _UNUSED)
+        self._fastest = velocity * (1 - _UNUSED)
         self._braking, self._braking_jerk = _USABLE * A, _USABLE * j
         self._rate = np.minimum(self._braking_jerk / self._braking, _POSITION_RATE / dt)
         self._rate_of_velocity = _VELOCITY_RATE / dt
@@ -155,22 +157,6 @@ class MotionFilter:
             reference_velocity=velocity,
             reference_acceleration=(velocity - state.reference_velocity) / dt,
         )
-
-    def broken(
-        self, state: MotionState, asked: Float[np.ndarray, "*batch T D"]
-    ) -> Bool[np.ndarray, "*batch T 4"]:
-        """True for each of `LIMIT_KINDS` that exact positions would violate."""
-        values = asked = np.asarray(asked, dtype=np.float64)
-        flags = [((asked > self._upper) | (asked < self._lower)).any(-1)]
-        for start, limit in (
-            (state.position, self.velocity),
-            (state.velocity, self.acceleration),
-            (state.acceleration, self.jerk),
-        ):
-            values = np.diff(np.concatenate([start[..., None, :], values], -2), axis=-2)
-            values = values / self.dt
-            flags.append((np.abs(values) > limit * _ROUNDING).any(-1))
-        return np.stack(flags, axis=-1)
 
     def _reference_motion(
         self, state: MotionState, asked: np.ndarray
@@ -217,149 +203,3 @@ def _braking_rate(
     knee = strength / rate
     root = np.sqrt(knee**2 + 2 * strength * np.abs(x))
     return np.copysign(root - knee, x), strength / root
-
-
-LARGEST_DEGREE = 3
-_LATEST = 1.5
-"""Frames for which the curve is continued when no action comes; then it comes to rest."""
-
-
-class ActionUpsampler:
-    """Setpoints between actions, on a B-spline, within limits.
-
-    The last d + 1 actions are the control points of a uniform B-spline of degree d: 0 holds the
-    newest, 1 is a line from the one before it, 2 and 3 have continuous velocity and
-    acceleration. The derivatives of such a curve lie between the differences of its control
-    points, so actions that keep the limits at their own rate lead to setpoints that keep them
-    at any. A `MotionFilter` at the rate of the setpoints keeps them whatever the actions are.
-
-    A curve of degree d is (d + 1)/2 actions late. A smaller latency puts each control point
-    ahead, along the difference of the last two actions, which makes their noise larger.
-
-    Attributes:
-        latency: Latency of the curve behind the actions [s].
-        position: Setpoint handed out last.
-    """
-
-    def __init__(
-        self,
-        limits: ActionLimits,
-        rate: float,
-        *,
-        degree: int = LARGEST_DEGREE,
-        latency: float | None = None,
-    ):
-        """Begin with `reset`.
-
-        Args:
-            limits: Limits of the actions, with their rate.
-            rate: Setpoints a second; at least as many as actions.
-            degree: Degree of the curve, 0 to 3.
-            latency: Latency of the curve, in actions; None: (degree + 1)/2, the largest.
-
-        Raises:
-            ValueError: An argument is out of its range.
-        """
-        if not 0 <= degree <= LARGEST_DEGREE:
-            raise ValueError(f"degree must be 0 to {LARGEST_DEGREE}, got {degree}")
-        if not limits.fps <= rate < float("inf"):
-            raise ValueError(
-                f"rate must be at least the {limits.fps:g} actions a second, got {rate:g}"
-            )
-        own = (degree + 1) / 2
-        latency = own if latency is None else latency
-        if not 0 <= latency <= own:
-            raise ValueError(
-                f"latency must be 0 to {own:g} actions for a curve of degree {degree}, got "
-                f"{latency:g}"
-            )
-        self.limits, self.rate, self.degree = limits, rate, degree
-        self.latency = latency / limits.fps
-        self._lead = own - latency
-        self._filter = MotionFilter(limits, 1 / rate)
-        self._points: np.ndarray | None = None
-        self._phase = 0.0
-
-    @property
-    def position(self) -> Float[np.ndarray, "*batch D"]:
-        return self._state.position
-
-    def reset(self, position: Float[np.ndarray, "*batch D"]) -> None:
-        """Start at rest at the present position; several robots move at once if there are.
-
-        Raises:
-            ValueError: It has another number of values than the limits.
-        """
-        position = self._checked(position)
-        self._state = MotionState.moving(position)
-        self._points = np.repeat(position[None], self.degree + 1, axis=0)
-        self._newest, self._phase = position, 0.0
-
-    def push(self, action: Float[np.ndarray, "*batch D"]) -> None:
-        """Take the next action; the phase of `setpoint` counts from now on.
-
-        Values that are not finite are taken for those before.
-
-        Raises:
-            ValueError: It has another number of values than the limits.
-            RuntimeError: There was no `reset`.
-        """
-        if self._points is None:
-            raise RuntimeError("reset() says where the robot is: call it first")
-        action = self._checked(action)
-        action = np.where(np.isfinite(action), action, self._newest)
-        ahead = action + self._lead * (action - self._newest)
-        self._points = np.concatenate([self._points[1:], ahead[None]])
-        self._newest = action
-
-    def repeat(self) -> None:
-        """Take the newest action once more: with no other ones, the motion comes to rest."""
-        self.push(self._newest)
-
-    def setpoint(self, phase: float) -> Float[np.ndarray, "*batch D"]:
-        """The next setpoint, 1/rate after the last.
-
-        Args:
-            phase: Time since the newest action, in actions. Beyond one, where the next action
-                is late, the curve goes on for half an action.
-        """
-        assert self._points is not None  # reset() comes before push()
-        weights = _weights(self.degree, min(phase, _LATEST))
-        self._state = self._filter.step(self._state, np.tensordot(weights, self._points, 1))
-        return self._state.position
-
-    def frame(self, action: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "n *batch D"]:
-        """All setpoints until the next action is due.
-
-        Where the rates do not divide, their number changes from one action to the next.
-
-        Raises:
-            ValueError: Same as `push`.
-        """
-        self.push(action)
-        made, step = [], self.limits.fps / self.rate
-        # Rounding must not make one more of them, just before the next action.
-        while self._phase < 1 - 1e-9:
-            made.append(self.setpoint(self._phase))
-            self._phase += step
-        self._phase -= 1
-        return np.stack(made)
-
-    def _checked(self, values: np.ndarray) -> np.ndarray:
-        values = np.asarray(values, dtype=np.float64)
-        if values.shape[-1:] != (len(self.limits.names),):
-            raise ValueError(
-                f"limits are given for {', '.join(self.limits.names)}, but there are values "
-                f"of shape {values.shape}"
-            )
-        return values
-
-
-def _weights(degree: int, u: float) -> Float[np.ndarray, " points"]:
-    """Weights of the control points, oldest first, by the recursion of Cox and de Boor."""
-    weights = np.array([1.0])
-    for d in range(1, degree + 1):
-        k = np.arange(d)
-        rising = (u + d - 1 - k) / d
-        weights = np.append(weights * (1 - rising), 0.0) + np.append(0.0, weights * rising)
-    return weights
