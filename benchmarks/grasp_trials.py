@@ -39,8 +39,7 @@ from hrc_learn.kinematics import (
     UnreachableError,
     gripper_down,
 )
-from hrc_learn.kinematics.inverse import solutions_from
-from hrc_learn.kinematics.redundancy import best_postures
+from hrc_learn.kinematics.inverse import best_postures, solutions_from
 from hrc_learn.regions import JointRegion
 from hrc_learn.sim.pinhole_camera import PinholeCamera
 

@@ -11,9 +11,10 @@ import pytest
 import torch
 from lerobot_folders import joint_path, write_folder
 from unchecked import shapes_unchecked
+from urdf_text import to_urdf
 
 from hrc_learn.dmp import PoseDMP
-from hrc_learn.kinematics import panda, to_urdf
+from hrc_learn.kinematics import panda
 from hrc_learn.teleoperation import dashboard_page
 
 ROOT = Path(__file__).parents[1]

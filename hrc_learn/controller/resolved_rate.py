@@ -20,7 +20,7 @@ from hrc_learn.geometry.numerics import (
     null_projection,
     solve_positive,
 )
-from hrc_learn.kinematics.redundancy import SINGULAR_BELOW
+from hrc_learn.kinematics.inverse import SINGULAR_BELOW
 from hrc_learn.pytree import pytree
 
 # Keeps the Cholesky factorisation possible at a singularity. It serves to judge how near that

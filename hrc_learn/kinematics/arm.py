@@ -25,9 +25,13 @@ from hrc_learn.kinematics.capsule_fit import fit_body
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 from hrc_learn.kinematics.description import Shape
-from hrc_learn.kinematics.inverse import TaskSpace, solutions_from, solve_inverse, unwound
-from hrc_learn.kinematics.redundancy import best_postures
-from hrc_learn.kinematics.urdf import to_urdf
+from hrc_learn.kinematics.inverse import (
+    TaskSpace,
+    best_postures,
+    solutions_from,
+    solve_inverse,
+    unwound,
+)
 
 # Density of aluminium shells with motors and gears in them, a little above water: used for
 # the volume of the capsules where a description gives no masses. A guess.
@@ -241,10 +245,6 @@ class Arm(SerialChain):
     def meshes(self) -> Mapping[str, tuple[MeshFile, ...]]:
         """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
         return self.shape.meshes
-
-    def urdf(self) -> str:
-        """URDF text with the links, joints and limits of this arm, without meshes."""
-        return to_urdf(self, name=self.name)
 
     # Inverse kinematics
 

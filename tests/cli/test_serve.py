@@ -10,8 +10,7 @@ import pytest
 from bare_arm import bare
 from commands import hrc
 from unchecked import shapes_unchecked
-
-from hrc_learn.kinematics import to_urdf
+from urdf_text import to_urdf
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,7 @@ from hrc_learn.controller.resolved_rate import (
     scale_task,
 )
 from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
-from hrc_learn.kinematics.redundancy import SINGULAR_BELOW
+from hrc_learn.kinematics.inverse import SINGULAR_BELOW
 
 
 def random(*shape: int, rng: torch.Generator) -> torch.Tensor:

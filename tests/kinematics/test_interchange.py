@@ -7,8 +7,9 @@ import torch
 from arm_samples import joint_positions
 from sampling import generator
 from torch.testing import assert_close
+from urdf_text import to_urdf
 
-from hrc_learn.kinematics import JointLimits, SerialChain, arm, panda, to_urdf
+from hrc_learn.kinematics import JointLimits, SerialChain, arm, panda
 
 # Axes along x, -z and a slant, a fixed joint in the middle and one at the end.
 ODD_ARM = """
@@ -33,7 +34,7 @@ ODD_ARM = """
 
 
 def test_urdf_lists_joints_with_their_limits():
-    robot = ElementTree.fromstring(panda.urdf())
+    robot = ElementTree.fromstring(to_urdf(panda))
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     assert tuple(joints)[:7] == panda.joint_names
     for i, name in enumerate(panda.joint_names):
@@ -48,7 +49,7 @@ def test_urdf_lists_joints_with_their_limits():
 def test_urdf_text_read_by_another_library_moves_alike():
     """To 1e-6: pytorch-kinematics rounds what it reads to float32."""
     q = joint_positions(50, rng=generator(1))
-    parsed = pytorch_kinematics.build_serial_chain_from_urdf(panda.urdf().encode(), "tcp")
+    parsed = pytorch_kinematics.build_serial_chain_from_urdf(to_urdf(panda).encode(), "tcp")
     parsed = parsed.to(dtype=torch.float64)
     assert_close(
         parsed.forward_kinematics(q).get_matrix(),
