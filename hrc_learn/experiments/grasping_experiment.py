@@ -108,7 +108,7 @@ class GraspingExperiment:
             "fraction of the joint-space approach": run.cell.log["approach"],
             "fraction of vision": run.cell.log["vision_activation"],
         }
-        return {"run": replace(recording, potentials=recording.potentials | fractions)}
+        return {"run": replace(recording, potentials={**recording.potentials, **fractions})}
 
     def log(self, run: GraspingRun) -> LoggedSteps:
         """Log of the grasp."""
