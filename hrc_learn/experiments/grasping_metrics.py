@@ -15,7 +15,6 @@ from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.run_measures import (
     grasp_offset,
     limit_violations,
-    span,
     true_tool,
     unwanted_contacts,
 )
@@ -41,8 +40,6 @@ REACH = 0.02
 class Descent:
     """State at the start of the last descent onto the object. NaN if it never descended."""
 
-    vision_time: float = math.nan
-    """Time since the vision region first contributed to the command [s]."""
     offset: float = math.nan
     """Horizontal distance of the end effector from the object [m]."""
     angle: float = math.nan
@@ -55,18 +52,14 @@ class Descent:
         descents = [event.time for event in log.events if event.text == "grasp"]
         if not descents:
             return cls()
-        servoing, time = span(log, "servo"), log["time"]
-        last = int(np.searchsorted(time, descents[-1])) - 1
+        last = int(np.searchsorted(log["time"], descents[-1])) - 1
         tool = true_tool(run.motion, run.world, len(log))[last]
         actual, demonstrated = (
             quaternion.rotate(q, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
             for q in (tool.orientation, run.scene.workplace.hover().orientation)
         )
-        guided = (time >= servoing[0]) & (log["vision_activation"] > 0)
-        taken_over = time[guided][0] if guided.any() else math.nan
         normal = torch.linalg.cross(actual, demonstrated)
         return cls(
-            vision_time=float(min(servoing[1], descents[-1]) - taken_over),
             offset=grasp_offset(log, run.motion, run.world, run.item.name, descents[-1]),
             angle=float(torch.atan2(normal.norm(), actual @ demonstrated)),
         )
@@ -125,7 +118,6 @@ def grasping_metrics() -> list[Metric[GraspingRun]]:
             at_most=20.0,
             claim="9.2 s (Experiment 2)",
         ),
-        Metric("time in vision", lambda run: Descent.of(run).vision_time, "s", listed=False),
         Metric("cycle time", lambda run: run.cell.time, "s", claim="15 s (Experiment 2)"),
         Metric(
             "pixel error at descent",

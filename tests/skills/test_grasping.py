@@ -103,7 +103,7 @@ def test_the_object_is_held_though_the_camera_was_turned(grasp):
     assert lift(grasp) > 0.1
     descent = Descent.of(grasp)
     assert 0 < descent.offset < 0.015
-    assert 0 < descent.vision_time < grasp.result.servo_time < grasp.cell.time
+    assert 0 < grasp.result.servo_time < grasp.cell.time
     values = evaluate(grasping_metrics(), grasp).values
     assert values["grasp_offset_mm"] == 1e3 * descent.offset
     assert values["object_held_lifted_and_carried_home"] == 1
