@@ -51,9 +51,9 @@ COMMANDS: dict[str, Command] = {
     "recover": Command("dataset_commands.recover", arguments.Recover, ("path",)),
     "extract": Command("conversion_commands.extract", arguments.Extract, ("dataset",)),
     "push": Command("dataset_commands.push", arguments.Push, ("dataset", "repo")),
-    "fit": Command("fit_commands.fit_primitives", arguments.FitPrimitives, ("dataset",)),
+    "fit": Command("fit_command.fit_primitives", arguments.FitPrimitives, ("dataset",)),
     "fit image-jacobian": Command(
-        "fit_commands.fit_image_jacobian", arguments.FitImageJacobian, ("dataset",)
+        "image_jacobian_commands.fit_image_jacobian", arguments.FitImageJacobian, ("dataset",)
     ),
     "evaluate": Command("evaluate_command.evaluate", arguments.Evaluate, ("model", "dataset")),
     "smooth": Command("smooth_command.smooth", arguments.Smooth, ("checkpoint",)),

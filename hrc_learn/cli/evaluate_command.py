@@ -1,7 +1,6 @@
 """`hrc evaluate`: errors of primitives on held-out demonstrations, and of image Jacobians."""
 
-import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,11 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from hrc_learn.cli._run import refuse_repeats, write_values
-from hrc_learn.cli._tables import named
 from hrc_learn.cli.arguments import Evaluate, FitPrimitives, columns
-from hrc_learn.cli.fit_commands import fit_silently
-from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
-from hrc_learn.jacobian import RBFImageJacobian
+from hrc_learn.cli.fit_command import fit_silently
+from hrc_learn.demos import DemonstrationSet, open_demos
 from hrc_learn.learning.channels import (
     CHANNELS,
     Motions,
@@ -26,10 +23,8 @@ from hrc_learn.learning.channels import (
 )
 from hrc_learn.learning.model_choice import best_models, predict
 from hrc_learn.learning.primitive_fitting import sampled
-from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
-from hrc_learn.viz.report import show_measurements
 
 UNITS = {
     "nrmse": "",
@@ -60,7 +55,10 @@ def evaluate(args: Evaluate) -> int:
             _fit_most(args, model)
             return _evaluate_primitives(args, model)
     if (args.model / "jacobian").is_dir():
-        return _evaluate_image_jacobian(args, args.model)
+        # MuJoCo, which primitives do not need.
+        from hrc_learn.cli.image_jacobian_commands import evaluate_image_jacobian
+
+        return evaluate_image_jacobian(args, args.model)
     return _evaluate_primitives(args, args.model)
 
 
@@ -153,11 +151,8 @@ def _made_by(model: Path) -> dict[str, Any]:
     Raises:
         ValueError: The model's folder does not name its dataset.
     """
-    try:
-        made_by = read_made_by(model)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{model / MADE_BY}: not valid JSON ({error})") from None
-    if not isinstance(made_by, dict) or not isinstance(made_by.get("dataset"), str):
+    made_by = read_made_by(model)
+    if not isinstance(made_by.get("dataset"), str):
         raise ValueError(
             f"{model / MADE_BY} does not name the model's dataset: give a folder of hrc fit"
         )
@@ -192,46 +187,3 @@ def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> T
         table.caption = f"{others} more, none worse"
     table.add_row("median", *(f"{x.quantile(0.5):.3g}" for x in measures.values()))
     return table
-
-
-MOST_ERROR = 0.05
-"""Largest median error of an image Jacobian relative to the true one."""
-_TILT = 0.1
-"""Tilt of the end effector in the second grid of poses [rad]; in the first it points down."""
-
-
-def _evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
-    """Compare an image Jacobian with the simulator's true one."""
-    torch.set_num_threads(1)
-    figures = _image_jacobian_figures(args, VisualServoSkill.load(model).jacobian)
-    bounded = "upright_relative_error_median"
-    row = replace(named(bounded, figures[bounded]), target=MOST_ERROR)
-    others = [named(name, value) for name, value in figures.items() if name != bounded]
-    show_measurements([row, *others], title=f"Image Jacobian {model}", elsewhere="--json FILE")
-    write_values(args.json, figures)
-    return int(row.ok is False)
-
-
-def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[str, float]:
-    """Errors on two grids of poses."""
-    # MuJoCo, which the evaluation of primitives does not need.
-    from hrc_learn.experiments.grasping_metrics import (
-        compare_with_truth,
-        held_out_grid,
-    )
-    from hrc_learn.sim import World
-    from hrc_learn.sim.workplace import Workplace
-
-    demos = load_demos(args.dataset)
-    if demos[0].position is None:
-        raise ValueError(f"{args.dataset}: no end-effector positions to place a grid around.")
-    shown = torch.cat([torch.from_numpy(demo.position) for demo in demos]).double()
-    workplace = Workplace()
-    world = World(workplace.scene)
-    world.reset(workplace.home_joints().numpy(), {})
-    camera, offset = workplace.scene.camera, world.hand_marker_offset()
-    figures: dict[str, float] = {}
-    for name, tilt in (("upright", 0.0), ("tilted", _TILT)):
-        measured = compare_with_truth(network, held_out_grid(shown, tilt=tilt), camera, offset)
-        figures |= {f"{name}_{key}": value for key, value in measured.items()}
-    return figures

@@ -3,15 +3,15 @@
 An experiment that is given no model uses the demo's, which is learned first if it is missing.
 """
 
+import hashlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
 from rich.console import Console
 
-from hrc_learn.cli._ledger import Ledger
 from hrc_learn.cli._run import command_line, refuse_existing
 from hrc_learn.cli._settings import with_settings
 from hrc_learn.cli.arguments import (
@@ -48,9 +48,9 @@ from hrc_learn.sim import CameraChange, CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.store import write_json
+from hrc_learn.store import read_json, write_json
 from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.viz.report import show_command
+from hrc_learn.viz.report import show_command, software_versions
 
 MODELS = Path("outputs/demo")
 """Folder of the demo, whose models are used if none are given."""
@@ -83,14 +83,10 @@ def run(args: Run) -> int:
     _refuse_inapplicable(args)
     refuse_existing(_folder(args), args.overwrite)
     is_real = args.drives_real_arm(_SIMULATED_ONLY)
-    experiment, make_task = {
-        "placing": _placing,
-        "grasping": _grasping,
-        "collaboration": _collaboration,
-    }[args.experiment](_with_models(args))
+    experiment = _experiment(_with_models(args))
     settings = with_settings(args.config, _Settings(experiment=experiment))
     if is_real:
-        return _run_on_arm(args, settings.site, *make_task(settings.experiment))
+        return _run_on_arm(args, settings.site, *_task(settings.experiment, args.shelf[0]))
     options = RunOptions(
         out=_folder(args),
         seed=args.seed,
@@ -120,75 +116,49 @@ def _refuse_inapplicable(args: Run) -> None:
             )
 
 
-def _placing(args: Run) -> tuple[PlacingExperiment, Callable[..., tuple[Workplace, Task]]]:
-    """Experiment 1, and its task on a real arm."""
-    folder = _model(args.placing)
-    experiment = PlacingExperiment(
-        placing=folder,
-        demonstrations=dataset_of(folder).resolve(),
-        imperfections=_imperfections(args),
-        arm=args.arm,
-        robot=_choice(args),
-    )
-
-    def task(experiment: PlacingExperiment) -> tuple[Workplace, Task]:
-        workplace = Workplace()
-        skill = PlacingSkill.load(folder, workplace.robot)
-        return workplace, placing_task(skill, workplace, args.shelf[0], experiment.speed)
-
-    return experiment, task
-
-
-def _grasping(args: Run) -> tuple[GraspingExperiment, Callable[..., tuple[Workplace, Task]]]:
-    """Experiment 2, and its task on a real arm."""
-    folder = _model(args.aiming)
-    experiment = GraspingExperiment(
-        aiming=folder,
-        imperfections=_imperfections(args),
-        camera=_simulated_camera(args),
-        page=PageConfig() if args.page else None,
-        arm=args.arm,
-        robot=_choice(args),
-    )
-
-    def task(experiment: GraspingExperiment) -> tuple[Workplace, Task]:
-        servoing = VisualServoSkill.load(folder)
-        workplace = Workplace().approached(servoing.approach)
-        return workplace, grasping_task(servoing, workplace, experiment.config)
-
-    return experiment, task
-
-
-def _collaboration(
-    args: Run,
-) -> tuple[CollaborationExperiment, Callable[..., tuple[Workplace, Task]]]:
-    """Experiment 3, the whole job, and its task on a real arm."""
-    aiming, placing = _model(args.aiming), _model(args.placing)
-    experiment = CollaborationExperiment(
-        aiming=aiming,
-        placing=placing,
+def _experiment(args: Run) -> Experiment[Any]:
+    common: dict[str, Any] = {
+        "imperfections": _imperfections(args),
+        "arm": args.arm,
+        "robot": _choice(args),
+    }
+    if args.experiment == "placing":
+        folder = _model(args.placing)
+        demonstrations = dataset_of(folder).resolve()
+        return PlacingExperiment(placing=folder, demonstrations=demonstrations, **common)
+    common |= {
+        "aiming": _model(args.aiming),
+        "camera": _simulated_camera(args),
+        "page": PageConfig() if args.page else None,
+    }
+    if args.experiment == "grasping":
+        return GraspingExperiment(**common)
+    return CollaborationExperiment(
+        placing=_model(args.placing),
         shelves=args.shelf,
         pulls=_possible_pulls(args),
         worker=args.worker,
         handover=args.handover,
-        imperfections=_imperfections(args),
         disturbances=Disturbances(camera_change=CameraChange() if args.camera_moved else None),
-        camera=_simulated_camera(args),
-        page=PageConfig() if args.page else None,
-        arm=args.arm,
-        robot=_choice(args),
+        **common,
     )
 
-    def task(experiment: CollaborationExperiment) -> tuple[Workplace, Task]:
-        servoing, skill = VisualServoSkill.load(aiming), PlacingSkill.load(placing, panda)
-        shelves = experiment.shelves
-        workplace = workplace_for(shelves, panda)
-        workplace = workplace.approached(servoing.approach)
-        return workplace, collaboration_task(
-            servoing, skill, workplace, shelves, experiment.config
-        )
 
-    return experiment, task
+def _task(experiment: Experiment[Any], shelf: str) -> tuple[Workplace, Task]:
+    """Workplace and task of an experiment on a real arm."""
+    if isinstance(experiment, PlacingExperiment):
+        workplace = Workplace()
+        skill = PlacingSkill.load(experiment.placing, workplace.robot)
+        return workplace, placing_task(skill, workplace, shelf, experiment.speed)
+    assert isinstance(experiment, GraspingExperiment | CollaborationExperiment)
+    servoing = VisualServoSkill.load(experiment.aiming)
+    if isinstance(experiment, GraspingExperiment):
+        workplace = Workplace().approached(servoing.approach)
+        return workplace, grasping_task(servoing, workplace, experiment.config)
+    shelves, skill = experiment.shelves, PlacingSkill.load(experiment.placing, panda)
+    workplace = workplace_for(shelves, panda).approached(servoing.approach)
+    job = collaboration_task(servoing, skill, workplace, shelves, experiment.config)
+    return workplace, job
 
 
 def _model(folder: Path | None) -> Path:
@@ -305,7 +275,8 @@ def learn(
 ) -> None:
     """Record demonstrations of placing and servoing, and learn from them.
 
-    Results of the same options and code are kept.
+    A step is repeated if its options, the folders that it reads, the code of this package, the
+    versions of the libraries or its result have changed.
 
     Args:
         out: Folder for `placing_demos`, `aiming_demos` and the models `placing`, `aiming`,
@@ -318,62 +289,72 @@ def learn(
     Raises:
         RuntimeError: The scripted expert fails.
     """
-    robot = robot or WithRobot()
-    ledger, options = Ledger(out / "steps.json"), {"robot": robot.robot, "tip": robot.tip}
+    robot, done = robot or WithRobot(), {}
+    ledger = out / "steps.json"
+    with suppress(OSError, ValueError):
+        done = read_json(ledger)
+    code = _digest(Path(__file__).parents[1], "*.py")
+    made_of = [software_versions(), code, robot.robot, robot.tip]
     for number, step in enumerate(_learning_steps(out, robot), start=1):
-        if not again and ledger.holds(step.result, options, *step.reads):
-            _announce(console, number, steps, f"{step.title}: up to date in {step.result}")
+        title, work, folders = step
+        digest = [*made_of, *map(_digest, folders)]
+        if not again and done.get(folders[-1].name) == digest:
+            title = f"{title}: up to date in {folders[-1]}"
+            _announce(console, number, steps, title)
             continue
-        _announce(console, number, steps, step.title)
-        step.work()
-        ledger.enter(step.result, options, *step.reads)
+        _announce(console, number, steps, title)
+        work()
+        done[folders[-1].name] = [*made_of, *map(_digest, folders)]
+        write_json(ledger, done)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Step:
-    """One step of `learn`."""
+def _digest(folder: Path, pattern: str = "*") -> str:
+    """Checksum of the names and contents of all files in a folder that match a pattern."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob(pattern) if path.is_file()):
+        name = path.relative_to(folder).as_posix()
+        digest.update(f"{name}\0{path.stat().st_size}\0".encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
-    title: str
-    work: Callable[[], None]
-    result: Path
-    reads: tuple[Path, ...] = ()
 
+def _learning_steps(
+    out: Path, robot: WithRobot
+) -> Iterator[tuple[str, Callable[[], None], list[Path]]]:
+    """Title and work of each step, and the folders that it reads, its result last."""
+    from hrc_learn.cli.fit_command import fit_primitives
+    from hrc_learn.cli.image_jacobian_commands import fit_image_jacobian
+    from hrc_learn.cli.record_command import record
 
-def _learning_steps(out: Path, robot: WithRobot) -> Iterator[_Step]:
-    """Demonstrations of placing and servoing, and the models of both."""
-    from hrc_learn.cli import fit_commands, record_command
-
-    def record(scenario: Any, folder: Path) -> None:
+    def demonstrate(scenario: Any, folder: Path) -> None:
         arguments = Record(
             scenario=scenario, out=folder, robot=robot.robot, tip=robot.tip, overwrite=True
         )
-        if record_command.record(arguments):
+        if record(arguments):
             raise RuntimeError(f"the scripted expert failed to demonstrate {scenario}")
 
-    placing, servoing = out / "placing_demos", out / "aiming_demos"
-    yield _Step(
-        title="Demonstrations of placing",
-        work=lambda: record("placing", placing),
-        result=placing,
+    placing, aiming = out / "placing_demos", out / "aiming_demos"
+    yield (
+        "Demonstrations of placing",
+        lambda: demonstrate("placing", placing),
+        [placing],
     )
-    yield _Step(
-        title="Demonstrations of servoing with an uncalibrated camera",
-        work=lambda: record("servoing", servoing),
-        result=servoing,
+    yield (
+        "Demonstrations of servoing with an uncalibrated camera",
+        lambda: demonstrate("servoing", aiming),
+        [aiming],
     )
     primitives = FitPrimitives(dataset=placing, out=out / "placing", overwrite=True)
-    yield _Step(
-        title="Movement primitives of placing",
-        work=lambda: fit_commands.fit_primitives(primitives),
-        result=primitives.folder,
-        reads=(placing,),
+    yield (
+        "Movement primitives of placing",
+        lambda: fit_primitives(primitives),
+        [placing, out / "placing"],
     )
-    jacobian = FitImageJacobian(dataset=servoing, out=out / "aiming", overwrite=True)
-    yield _Step(
-        title="Image Jacobian of servoing",
-        work=lambda: fit_commands.fit_image_jacobian(jacobian),
-        result=jacobian.folder,
-        reads=(servoing,),
+    jacobian = FitImageJacobian(dataset=aiming, out=out / "aiming", overwrite=True)
+    yield (
+        "Image Jacobian of servoing",
+        lambda: fit_image_jacobian(jacobian),
+        [aiming, out / "aiming"],
     )
 
 

@@ -104,7 +104,7 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
         yield
     except OSError as error:
         named = error.filename is not None and SUFFIX not in str(error.filename)
-        if error.errno in DISK_ERRORS and not named:
+        if error.errno is not None and error.errno in DISK_ERRORS and not named:
             raise OSError(error.errno, os.strerror(error.errno), str(path)) from error
         raise
 

@@ -1,29 +1,21 @@
-"""`hrc fit`: movement primitives and image Jacobians from demonstrations."""
+"""`hrc fit`: movement primitives from demonstrations."""
 
 import shlex
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from rich.console import Console
 
 from hrc_learn import distributed
 from hrc_learn.cli._run import command_line, configuration, refuse_repeats, write_values
-from hrc_learn.cli._settings import with_settings
-from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
-from hrc_learn.cli.arguments import FitImageJacobian, FitPrimitives
+from hrc_learn.cli.arguments import FitPrimitives
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.source import open_dataset
-from hrc_learn.jacobian import (
-    CellErrors,
-    EvidenceConfig,
-    ImageJacobianFitConfig,
-    RBFCenters,
-    paper_grid,
-)
-from hrc_learn.learning.fit_recordings import fit_recording, fit_report, learning_recording
+from hrc_learn.learning.channels import CHANNELS
+from hrc_learn.learning.fit_recordings import fit_recording, fit_report
 from hrc_learn.learning.model_choice import best_models, fit_contextual, keep_best
 from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
@@ -32,12 +24,15 @@ from hrc_learn.learning.primitive_fitting import (
     sampled,
 )
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit
-from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
-from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
-from hrc_learn.viz.figures import learning_figure, workspace_figure
-from hrc_learn.viz.learning_dashboards import record_fit, record_learning
-from hrc_learn.viz.report import PAGE, show_command, write_report
+from hrc_learn.viz.learning_dashboards import record_fit
+from hrc_learn.viz.report import (
+    PAGE,
+    Measurement,
+    show_command,
+    show_measurements,
+    write_report,
+)
 
 
 def fit_primitives(args: FitPrimitives) -> None:
@@ -110,8 +105,6 @@ def _learn(
     if args.several == "best" and args.scaling == "none":
         metrics |= keep_best(fitted, demos, args.context, folder)
     fitted.save(folder, each=args.several == "distribution")
-    if args.several == "distribution":
-        metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
     return fitted, metrics
 
 
@@ -152,8 +145,7 @@ def _wanted(args: FitPrimitives) -> dict[str, Any]:
 
 
 def _fit_streamed(args: FitPrimitives, console: Console) -> None:
-    given = (args.context, args.method != "trajectory", args.scaling != "none")
-    if any(given):
+    if args.context or (args.method, args.scaling) != ("trajectory", "none"):
         raise ValueError(
             "--several streamed is an unscaled least-squares fit: it takes neither --method "
             "nor --scaling nor --context"
@@ -207,14 +199,6 @@ def _made_by(args: FitPrimitives) -> dict:
     return asdict(args) | {"dataset": args.dataset.resolve(), "out": args.folder}
 
 
-def _spread(fitted: FittedPrimitives, channel: str) -> float:
-    """Standard deviation over demonstrations, root mean square along the motion [rad or m]."""
-    distribution = fitted.distribution(channel)
-    durations = fitted.demonstrations.time.amax(dim=1)
-    time = torch.linspace(0, float(durations.mean()), 100, dtype=torch.float64)
-    return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
-
-
 def _draw(
     fitted: FittedPrimitives,
     args: FitPrimitives,
@@ -226,13 +210,14 @@ def _draw(
         return
     shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
     record_fit(folder / "fit.rrd", shown)
-    rows = primitive_rows(metrics)
-    write_report(folder, fit_report(shown, rows, configuration(args), command_line()))
+    write_report(folder, fit_report(shown, _rows(metrics), configuration(args), command_line()))
 
 
 def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:
     write_json(folder / "metrics.json", metrics)
-    show_values(f"Fit of {args.dataset}", metrics, primitive_rows(metrics))
+    rows = _rows(metrics)
+    title, more = f"Fit of {args.dataset}", len(metrics) - len(rows)
+    show_measurements(rows, title=title, more=more, elsewhere="metrics.json")
     for channel, better in best_models(folder).items():
         error = 100 * metrics[f"held_out_{channel}_{better}_nrmse_median"]
         mean = 100 * metrics[f"held_out_{channel}_mean_nrmse_median"]
@@ -250,82 +235,47 @@ _MODELS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class _JacobianSettings:
-    """Settings of the fit of an image Jacobian."""
-
-    learning: EvidenceConfig = field(default_factory=EvidenceConfig)
-    fit: ImageJacobianFitConfig = field(default_factory=ImageJacobianFitConfig)
-
-
-_PAPER_NEURONS = RBFCenters(centers=paper_grid(), width=0.1)
-
-
-def fit_image_jacobian(args: FitImageJacobian) -> None:
-    """Fit the image Jacobian and the target in the image.
-
-    Raises:
-        ValueError: An episode is named twice.
-    """
-    settings = with_settings(args.config, _JacobianSettings())
-    learning = settings.learning
-    refuse_repeats(args.episodes)
-    with distributed.processes() as rank:
-        console = Console(quiet=rank != 0)
-        demos = open_demos(args.dataset, episodes=args.episodes or None)
-        for note in demos.notes:
-            console.print(f"note: {note}")
-        if args.learn and len(demos) < learning.hold_out:
-            console.print(
-                f"note: {len(demos)} demonstrations are too few to learn the neurons; they "
-                f"stay as they are (--config learning.hold_out={learning.hold_out})"
-            )
-        with console.status(f"Fitting {len(demos)} demonstrations") as status:
-            skill = fit_visual_servo(
-                demos,
-                None
-                if args.neurons == "around"
-                else RBFCenters(centers=paper_grid(), width=0.1),
-                settings.fit,
-                learning if args.learn else None,
-                lambda number, state: status.update(
-                    f"Learning, round {number}: held-out error {state.held_out_error:.3f} px"
-                ),
-            )
-        if rank == 0:
-            _write(args, skill, demos, console)
+# Key in JSON of a channel, title, unit and largest value that passes. A primitive represents
+# its demonstration up to a centimetre in a motion of half a metre.
+_ROWS = (
+    # The maximum, so that one demonstration that is not represented shows.
+    ("{}_nrmse_max", "worst NRMSE of a demonstration", "%", 2.0),
+    ("mean_{}_nrmse_median", "median NRMSE of the common model", "%", None),
+    ("{}_turn_rmse_max", "worst rotation error", "deg", None),
+)
+_WORDS = {"joint": "joints", "orientation": "orientation"}
+_HELD_OUT = {
+    "held_out_{}_mean_nrmse_median": "held out, by the mean",
+    "held_out_{}_contextual_nrmse_median": "held out, by start and goal",
+    "held_out_{}_nearest_nrmse_median": "held out, by the nearest",
+}
+_RESOLUTION = 0.01
+"""Resolution of NRMSE [%] and of rotation errors [deg]: an encoder resolves 1e-4 rad."""
 
 
-def _write(
-    args: FitImageJacobian,
-    skill: VisualServoSkill,
-    demos: DemonstrationSource,
-    console: Console,
-) -> None:
-    metrics = skill.metrics()
-    with new_folder(args.folder, asdict(args) | {"out": args.folder}, args.overwrite) as folder:
-        skill.save(folder)
-        write_json(folder / "metrics.json", metrics)
-        if skill.cells is not None:
-            _error_map(skill.cells, folder / "error_map.png")
-        if skill.learned is not None:
-            held_out = [state.held_out_error for state in skill.learned.rounds]
-            figure = learning_figure(held_out, skill.learned.best, "px")
-            figure.savefig(folder / "learning.png", dpi=120)
-        title = f"Image Jacobian from {args.dataset.name}"
-        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
-    rows = image_jacobian_rows(metrics)
-    show_values(f"Image Jacobian from {args.dataset}", metrics, rows)
-    print(f"Model in {shlex.quote(str(args.folder))}")
-    print(f"Dashboard: {show_command(args.folder)}")
-    write_values(args.json, metrics)
-
-
-def _error_map(cells: CellErrors, path: Path) -> None:
-    """Held-out error and posterior uncertainty over the horizontal plane."""
-    maps = [
-        ("Held-out error over image motion", cells.relative.numpy()),
-        ("Uncertainty of the Jacobian", cells.uncertainty.numpy()),
+def _rows(metrics: Mapping[str, float]) -> list[Measurement]:
+    """Main measured values, NRMSE relative to the range of motion."""
+    rows = [
+        Measurement(name=name, value=factor * metrics[key], unit=unit)
+        for key, name, factor, unit in (
+            ("demonstrations", "demonstrations", 1, ""),
+            ("left_out_error", "held-out error, relative to the spread of actions", 100, "%"),
+        )
+        if key in metrics
     ]
-    x, y = cells.edges.mT.numpy()
-    workspace_figure(maps, x, y).savefig(path, dpi=120)
+    for channel in CHANNELS:
+        held_out = [key for key in _HELD_OUT if key.format(channel) in metrics]
+        best = sorted(held_out, key=lambda key: metrics[key.format(channel)])[:1]
+        shown = [*_ROWS, *((key, _HELD_OUT[key], "%", None) for key in best)]
+        rows += [
+            Measurement(
+                name=f"{_WORDS.get(channel, 'end effector')}: {name}",
+                value=(100 if unit == "%" else 1) * metrics[key.format(channel)],
+                unit=unit,
+                target=target,
+                resolution=_RESOLUTION,
+            )
+            for key, name, unit, target in shown
+            if key.format(channel) in metrics
+        ]
+    return rows

@@ -1,0 +1,168 @@
+"""`hrc fit image-jacobian`, and `hrc evaluate` of its models."""
+
+import shlex
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from hrc_learn import distributed
+from hrc_learn.cli._run import refuse_repeats, write_values
+from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli.arguments import Evaluate, FitImageJacobian
+from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
+from hrc_learn.jacobian import (
+    EvidenceConfig,
+    ImageJacobianFitConfig,
+    RBFCenters,
+    RBFImageJacobian,
+    paper_grid,
+)
+from hrc_learn.learning.fit_recordings import learning_recording
+from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.store import new_folder, write_json
+from hrc_learn.viz.learning_dashboards import record_learning
+from hrc_learn.viz.report import Measurement, show_command, show_measurements
+
+# Key in JSON, title, factor, unit, largest value that passes, resolution. Half of a relative
+# error is image noise, and the controller converges from far larger errors; a marker is
+# detected to 0.1 px.
+_ROWS = (
+    ("pairs", "pairs of images", 1, "", None, 0.0),
+    ("neurons", "neurons", 1, "", None, 0.0),
+    ("motion_px", "image motion in a pair", 1, "px", None, 0.0),
+    ("held_out_relative", "held-out error, relative to that motion", 100, "%", 10.0, 0.0),
+    (
+        *("held_out_relative_worst_cell", "held-out error, worst part of the workspace"),
+        *(100, "%", None, 0.0),
+    ),
+    ("target_error_px", "target in the image, error", 1, "px", None, 0.1),
+    ("angle_spread_deg", "angle of object and gripper, spread", 1, "deg", None, 0.0),
+    ("approach_spread_deg", "orientation above the object, spread", 1, "deg", None, 0.0),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _JacobianSettings:
+    """Settings of the fit of an image Jacobian."""
+
+    learning: EvidenceConfig = field(default_factory=EvidenceConfig)
+    fit: ImageJacobianFitConfig = field(default_factory=ImageJacobianFitConfig)
+
+
+def fit_image_jacobian(args: FitImageJacobian) -> None:
+    """Fit the image Jacobian and the target in the image.
+
+    Raises:
+        ValueError: An episode is named twice.
+    """
+    settings = with_settings(args.config, _JacobianSettings())
+    learning = settings.learning
+    refuse_repeats(args.episodes)
+    with distributed.processes() as rank:
+        console = Console(quiet=rank != 0)
+        demos = open_demos(args.dataset, episodes=args.episodes or None)
+        for note in demos.notes:
+            console.print(f"note: {note}")
+        if args.learn and len(demos) < learning.hold_out:
+            console.print(
+                f"note: {len(demos)} demonstrations are too few to learn the neurons; they "
+                f"stay as they are (--config learning.hold_out={learning.hold_out})"
+            )
+        # The paper's grid, or neurons around the demonstrations.
+        on_grid = args.neurons == "grid"
+        neurons = RBFCenters(centers=paper_grid(), width=0.1) if on_grid else None
+        with console.status(f"Fitting {len(demos)} demonstrations") as status:
+            skill = fit_visual_servo(
+                demos,
+                neurons,
+                settings.fit,
+                learning if args.learn else None,
+                lambda number, state: status.update(
+                    f"Learning, round {number}: held-out error {state.held_out_error:.3f} px"
+                ),
+            )
+        if rank == 0:
+            _write(args, skill, demos)
+
+
+def _write(
+    args: FitImageJacobian,
+    skill: VisualServoSkill,
+    demos: DemonstrationSource,
+) -> None:
+    metrics = skill.metrics()
+    with new_folder(args.folder, asdict(args) | {"out": args.folder}, args.overwrite) as folder:
+        skill.save(folder)
+        write_json(folder / "metrics.json", metrics)
+        title = f"Image Jacobian from {args.dataset.name}"
+        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
+    rows = [
+        Measurement(
+            name=name,
+            value=factor * metrics[key] if unit else round(metrics[key]),
+            unit=unit,
+            target=target,
+            resolution=resolution,
+        )
+        for key, name, factor, unit, target, resolution in _ROWS
+        if key in metrics
+    ]
+    title, more = f"Image Jacobian from {args.dataset}", len(metrics) - len(rows)
+    show_measurements(rows, title=title, more=more, elsewhere="metrics.json")
+    print(f"Model in {shlex.quote(str(args.folder))}")
+    print(f"Dashboard: {show_command(args.folder)}")
+    write_values(args.json, metrics)
+
+
+MOST_ERROR = 0.05
+"""Largest median error of an image Jacobian relative to the true one."""
+_TILT = 0.1
+"""Tilt of the end effector in the second grid of poses [rad]; in the first it points down."""
+
+
+def evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
+    """Compare an image Jacobian with the simulator's true one."""
+    torch.set_num_threads(1)
+    figures = _image_jacobian_figures(args, VisualServoSkill.load(model).jacobian)
+    bounded = "upright_relative_error_median"
+    row = replace(_named(bounded, figures[bounded]), target=MOST_ERROR)
+    others = [_named(name, value) for name, value in figures.items() if name != bounded]
+    show_measurements([row, *others], title=f"Image Jacobian {model}", elsewhere="--json FILE")
+    write_values(args.json, figures)
+    return int(row.ok is False)
+
+
+def _named(name: str, value: float) -> Measurement:
+    """Measured value by its name in JSON, whose last word is the unit if it is one."""
+    stem, _, unit = name.rpartition("_")
+    known = unit in ("px", "mm", "deg", "ms", "s")
+    words = (stem if known else name).replace("_", " ")
+    return Measurement(name=words, value=value, unit=unit if known else "")
+
+
+def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[str, float]:
+    """Errors on two grids of poses."""
+    # MuJoCo, which the evaluation of primitives does not need.
+    from hrc_learn.experiments.grasping_metrics import (
+        compare_with_truth,
+        held_out_grid,
+    )
+    from hrc_learn.sim import World
+    from hrc_learn.sim.workplace import Workplace
+
+    demos = load_demos(args.dataset)
+    if demos[0].position is None:
+        raise ValueError(f"{args.dataset}: no end-effector positions to place a grid around.")
+    shown = torch.cat([torch.from_numpy(demo.position) for demo in demos]).double()
+    workplace = Workplace()
+    world = World(workplace.scene)
+    world.reset(workplace.home_joints().numpy(), {})
+    camera, offset = workplace.scene.camera, world.hand_marker_offset()
+    figures: dict[str, float] = {}
+    for name, tilt in (("upright", 0.0), ("tilted", _TILT)):
+        measured = compare_with_truth(network, held_out_grid(shown, tilt=tilt), camera, offset)
+        figures |= {f"{name}_{key}": value for key, value in measured.items()}
+    return figures
