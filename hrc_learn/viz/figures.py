@@ -336,62 +336,6 @@ def residual_figure(fit: FitRecording) -> Figure:
     return figure
 
 
-def workspace_figure(
-    maps: Sequence[tuple[str, Float[np.ndarray, "nx ny"]]],
-    x: Float[np.ndarray, " nx_and_1"],
-    y: Float[np.ndarray, " ny_and_1"],
-) -> Figure:
-    """Fractions over cells of the horizontal plane, in percent, side by side.
-
-    Args:
-        maps: Title and values of each map, x first; NaN in unknown cells.
-        x: Edges of the cells [m].
-        y: Edges of the cells [m].
-    """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 0.15 + 3.1 * 2 / max(len(maps), 2)))
-        row = figure.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
-        for axes, (title, shares) in zip(row, maps, strict=True):
-            mesh = axes.pcolormesh(x, y, 100 * shares.T, cmap="Blues", vmin=0)
-            _write_cells(axes, x, y, 100 * shares)
-            axes.set(title=title, xlabel="x [m]", aspect="equal")
-            axes.grid(False)
-            figure.colorbar(mesh, ax=axes, label="%", shrink=0.8)
-        row[0].set_ylabel("y [m]")
-    return figure
-
-
-def _write_cells(axes: Axes, x: np.ndarray, y: np.ndarray, values: np.ndarray) -> None:
-    most = np.nanmax(values)
-    for (i, j), value in np.ndenumerate(values):
-        if np.isfinite(value):
-            colour = "white" if value > 0.6 * most else "black"
-            place = (x[i] + x[i + 1]) / 2, (y[j] + y[j + 1]) / 2
-            axes.text(*place, f"{value:.2g}", color=colour, ha="center", va="center")
-
-
-def learning_figure(held_out: Sequence[float], best: int, unit: str) -> Figure:
-    """Held-out error over the rounds of learning.
-
-    Args:
-        held_out: Error after each round; the first value is that before learning.
-        best: Round whose result was kept.
-        unit: Unit of the error.
-    """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(0.62 * WIDTH, 2.5))
-        axes = figure.subplots()
-        axes.plot(held_out, "o-", color=palette.RUN, ms=4)
-        _ring(axes, best, held_out[best], "kept")
-        axes.set(
-            xlabel="round",
-            ylabel=f"held-out error [{unit}]",
-            title="Error on held-out demonstrations",
-        )
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return figure
-
-
 def _ring(axes: Axes, x: float | int, y: float, words: str) -> None:
     """Draw a ring around a point, with a label next to it."""
     axes.plot(x, y, "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
