@@ -163,18 +163,14 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
         check_names(joint_names, recorded.position.shape[1])
         response, samples, noise, weights, rate = _fit(recorded, n_basis, **options)
         weights = _unscaled(weights, samples, recorded, scaling, joint_names)
-        dmp = cls(
-            weights=samples.batched(weights),
-            start=samples.batched(samples.first),
-            goal=samples.batched(samples.last),
-            start_velocity=samples.batched(rate / samples.duration[:, None]),
-            duration=samples.batched(samples.duration),
-            amplitude=samples.batched(samples.amplitude),
-            timestamps=samples.timestamps,
-            basis=response.basis,
-            spring=response.spring,
+        ends = torch.stack([rate, samples.first.double(), samples.last.double()], dim=-1)
+        dmp = cls.from_coordinates(
+            samples.batched(torch.cat([weights, ends], dim=-1)),
+            samples.batched(samples.duration),
+            samples.batched(samples.amplitude),
+            samples.timestamps,
+            response,
             scaling=scaling,
-            approach=response.approach,
             joint_names=joint_names,
             units=units,
         )

@@ -148,8 +148,9 @@ class LinearPrimitive(nn.Module):
         *batch, D, N = self.weights.shape
         names = "" if self.joint_names is None else f" ({', '.join(self.joint_names)})"
         error = "" if self.fit_report is None else f", NRMSE {self.fit_report.nrmse.max():.2g}"
+        many = f"batch {tuple(batch)}, " if batch else ""
         return (
-            f"batch {tuple(batch)}, {D} columns [{self.units}]{names}, {N} functions of "
+            f"{many}{D} columns [{self.units}]{names}, {N} functions of "
             f"{type(self.basis).__name__}, scaling {self.scaling!r}{error}"
         )
 
@@ -192,20 +193,51 @@ class LinearPrimitive(nn.Module):
             A primitive with memory of its own, the same parts and names, and no fit report.
         """
         x = coordinates.to(self.weights)
-        batch = x.shape[:-2]
         duration = self.duration if duration is None else duration
         amplitude = self.amplitude if amplitude is None else amplitude
-        duration = duration.to(x).expand(batch).clone()
-        return self.with_tensors(
-            {
-                "weights": x[..., :-3].clone(),
-                "start_velocity": x[..., -3] / duration[..., None],
-                "start": x[..., -2].clone(),
-                "goal": x[..., -1].clone(),
-                "duration": duration,
-                "amplitude": amplitude.to(x).expand(*batch, -1).clone(),
-                "timestamps": (self.timestamps if timestamps is None else timestamps).clone(),
-            }
+        return type(self).from_coordinates(
+            x,
+            duration.to(x).expand(x.shape[:-2]),
+            amplitude.to(x).expand(*x.shape[:-2], -1),
+            (self.timestamps if timestamps is None else timestamps),
+            self.response,
+            scaling=self.forcing_scale,
+            joint_names=self.joint_names,
+            units=self.units,
+        )
+
+    @classmethod
+    def from_coordinates[S: "LinearPrimitive"](
+        cls: type[S],
+        x: Float[Tensor, "*batch D M"],
+        duration: Float[Tensor, "*batch"],
+        amplitude: Float[Tensor, "*batch D"],
+        timestamps: Float[Tensor, "*#batch T"],
+        response: Response,
+        **parts: Any,
+    ) -> S:
+        """Primitives from coordinates, with memory of their own.
+
+        Args:
+            x: Weights, start velocity dy/ds, start and goal, as from `coordinates`.
+            duration: [s].
+            amplitude: Range of each column.
+            timestamps: Normalised times of the default rollout.
+            response: Response of basis and spring.
+            parts: Scaling, names and units.
+        """
+        return cls(
+            weights=x[..., :-3].clone(),
+            start_velocity=x[..., -3] / duration[..., None],
+            start=x[..., -2].clone(),
+            goal=x[..., -1].clone(),
+            duration=duration.clone(),
+            amplitude=amplitude.clone(),
+            timestamps=timestamps.clone(),
+            basis=response.basis,
+            spring=response.spring,
+            approach=response.approach,
+            **parts,
         )
 
     def tensors(self) -> dict[str, Tensor]:

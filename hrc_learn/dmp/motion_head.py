@@ -176,18 +176,12 @@ class MotionHead(nn.Module):
         """
         plan = self._plan(parameters, start, start_velocity, None, None)
         x, batch = plan.coordinates, plan.coordinates.shape[:-2]
-        duration = plan.duration.expand(batch)
-        return JointDMP(
-            weights=x[..., :-3],
-            start_velocity=x[..., -3] / duration[..., None],
-            start=x[..., -2],
-            goal=x[..., -1],
-            duration=duration,
-            amplitude=self.amplitude.to(x).expand(*batch, -1),
-            timestamps=torch.linspace(0, 1, samples).to(x),
-            basis=self.response.basis,
-            spring=self.response.spring,
-            approach=self.response.approach,
+        return JointDMP.from_coordinates(
+            x,
+            plan.duration.expand(batch),
+            self.amplitude.to(x).expand(*batch, -1),
+            torch.linspace(0, 1, samples).to(x),
+            self.response,
         )
 
     def distribution(

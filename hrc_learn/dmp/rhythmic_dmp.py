@@ -57,8 +57,7 @@ def fit_rhythmic(
         ValueError: Bad samples (the message names them), or less than one period of them.
     """
     samples = check_samples(time, position, mask=mask)
-    spring, basis = SpringDamper(), PeriodicBasis(count=n_basis)
-    response = response_of(spring, basis)
+    response = response_of(SpringDamper(), PeriodicBasis(count=n_basis))
     parts = []
     for s, duration, y, valid in zip(
         samples.s, samples.duration, samples.position.double(), samples.mask, strict=True
@@ -69,19 +68,15 @@ def fit_rhythmic(
             raise ValueError(
                 f"a rhythm needs a whole period of {tau:.3f} s, got {duration.item():.3f} s"
             )
-        parts.append((tau, *_solve(response, elapsed / tau, y, REGULARIZATION)))
-    tau, weights, rate, start, centre = (torch.stack(part) for part in zip(*parts, strict=True))
+        parts.append((tau, _solve(response, elapsed / tau, y, REGULARIZATION)))
+    tau, x = (torch.stack(part) for part in zip(*parts, strict=True))
 
-    dmp = JointDMP(
-        weights=samples.batched(weights),
-        start=samples.batched(start),
-        goal=samples.batched(centre),
-        start_velocity=samples.batched(rate / tau[:, None]),
-        duration=samples.batched(tau),
-        amplitude=samples.batched(samples.amplitude),
-        timestamps=(samples.s * (samples.duration / tau)[:, None]).reshape(*samples.batch, -1),
-        basis=basis,
-        spring=spring,
+    dmp = JointDMP.from_coordinates(
+        samples.batched(x),
+        samples.batched(tau),
+        samples.batched(samples.amplitude),
+        (samples.s * (samples.duration / tau)[:, None]).reshape(*samples.batch, -1),
+        response,
         joint_names=joint_names,
         units=units,
     )
@@ -103,8 +98,7 @@ def find_period(
 
     def misfit(tau: Tensor) -> Tensor:
         s = elapsed / tau
-        weights, rate, start, centre = _solve(response, s, y, SEARCH_RIDGE)
-        x = torch.cat([weights, torch.stack([rate, start, centre], dim=-1)], dim=-1)
+        x = _solve(response, s, y, SEARCH_RIDGE)
         return (response.state(s)[:, 0] @ x.mT - y).square().sum()
 
     left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
@@ -144,8 +138,8 @@ def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
 
 def _solve(
     response: Response, s: Tensor, y: Float[Tensor, "T D"], regularization: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Weights (D, N), start velocity by s, start and centre (D,) of the closest rhythm."""
+) -> Float[Tensor, "D M"]:
+    """Coordinates of the closest rhythm: weights, start velocity by s, start, and centre."""
     centre = _mean_of_whole_cycles(s, y)
     H = response.state(s)[:, 0]
     # Units in which the ridge penalises all columns alike.
@@ -153,7 +147,7 @@ def _solve(
     size = A.norm(dim=0)
     residual = y - H[:, -1:] * centre
     x = ridge_inverse(A / size, regularization) @ residual / size[:, None]
-    return x[:-2].mT, x[-2], x[-1], centre
+    return torch.cat([x.mT, centre[:, None]], dim=-1)
 
 
 def _mean_of_whole_cycles(s: Tensor, y: Tensor) -> Tensor:

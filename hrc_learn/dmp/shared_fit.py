@@ -74,16 +74,12 @@ def fit_shared(
         X, square, _ = solve_normal(response, n, products, STRONG_RIDGE)
     mean = sums / len(demonstrations)
     start, goal, amplitude, duration = mean[0], mean[1], mean[2], mean[3, 0]
-    primitive = JointDMP(
-        weights=X[0, :, :-1].contiguous(),
-        start=start,
-        goal=goal,
-        start_velocity=X[0, :, -1] / duration,
-        duration=duration,
-        amplitude=torch.where(amplitude > 0, amplitude, 1.0),
-        timestamps=torch.linspace(0, 1, TIMESTAMPS, dtype=torch.float64),
-        basis=response.basis,
-        spring=response.spring,
+    primitive = JointDMP.from_coordinates(
+        torch.cat([X[0], start[:, None], goal[:, None]], dim=-1),
+        duration,
+        torch.where(amplitude > 0, amplitude, 1.0),
+        torch.linspace(0, 1, TIMESTAMPS, dtype=torch.float64),
+        response,
         joint_names=joint_names,
         units=units,
     )

@@ -228,12 +228,12 @@ def piecewise_quintic(
     )
     L = t1 - t0
     u = (s[:, None] - t0) / L
-    terms = y1 - y0, v0 * L, v1 * L
+    change, w0, w1 = y1 - y0, v0 * L, v1 * L
     curves, coefficients = [], QUINTIC.to(u)
     for order in range(3):
         powers = u[..., None] ** torch.arange(coefficients.shape[-1], device=u.device)
         shapes = powers @ coefficients.mT
-        value = sum(term * shapes[..., k] for k, term in enumerate(terms))
+        value = change * shapes[..., 0] + w0 * shapes[..., 1] + w1 * shapes[..., 2]
         curves.append((y0 + value if order == 0 else value) / L**order)
         exponents = torch.arange(1, coefficients.shape[-1]).to(u)
         coefficients = coefficients[:, 1:] * exponents

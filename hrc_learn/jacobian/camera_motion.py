@@ -36,6 +36,12 @@ FEWEST_FRAMES = 10
 # Errors are clipped at this multiple of their median: a half-covered marker is off by pixels in
 # a frame or two, a moved camera in all frames.
 _OUTLIER = 3.0
+# Time window for a motion [s]. A small motion counts in full after half of it, on average.
+_WINDOW = 1.0
+# Threshold relative to the largest displacement in held-out demonstrations.
+_MARGIN = 2.5
+# Difference of camera placements, in median differences of neighbouring episodes.
+_APART = 6.0
 # Gauss-Newton steps: three are enough for ten degrees.
 _REFINEMENTS = 5
 
@@ -94,12 +100,7 @@ class CameraReference:
 
     @staticmethod
     def fit(
-        demonstrations: Sequence[ImageDemonstration],
-        fps: float,
-        image_size: tuple[int, int],
-        *,
-        window: float = 1.0,
-        margin: float = 2.5,
+        demonstrations: Sequence[ImageDemonstration], fps: float, image_size: tuple[int, int]
     ) -> CameraReference:
         """Learn the camera and the largest displacement without any motion.
 
@@ -108,9 +109,6 @@ class CameraReference:
                 times.
             fps: Frame rate [1/s].
             image_size: Width and height of the image [px].
-            window: Time window for a motion [s]. A small motion counts in full after half of
-                it, on average.
-            margin: Threshold relative to the largest displacement in held-out demonstrations.
 
         Raises:
             ValueError: There are fewer than two demonstrations, or they hardly show the marker.
@@ -120,38 +118,32 @@ class CameraReference:
                 f"a camera's reference needs two demonstrations or more, to hold one out; got "
                 f"{len(demonstrations)}."
             )
-        if not (window > 0 and fps > 0 and margin >= 1):
-            raise ValueError(
-                f"window and fps must be positive and margin at least 1, got {window}, {fps} "
-                f"and {margin}."
-            )
+        if not fps > 0:
+            raise ValueError(f"fps must be positive, got {fps}.")
         largest = 0.0
         folds = min(FOLDS, len(demonstrations))
         for fold in range(folds):
             others = [d for i, d in enumerate(demonstrations) if i % folds != fold]
             camera = _camera_of(others, image_size)
-            watch = CameraWatch(_reference(camera, others, np.inf, window))
+            watch = CameraWatch(_reference(camera, others, np.inf))
             for demo in demonstrations[fold::folds]:
                 largest = max(largest, _largest_displacement(watch, demo, fps))
         if not largest:
             raise ValueError(
-                f"no demonstration shows the marker {FEWEST_FRAMES} times within {window} s: "
+                f"no demonstration shows the marker {FEWEST_FRAMES} times within {_WINDOW} s: "
                 "record some in which the camera sees the marker."
             )
         camera = _camera_of(demonstrations, image_size)
-        return _reference(camera, demonstrations, margin * largest, window)
+        return _reference(camera, demonstrations, _MARGIN * largest)
 
 
 def _reference(
-    camera: MarkerCamera,
-    demonstrations: Sequence[ImageDemonstration],
-    threshold: float,
-    window: float,
+    camera: MarkerCamera, demonstrations: Sequence[ImageDemonstration], threshold: float
 ) -> CameraReference:
     points = np.concatenate([camera.points(_seen(demo)[0]) for demo in demonstrations])
     lower, upper = (tuple(corner.tolist()) for corner in (points.min(0), points.max(0)))
     return CameraReference(
-        camera=camera, threshold=threshold, window=window, lower=lower, upper=upper
+        camera=camera, threshold=threshold, window=_WINDOW, lower=lower, upper=upper
     )
 
 
@@ -248,23 +240,19 @@ class CameraPlacement:
 
 
 def camera_placements(
-    demonstrations: Sequence[ImageDemonstration],
-    image_size: tuple[int, int],
-    *,
-    margin: float = 6.0,
+    demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
 ) -> list[CameraPlacement]:
     """Camera placements of a data set, in the order of recording.
 
     Camera and marker are fitted to all episodes together, and the camera's motion to each
-    episode. An episode joins the first placement from which it differs by less than `margin`
-    times the median difference of neighbouring episodes. A camera that was moved every second
+    episode. An episode joins the first placement from which it differs by less than six times
+    the median difference of neighbouring episodes. A camera that was moved every second
     episode, or more often, is not detected.
 
     Args:
         demonstrations: Demonstrations in the order of recording; in memory, as they are read
             several times.
         image_size: Width and height of the image [px].
-        margin: Multiple of the median difference.
 
     Returns:
         One placement if the camera never moved. Episodes that hardly show the marker are in
@@ -290,7 +278,7 @@ def camera_placements(
     typical = np.median([apart(i, i + 1) for i in range(len(chosen) - 1)])
     groups: list[list[int]] = []
     for i in range(len(chosen)):
-        home = next((g for g in groups if apart(g[0], i) <= margin * typical), None)
+        home = next((g for g in groups if apart(g[0], i) <= _APART * typical), None)
         if home is None:
             groups.append([i])
         else:

@@ -11,10 +11,9 @@ summed statistics.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
-from typing import Any
 
 import numpy as np
 import torch
@@ -415,20 +414,6 @@ class ImageJacobianFitReport:
     noise: float
     """Standard deviation of each coordinate of dx that the posterior assumes [px]."""
 
-    def summary(self) -> dict[str, Any]:
-        """The report as plain numbers."""
-        return asdict(self)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Posterior:
-    """Distribution of the weights after the fit."""
-
-    mean: Float[Tensor, "P 2"]
-    """Mean of the weights [px/m], one column an image row."""
-    covariance: Float[Tensor, "P P"]
-    """Covariance of the weights of either image row [(px/m)^2]."""
-
 
 def weight_covariance(
     centers: Float[Tensor, "K _"],
@@ -463,7 +448,7 @@ def fit_weights(
     folds: Sequence[RegressionStatistics],
     precision: Float[Tensor, "P P"],
     config: ImageJacobianFitConfig,
-) -> tuple[Posterior, ImageJacobianFitReport]:
+) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P P"], ImageJacobianFitReport]:
     """Fit to all folds; each in turn is held out to measure the error on unseen data.
 
     Args:
@@ -486,21 +471,23 @@ def fit_weights(
     # A network that is too coarse for the data has an error that acts as noise on the weights.
     # Half of it, as the square sums two coordinates. (NaN, with one fold, keeps the noise.)
     noise = max(noise, held_out / 2)
-    posterior = solve(total, precision, noise)
+    mean, covariance = solve(total, precision, noise)
     report = ImageJacobianFitReport(
         pairs=total.count,
         motion=float(total.energy / total.count) ** 0.5,
-        error=(total.squared_error(posterior.mean) / total.count) ** 0.5,
+        error=(total.squared_error(mean) / total.count) ** 0.5,
         held_out_error=held_out**0.5,
         noise=noise**0.5,
     )
-    return posterior, report
+    return mean, covariance, report
 
 
 def solve(
     statistics: RegressionStatistics, precision: Float[Tensor, "P P"], noise: float
-) -> Posterior:
-    """Posterior of the weights for a zero-mean prior.
+) -> tuple[Float[Tensor, "P 2"], Float[Tensor, "P P"]]:
+    """Posterior mean and covariance of the weights [px/m] for a zero-mean prior.
+
+    The mean has one column for each image row; both rows have one covariance.
 
     Args:
         statistics: Statistics of the data.
@@ -509,7 +496,7 @@ def solve(
     """
     factor = torch.linalg.cholesky(statistics.gram / noise + precision)
     mean = torch.cholesky_solve(statistics.cross / noise, factor)
-    return Posterior(mean=mean, covariance=torch.cholesky_inverse(factor))
+    return mean, torch.cholesky_inverse(factor)
 
 
 def _held_out_square(
@@ -528,4 +515,4 @@ def weights_without_each(
 ) -> list[Float[Tensor, "P 2"]]:
     """Posterior means of all folds but one, for each fold left out."""
     rests = (reduce(add, [*folds[:i], *folds[i + 1 :]]) for i in range(len(folds)))
-    return [solve(rest, precision, noise).mean for rest in rests]
+    return [solve(rest, precision, noise)[0] for rest in rests]

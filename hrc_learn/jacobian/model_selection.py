@@ -208,7 +208,7 @@ class NegativeLogEvidence(nn.Module):
         config = self.fit_config()
         precision = prior_precision(self.centers, config)
         noise = 2 * config.pixel_noise**2
-        weights = solve(self.statistics(training), precision, noise).mean
+        weights, _ = solve(self.statistics(training), precision, noise)
         # The weights are fitted to the training pairs alone.
         unseen = self.statistics(held_out)
         error = (unseen.squared_error(weights) / unseen.count) ** 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -143,11 +144,11 @@ class RBFImageJacobian(nn.Module):
         K = len(network.centers)
         parts = statistics_by_fold(network.basis, K, demonstrations, config)
         precision = prior_precision(network.centers, config)
-        posterior, report = fit_weights(parts, precision, config)
-        rows = posterior.mean.mT.unflatten(-1, (6, -1))  # (2, 6, K)
+        mean, covariance, report = fit_weights(parts, precision, config)
+        rows = mean.mT.unflatten(-1, (6, -1))  # (2, 6, K)
         scale = component_scale(rows, config.rotation_scale)
         network.weight.data = (rows * scale[:, None]).flatten(0, 1)
-        network.covariance = posterior.covariance
+        network.covariance = covariance
         network.report = report
         return network.to(neurons.centers.dtype)
 
@@ -205,7 +206,7 @@ class RBFImageJacobian(nn.Module):
             "units": _UNITS,
             "input_indices": list(self.input_indices),
             "normalized": self.normalized,
-            "report": None if self.report is None else self.report.summary(),
+            "report": None if self.report is None else asdict(self.report),
         }
         write_model(folder, _KIND, config, self.state_dict())
 
