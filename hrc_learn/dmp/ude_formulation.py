@@ -75,13 +75,14 @@ class UdePrimitive(JointDMP):
             v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, second)
             force = slope - second + motion.spring.alpha * (v - rate)
             change = (ridge_inverse(motion.basis.forcing(s), REGULARIZATION) @ force).mT
-            motion.weights += change.to(motion.weights)
+            # A new tensor, because both primitives share the weights until here.
+            motion.weights = torch.nn.Parameter(motion.weights + change.to(motion.weights))
             motion.fit_report = errors.compare(motion.rollout().position)
         return motion
 
     @classmethod
     def of(cls, linear: JointDMP) -> "UdePrimitive":
-        """Primitive with the weights of a linear one."""
+        """Primitive that shares the weights of a linear one."""
         return cls(**linear.arguments())
 
     def config(self) -> dict[str, Any]:
