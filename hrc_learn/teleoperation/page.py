@@ -23,7 +23,7 @@ from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.teleoperation.devices import OPEN, rumble_strength
-from hrc_learn.teleoperation.gate import AddressConfig, Content, Control, Gate
+from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate
 from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.messages import (
     Ask,
@@ -46,6 +46,7 @@ from hrc_learn.teleoperation.page_operator import (
 from hrc_learn.teleoperation.page_operator import PageHuman as PageHuman
 from hrc_learn.teleoperation.page_scene import PageScene
 from hrc_learn.teleoperation.page_sockets import (
+    Control,
     PageSockets,
     guarded_viser,
     page_contents,

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hrc_learn.teleoperation.gate import Control, Gate, address, qr_code
+from hrc_learn.teleoperation.gate import Gate, address, qr_code
 from hrc_learn.teleoperation.gate.address import (
     Address,
     AddressConfig,
