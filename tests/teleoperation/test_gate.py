@@ -26,6 +26,7 @@ from hrc_learn.teleoperation.gate.messages import (
     view_message,
 )
 from hrc_learn.teleoperation.page import PageConfig, slow_words
+from hrc_learn.teleoperation.page_sockets import Control
 
 
 class Clock:
