@@ -145,6 +145,8 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
         boxes: Fixed boxes, in the base frame.
     """
     import trimesh
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
     scene = trimesh.Scene()
@@ -156,7 +158,7 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
             roughnessFactor=0.75,
             alphaMode="OPAQUE" if colour[3] >= 1 else "BLEND",
         )
-        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        mesh.visual = TextureVisuals(material=material)
         scene.add_geometry(mesh, node_name=name, geom_name=name)
 
     for k, body in enumerate(bodies):
@@ -165,7 +167,7 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
     for colour in dict.fromkeys(box.colour for box in boxes):
         parts = [box_mesh(box) for box in boxes if box.colour == colour]
         add(f"stands_{len(scene.geometry)}", _joined(parts), colour)
-    return trimesh.exchange.gltf.export_glb(scene, include_normals=True)
+    return export_glb(scene, include_normals=True)
 
 
 def _held(body: Body) -> dict[str, Any]:
@@ -254,4 +256,6 @@ def _mesh(
 def _joined(meshes: Sequence[Trimesh]) -> Trimesh:
     import trimesh
 
-    return trimesh.util.concatenate(list(meshes))
+    mesh = trimesh.util.concatenate(list(meshes))
+    assert isinstance(mesh, trimesh.Trimesh)
+    return mesh

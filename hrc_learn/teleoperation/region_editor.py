@@ -253,7 +253,7 @@ class RegionEditor:
         """Make the next rectangle drawn on the screen the region's footprint."""
         self._draw.disabled = True
 
-        @self._scene.on_rect_select()
+        @self._scene.on_rect_select()  # pyright: ignore[reportArgumentType]
         async def drawn(event: Any) -> None:
             self._scene.remove_rect_select_callback(drawn)
             self._draw.disabled = False
@@ -278,7 +278,7 @@ class RegionEditor:
         """Mark the target above the next point clicked."""
         self._mark_next_button.disabled = True
 
-        @self._scene.on_click()
+        @self._scene.on_click()  # pyright: ignore[reportArgumentType]
         async def clicked(event: Any) -> None:
             self._scene.remove_click_callback(clicked)
             self._mark_next_button.disabled = False

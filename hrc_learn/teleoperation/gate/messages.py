@@ -35,7 +35,7 @@ class MessageError(ValueError):
     """A message that no client of ours sends."""
 
 
-class _Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     pass
 
 
