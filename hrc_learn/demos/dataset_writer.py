@@ -16,7 +16,14 @@ from hrc_learn.demos.read.dataset_folder import (
     recovery_advice,
     staging_folder,
 )
-from hrc_learn.demos.read.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
+from hrc_learn.demos.read.metadata import (
+    INDEX_FEATURES,
+    Sidecar,
+    SidecarColumn,
+    episode_statistics,
+    read_sidecar,
+)
+from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.recording_recovery import begin, discard, finish
 from hrc_learn.demos.videos import CameraRecorder, Image, video_features
 from hrc_learn.store import DATASET, Claim
@@ -343,6 +350,7 @@ class DatasetWriter:
         return columns, staged
 
     def _header(self, columns: Sequence[recorded.RecordedColumn]) -> recorded.RecordingHeader:
+        known = {column.role: column for column in columns if column.role is not None}
         return recorded.RecordingHeader(
             fps=self.fps,
             robot_type=self.robot_type,
@@ -351,8 +359,15 @@ class DatasetWriter:
                 **self._video_features,
                 **INDEX_FEATURES,
             },
-            sidecar=recorded.sidecar_of(
-                columns, self.joint_names, self._frames_of_poses, self._details
+            sidecar=Sidecar(
+                units={role: ROLES[role].unit for role in known},
+                columns={
+                    role: SidecarColumn(key=column.key, names=column.names)
+                    for role, column in known.items()
+                },
+                joint_names=self.joint_names,
+                frames=self._frames_of_poses,
+                details=self._details,
             ),
         )
 

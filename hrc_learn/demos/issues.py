@@ -11,14 +11,17 @@ _UNPRINTABLE = re.compile(
     # Control characters, and those that reverse the direction of text or hide it.
     "[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
-_LONGEST_NAME = 300
+_LONGEST_TEXT, _END = 300, 120
+"""Characters shown of a text from a file, and those of its end, where the advice stands."""
 _FIGURE_OR_QUOTE = re.compile(r"[-+]?\d[\d.e+-]*|'[^']*'")
 
 
 def plain_text(text: str) -> str:
     """Text from a file, safe to print in a terminal: escapes removed, length bounded."""
     shown = _UNPRINTABLE.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
-    return shown if len(shown) <= _LONGEST_NAME else f"{shown[:_LONGEST_NAME]}..."
+    if len(shown) <= _LONGEST_TEXT:
+        return shown
+    return f"{shown[: _LONGEST_TEXT - _END]} ... {shown[-_END:]}"
 
 
 def aligned(rows: Sequence[tuple[str, ...]], side: Literal["<", ">"] = "<") -> Iterator[str]:

@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64, Shaped
 from hrc_learn.demos.demonstration import float_array
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
-from hrc_learn.demos.read.metadata import Sidecar, SidecarColumn, Statistics
+from hrc_learn.demos.read.metadata import Sidecar, Statistics
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json
@@ -102,26 +102,6 @@ def lerobot_features(columns: Sequence[RecordedColumn]) -> dict[str, dict]:
         }
         for key, components in names.items()
     }
-
-
-def sidecar_of(
-    columns: Sequence[RecordedColumn],
-    joint_names: Sequence[str],
-    frames: Mapping[str, str],
-    details: Mapping[str, object],
-) -> Sidecar:
-    """Declaration of these columns."""
-    known = {column.role: column for column in columns if column.role is not None}
-    return Sidecar(
-        units={role: ROLES[role].unit for role in known},
-        columns={
-            role: SidecarColumn(key=column.key, names=column.names)
-            for role, column in known.items()
-        },
-        joint_names=tuple(joint_names),
-        frames=dict(frames),
-        details=dict(details),
-    )
 
 
 def encode(

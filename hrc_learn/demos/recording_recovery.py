@@ -11,23 +11,11 @@ import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hrc_learn import store
 from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_folder import recovery_advice, staging_folder
 from hrc_learn.demos.recorded_episode import staged_paths
-from hrc_learn.store import (
-    DATASET,
-    BusyError,
-    Claim,
-    Count,
-    delete_files,
-    read_json,
-    recover,
-    replacing,
-    resolved,
-    source_of,
-    write_json,
-)
 
 _RECORDING = "recording.json"
 _EPISODE = "episode_[0-9][0-9][0-9][0-9][0-9][0-9]."
@@ -40,7 +28,7 @@ class _Recording:
     """Header of a recording."""
 
     id: str = field(default_factory=lambda: uuid.uuid4().hex)
-    episodes: Count | None = None
+    episodes: store.Count | None = None
     """Number of episodes of the dataset that it extends; None for a new one."""
 
 
@@ -55,7 +43,7 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
         FileExistsError: `root` exists or may not be replaced by a longer dataset, an
             interrupted recording of it holds episodes, or a foreign folder has its name.
     """
-    root, staging = resolved(root), staging_folder(root)
+    root, staging = store.resolved(root), staging_folder(root)
     if staging.is_dir() and not _is_recording(staging):
         raise FileExistsError(
             f"{staging} is no interrupted recording and is not touched: move it away, or "
@@ -76,17 +64,17 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
             f"{recovery_advice(root)} makes a dataset of its saved episodes; remove it to "
             f"start anew"
         ) from None
-    write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
+    store.write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
 
 
-def finish(root: Path, claim: Claim) -> None:
+def finish(root: Path, claim: store.Claim) -> None:
     """Make or extend a dataset from its recording, then remove the recording.
 
     Raises:
         DatasetError: No episode was saved for a new dataset.
         FileExistsError: Another dataset has the name.
     """
-    root, staging = resolved(root), staging_folder(root)
+    root, staging = store.resolved(root), staging_folder(root)
     if not _is_done(root, staging):
         header = _read_header(staging)
         episodes = header.episodes
@@ -101,8 +89,12 @@ def finish(root: Path, claim: Claim) -> None:
                 f"{root} away to make a dataset of it"
             )
         paths = staged_paths(staging, episodes or 0)
-        with replacing(
-            claim, DATASET, overwrite=episodes is not None, others="keep", source=header.id
+        with store.replacing(
+            claim,
+            store.DATASET,
+            overwrite=episodes is not None,
+            others="keep",
+            source=header.id,
         ) as new:
             assemble(paths, new, earlier=None if episodes is None else root)
     discard(staging)
@@ -129,7 +121,7 @@ def recover_dataset(root: str | Path) -> Path:
     root = Path(root)
     if not _is_recording(staging_folder(root)):
         raise FileNotFoundError(f"no interrupted recording at {staging_folder(root)}")
-    with Claim(root) as claim:
+    with store.Claim(root) as claim:
         finish(root, claim)
     return root
 
@@ -150,8 +142,8 @@ def recover_all(path: str | Path) -> list[str]:
     Raises:
         BusyError: `path` itself is being written.
     """
-    path = resolved(path)
-    done = recover(path)
+    path = store.resolved(path)
+    done = store.recover(path)
     suffix = staging_folder(path).name.removeprefix(path.name)
     for staging in [staging_folder(path), *path.glob(f"**/*{suffix}")]:
         if not _is_recording(staging):
@@ -159,7 +151,7 @@ def recover_all(path: str | Path) -> list[str]:
         root = staging.with_name(staging.name.removesuffix(suffix))
         try:
             recover_dataset(root)
-        except (BusyError, DatasetError, FileExistsError) as error:
+        except (store.BusyError, DatasetError, FileExistsError) as error:
             done.append(str(error))
         else:
             done.append(f"{root}: made from the saved episodes of an interrupted recording")
@@ -169,8 +161,8 @@ def recover_all(path: str | Path) -> list[str]:
 def discard(staging: Path) -> None:
     """Remove the folder of a recording, but no foreign file in it."""
     # The header goes last: it tells that the rest is not needed, if this is interrupted too.
-    delete_files(staging, _FILES)
-    if not delete_files(staging, [_RECORDING]):
+    store.delete_files(staging, _FILES)
+    if not store.delete_files(staging, [_RECORDING]):
         kept = (staging.with_name(f"{staging.name}.kept{n or ''}") for n in itertools.count())
         staging.rename(next(path for path in kept if not os.path.lexists(path)))
 
@@ -179,8 +171,8 @@ def _read_header(staging: Path) -> _Recording:
     """Header of a recording; one without was interrupted before it was written."""
     path = staging / _RECORDING
     if not path.is_file():
-        write_json(path, _Recording())
-    return read_json(path, _Recording, "move the recording away")
+        store.write_json(path, _Recording())
+    return store.read_json(path, _Recording, "move the recording away")
 
 
 def _is_recording(staging: Path) -> bool:
@@ -200,4 +192,4 @@ def _has_episodes(staging: Path) -> bool:
 def _is_done(root: Path, staging: Path) -> bool:
     """True if the dataset holds the recorded episodes and only the recording remains."""
     named = root.is_dir() and (staging / _RECORDING).is_file()
-    return named and source_of(root) == _read_header(staging).id
+    return named and store.source_of(root) == _read_header(staging).id

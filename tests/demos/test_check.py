@@ -536,6 +536,20 @@ def test_names_unknown(root):
     find(check_dataset(root).warnings, "names no components")
 
 
+def test_one_name_for_a_vector_names_no_component(root):
+    change_feature(root, STATE, names=["state"])
+    find(check_dataset(root).warnings, "names no components")
+    assert load_demos(root)[0].joint_position.shape == (60, 3)
+    mapped = load_demos(root, mapping={"joint_position": f"{STATE}[0:2]"})
+    assert mapped[0].joint_position.shape == (60, 2)
+
+
+def test_a_long_message_keeps_its_advice():
+    text = str(warning(message=f"{'name, ' * 200}: name one of them", key="state"))
+    assert len(text) < 320
+    assert text.endswith("name one of them")
+
+
 def test_speed_limits_are_the_callers(root):
     assert not any("jumps" in f.message for f in check_dataset(root).warnings)
     slow = check_dataset(root, speed_limits=dict.fromkeys("abc", 1e-3))

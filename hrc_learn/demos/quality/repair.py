@@ -10,19 +10,8 @@ import numpy as np
 
 from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
-from hrc_learn.demos.quality.episode_edits import (
-    ColumnSemantics,
-    EpisodeEdit,
-    drop_bad_frames,
-    drop_late,
-    drop_repeats,
-    fix_signs,
-    renew_stamps,
-    resample_to_grid,
-    trim,
-    unwrap,
-)
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.contract import fingerprint, keep_contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
@@ -175,7 +164,7 @@ class _Repair:
         )
         self.faults = {fault.episode: fault for fault in faults}
         """Episodes that contradict the units of the others."""
-        self.semantics = ColumnSemantics(
+        self.semantics = edits.ColumnSemantics(
             selections=columns.selections, joint_names=columns.joint_names, units=decisions
         )
         segments = read_segments(folder) if options.videos else None
@@ -218,7 +207,7 @@ class _Repair:
             self._carry_contract(target)
             shutil.rmtree(staging)
 
-    def _edits(self, progress: Progress | None) -> Iterator[EpisodeEdit]:
+    def _edits(self, progress: Progress | None) -> Iterator[edits.EpisodeEdit]:
         """Repaired episodes; the report counts them, and those that are left out."""
         report = self.report
         entries = progress(self.folder.episodes) if progress else self.folder.episodes
@@ -239,7 +228,9 @@ class _Repair:
             report.frames += len(edit)
             yield edit
 
-    def _repaired(self, entry: EpisodeEntry, frames: RawFrames | DatasetError) -> EpisodeEdit:
+    def _repaired(
+        self, entry: EpisodeEntry, frames: RawFrames | DatasetError
+    ) -> edits.EpisodeEdit:
         """Apply the permitted edits to one episode."""
         options = self.options
         if (fault := self.faults.get(entry.index)) is not None:
@@ -248,19 +239,19 @@ class _Repair:
             raise frames
         edit = self._unedited(entry, frames)
         if "time" not in edit.semantics.selections:
-            edit = renew_stamps(edit, self.folder.fps)
-        edit = drop_bad_frames(edit, options.drop_bad_frames)
+            edit = edits.renew_stamps(edit, self.folder.fps)
+        edit = edits.drop_bad_frames(edit, options.drop_bad_frames)
         for wanted, change in (
-            (options.drop_late, drop_late),
-            (options.trim, trim),
-            (options.drop_repeats, drop_repeats),
-            (options.unwrap, unwrap),
-            (options.fix_signs, fix_signs),
+            (options.drop_late, edits.drop_late),
+            (options.trim, edits.trim),
+            (options.drop_repeats, edits.drop_repeats),
+            (options.unwrap, edits.unwrap),
+            (options.fix_signs, edits.fix_signs),
         ):
             if wanted:
                 edit = change(edit)
         if options.fps is not None:
-            edit = resample_to_grid(edit, options.fps)
+            edit = edits.resample_to_grid(edit, options.fps)
         stalled = np.flatnonzero(np.diff(edit.time) <= 0)
         if len(stalled):
             raise edit.fault(
@@ -270,14 +261,14 @@ class _Repair:
             )
         return edit
 
-    def _unedited(self, entry: EpisodeEntry, frames: RawFrames) -> EpisodeEdit:
+    def _unedited(self, entry: EpisodeEntry, frames: RawFrames) -> edits.EpisodeEdit:
         """The frames of an episode that are to be kept."""
         semantics = self.semantics
         time = recorded_stamps(self.folder, frames)
         if "time" in semantics.selections:
             ((key, index),) = semantics.selections["time"].columns
             time = frames[key][:, index].astype(float) * semantics.units["time"].factor
-        edit = EpisodeEdit(
+        edit = edits.EpisodeEdit(
             entry=entry,
             semantics=semantics,
             frames={

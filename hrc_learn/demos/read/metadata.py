@@ -84,6 +84,8 @@ def read_features(info: dict) -> dict[str, Feature]:
             ) from error
         if dtype.startswith(NUMERIC):
             names = flatten_names(declared.get("names"))
+            if names is not None and len(names) == 1 < prod(shape):
+                names = None  # openpi's converters name the vector, not its components
             if names is not None and len(names) != prod(shape):
                 raise DatasetError(
                     f"{len(names)} names for {prod(shape)} components; correct names or "
