@@ -19,7 +19,6 @@ Colour = tuple[float, float, float, float]
 PLAIN: Colour = (0.86, 0.87, 0.89, 1.0)
 """Colour of a robot link without a colour of its own."""
 
-_SUFFIXES = (".dae", ".stl", ".obj")
 _CREASE = np.deg2rad(40.0)
 """Angle between two faces from which on the edge between them is drawn sharp [rad]."""
 
@@ -115,7 +114,7 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
     """Read the shape in a file; it is kept, so the file is read once.
 
     Args:
-        path: A .dae (COLLADA), .stl (binary or text) or .obj (Wavefront) file.
+        path: A mesh file of a format that trimesh reads, such as COLLADA, STL, OBJ or PLY.
 
     Returns:
         Its parts, one for each material, in the frame and unit that the file is meant in:
@@ -123,7 +122,7 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
         COLLADA's `up_axis` is ignored, as all readers of URDF do.
 
     Raises:
-        ValueError: The file is of another kind, broken, or holds no triangle.
+        ValueError: The file is of another format, broken, or holds no triangle.
         ModuleNotFoundError: trimesh is not installed.
     """
     from trimesh.graph import smooth_shade
@@ -150,7 +149,7 @@ def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
     """Corners of the triangles in a file that `read_mesh` reads, each once [m].
 
     Raises:
-        ValueError: The file is of another kind, broken, or holds no triangle.
+        ValueError: The file is of another format, broken, or holds no triangle.
         ModuleNotFoundError: trimesh is not installed.
     """
     corners = [mesh.vertices[mesh.faces].reshape(-1, 3) for mesh, _ in _meshes(path)]
@@ -159,10 +158,6 @@ def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
 
 def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
     """Meshes in a file, in metres, at their places in its scene, with their colours."""
-    if path.suffix.lower() not in _SUFFIXES:
-        raise ValueError(
-            f"{path}: cannot read {path.suffix} meshes, only {', '.join(_SUFFIXES)}."
-        )
     try:
         import collada  # noqa: F401  # which trimesh reads COLLADA with
         import trimesh
@@ -175,7 +170,7 @@ def _meshes(path: Path) -> list[tuple[Any, Colour | None]]:
     try:
         scene = trimesh.load_scene(path, process=False)
     except Exception as error:  # its readers raise errors of all kinds at broken files
-        raise ValueError(f"{path} is no complete mesh file: {error}") from error
+        raise ValueError(f"{path} is no mesh that trimesh reads: {error}") from error
     unit = str(scene.units or "").partition(" * ")[0]
     scale = float(unit) if unit[:1].isdigit() else 1.0
     found = []

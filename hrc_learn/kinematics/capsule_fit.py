@@ -9,6 +9,7 @@ tools/fit_capsules.py fits more closely, for the registered arms.
 from __future__ import annotations
 
 import math
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,7 +66,12 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
             start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
             capsules.append(_named(link, start, end, radius))
         else:
-            hulls[link].append(hull_of(shape))
+            try:
+                hull = hull_of(shape)
+            except ValueError as error:  # a broken mesh
+                warnings.warn(f"no capsule for a shape of link {link}: {error}", stacklevel=2)
+            else:
+                hulls[link].append(hull)
     for link, parts in hulls.items():
         capsules += [_named(link, *fitted) for fitted in fit_link(parts)]
     if not capsules:

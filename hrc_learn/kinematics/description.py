@@ -23,7 +23,7 @@ Transform = Float[np.ndarray, "4 4"]
 
 MOVING = ("revolute", "continuous", "prismatic")
 _KINDS = (*MOVING, "fixed", "floating", "planar", "ball", "free")
-# No robot's joints are further apart [m]; a file in millimetres gives some hundreds.
+# No parts of a robot are further apart [m]; a file in millimetres gives some hundreds.
 _FURTHEST = 100.0
 
 # Names of a gripper's joints and of the links that they move, and words which show that such a
@@ -141,6 +141,9 @@ class Description:
         self._above: dict[str, Joint] = {}
         self._check_names("links", [link.name for link in links])
         self._check_names("joints", [joint.name for joint in joints])
+        for link in links:
+            for shape in (*link.visuals, *link.collisions):
+                self._check_lengths(f"a shape of link {link.name}", shape.pose)
         for joint in joints:
             self._check_joint(joint)
             self._below[joint.parent].append(joint)
@@ -169,10 +172,14 @@ class Description:
                 f"{self.path}: link {joint.child} has two parents, by the joints {before.name} "
                 f"and {joint.name}: a robot is a tree"
             )
-        if not np.abs(joint.origin[:3, 3]).max() < _FURTHEST:
+        self._check_lengths(f"joint {joint.name}", joint.origin)
+
+    def _check_lengths(self, what: str, pose: Transform) -> None:
+        furthest = np.abs(pose[:3, 3]).max()
+        if not furthest < _FURTHEST:
             raise ValueError(
-                f"{where} is {np.abs(joint.origin[:3, 3]).max():.3g} m from its parent's "
-                "frame: lengths are in metres"
+                f"{self.path}: {what} is {furthest:.3g} m from the frame that carries it: "
+                "lengths are in metres"
             )
 
     @property

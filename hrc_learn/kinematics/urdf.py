@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import warnings
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,6 +23,9 @@ from hrc_learn.kinematics.description import (
 )
 
 _BOUNDS = ("lower", "upper", "velocity", "effort")
+# Attributes that are no numbers; in others these words are numbers that no robot has.
+_WORDS = ("name", "link", "joint", "type", "filename")
+_NOT_FINITE = re.compile(r"\b(nan|inf|infinity)\b", re.IGNORECASE)
 
 
 def read_urdf(path: Path) -> Description:
@@ -42,7 +46,7 @@ def read_urdf(path: Path) -> Description:
             f"{path} is neither URDF nor MJCF: it begins with <{robot.tag}>, not with <robot> "
             "or <mujoco>"
         )
-    _refuse_xacro(path, robot)
+    _check_texts(path, robot)
     reader = _Reader(path, robot)
     links = [reader.link(element) for element in robot.findall("link")]
     joints = [reader.joint(element) for element in robot.findall("joint")]
@@ -67,20 +71,25 @@ def _parsed(path: Path) -> ElementTree.Element:
     return builder.close()
 
 
-def _refuse_xacro(path: Path, robot: ElementTree.Element) -> None:
-    """Raise a ValueError if macros or expressions of xacro are left; properties may be."""
+def _check_texts(path: Path, robot: ElementTree.Element) -> None:
+    """Raise a ValueError if xacro is left, but for properties, or a number is not finite."""
     names = [key for key, value in robot.attrib.items() if "xacro" in value]
     prefixes = ("xacro:", *(f"{name.removeprefix('xmlns:')}:" for name in names))
     harmless = tuple(prefix + kind for prefix in prefixes for kind in ("property", "arg"))
-    for element in robot.iter():
-        found = [element.tag] if element.tag.startswith(prefixes) else []
-        if element.tag in harmless:
-            continue
-        if element.tag in ("link", "joint"):
-            texts = (text for part in element.iter() for text in part.attrib.values())
-            found += [text for text in texts if "${" in text or "$(" in text]
-        if found:
-            raise ValueError(f"{path} holds {found[0]}: make URDF of it with xacro first")
+    left = [element.tag for element in robot.iter() if element.tag.startswith(prefixes)]
+    left = [tag for tag in left if tag not in harmless]
+    for part in (*robot.findall("link"), *robot.findall("joint")):
+        for element in part.iter():
+            for key, text in element.attrib.items():
+                if "${" in text or "$(" in text:
+                    left.append(text)
+                elif key not in _WORDS and _NOT_FINITE.search(text):
+                    raise ValueError(
+                        f"{path}: {part.tag} {part.get('name')} has {key}={text!r}, not finite "
+                        "numbers"
+                    )
+    if left:
+        raise ValueError(f"{path} holds {left[0]}: make URDF of it with xacro first")
 
 
 class _Reader:

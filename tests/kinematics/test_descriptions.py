@@ -19,6 +19,10 @@ from hrc_learn.kinematics import Arm, MissingModelError, arm
 
 NAMES = [f"j{i}" for i in range(1, 7)]
 MESH = '<visual><geometry><mesh filename="package://not/there.stl"/></geometry></visual>'
+FAR = (
+    '<collision><origin xyz="0 0 1e300"/><geometry><sphere radius="1"/></geometry></collision>'
+)
+HEAVY = '<inertial><mass value="1"/><inertia ixx="nan" iyy="1" izz="1"/></inertial>'
 XMLNS = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 
 
@@ -180,9 +184,11 @@ REFUSED = {
     "velocity -3": (changed('velocity="2"', 'velocity="-3"', 1), "velocity limit -3"),
     "range 0": (changed('lower="-2.5"', 'lower="2.6"', 1), "range 2.6 to 2.6"),
     "offset 1e300": (changed('xyz="0.1', 'xyz="1e300', 1), r"1e\+300 m"),
+    "far shape": (changed('<link name="l2"/>', f'<link name="l2">{FAR}</link>'), "m from"),
+    "inertia": (changed('<link name="l2"/>', f'<link name="l2">{HEAVY}</link>'), "not finite"),
     "millimetres": (changed('xyz="0.1', 'xyz="333', 1), "lengths are in metres"),
-    "infinite": (changed('xyz="0.1', 'xyz="inf', 1), "3 finite numbers"),
-    "not a number": (changed('upper="2.6"', 'upper="nan"', 1), "finite number"),
+    "infinite": (changed('xyz="0.1', 'xyz="inf', 1), "not finite numbers"),
+    "not a number": (changed('upper="2.6"', 'upper="nan"', 1), "finite"),
     "digits apart": (changed('xyz="0.1', 'xyz="1_0', 1), "finite number"),
     "a unit": (changed('lower="-2.5"', 'lower="-2.5m"', 1), "lower='-2.5m'"),
     "zero axis": (changed('axis xyz="0 1 0"', 'axis xyz="0 0 0"', 1), "axis .* is zero"),
@@ -212,6 +218,14 @@ def test_pinocchio_refuses_them_too(kind):
     pinocchio = pytest.importorskip("pinocchio")
     with pytest.raises(ValueError, match=r"valid URDF model|any body named l6"):
         pinocchio.buildModelFromXML(robot(REFUSED[kind][0]))
+
+
+def test_a_broken_mesh_is_no_capsule(tmp_path):
+    (tmp_path / "no.stl").write_bytes(b"solid\n")
+    content = changed('<link name="l3"/>', f'<link name="l3">{MESH}</link>')
+    described = load(tmp_path, robot(content.replace("package://not/there.stl", "no.stl")))
+    with pytest.warns(UserWarning, match=r"no capsule for a shape of link 3: .*no\.stl"):
+        assert described.whole.capsules
 
 
 def test_a_long_chain_is_no_deep_recursion(tmp_path):
