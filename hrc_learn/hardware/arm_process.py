@@ -21,7 +21,7 @@ from typing import Any, Protocol, final, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.protocols import ArmState
+from hrc_learn.protocols import Arm, ArmState, Gripper
 from hrc_learn.watchdog import (
     Report,
     Watchdog,
@@ -104,23 +104,11 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> dict[int, A
 
 
 @runtime_checkable
-class StoppableArm(Protocol):
+class StoppableArm(Arm, Gripper, Protocol):
     """An arm and its gripper, as a driver has them."""
-
-    def read(self) -> ArmState:
-        """Return the newest state."""
-        ...
-
-    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
-        """Set the joint velocities [rad/s]."""
-        ...
 
     def stop(self) -> None:
         """Bring the arm to rest."""
-        ...
-
-    def move(self, width: float) -> None:
-        """Set the opening of the gripper [m]."""
         ...
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -155,37 +155,22 @@ class Motions:
                 f"channel {channel!r} needs. hrc check lists the columns."
             )
 
+    @torch.no_grad()
     def adapted(self, channel: str, primitive: Primitive) -> "Reproduction":
         """Motion of a common primitive with start, goal and duration of each demonstration."""
-        last = (self.demos.length - 1)[:, None, None]
+        last = (self.demos.length - 1)[:, None]
+        columns = [self.column(name) for name in CHANNELS[channel]]
+        starts = [x[:, 0] for x in columns]
+        goals = [x.take_along_dim(last[..., None], dim=1)[:, 0] for x in columns]
+        start, goal = (Pose(*x) if channel == "pose" else x[0] for x in (starts, goals))
+        time = self.demos.time
+        lasting = time.take_along_dim(last, dim=1)[:, 0]
+        return Reproduction.of(cast(Any, primitive).rollout(time, start, goal, lasting))
 
-        def ends(name: str) -> tuple[Tensor, Tensor]:
-            values = self.column(name)
-            return values[:, 0], values.take_along_dim(last, dim=1)[:, 0]
-
-        time, duration = self.demos.time, self.demos.time.take_along_dim(last[..., 0], dim=1)
-        lasting = duration[:, 0]
-        if isinstance(primitive, JointDMP):
-            start, goal = ends(CHANNELS[channel][0])
-            return Reproduction(primitive.rollout(time, start, goal, lasting).position)
-        turn_start, turn_goal = ends("orientation")
-        if isinstance(primitive, OrientationDMP):
-            motion = primitive.rollout(time, turn_start, turn_goal, lasting)
-            return Reproduction(orientation=motion.orientation)
-        start, goal = ends("position")
-        motion = primitive.rollout(
-            time, Pose(start, turn_start), Pose(goal, turn_goal), lasting
-        )
-        return Reproduction(motion.position, motion.orientation)
-
+    @torch.no_grad()
     def own(self, primitive: Primitive) -> "Reproduction":
         """Motion of each demonstration's own primitive."""
-        if isinstance(primitive, OrientationDMP):
-            return Reproduction(orientation=primitive.rollout().orientation)
-        if isinstance(primitive, JointDMP):
-            return Reproduction(primitive.rollout().position)
-        motion = primitive.rollout()
-        return Reproduction(motion.position, motion.orientation)
+        return Reproduction.of(primitive.rollout())
 
     def _body_shape(self) -> Tensor | None:
         """Arm angle of a Franka arm [rad], continuous, in the same turn at the start."""
@@ -207,10 +192,10 @@ class Reproduction:
     orientation: Float[Tensor, "demos frames 4"] | None = None
     """Unit quaternions; None for joints and positions."""
 
-    def __post_init__(self):
-        for name, values in vars(self).items():
-            if values is not None:
-                object.__setattr__(self, name, values.detach())
+    @classmethod
+    def of(cls, motion: Any) -> "Reproduction":
+        """Position and orientation of a trajectory, as far as it has them."""
+        return cls(getattr(motion, "position", None), getattr(motion, "orientation", None))
 
 
 def load_primitive(folder: Path, channel: str) -> Primitive:
