@@ -4,7 +4,7 @@ No pose is stored per arm. Layouts with tables and cabinets at several distances
 the usual ones first, until one suits the arm (`layout_quality`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
@@ -298,6 +298,11 @@ class CellLayout:
     view.
     """
 
+    @property
+    def rank(self) -> float:
+        """Quality, less what views of the marker are missing."""
+        return _worth(self.quality, self.seen)
+
 
 type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
 
@@ -310,11 +315,13 @@ def layout_for(robot: Arm) -> CellLayout:
         UnreachableError: In no layout the arm reaches the table and all shelves.
     """
     best: CellLayout | None = None
-    for layout in _layouts(robot):
-        if best is None or _rank(layout) > _rank(best):
-            best = layout
-        if _rank(best) >= _ENOUGH:
-            return best
+    for places, above in _candidates(robot):
+        for workplace in places:
+            layout = _evaluated(workplace, above)
+            if layout is not None and (best is None or layout.rank > best.rank):
+                best = layout
+            if best is not None and best.rank >= _ENOUGH:
+                return best
     if best is None:
         raise UnreachableError(
             f"the {robot.name} does not reach the table and all shelves from home, with "
@@ -324,8 +331,8 @@ def layout_for(robot: Arm) -> CellLayout:
     return best
 
 
-def _layouts(robot: Arm) -> Iterator[CellLayout]:
-    """Layouts that suit an arm, the likely ones first."""
+def _candidates(robot: Arm) -> Iterator[tuple[list[Workplace], _Above]]:
+    """Workplaces that suit an arm, with postures above their table; the likely ones first."""
     unlikely = []
     for reach in _REACHES:
         for scale in _SCALES:
@@ -336,22 +343,10 @@ def _layouts(robot: Arm) -> Iterator[CellLayout]:
             above = _above_table(places[0])
             # No layout is better than the best posture above its table.
             if any(_worth(m.quality, m.seen) >= _ENOUGH for _, m in above):
-                yield from _evaluated_all(places, above)
+                yield places, above
             elif above:
                 unlikely.append((places, above))
-    for places, above in unlikely:
-        yield from _evaluated_all(places, above)
-
-
-def _evaluated_all(places: Sequence[Workplace], above: _Above) -> Iterator[CellLayout]:
-    for workplace in places:
-        layout = _evaluated(workplace, above)
-        if layout is not None:
-            yield layout
-
-
-def _rank(layout: CellLayout) -> float:
-    return _worth(layout.quality, layout.seen)
+    yield from unlikely
 
 
 def _worth(quality: float, seen: float) -> float:
@@ -465,7 +460,7 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
                 quality=min(quality, marked.quality, clear, 1.0),
                 seen=marked.seen,
             )
-            if clear > 0 and (best is None or min(_rank(layout), _ENOUGH) > _rank(best)):
+            if clear > 0 and (best is None or min(layout.rank, _ENOUGH) > best.rank):
                 best = layout
     return best
 
