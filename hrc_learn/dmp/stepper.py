@@ -14,6 +14,7 @@ from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.pose_dmp import BODY, ERROR, POSITION, PoseDMP
+from hrc_learn.dmp.response import PiecewisePolynomial
 from hrc_learn.geometry import Pose, minimum_jerk
 
 Vector = Float64[np.ndarray, "D"]
@@ -152,10 +153,8 @@ class Stepper:
             weights = self._scaling.scale(weights, start, goal, self._shown, np)
         # One motion instead of one for each basis function.
         forced = motion.response.forced
-        table = forced.coefficients.cpu().numpy() @ weights
-        self._table = np.ascontiguousarray(table.reshape(*table.shape[:2], -1))
-        self._exponents = np.arange(table.shape[1], dtype=float)
-        self._interval = forced.interval
+        table = forced.coefficients.cpu() @ torch.from_numpy(weights.copy())
+        self._table = PiecewisePolynomial(table, forced.interval, forced.periodic)
         self._end = math.inf if forced.periodic else forced.end
         half, stiffness = self._spring.alpha / 2, self._spring.stiffness
         # A + alpha / 2 I, see `SpringDamper.propagator`.
@@ -270,11 +269,7 @@ class Stepper:
 
     def _forced(self, s: float) -> Pair:
         """State (y, dy/ds) caused by the forcing term, by the table and the spring after it."""
-        x = (s % 1.0 if self._end == math.inf else min(s, self._end)) / self._interval
-        piece = min(int(x), len(self._table) - 1)
-        # From -1 to 1 along a piece, as in `PiecewisePolynomial`.
-        powers = (2.0 * (x - piece) - 1.0) ** self._exponents
-        forced = powers.dot(self._table[piece]).reshape(2, -1)
+        forced = self._table.at(s)
         return forced if s <= self._end else self._propagator(s - self._end).dot(forced)
 
     def _propagator(self, s: float) -> Float64[np.ndarray, "2 2"]:
