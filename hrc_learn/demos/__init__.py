@@ -1,5 +1,7 @@
 """Demonstrations: recorded as LeRobot datasets, read as plain arrays, checked and repaired."""
 
+from hrc_learn.demos.dataset_assembly import recover_all as recover_all
+from hrc_learn.demos.dataset_assembly import recover_dataset as recover_dataset
 from hrc_learn.demos.dataset_writer import DatasetWriter as DatasetWriter
 from hrc_learn.demos.demonstration import Demonstration as Demonstration
 from hrc_learn.demos.demonstration import DemonstrationSet as DemonstrationSet
@@ -24,5 +26,3 @@ from hrc_learn.demos.read.quantities import ROLES as ROLES
 from hrc_learn.demos.read.source import DemonstrationSource as DemonstrationSource
 from hrc_learn.demos.read.source import load_demos as load_demos
 from hrc_learn.demos.read.source import open_demos as open_demos
-from hrc_learn.demos.recording_recovery import recover_all as recover_all
-from hrc_learn.demos.recording_recovery import recover_dataset as recover_dataset

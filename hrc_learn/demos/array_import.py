@@ -223,11 +223,15 @@ def demonstrations_from_arrays(
             f"{', '.join(table)}",
             file=path,
         )
+    factors = {
+        role.replace("joint_position", "joints"): unit_factor(role, unit)
+        for role, unit in (options.units or {}).items()
+    }
     count = max(len(values) for values in found.values())
     demos = []
     for index in range(count):
         episode = {
-            name: _scaled(name, values[index if len(values) > 1 else 0], options.units or {})
+            name: values[index if len(values) > 1 else 0] * factors.get(name, 1.0)
             for name, values in found.items()
         }
         try:
@@ -295,11 +299,6 @@ def _by_name(table: ArrayTable) -> dict[str, list[str]]:
         elif values.shape[-1] == 1 or name == UNNAMED:
             found.setdefault("joints", []).append(name)
     return found
-
-
-def _scaled(name: str, values: np.ndarray, units: Mapping[str, str]) -> np.ndarray:
-    role = {"joints": "joint_position"}.get(name, name)
-    return values * unit_factor(role, units[role]) if role in units else values
 
 
 def _demonstration(episode: Mapping[str, np.ndarray], options: ArrayOptions) -> Demonstration:

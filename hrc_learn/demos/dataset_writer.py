@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.demos import recorded_episode as recorded
+from hrc_learn.demos.dataset_assembly import begin, discard, finish
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_folder import (
@@ -24,7 +25,6 @@ from hrc_learn.demos.read.metadata import (
     read_sidecar,
 )
 from hrc_learn.demos.read.quantities import ROLES
-from hrc_learn.demos.recording_recovery import begin, discard, finish
 from hrc_learn.demos.videos import CameraRecorder, Image, video_features
 from hrc_learn.store import DATASET, Claim
 

@@ -7,7 +7,7 @@ was made from, so that an interrupted extraction continues and notices new recor
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float64, UInt8
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
-from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.read.dataset_folder import Progress, open_folder
 from hrc_learn.demos.read.frames import to_numpy
 from hrc_learn.demos.videos import VideoSegment, decode, image_key, read_segments, video_keys
 from hrc_learn.store import new_file
@@ -28,8 +28,6 @@ _SOURCE = b"hrc_learn.video"
 
 Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
 """Pixel (u right, v down) of the feature in an RGB image, or None if it is not visible."""
-
-Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
 
 
 Track = tuple[Float64[np.ndarray, "_frames 2"], Bool[np.ndarray, " _frames"]]

@@ -155,12 +155,7 @@ class ValidationReport:
         self, check: Callable[P, Iterable[Issue]], *args: P.args, **kwargs: P.kwargs
     ) -> None:
         """Run a check and file its issues."""
-
-        def collect() -> None:
-            for issue in check(*args, **kwargs):
-                self.add(issue)
-
-        self.attempt(collect)
+        self.attempt(lambda: [self.add(issue) for issue in check(*args, **kwargs)])
 
     def lines(self, full: bool = False) -> Iterator[str]:
         """The report as text; issues of one kind become one line that names the worst place.

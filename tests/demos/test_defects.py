@@ -12,7 +12,7 @@ from hrc_learn.demos import DatasetError, Issue, check_dataset, load_demos
 NETWORK = re.compile(r"hub|network|internet|offline|download|connection", re.IGNORECASE)
 
 
-@pytest.fixture(params=["v3.0", "v2.1", "v2.0"])
+@pytest.fixture(params=["v3.0", "v2.1"])
 def copy(tmp_path, request):
     motions = [joint_path(60, seed=i) for i in range(3)]
     episodes = [

@@ -93,8 +93,15 @@ def check_dataset(
         report.run(check, folder)
     parse_mapping(mapping or {}, folder.features)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
-    if dataset is not None:
-        _require_limits(dataset, speed_limits or {})
+    names = () if dataset is None else dataset.columns.joint_names
+    for name, limit in (speed_limits or {}).items() if dataset is not None else ():
+        if name not in names:
+            raise ValueError(
+                f"speed_limits: {folder.root} has no joint {name!r}; there are "
+                f"{', '.join(names) or 'none'}"
+            )
+        if not limit > 0:
+            raise ValueError(f"speed_limits: that of {name} must be positive, but is {limit}")
     report.attempt(lambda: check_videos(folder, report))
     if dataset is None:
         for _ in _first_pass(folder, report, None, {}):
@@ -103,19 +110,6 @@ def check_dataset(
         given = (mapping or {}, units or {}, speed_limits or {})
         report.attempt(lambda: _check_content(dataset, report, *given))
     return report
-
-
-def _require_limits(dataset: OpenedDataset, speed_limits: Mapping[str, float | int]) -> None:
-    """Raise ValueError if a limit has no joint, or is not positive."""
-    names = dataset.columns.joint_names
-    for name, limit in speed_limits.items():
-        if name not in names:
-            raise ValueError(
-                f"speed_limits: {dataset.folder.root} has no joint {name!r}; there are "
-                f"{', '.join(names) or 'none'}"
-            )
-        if not limit > 0:
-            raise ValueError(f"speed_limits: that of {name} must be positive, but is {limit}")
 
 
 def _first_pass(

@@ -16,7 +16,7 @@ from hrc_learn.demos.issues import DatasetError, Issue, aligned
 from hrc_learn.demos.preprocessing import resting
 from hrc_learn.demos.quality.check import check_dataset
 from hrc_learn.demos.quality.episode_checks import motion_sketch
-from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.read.dataset_folder import Progress, open_folder
 from hrc_learn.demos.read.frames import each_or_fault
 from hrc_learn.demos.read.source import open_demos
 
@@ -28,8 +28,6 @@ MEASURES = {
     "late": "fraction of late frames",
 }
 """Measure of an episode -> its meaning or unit."""
-
-Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
 
 # Doubt added by one finding: an error alone outranks all that is merely unusual.
 _ERROR, _WARNING, _REPEAT = 10.0, 1.0, 3.0

@@ -1,7 +1,7 @@
 """Repaired and curated copies of a dataset, and the decisions kept next to it."""
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -14,7 +14,7 @@ from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.contract import fingerprint, keep_contract
-from hrc_learn.demos.read.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry, Progress, open_folder
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
@@ -22,8 +22,6 @@ from hrc_learn.demos.read.units import Quantities, units_from_episodes
 from hrc_learn.demos.recorded_episode import episode_path
 from hrc_learn.demos.videos import Segments, read_segments
 from hrc_learn.store import DATASET, Count, read_json, replacing, write_json
-
-Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
 
 _LARGEST_NOTE = 2**20
 """Largest card, licence or foreign metadata file that is copied [bytes]."""

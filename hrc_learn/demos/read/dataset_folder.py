@@ -2,7 +2,7 @@
 
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partialmethod
 from itertools import accumulate
@@ -332,6 +332,8 @@ def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
     }
 
 
+Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
+"""Wrapper of a sequence of episodes, such as a progress bar."""
 EpisodeFilter = Callable[[EpisodeEntry], bool]
 """True for an episode that is wanted, by its `index`, `length` and `tasks`."""
 
