@@ -42,9 +42,8 @@ from hrc_learn.sim import MovingBodies, SceneConfig, World
 from hrc_learn.sim.pinhole_camera import PinholeCamera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
-from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
+from hrc_learn.teleoperation.devices import Gamepad, HapticDevice, TerminalKeyboard
 from hrc_learn.teleoperation.gate import qr_code
-from hrc_learn.teleoperation.haptic_device import HapticDevice
 from hrc_learn.teleoperation.headset import BUILD
 from hrc_learn.teleoperation.page import Page, PageConfig
 from hrc_learn.teleoperation.page_session import (

@@ -143,7 +143,8 @@ class Person(Human):
         self._human = self._opened(config)
 
     def _opened(self, config: PersonConfig) -> Human:
-        from hrc_learn.teleoperation.devices import Gamepad, LinkGuide, TerminalKeyboard
+        from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
+        from hrc_learn.teleoperation.hand_guiding import LinkGuide
         from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
 
         match config.kind:

@@ -4,12 +4,12 @@ Devices are in `teleoperation.devices`, the browser page in `teleoperation.page`
 scripted demonstrations, which need the simulator, in modules of their own.
 """
 
-from hrc_learn.teleoperation.devices import CombinedInput as CombinedInput
-from hrc_learn.teleoperation.devices import InputFilter as InputFilter
-from hrc_learn.teleoperation.devices import InputFilterConfig as InputFilterConfig
+from hrc_learn.teleoperation.hand_guiding import CombinedInput as CombinedInput
 from hrc_learn.teleoperation.hand_guiding import ForceMapping as ForceMapping
 from hrc_learn.teleoperation.hand_guiding import HandGuidedArm as HandGuidedArm
 from hrc_learn.teleoperation.hand_guiding import HandGuidingConfig as HandGuidingConfig
+from hrc_learn.teleoperation.hand_guiding import InputFilter as InputFilter
+from hrc_learn.teleoperation.hand_guiding import InputFilterConfig as InputFilterConfig
 from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig as InteractionForceConfig,
 )

@@ -1,164 +1,38 @@
-"""Devices that move the end effector, as stand-ins for a haptic one: a gamepad, the keys of a
-terminal; several sources of human input at once, and a filter that bounds their acceleration.
+"""Devices that move the end effector: a gamepad, the keys of a terminal, and a haptic device
+with force feedback like the paper's Omega.
 
-A device is whatever has `Human.read`: it says at each step what the person asks for.
+A device is whatever has `Human.read`: it returns at each step what the person asks for. The
+haptic device was not run on hardware: `forcedimension-core`, the extra `haptic`, drives it
+where the maker's SDK is installed; tests drive the same interface without a device.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from threading import Event, Thread
 from types import MappingProxyType
-from typing import Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from hrc_learn.kinematics import SerialChain
+from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput, Request
 from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
-    bounded,
     capped,
-    pull_to_nullspace_input,
+    guiding_twist,
     steering_twist,
 )
 
 OPEN = 0.08
 """Width of the open gripper [m]."""
-
-
-class CombinedInput(Human):
-    """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
-
-    Null-space inputs and twists add up. Of gripper, region, target and turn the first source
-    that sets them is used; requests of all are passed on, and any of them pauses or stops.
-    """
-
-    def __init__(self, *sources: Human):
-        """Join them.
-
-        Raises:
-            ValueError: There are none.
-        """
-        if not sources:
-            raise ValueError("a combined input needs at least one source.")
-        self._sources = sources
-
-    def read(self, state: ArmState) -> HumanInput:
-        """Combined input of all sources."""
-        inputs = [source.read(state) for source in self._sources]
-        joints = len(state.joint_position)
-        return HumanInput(
-            nullspace_input=np.sum([i.effort(joints) for i in inputs], axis=0),
-            twist=np.sum([i.twist for i in inputs], axis=0),
-            gripper=next((i.gripper for i in inputs if i.gripper is not None), None),
-            region=next((i.region for i in inputs if i.region is not None), None),
-            target=next((i.target for i in inputs if i.target is not None), None),
-            turn=next((i.turn for i in inputs if i.turn is not None), None),
-            requests=tuple(request for i in inputs for request in i.requests),
-            pause=any(i.pause for i in inputs),
-            stop=next((i.stop for i in inputs if i.stop), ""),
-        )
-
-    def tell(self, feedback: Feedback) -> None:
-        """Tell all sources."""
-        for source in self._sources:
-            source.tell(feedback)
-
-
-_ELBOW = 4
-"""Joint whose origin a `LinkGuide` pulls, counted from 1."""
-
-
-class LinkGuide(Human):
-    """Pulls a link in the null space with a device that otherwise guides the end effector.
-
-    The device's speed, as a fraction of its largest, is that fraction of the largest force on
-    the link. The end effector is left alone.
-    """
-
-    def __init__(
-        self,
-        human: Human,
-        chain: SerialChain,
-    ):
-        """Take a device.
-
-        Args:
-            human: The device.
-            chain: The arm.
-        """
-        self._human, self._chain, self._config = human, chain, InteractionForceConfig()
-
-    def read(self, state: ArmState) -> HumanInput:
-        """The null-space input now."""
-        asked, config = self._human.read(state), self._config
-        # As a gizmo's displacement, whose largest force and speed are those of the device.
-        force = capped(config.max_force / config.speed * asked.twist[:3], config.max_force)
-        d = pull_to_nullspace_input(self._chain, state.joint_position, _ELBOW, force, config)
-        return replace(
-            asked,
-            nullspace_input=bounded(asked.effort(len(d)) + d, config.max_nullspace_input),
-            twist=np.zeros(6),
-        )
-
-    def tell(self, feedback: Feedback) -> None:
-        """Tell the person at the device."""
-        self._human.tell(feedback)
-
-
-@dataclass(frozen=True, kw_only=True)
-class InputFilterConfig:
-    """Bounds on the acceleration of the end effector."""
-
-    linear: float = 1.5
-    """[m/s^2]: from rest to a gizmo's full speed, and back, in a sixth of a second."""
-    angular: float = 5.0
-    """[rad/s^2]"""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, but is {value}.")
-
-
-class InputFilter(Human):
-    """Passes human input on with the acceleration of the end effector bounded.
-
-    A key that is pressed asks for full speed at once, and a gizmo that is released for none:
-    unfiltered, the arm would jerk, and so would what is learned from it.
-    """
-
-    def __init__(self, human: Human, config: InputFilterConfig | None = None):
-        """Start at rest.
-
-        Args:
-            human: Source of the input.
-            config: Bounds.
-        """
-        self._human, self._config = human, config or InputFilterConfig()
-        # The first reading has no predecessor: an infinite time makes its dt zero below.
-        self._twist, self._time = np.zeros(6), np.inf
-
-    def read(self, state: ArmState) -> HumanInput:
-        """The filtered input now."""
-        human_input, config = self._human.read(state), self._config
-        dt = max(state.time - self._time, 0.0)
-        change = human_input.twist - self._twist
-        self._time = state.time
-        self._twist = self._twist + np.concatenate(
-            [capped(change[:3], config.linear * dt), capped(change[3:], config.angular * dt)]
-        )
-        return replace(human_input, twist=self._twist)
-
-    def tell(self, feedback: Feedback) -> None:
-        """Tell the person whose input it is."""
-        self._human.tell(feedback)
 
 
 # SDL's layout of a game controller, the same for every make (CONTROLLER_AXIS_*, _BUTTON_*).
@@ -463,3 +337,174 @@ def _typed_in_terminal() -> str:
             break
         text += more.decode(errors="ignore")
     return text
+
+
+@runtime_checkable
+class ForceDevice(Protocol):
+    """Part of `forcedimension_core.dhd` that is used here, under its names; -1 reports a
+    failure.
+    """
+
+    def getPosition(self, out: Any, ID: int = -1) -> int: ...
+    def getLinearVelocity(self, out: Any, ID: int = -1) -> int: ...
+    def setForce(self, f: Any, ID: int = -1) -> int: ...
+    def getButton(self, index: int, ID: int = -1) -> int: ...
+    def enableForce(self, enable: bool, ID: int = -1) -> int: ...
+    def close(self, ID: int = -1) -> int: ...
+
+
+_HAPTIC_SCALE = 2.5
+"""Motion of the end effector for that of the hand: an Omega's workspace is 0.16 m wide."""
+_HAPTIC_STIFFNESS = 120.0
+"""Stiffness of the spring that pulls the device to where the arm has followed it [N/m]."""
+_HAPTIC_DAMPING = 4.0
+"""Damping of the hand's motion while the clutch is closed [N s/m]."""
+_HAPTIC_CONTACT = 0.1
+"""Fraction of the contact force at the end effector that the device renders."""
+_HAPTIC_MAX_FORCE = 6.0
+"""Largest force on the hand [N]; an Omega can hold 12."""
+_HAPTIC_PERIOD = 0.001
+"""Time between two forces [s]."""
+_HAPTIC_STALE = 0.1
+"""Time without feedback from the control loop after which the force vanishes [s]."""
+_HAPTIC_CLUTCH = 0
+"""Button that closes the clutch while it is held."""
+
+
+class _Pull(NamedTuple):
+    """Input of the force thread, exchanged as one reference."""
+
+    rest: Float[np.ndarray, "3"]
+    """Position of the device that corresponds to the present end-effector position [m]."""
+    push: Float[np.ndarray, "3"]
+    """Force of what the arm meets, as the hand feels it [N]."""
+    until: float
+    """Time from which on this reference is stale [s]."""
+
+
+class HapticDevice(Human):
+    """Guides the end effector while the clutch is held, and renders the tracking error as a
+    force.
+
+    When the clutch closes, the pointer is at the end effector. It then moves with the device,
+    scaled by 2.5, and the end effector follows it like a gizmo. The person feels what the
+    arm does not follow:
+
+        f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force
+
+    with x_arm the device position at which the pointer would be at the end effector. The axes
+    of the device are those of the base for a person that faces the arm: x towards the person, z
+    up.
+
+        with HapticDevice.open(panda) as device:
+            HandGuidedArm(panda, arm, device)
+
+    An unplugged device requests nothing.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        device: ForceDevice,
+        *,
+        number: int = -1,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Take an open device; `HapticDevice.open` finds one.
+
+        Args:
+            chain: Kinematics of the guided arm.
+            device: Interface of Force Dimension's library.
+            number: Number of the device; -1: the one opened last.
+            clock: Monotonic clock [s].
+        """
+        self._chain, self._device, self._number = chain, device, number
+        self._forces, self._clock = InteractionForceConfig(), clock
+        # Positions of hand and tool at which the clutch was closed.
+        self._clutched: tuple[np.ndarray, np.ndarray] | None = None
+        self._tool = np.zeros(3)
+        self._pull: _Pull | None = None
+        self._closing = Event()
+        self._thread = Thread(target=self._push_back, name="haptic device", daemon=True)
+
+    @classmethod
+    def open(cls, chain: SerialChain) -> HapticDevice:
+        """Open the first device by forcedimension-core, which the extra `haptic` brings.
+
+        Args:
+            chain: Kinematics of the guided arm.
+
+        Raises:
+            ValueError: There is no device, or the maker's SDK is not installed.
+        """
+        try:
+            from forcedimension_core import dhd  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise ValueError(
+                f"a haptic device needs the extra `haptic` and Force Dimension's SDK: {error}"
+            ) from error
+        connect = dhd.open  # a device, no file
+        number = connect()
+        if number < 0:
+            raise ValueError(f"no haptic device: {dhd.errorGetLastStr()}.")
+        return cls(chain, dhd, number=number)
+
+    def __enter__(self) -> HapticDevice:
+        self._device.enableForce(True, self._number)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._device.setForce((0.0, 0.0, 0.0), self._number)
+        self._device.enableForce(False, self._number)
+        self._device.close(self._number)
+
+    def read(self, state: ArmState) -> HumanInput:
+        """Motion of the end effector as the hand is now."""
+        still = HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
+        hand = self._vector(self._device.getPosition)
+        tool = self._chain.forward(torch.from_numpy(state.joint_position))
+        self._tool = tool.position.numpy()
+        if hand is None or self._device.getButton(_HAPTIC_CLUTCH, self._number) != 1:
+            self._clutched = None
+            return still
+        if self._clutched is None:
+            self._clutched = hand, self._tool
+        began, start = self._clutched
+        pointer = start + _HAPTIC_SCALE * (hand - began)
+        velocity = self._forces.rate * (pointer - self._tool)
+        twist = guiding_twist(tool, velocity, coarse_orientation(tool.position), self._forces)
+        return HumanInput(nullspace_input=still.nullspace_input, twist=twist)
+
+    def tell(self, feedback: Feedback) -> None:
+        """Let the hand feel how far the arm is behind, and what it meets."""
+        if self._clutched is None:
+            self._pull = None
+            return
+        began, start = self._clutched
+        rest = began + (self._tool - start) / _HAPTIC_SCALE
+        push = np.zeros(3)
+        if feedback.contact_force is not None and not feedback.contact_expected:
+            push = _HAPTIC_CONTACT * feedback.contact_force
+        self._pull = _Pull(rest, push, self._clock() + _HAPTIC_STALE)
+
+    def force(self) -> Float[np.ndarray, "3"]:
+        """Force on the hand now [N]; none where the clutch is open or the loop is silent."""
+        pull = self._pull
+        hand = self._vector(self._device.getPosition)
+        velocity = self._vector(self._device.getLinearVelocity)
+        if pull is None or hand is None or velocity is None or self._clock() > pull.until:
+            return np.zeros(3)
+        spring = _HAPTIC_STIFFNESS * (pull.rest - hand) - _HAPTIC_DAMPING * velocity
+        return capped(spring + pull.push, _HAPTIC_MAX_FORCE)
+
+    def _vector(self, read: Callable[..., int]) -> Float[np.ndarray, "3"] | None:
+        out = [0.0, 0.0, 0.0]
+        return None if read(out, self._number) < 0 else np.array(out)
+
+    def _push_back(self) -> None:
+        with contextlib.suppress(OSError):  # it has been unplugged
+            while not self._closing.wait(_HAPTIC_PERIOD):
+                self._device.setForce(self.force().tolist(), self._number)

@@ -1,5 +1,5 @@
 """Hand guiding: pulls at the arm's body become null-space input d, a held end effector is
-guided, and a hand-guided arm follows the combined input.
+guided, several sources are combined and filtered, and a hand-guided arm follows them.
 
 This is the mixed interface of the paper. There, the displacement of a joint's gizmo commands a
 proportional velocity, mapped to the joints by the pseudo-inverse of that joint's Jacobian
@@ -7,7 +7,7 @@ proportional velocity, mapped to the joints by the pseudo-inverse of that joint'
 gizmo of the end effector guides the end effector.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain, coarse_orientation
-from hrc_learn.protocols import Arm, ArmState, Human, HumanInput
+from hrc_learn.protocols import Arm, ArmState, Feedback, Human, HumanInput
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.step_report import PersonFeedback, filter_hindrance
 
@@ -400,3 +400,132 @@ class HandGuidedArm:
             velocity = velocity + _APPROACH_RATE * towards
         # Shortened as a whole: the direction is kept.
         return velocity / max(1.0, float(velocity.norm()) / ATTRACTION)
+
+
+class CombinedInput(Human):
+    """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
+
+    Null-space inputs and twists add up. Of gripper, region, target and turn the first source
+    that sets them is used; requests of all are passed on, and any of them pauses or stops.
+    """
+
+    def __init__(self, *sources: Human):
+        """Join them.
+
+        Raises:
+            ValueError: There are none.
+        """
+        if not sources:
+            raise ValueError("a combined input needs at least one source.")
+        self._sources = sources
+
+    def read(self, state: ArmState) -> HumanInput:
+        """Combined input of all sources."""
+        inputs = [source.read(state) for source in self._sources]
+        joints = len(state.joint_position)
+        return HumanInput(
+            nullspace_input=np.sum([i.effort(joints) for i in inputs], axis=0),
+            twist=np.sum([i.twist for i in inputs], axis=0),
+            gripper=next((i.gripper for i in inputs if i.gripper is not None), None),
+            region=next((i.region for i in inputs if i.region is not None), None),
+            target=next((i.target for i in inputs if i.target is not None), None),
+            turn=next((i.turn for i in inputs if i.turn is not None), None),
+            requests=tuple(request for i in inputs for request in i.requests),
+            pause=any(i.pause for i in inputs),
+            stop=next((i.stop for i in inputs if i.stop), ""),
+        )
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell all sources."""
+        for source in self._sources:
+            source.tell(feedback)
+
+
+_ELBOW = 4
+"""Joint whose origin a `LinkGuide` pulls, counted from 1."""
+
+
+class LinkGuide(Human):
+    """Pulls a link in the null space with a device that otherwise guides the end effector.
+
+    The device's speed, as a fraction of its largest, is that fraction of the largest force on
+    the link. The end effector is left alone.
+    """
+
+    def __init__(
+        self,
+        human: Human,
+        chain: SerialChain,
+    ):
+        """Take a device.
+
+        Args:
+            human: The device.
+            chain: The arm.
+        """
+        self._human, self._chain, self._config = human, chain, InteractionForceConfig()
+
+    def read(self, state: ArmState) -> HumanInput:
+        """The null-space input now."""
+        asked, config = self._human.read(state), self._config
+        # As a gizmo's displacement, whose largest force and speed are those of the device.
+        force = capped(config.max_force / config.speed * asked.twist[:3], config.max_force)
+        d = pull_to_nullspace_input(self._chain, state.joint_position, _ELBOW, force, config)
+        return replace(
+            asked,
+            nullspace_input=bounded(asked.effort(len(d)) + d, config.max_nullspace_input),
+            twist=np.zeros(6),
+        )
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell the person at the device."""
+        self._human.tell(feedback)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputFilterConfig:
+    """Bounds on the acceleration of the end effector."""
+
+    linear: float = 1.5
+    """[m/s^2]: from rest to a gizmo's full speed, and back, in a sixth of a second."""
+    angular: float = 5.0
+    """[rad/s^2]"""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise ValueError(f"{name} must be positive, but is {value}.")
+
+
+class InputFilter(Human):
+    """Passes human input on with the acceleration of the end effector bounded.
+
+    A key that is pressed asks for full speed at once, and a gizmo that is released for none:
+    unfiltered, the arm would jerk, and so would what is learned from it.
+    """
+
+    def __init__(self, human: Human, config: InputFilterConfig | None = None):
+        """Start at rest.
+
+        Args:
+            human: Source of the input.
+            config: Bounds.
+        """
+        self._human, self._config = human, config or InputFilterConfig()
+        # The first reading has no predecessor: an infinite time makes its dt zero below.
+        self._twist, self._time = np.zeros(6), np.inf
+
+    def read(self, state: ArmState) -> HumanInput:
+        """The filtered input now."""
+        human_input, config = self._human.read(state), self._config
+        dt = max(state.time - self._time, 0.0)
+        change = human_input.twist - self._twist
+        self._time = state.time
+        self._twist = self._twist + np.concatenate(
+            [capped(change[:3], config.linear * dt), capped(change[3:], config.angular * dt)]
+        )
+        return replace(human_input, twist=self._twist)
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell the person whose input it is."""
+        self._human.tell(feedback)

@@ -20,13 +20,15 @@ from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.pick_and_place import INTERACT
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder, pressed
-from hrc_learn.teleoperation.devices import CombinedInput, InputFilter, InputFilterConfig
 from hrc_learn.teleoperation.gate.messages import TrackedHand
 from hrc_learn.teleoperation.hand_guiding import (
+    CombinedInput,
     Frame,
     GuidedStep,
     HandGuidedArm,
     HandGuidingConfig,
+    InputFilter,
+    InputFilterConfig,
 )
 from hrc_learn.teleoperation.page import Page, PageConfig, PageHuman, PageStatus
 from hrc_learn.viz.palette import GREEN, rgba

@@ -13,14 +13,13 @@ from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.teleoperation import InputFilter, InputFilterConfig, InteractionForceConfig
 from hrc_learn.teleoperation.devices import (
     DIRECTIONS,
-    CombinedInput,
     Gamepad,
     KeyboardState,
-    LinkGuide,
     TerminalKeyboard,
     deflection,
     rumble_strength,
 )
+from hrc_learn.teleoperation.hand_guiding import CombinedInput, LinkGuide
 
 Q = panda.ready.numpy()
 STATE = ArmState(time=0.0, joint_position=Q, joint_velocity=0 * Q, gripper_width=0.08)

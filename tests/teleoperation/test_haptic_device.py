@@ -12,7 +12,7 @@ import torch
 
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Feedback
-from hrc_learn.teleoperation.haptic_device import (
+from hrc_learn.teleoperation.devices import (
     ForceDevice,
     HapticDevice,
 )
