@@ -18,6 +18,7 @@ from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
     DemonstrationTrace,
+    ErrorMap,
     FitRecording,
     LearningRecording,
 )
@@ -160,6 +161,8 @@ def fit_report(
 
 _MOST_PATHS = 30
 """Largest number of paths drawn, as more hide each other."""
+_BELOW = 0.03
+"""Distance of the error map below the lowest path, so that both are visible [m]."""
 
 
 def learning_recording(
@@ -177,19 +180,28 @@ def learning_recording(
     Raises:
         ValueError: The skill was loaded, and its held-out errors are unknown.
     """
+    measured, cells = skill.metrics(), skill.cells
+    assert cells is not None  # or there would be no metrics
+    x, y = cells.edges.mT.numpy()
     shown = islice(feature_trajectories(demos), _MOST_PATHS)
     paths = tuple(watched.pose.position.numpy() for watched in shown)
     height = float(np.mean([path[:, 2].mean() for path in paths]))
     learned = skill.learned
     return LearningRecording(
         title=title,
-        measured=skill.metrics(),
+        measured=measured,
         curves={} if learned is None else _curves(learned),
         best=0 if learned is None else learned.best,
         centers=np.zeros((1, 0, 3))
         if learned is None
         else np.stack([_places(state.neurons, height) for state in learned.rounds]),
         paths=paths,
+        errors=ErrorMap(
+            x=x,
+            y=y,
+            z=min(float(path[:, 2].min()) for path in paths) - _BELOW,
+            relative_error=cells.relative.numpy(),
+        ),
     )
 
 

@@ -298,6 +298,20 @@ class DemonstrationsRecording:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class ErrorMap:
+    """Relative error over cells of the horizontal plane."""
+
+    x: Float[np.ndarray, " nx_and_1"]
+    """Edges of the cells [m]."""
+    y: Float[np.ndarray, " ny_and_1"]
+    """Edges of the cells [m]."""
+    z: float
+    """Height at which the cells are drawn [m]."""
+    relative_error: Float[np.ndarray, "nx ny"]
+    """Error relative to the size of the predicted quantity; NaN in an empty cell."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LearningRecording:
     """Rounds of learning; the first one is the state before learning.
 
@@ -319,6 +333,8 @@ class LearningRecording:
     """Centres of the neurons in each round [m]."""
     paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
     """Paths of the end effector in demonstrations [m]."""
+    errors: ErrorMap | None = None
+    """Errors on held-out demonstrations."""
 
     def __post_init__(self) -> None:
         rounds = len(self.centers)

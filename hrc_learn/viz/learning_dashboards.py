@@ -7,6 +7,7 @@ image Jacobians by the convergence and neurons of their learning rounds.
 import os
 from dataclasses import dataclass
 
+import matplotlib
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -15,6 +16,7 @@ from jaxtyping import Float
 from hrc_learn.log.recordings import (
     DemonstrationsRecording,
     DemonstrationTrace,
+    ErrorMap,
     FitRecording,
     LearningRecording,
 )
@@ -316,6 +318,8 @@ def _fitted(fit: FitRecording) -> str:
 ROUND = "round"
 """Timeline of learning, with one step per round."""
 
+_THICKNESS = 0.002  # of the error map's cells [m]
+
 
 def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -> None:
     """Write the rounds of learning as an .rrd file with its layout; `rerun FILE` shows it.
@@ -327,8 +331,8 @@ def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -
     tab = learning_tab(learning)
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
     if every := learning.paths or [path for path in learning.centers if len(path)]:
-        name = "End effector (grey), neurons (orange)"
-        eye = frame_view(np.concatenate(every), base=False)
+        name = "End effector (grey), neurons (orange), held-out error (blue)"
+        eye = _look_down(np.concatenate(every))
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
     right = [tab_view(tab)] if tab.plots else []
     layout = dashboard(left, right, row_shares=(3, 2), timeline=ROUND)
@@ -336,6 +340,8 @@ def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -
         send_summary(stream, _learned(learning))
         if learning.paths:
             _send_strips(stream, "demonstrations", learning.paths, palette.DEMO, 0.0008)
+        if learning.errors is not None:
+            stream.log("world/errors", _cells(learning.errors), static=True)
         _send_neurons(stream, learning.centers)
         for plot in tab.plots:
             curve, kept = plot.curves
@@ -373,6 +379,25 @@ def _rounds(numbers: np.ndarray) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(ROUND, sequence=numbers)]
 
 
+def _cells(errors: ErrorMap) -> rr.Boxes3D:
+    """Flat boxes, the darker the larger the error, with the error in percent on them."""
+    x, y = (np.convolve(edges, (0.5, 0.5), mode="valid") for edges in (errors.x, errors.y))
+    known = np.isfinite(errors.relative_error)
+    relative, flat = errors.relative_error[known], np.full(int(known.sum()), _THICKNESS)
+    middle = [grid[known] for grid in np.meshgrid(x, y, indexing="ij")]
+    size = np.meshgrid(np.diff(errors.x), np.diff(errors.y), indexing="ij")
+    # From a pale blue to one on which black figures can still be read.
+    shades = matplotlib.colormaps["Blues"](0.15 + 0.5 * relative / relative.max(initial=1e-12))
+    return rr.Boxes3D(
+        centers=np.stack([*middle, np.full_like(flat, errors.z)], axis=-1),
+        half_sizes=np.stack([*(grid[known] / 2 for grid in size), flat], axis=-1),
+        colors=(255 * shades).astype(np.uint8),
+        labels=[f"{100 * value:.1f} %" for value in relative],
+        show_labels=True,
+        fill_mode=rr.components.FillMode.Solid,
+    )
+
+
 def _learned(learning: LearningRecording) -> str:
     """Summary of the learning, as Markdown."""
     lines = [f"# {learning.title}", ""]
@@ -381,3 +406,14 @@ def _learned(learning: LearningRecording) -> str:
         lines += [f"Round {learning.best} of {last} was kept: the dots.", ""]
     rows = [(n.replace("_", " "), f"{value:.4g}") for n, value in learning.measured.items()]
     return "\n".join([*lines, *markdown_table(("measured", "value"), rows)])
+
+
+def _look_down(points: np.ndarray) -> rrb.EyeControls3D:
+    """An eye above the workspace, so near and steep that every cell can be read."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.2)
+    return rrb.EyeControls3D(
+        position=middle + reach * np.array([0.75, 0.2, 1.0]),
+        look_target=middle,
+        eye_up=(0.0, 0.0, 1.0),
+    )

@@ -58,7 +58,10 @@ def hearing_interrupts():
 
 
 @pytest.mark.usefixtures("hearing_interrupts")
-@pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize(
+    "ended_by",
+    [signal.SIGKILL, signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)],
+)
 def test_what_is_recorded_survives_the_end_of_the_program(tmp_path, ended_by):
     demos, log = tmp_path / "demos", tmp_path / "log"
     command = [sys.executable, "-m", "hrc_learn.cli", "page", "--out", str(demos)]

@@ -10,6 +10,7 @@ from sample_runs import LIMITS, NAMES, sample_fit, sample_run
 from hrc_learn.viz import (
     DemonstrationsRecording,
     DemonstrationTrace,
+    ErrorMap,
     LearningRecording,
 )
 from hrc_learn.viz.learning_dashboards import record_demonstrations, record_fit, record_learning
@@ -168,6 +169,12 @@ def learning(**changes) -> LearningRecording:
         "best": 2,
         "centers": rng.normal(size=(ROUNDS, NEURONS, 3)),
         "paths": (rng.normal(size=(50, 3)), rng.normal(size=(2000, 3))),
+        "errors": ErrorMap(
+            x=np.array([0.0, 0.1, 0.3]),
+            y=np.array([0.4, 0.5]),
+            z=0.15,
+            relative_error=np.array([[0.05], [np.nan]]),
+        ),
     }
     return LearningRecording(**given | changes)
 
@@ -195,14 +202,24 @@ def test_neurons_are_followed_from_round_to_round(tmp_path):
     np.testing.assert_allclose(positions, learning().centers, atol=1e-6)
 
 
+def test_cells_say_their_error_in_percent_and_empty_ones_are_left_out(tmp_path):
+    rrd = recorded(tmp_path)
+    assert rrd.column("world/errors", "Boxes3D:labels", static=True) == [["5.0 %"]]
+    ((centre,),) = rrd.column("world/errors", "Boxes3D:centers", static=True)
+    np.testing.assert_allclose(centre, [0.05, 0.45, 0.15], atol=1e-6)
+    ((half_size,),) = rrd.column("world/errors", "Boxes3D:half_sizes", static=True)
+    np.testing.assert_allclose(half_size[:2], [0.05, 0.05], atol=1e-6)
+
+
 def test_the_summary_says_what_was_kept_and_measured(tmp_path):
     ((text,),) = recorded(tmp_path).column("summary", "TextDocument:text", static=True)
     assert "Round 2 of 3 was kept" in text
     assert "| held out error px | 0.25 |" in text.splitlines()
 
 
-def test_a_fit_without_rounds_has_no_curves(tmp_path):
+def test_a_fit_without_rounds_shows_where_it_errs(tmp_path):
     rrd = recorded(tmp_path, curves={}, best=0, centers=np.zeros((1, 0, 3)))
+    assert "world/errors" in rrd.entities
     assert not {e for e in rrd.entities if e.startswith(("learning", "world/neurons"))}
     ((text,),) = rrd.column("summary", "TextDocument:text", static=True)
     assert "Round" not in text
