@@ -126,7 +126,7 @@ def estimators(J: Tensor):
     return [cls(network(J)) for cls in (PaperEstimator, CompositeEstimator, KalmanEstimator)]
 
 
-@pytest.mark.parametrize("kind", range(3), ids=["paper", "composite", "kalman"])
+@pytest.mark.parametrize("kind", [0, 2], ids=["paper", "kalman"])
 def test_a_batch_is_a_loop(kind: int):
     """Over many steps, with every optional field, for estimators with and without memory."""
     rng = sampling.generator(3)

@@ -24,20 +24,13 @@ from hrc_learn.deploy import EagerRunner
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,
-    FixedEstimator,
     KalmanEstimator,
-    PaperEstimator,
 )
 from hrc_learn.kinematics import panda
 
 POISONS = {"nan": torch.nan, "inf": torch.inf, "-inf": -torch.inf}
 DT = 0.02
-ESTIMATORS = [
-    FixedEstimator,
-    PaperEstimator,
-    CompositeEstimator,
-    KalmanEstimator,
-]
+ESTIMATORS = [CompositeEstimator, KalmanEstimator]
 
 
 @pytest.fixture(autouse=True)

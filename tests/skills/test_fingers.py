@@ -53,9 +53,15 @@ def cell_of(hand):
     return WorkCell(chain=panda, arm=hand, gripper=hand, human=person, advance=hand.advance)
 
 
-@pytest.mark.parametrize("tells_on_the_way", [True, False])
-@pytest.mark.parametrize("late", [0.0, 0.5, 1.5])
-@pytest.mark.parametrize(("start", "goal"), [(OPEN, CLOSED), (WIDTH, OPEN)])
+@pytest.mark.parametrize(
+    ("start", "goal", "late", "tells_on_the_way"),
+    [
+        (OPEN, CLOSED, 0.0, True),
+        (OPEN, CLOSED, 1.5, False),
+        (WIDTH, OPEN, 0.5, True),
+        (WIDTH, OPEN, 0.0, False),
+    ],
+)
 def test_the_arm_waits_until_the_fingers_have_arrived(start, goal, late, tells_on_the_way):
     between = WIDTH if goal == CLOSED else 0.0
     hand = SlowHand(start, late=late, between=between, tells_on_the_way=tells_on_the_way)

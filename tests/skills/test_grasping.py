@@ -244,6 +244,7 @@ SWEPT = 17
 above the table leads through the object."""
 
 
+@pytest.mark.slow
 @shapes_unchecked()
 def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
     """Nobody told it where that is."""

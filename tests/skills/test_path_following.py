@@ -111,10 +111,14 @@ def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_go
 
 
 @pytest.mark.parametrize(
-    ("straight", "after_push", "share"),
-    [(0.6, "return", 0.0), (0.725, "return", 0.5), (0.9, "return", 1.0), (0.6, "stay", 1.0)],
+    ("straight", "after_push", "share", "farther"),
+    [
+        (0.6, "return", 0.0, True),
+        (0.725, "return", 0.5, True),
+        (0.6, "return", 0.0, False),
+        (0.6, "stay", 1.0, True),
+    ],
 )
-@pytest.mark.parametrize("farther", [True, False])
 def test_nobody_pushes_joints_so_far_that_they_do_not_find_back(
     straight, after_push, share, farther
 ):

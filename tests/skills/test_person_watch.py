@@ -253,7 +253,7 @@ class Hand:
         return np.broadcast_to(self._tip - [0.0, 0.0, down], (1, 2, 3)).copy()
 
 
-@pytest.mark.parametrize("gap", [0.1, 0.15, 0.2, 0.3])
+@pytest.mark.parametrize("gap", [0.1, 0.2])
 def test_a_hand_that_sets_off_meets_an_arm_at_rest(gap):
     """Seen as late as nominal, with 9 m/s^2: commands take effect before it is there."""
     sizes = replace(Imperfections.nominal(), person_noise=0.0, person_loss=0.0)

@@ -191,9 +191,7 @@ def test_an_arm_that_does_not_know_where_people_are_rests():
     assert cell.task_time < 0.1
 
 
-@pytest.mark.parametrize(
-    ("mode", "moves"), [("none", False), ("expert", False), ("automatic", True), ("both", True)]
-)
+@pytest.mark.parametrize(("mode", "moves"), [("expert", False), ("both", True)])
 def test_the_null_space_makes_way_by_itself_if_it_is_told_to(mode, moves):
     """Of somebody who stands beside the forearm, while the end effector is held."""
     elbow, wrist = panda.joint_origins(START)[3:5].numpy()

@@ -104,10 +104,9 @@ def lowered(by):
     return Pose(start.position - torch.tensor([0, 0, by]).double(), start.orientation)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.2])
-def test_a_surface_is_found_where_it_is(noise):
+def test_a_surface_is_found_where_it_is():
     top = float(panda.forward(HOVER).position[2]) - 0.03
-    cell = cell_with(Wall(top, noise=noise))
+    cell = cell_with(Wall(top, noise=0.2))
     met = cell.move_until_contact(lowered(0.06))
     assert met is not None
     assert float(met.position[2]) == pytest.approx(top, abs=1.5e-3)
@@ -230,9 +229,7 @@ def test_an_arm_whose_delay_is_known_keeps_to_its_path(straight):
     ("start", "side", "ends_at"),
     [
         ([-0.55, 0.77, -1.28, -2.3, -0.03, 1.12, -0.38], -1, "limit"),
-        ([-0.13, 0.8, 1.3, -2.25, -1.07, 1.07, -1.29], 1, "limit"),
         ([0.82, -0.67, -1.4, -1.91, -0.1, 2.0, -0.19], -1, "singularity"),
-        ([-0.12, 0.01, -0.48, -1.53, 0.95, 2.26, -1.12], -1, "singularity"),
     ],
 )
 def test_however_hard_and_long_a_person_pushes_the_task_keeps_its_place_and_room(
