@@ -274,7 +274,7 @@ class Cell:
 
     chain, joints, distances = panda, panda.ready, None
     config, human_input = SimpleNamespace(dt=0.02, return_speed=0.4), HumanInput()
-    pose = ABOVE
+    pose, loop_state = ABOVE, SimpleNamespace(safety=None)
 
     def __init__(self, waits=1):
         self.time, self.task_time, self.waits = 0.0, 0.0, waits
@@ -302,7 +302,7 @@ class IdealStep:
     def initial_state(self, joints):
         return State()
 
-    restarted = observed = staticmethod(lambda state, _: state)
+    restarted = observed = staticmethod(lambda state, *_: state)
     probe_height = staticmethod(lambda state, target: CONFIG.probe)
     pixel_error = turn_error = staticmethod(lambda state, now, target: 0.0)
     out_of_view = staticmethod(lambda state, time: False)
