@@ -46,9 +46,9 @@ from hrc_learn.sim.workplace import Workplace
 
 _BEGIN, _END = "<!-- arms:begin -->", "<!-- arms:end -->"
 _HEADER = (
-    "| arm | maker | joints | reach [m] | largest difference from MuJoCo, Pinocchio "
+    "| arm | maker | joints | reach [m] | difference from MuJoCo, Pinocchio "
     "| poses found [%] | self-collision [%]: capsules, MuJoCo, missed "
-    "| servoing: done [%]; steps beyond limits, self-contacts "
+    "| servoing: done [%]; limit violations, self-contacts "
     "| `hrc demo`: grasp, placement [mm] |\n|---|---|---|---|---|---|---|---|---|"
 )
 _COLUMNS = _HEADER.splitlines()[0].count("|") - 1
