@@ -92,7 +92,7 @@ class Joint:
 
     @property
     def is_finger(self) -> bool:
-        """True if its name, or that of the link it moves, is one of a gripper's joint."""
+        """True if the name of the joint, or of the link that it moves, is that of a gripper."""
         name, child = self.name.lower(), self.child.lower()
         if _ARM_JOINT.search(name):
             return False

@@ -74,7 +74,8 @@ def arm(
         tip: Link, body or site to be the flange, of files; None: the only end besides a
             gripper's.
         tool: Tool centre point in the frame of the flange, of files.
-        limits: Replacements of limits, see `arm_from_file`.
+        limits: Limits that replace or complete those of a file, by joint name, or a TOML file;
+            None: the file named after it, `ur5e.limits.toml` for `ur5e.urdf`, if there is one.
         ready: A comfortable posture [rad, m].
 
     Raises:
