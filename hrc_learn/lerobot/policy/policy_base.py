@@ -142,6 +142,7 @@ class MotionPolicy(PreTrainedPolicy):
     config_class = MotionPolicyConfig  # pyright: ignore[reportAssignmentType]
     name = "motion"  # pyright: ignore[reportAssignmentType]
 
+    config: Any
     measured: Int[Tensor, "A"]
     """Columns of the state that hold the action's components; -1: none does."""
 
