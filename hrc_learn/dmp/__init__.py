@@ -17,6 +17,8 @@ from hrc_learn.dmp.interaction_primitive import InteractionPrimitive as Interact
 from hrc_learn.dmp.joint_dmp import BasisSelection as BasisSelection
 from hrc_learn.dmp.joint_dmp import FitOptions as FitOptions
 from hrc_learn.dmp.joint_dmp import JointDMP as JointDMP
+from hrc_learn.dmp.joint_dmp import SharedFit as SharedFit
+from hrc_learn.dmp.joint_dmp import fit_shared as fit_shared
 from hrc_learn.dmp.joint_dmp import select_basis_count as select_basis_count
 from hrc_learn.dmp.motion_head import MotionDistribution as MotionDistribution
 from hrc_learn.dmp.motion_head import MotionHead as MotionHead
@@ -36,8 +38,6 @@ from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_orientation as fit_rhythmic_orientation
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_pose as fit_rhythmic_pose
 from hrc_learn.dmp.samples import FitReport as FitReport
-from hrc_learn.dmp.shared_fit import SharedFit as SharedFit
-from hrc_learn.dmp.shared_fit import fit_shared as fit_shared
 from hrc_learn.dmp.stepper import Stepper as Stepper
 from hrc_learn.dmp.task_dmp import ContextualDMP as ContextualDMP
 from hrc_learn.dmp.task_dmp import FramedDMP as FramedDMP

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from hrc_learn.dmp import JointDMP, mean_primitive
-from hrc_learn.dmp.shared_fit import fit_shared
+from hrc_learn.dmp.joint_dmp import fit_shared
 
 
 def demonstrations(n=4, frames=150, seed=0):
