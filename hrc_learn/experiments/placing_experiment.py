@@ -187,7 +187,7 @@ class PlacingExperiment:
             )
             name = "run" if shelf == run.demonstrated_shelf else f"run_{shelf}"
             # Neither a camera nor a person takes part.
-            recordings[name] = replace(recording, camera=None, nullplannedinput=None)
+            recordings[name] = replace(recording, camera=None, nullspace_input=None)
         return recordings
 
     def log(self, run: PlacingRun) -> LoggedSteps:
