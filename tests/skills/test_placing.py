@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,8 +12,9 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.experiments.metric_table import evaluate
-from hrc_learn.experiments.placing_metrics import PlacingOutcome, placing_metrics
-from hrc_learn.experiments.placing_trial import place
+from hrc_learn.experiments.placing_experiment import PlacingExperiment
+from hrc_learn.experiments.placing_metrics import PlacingOutcome, PlacingRun, placing_metrics
+from hrc_learn.experiments.placing_trial import SPACES, place
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.learning.primitive_fitting import fit_primitives
@@ -183,6 +185,29 @@ def test_an_executed_placing_ends_on_the_shelf_as_demonstrated(skill, demos):
     # Measured by the simulator, of an object let down until the arm feels the board.
     assert 0 < outcome.place_error < 1.5e-3
     np.testing.assert_allclose(run.path[-1], run.plan.goal.position.numpy(), atol=1e-3)
+    # The same placing for every shelf and space: it is recorded, measured and reported.
+    shelves = WORKPLACE.shelf_names()
+    placings = PlacingRun(
+        workplace=WORKPLACE,
+        demonstration=demos[0],
+        demonstrated_shelf="middle",
+        placings={(space, shelf): run for space in SPACES for shelf in shelves},
+        outcomes={space: dict.fromkeys(shelves, outcome) for space in SPACES},
+    )
+    experiment = PlacingExperiment(placing=Path(), demonstrations=Path())
+    recordings = experiment.recordings(placings)
+    assert set(recordings) == {"run", "run_lower", "run_upper"}
+    recording = recordings["run"]
+    assert recording.camera is None
+    assert recording.nullspace_input is None
+    carried = np.isfinite(recording.demo_joint_position).all(axis=1)
+    assert carried[0]
+    assert len(run.plan.path) <= carried.sum() < len(carried)
+    (section,) = experiment.sections(placings, recordings)
+    assert [picture.name for picture in section.figures] == ["paths", "joints"]
+    values = evaluate(experiment.metrics(), placings).values
+    assert values["place_error_mm"] == values["joint_space_place_error_mm"]
+    assert values["reproduction_joint_rmse_deg"] > 0
     assert [event.text for event in run.cell.log.events] == [
         "transfer",
         "release",
