@@ -15,21 +15,17 @@ from hrc_learn.controller.constraint_layer import SeparationConfig as Separation
 from hrc_learn.controller.constraint_layer import (
     constrained_velocity as constrained_velocity,
 )
-from hrc_learn.controller.feedback import BlendingConfig as BlendingConfig
-from hrc_learn.controller.feedback import BlendingState as BlendingState
-from hrc_learn.controller.feedback import VisionBlending as VisionBlending
 from hrc_learn.controller.interface import GRIPPER_DOWN as GRIPPER_DOWN
 from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
 from hrc_learn.controller.interface import Command as Command
 from hrc_learn.controller.interface import Goals as Goals
 from hrc_learn.controller.interface import Observation as Observation
-from hrc_learn.controller.safety_filter import FilteredVelocity as FilteredVelocity
+from hrc_learn.controller.resolved_rate import BlendingConfig as BlendingConfig
+from hrc_learn.controller.resolved_rate import VisionBlending as VisionBlending
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
 from hrc_learn.controller.safety_filter import VelocityStep as VelocityStep
-from hrc_learn.controller.safety_filter import VelocityStepState as VelocityStepState
 from hrc_learn.controller.safety_filter import WantedVelocity as WantedVelocity
 from hrc_learn.controller.safety_state import INTERVENTIONS as INTERVENTIONS
-from hrc_learn.controller.safety_state import ConstraintReport as ConstraintReport
 from hrc_learn.controller.safety_state import SafetyConfig as SafetyConfig
 from hrc_learn.controller.safety_state import SafetyReport as SafetyReport
 from hrc_learn.controller.safety_state import SafetyState as SafetyState

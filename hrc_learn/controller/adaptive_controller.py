@@ -12,31 +12,29 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller.feedback import (
+from hrc_learn.controller.interface import Command, Goals, Observation
+from hrc_learn.controller.resolved_rate import (
     BlendingConfig,
     BlendingState,
     Feedback,
+    PoseDrift,
     VisionBlending,
     approach_velocity,
     effective_goals,
-    next_task_level,
-    potential_rate,
-    regional_feedback,
-    validated_position,
-    validated_step,
-)
-from hrc_learn.controller.interface import Command, Goals, Observation
-from hrc_learn.controller.resolved_rate import (
-    PoseDrift,
     excess_speed,
     measure_drift,
+    next_task_level,
     planned_motion,
+    potential_rate,
+    regional_feedback,
     resolved_rate,
     restored_drift,
     saturate_in_null_space,
     scale_null_space,
     scale_task,
     task_descent,
+    validated_position,
+    validated_step,
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState

@@ -1,33 +1,21 @@
 """Visual servoing, grasping, placing, pick and place. Skills know protocols, not devices."""
 
 from hrc_learn.skills.arm_motion import PositionServo as PositionServo
-from hrc_learn.skills.arm_motion import PositionServoConfig as PositionServoConfig
-from hrc_learn.skills.arm_motion import StraightLine as StraightLine
 from hrc_learn.skills.arm_motion import joint_line as joint_line
 from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
 from hrc_learn.skills.grasping import Grasping as Grasping
 from hrc_learn.skills.grasping import GraspingConfig as GraspingConfig
-from hrc_learn.skills.grasping import GraspResult as GraspResult
-from hrc_learn.skills.marker_sensor import DelayedChannel as DelayedChannel
 from hrc_learn.skills.marker_sensor import LatencyConfig as LatencyConfig
 from hrc_learn.skills.marker_sensor import MarkerObservation as MarkerObservation
 from hrc_learn.skills.marker_sensor import MarkerSensor as MarkerSensor
-from hrc_learn.skills.pick_and_place import Phase as Phase
 from hrc_learn.skills.pick_and_place import PickAndPlace as PickAndPlace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig as PickAndPlaceConfig
-from hrc_learn.skills.pick_and_place import PickPlaceJob as PickPlaceJob
 from hrc_learn.skills.placing import PlacingSkill as PlacingSkill
-from hrc_learn.skills.placing import Plan as Plan
-from hrc_learn.skills.placing import check_plan as check_plan
-from hrc_learn.skills.placing import plan_candidates as plan_candidates
 from hrc_learn.skills.servo_target import ServoTarget as ServoTarget
 from hrc_learn.skills.servo_target import VisualServoConfig as VisualServoConfig
-from hrc_learn.skills.task_workplace import CollisionChecker as CollisionChecker
-from hrc_learn.skills.task_workplace import GraspObject as GraspObject
 from hrc_learn.skills.task_workplace import Workplace as Workplace
 from hrc_learn.skills.visual_servoing import VisualServo as VisualServo
 from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
-from hrc_learn.skills.visual_skill import VisualTarget as VisualTarget
 from hrc_learn.skills.work_cell import BlockedPathError as BlockedPathError
 from hrc_learn.skills.work_cell import MissedGraspError as MissedGraspError
 from hrc_learn.skills.work_cell import StoppedByPersonError as StoppedByPersonError

@@ -179,7 +179,9 @@ def test_both_signs_of_every_quaternion_give_the_same_command():
     q = near_starts(20, rng=rng)
     state = controller.initial_state(q)
     goals = controller.goals
-    flipped = goals.turned_to(-goals.orientation.goal)
+    flipped = replace(
+        goals, orientation=replace(goals.orientation, goal=-goals.orientation.goal)
+    )
     one, _ = controller.step(state, observe(q, goals=goals))
     other, _ = controller.step(state, observe(q, goals=flipped))
     torch.testing.assert_close(one.joint_velocity, other.joint_velocity, rtol=0, atol=1e-14)

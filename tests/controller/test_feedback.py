@@ -4,8 +4,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from hrc_learn.controller import BlendingConfig, BlendingState, VisionBlending
-from hrc_learn.controller.feedback import approach_velocity, fade, next_task_level
+from hrc_learn.controller import BlendingConfig, VisionBlending
+from hrc_learn.controller.resolved_rate import (
+    BlendingState,
+    approach_velocity,
+    fade,
+    next_task_level,
+)
 from hrc_learn.kinematics import panda
 from hrc_learn.regions import PostureRegion
 

@@ -94,7 +94,8 @@ class Loop:
         for _ in range(round(seconds / DT)):
             self.drawn = self.law.turned(self.drawn, wish.turn, 0.8 * DT)
             turned = quaternion.multiply(self.drawn.turn, DOWN)
-            planned = self.planned.turned_to(turned)
+            region = replace(self.planned.orientation, goal=turned)
+            planned = replace(self.planned, orientation=region)
             self.drawn, remark = self.law.read(self.drawn, wish, planned, self.time)
             self.said += [remark] if remark else []
             goals, self.drawn = self.law.applied(self.drawn, planned, self.pose.position)
