@@ -185,18 +185,15 @@ def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterato
         f"{folder.fps:g} Hz ({frames / folder.fps / 60:.1f} min), in the LeRobot format "
         f"{folder.version}.\n"
     )
-    yield "| task | episodes |\n| --- | --- |"
     shown = Counter(task for entry in folder.episodes for task in entry.tasks)
     for task, count in shown.most_common(_MOST_TASKS):
-        yield f"| {_cell(task)} | {count} |"
+        yield f"- {_cell(task)} ({count} episodes)"
     if len(shown) > _MOST_TASKS:
-        yield f"| and {len(shown) - _MOST_TASKS} more | |"
-    cameras = [feature for feature in folder.features.values() if feature.is_picture]
-    if cameras:
-        yield "\n| camera | shape | stored as |\n| --- | --- | --- |"
-        for feature in cameras:
-            shape = " x ".join(map(str, feature.shape))
-            yield f"| `{_cell(feature.key)}` | {shape} | {feature.dtype} |"
+        yield f"- and {len(shown) - _MOST_TASKS} more tasks"
+    for feature in folder.features.values():
+        if feature.is_picture:
+            size = " x ".join(map(str, feature.shape))
+            yield f"- camera `{_cell(feature.key)}`: {size}, stored as {feature.dtype}"
     if report.contract is not None:
         header, *rows = report.contract.rows()
         yield "\n## Columns\n"

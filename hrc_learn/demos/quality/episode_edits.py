@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float64, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.filters import trim_rest
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.preprocessing import linear, nearest_frames
+from hrc_learn.demos.preprocessing import linear, nearest_frames, trim_rest
 from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
