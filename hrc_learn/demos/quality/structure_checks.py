@@ -225,7 +225,8 @@ def unchanged_files(folder: DatasetFolder) -> Iterator[Issue]:
         yield Issue(message=f"cannot be read ({error})", file=MANIFEST)
         return
     for name in changed:
-        if name != SIDECAR_PATH:
+        # A missing file is reported as such by the check of its content.
+        if name != SIDECAR_PATH and (folder.root / name).is_file():
             yield Issue(
                 message=f"is not as it was written: its checksum differs. Copy it again, or "
                 f"delete {MANIFEST} if it was changed on purpose",
