@@ -1,11 +1,11 @@
 """The image Jacobian: learned offline from demonstrations, adapted online."""
 
-from hrc_learn.jacobian.camera_correction import CameraCorrection as CameraCorrection
-from hrc_learn.jacobian.camera_correction import ObjectPlane as ObjectPlane
+from hrc_learn.jacobian.camera_motion import CameraCorrection as CameraCorrection
 from hrc_learn.jacobian.camera_motion import CameraMotion as CameraMotion
 from hrc_learn.jacobian.camera_motion import CameraPlacement as CameraPlacement
 from hrc_learn.jacobian.camera_motion import CameraReference as CameraReference
 from hrc_learn.jacobian.camera_motion import CameraWatch as CameraWatch
+from hrc_learn.jacobian.camera_motion import ObjectPlane as ObjectPlane
 from hrc_learn.jacobian.camera_motion import camera_placements as camera_placements
 from hrc_learn.jacobian.estimators import BroydenConfig as BroydenConfig
 from hrc_learn.jacobian.estimators import BroydenEstimator as BroydenEstimator
