@@ -188,13 +188,15 @@ def parse(source: Path) -> ast.Module:
 def imports_of(source: Path) -> Iterator[Import]:
     """Every import of a file, relative ones made absolute."""
 
-    def visit(node: ast.AST, lazy: bool) -> Iterator[Import]:
+    rest: list[tuple[ast.AST, bool]] = [(parse(source), False)]
+    while rest:
+        node, lazy = rest.pop()
         for child in ast.iter_child_nodes(node):
-            for module in modules_named(child, source):
-                yield Import(source, getattr(child, "lineno", 0), module, lazy)
-            yield from visit(child, lazy or waits(child))
-
-    yield from visit(parse(source), lazy=False)
+            # Expressions hold no imports.
+            if isinstance(child, (ast.stmt, ast.excepthandler, ast.match_case)):
+                for module in modules_named(child, source):
+                    yield Import(source, getattr(child, "lineno", 0), module, lazy)
+                rest.append((child, lazy or waits(child)))
 
 
 def waits(node: ast.AST) -> bool:
@@ -224,9 +226,19 @@ def imported_from(node: ast.ImportFrom, source: Path) -> str:
     return ".".join([*parents, *([node.module] if node.module else [])])
 
 
-ALL_IMPORTS = [i for source in SOURCES for i in imports_of(source)]
-OURS = [i for i in ALL_IMPORTS if i.top == "hrc_learn"]
-OTHERS = [i for i in ALL_IMPORTS if i.top not in {"hrc_learn", *sys.stdlib_module_names}]
+@cache
+def all_imports() -> list[Import]:
+    return [i for source in SOURCES for i in imports_of(source)]
+
+
+@cache
+def ours() -> list[Import]:
+    return [i for i in all_imports() if i.top == "hrc_learn"]
+
+
+@cache
+def others() -> list[Import]:
+    return [i for i in all_imports() if i.top not in {"hrc_learn", *sys.stdlib_module_names}]
 
 
 def tracked_files() -> list[Path]:
@@ -249,7 +261,7 @@ def test_every_package_has_its_place():
 def test_imports_run_one_way(package):
     wrong = [
         str(i)
-        for i in OURS
+        for i in ours()
         if i.package == package and i.module.split(".")[1] not in {package, *LAYERS[package]}
     ]
     assert not wrong
@@ -270,7 +282,7 @@ def test_no_module_imports_itself_around_others():
 
 
 def test_the_package_itself_imports_its_parts_only():
-    assert not [str(i) for i in OTHERS if i.package == "__init__"]
+    assert not [str(i) for i in others() if i.package == "__init__"]
 
 
 @pytest.mark.parametrize("package", LAYERS)
@@ -278,7 +290,7 @@ def test_libraries_stay_where_they_belong(package):
     eager, lazy = LIBRARIES[package], LAZY_LIBRARIES.get(package, set())
     wrong = [
         str(i)
-        for i in OTHERS
+        for i in others()
         if i.package == package and i.top not in (eager | lazy if i.lazy else eager)
     ]
     assert not wrong
@@ -298,7 +310,7 @@ def test_every_library_is_declared(package):
         declared |= required(requirements) if extra != "dev" else set()
     missing = [
         str(i)
-        for i in OTHERS
+        for i in others()
         if i.package == package and DISTRIBUTIONS.get(i.top, i.top) not in declared
     ]
     assert not missing

@@ -55,8 +55,8 @@ COMMANDS: dict[str, Command] = {
     "fit image-jacobian": Command(
         "image_jacobian_commands.fit_image_jacobian", arguments.FitImageJacobian, ("dataset",)
     ),
-    "evaluate": Command("evaluate_command.evaluate", arguments.Evaluate, ("model", "dataset")),
-    "smooth": Command("smooth_command.smooth", arguments.Smooth, ("checkpoint",)),
+    "evaluate": Command("model_commands.evaluate", arguments.Evaluate, ("model", "dataset")),
+    "smooth": Command("model_commands.smooth", arguments.Smooth, ("checkpoint",)),
     "report": Command("dashboard_commands.report", arguments.Report, ("runs",)),
     "page": Command("loop_commands.page", arguments.ServePage),
     "serve": Command("loop_commands.serve", arguments.Serve),

@@ -257,7 +257,7 @@ def test_the_distribution_of_its_own_imports_nothing_else_of_ours(tmp_path):
 
 def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
     from hrc_learn.cli.arguments import Smooth
-    from hrc_learn.cli.smooth_command import smooth
+    from hrc_learn.cli.model_commands import smooth
 
     dataset = write(tmp_path / "set", paths(7), panda.joint_names)
     file = tmp_path / "limits.json"

@@ -1,19 +1,21 @@
-"""`hrc evaluate`: errors of primitives on held-out demonstrations, and of image Jacobians."""
+"""`hrc evaluate` and `hrc smooth`: errors of models, and limits on the actions of policies."""
 
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from hrc_learn.cli._run import refuse_repeats, write_values
-from hrc_learn.cli.arguments import Evaluate, FitPrimitives, columns
+from hrc_learn.cli.arguments import Evaluate, FitPrimitives, Smooth, columns
 from hrc_learn.cli.fit_command import fit_silently
 from hrc_learn.demos import DemonstrationSet, open_demos
+from hrc_learn.kinematics import panda
 from hrc_learn.learning.channels import (
     CHANNELS,
     Motions,
@@ -187,3 +189,51 @@ def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> T
         table.caption = f"{others} more, none worse"
     table.add_row("median", *(f"{x.quantile(0.5):.3g}" for x in measures.values()))
     return table
+
+
+def smooth(args: Smooth) -> None:
+    """Add limits to a checkpoint or a file, or remove them."""
+    if args.checkpoint is not None and not args.checkpoint.is_dir():
+        raise FileNotFoundError(f"there is no folder {args.checkpoint}")
+    if args.checkpoint is None and (args.remove or args.limits is None):
+        raise ValueError("give --checkpoint, or --limits to write only a file.")
+    # LeRobot takes seconds to import.
+    from hrc_learn.lerobot.arm_values import ArmValues
+    from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
+
+    if args.remove and args.checkpoint is not None:
+        remove_smoothing(args.checkpoint)
+        print(f"limits removed from {args.checkpoint}")
+        return
+    if args.dataset is None:
+        raise ValueError("give --dataset: the limits are those of its demonstrators.")
+    if not args.scale > 0:
+        raise ValueError(f"--scale must be positive, got {args.scale}")
+    limits = gathered_limits(
+        args.dataset,
+        scale=args.scale,
+        urdf=args.urdf,
+        calibration=args.calibration,
+        degrees=args.degrees,
+    )
+    if args.urdf is None and args.calibration is None:
+        ends = zip(panda.limits.lower.tolist(), panda.limits.upper.tolist(), strict=True)
+        limits = limits.within(dict(zip(ArmValues(panda).joints, ends, strict=True)))
+    if args.limits is not None:
+        limits.save(args.limits)
+    if args.checkpoint is not None:
+        add_smoothing(args.checkpoint, limits)
+    values = asdict(limits)
+    table = Table("value", "velocity [1/s]", "acceleration [1/s^2]", "jerk [1/s^3]")
+    kinds = ("velocity", "acceleration", "jerk")
+    for i, name in enumerate(limits.names):
+        table.add_row(name, *(f"{values[kind][i]:.3g}" for kind in kinds))
+    Console().print(table)
+    if args.checkpoint is not None:
+        print(f"{args.checkpoint} keeps its actions within these limits")
+    figures = {
+        f"{kind}_{name}": float(v)
+        for kind in kinds
+        for name, v in zip(limits.names, np.array(values[kind]), strict=True)
+    }
+    write_values(args.json, figures)
