@@ -21,6 +21,7 @@ import tokenize
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -111,7 +112,11 @@ class Source:
     module: str
     text: str
     tree: ast.Module
-    tokens: list[tokenize.TokenInfo]
+
+    @cached_property
+    def tokens(self) -> list[tokenize.TokenInfo]:
+        """All tokens of the file."""
+        return list(tokenize.generate_tokens(io.StringIO(self.text).readline))
 
     @property
     def is_face(self) -> bool:
@@ -216,7 +221,6 @@ def read_package(root: Path) -> list[Source]:
                 module=".".join(parts[:-1] if parts[-1] == "__init__" else parts),
                 text=text,
                 tree=ast.parse(text, filename=str(path)),
-                tokens=list(tokenize.generate_tokens(io.StringIO(text).readline)),
             )
         )
     if not sources:
