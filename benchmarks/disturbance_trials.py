@@ -28,7 +28,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.cameras import PinholeCamera
 from hrc_learn.skills.visual_skill import guessed_network
 
 ELBOW = 4

@@ -41,7 +41,7 @@ from hrc_learn.kinematics import (
 )
 from hrc_learn.kinematics.inverse import best_postures, solutions_from
 from hrc_learn.regions import JointRegion
-from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.cameras import PinholeCamera
 
 TABLE = ((0.26, 0.54, -0.02), (0.42, 0.34, 0.02))
 """Centre and half edges of the table [m], as simulated."""

@@ -7,7 +7,7 @@ from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals, Ob
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.cameras import PinholeCamera
 
 DOUBLE = torch.float64
 LIMITS = panda.limits

@@ -39,7 +39,7 @@ from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import MovingBodies, SceneConfig, World
-from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.cameras import PinholeCamera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import Gamepad, HapticDevice, TerminalKeyboard

@@ -30,7 +30,7 @@ from hrc_learn.jacobian import (
     PaperEstimator,
 )
 from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
-from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.cameras import PinholeCamera
 
 
 class TestTheLaw:

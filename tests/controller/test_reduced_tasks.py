@@ -13,7 +13,7 @@ from hrc_learn.controller.resolved_rate import task_descent
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
 from hrc_learn.kinematics import Arm, arm, panda, solve_inverse, task_basis, task_rank
-from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.cameras import PinholeCamera
 from hrc_learn.skills.placing import follow_pose
 
 TASKS = ("position+axis", "position")

@@ -21,7 +21,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.pinhole_camera import PinholeCamera
+from hrc_learn.sim.cameras import PinholeCamera
 
 DOUBLE = torch.float64
 J0 = torch.tensor([[-1500.0, 0, 0, 0, -200, 60], [0, 2400, 170, -200, 0, 180]], dtype=DOUBLE)
