@@ -69,7 +69,7 @@ class Args:
 
 
 def main(args: Args) -> None:
-    from hrc_learn.lerobot.policy.training_samples import read_episodes
+    from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     torch.set_num_threads(1)
     figures: dict[str, float] = {}
@@ -259,7 +259,7 @@ class Nearest:
     def __init__(
         self, shown: Sequence[Episode], stats: dict[str, dict[str, Tensor]], chunk: int
     ):
-        from hrc_learn.lerobot.policy.training_samples import SampleWindows
+        from hrc_learn.lerobot.policy.policy_base import SampleWindows
 
         windows = SampleWindows(shown, {STATE: None, ACTION: range(chunk)}, 1)
         everything = windows.batch(torch.arange(len(windows)))
@@ -352,7 +352,7 @@ def train(
 
     The learning rate falls along a cosine over that time.
     """
-    from hrc_learn.lerobot.policy.training_samples import SampleWindows
+    from hrc_learn.lerobot.policy.policy_base import SampleWindows
 
     config = policy.config
     seen = config.observation_delta_indices

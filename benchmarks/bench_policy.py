@@ -98,7 +98,7 @@ class Done:
 
 def main(args: Args) -> None:
     from hrc_learn.lerobot.envs import ArmEnvConfig
-    from hrc_learn.lerobot.policy.training_samples import read_episodes
+    from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     torch.set_num_threads(1)
     env = ArmEnvConfig(task=args.task, fps=args.fps, pixels=args.task == "grasping")
@@ -228,7 +228,7 @@ def _config(name: str, width: int) -> Any:
 
 def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> dict[str, float]:
     """As lerobot-train does it, with batches from memory; mean losses of some tenths of it."""
-    from hrc_learn.lerobot.policy.training_samples import SampleWindows, read_episodes
+    from hrc_learn.lerobot.policy.policy_base import SampleWindows, read_episodes
 
     config = policy.config
     episodes = [e | _observation(e[STATE]) for e in read_episodes(dataset, (STATE, ACTION))]

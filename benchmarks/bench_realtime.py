@@ -73,7 +73,7 @@ type Stepper = Callable[[dict[str, Any]], tuple[np.ndarray, bool]]
 
 def main(args: Args) -> None:
     from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
-    from hrc_learn.lerobot.policy.training_samples import read_episodes
+    from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     torch.set_num_threads(1)
     columns = read_episodes(args.data, (STATE, ACTION))

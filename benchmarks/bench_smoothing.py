@@ -163,7 +163,7 @@ def _report(
 
 def _read(root: Path, args: Args) -> tuple[list[Episode], list[Episode], ActionLimits, float]:
     """Episodes to learn from, those held out, limits, frame rate; of columns that move."""
-    from hrc_learn.lerobot.policy.training_samples import read_episodes
+    from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     columns = read_episodes(root, (STATE, ACTION))
     episodes = [{STATE: e[STATE].float(), ACTION: e[ACTION].float()} for e in columns]

@@ -13,7 +13,7 @@ from hrc_learn.geometry import minimum_jerk
 from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 from hrc_learn.lerobot.policy.dmp_policy import DMPPolicy
 from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
-from hrc_learn.lerobot.policy.training_samples import SampleWindows
+from hrc_learn.lerobot.policy.policy_base import SampleWindows
 
 FPS = 20.0
 NAMES = ["a.pos", "b.pos"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hrc_learn.lerobot.policy.training_samples import read_episodes
+from hrc_learn.lerobot.policy.policy_base import read_episodes
 
 pytestmark = pytest.mark.slow
 

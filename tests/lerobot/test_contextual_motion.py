@@ -7,9 +7,9 @@ import torch
 from lerobot_samples import reaching, write_dataset
 
 from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
-from hrc_learn.lerobot.policy import training_samples
+from hrc_learn.lerobot.policy import policy_base
 from hrc_learn.lerobot.policy.contextual_motion import ContextualMotion, fit_closed_form
-from hrc_learn.lerobot.policy.training_samples import SampleWindows
+from hrc_learn.lerobot.policy.policy_base import SampleWindows
 
 EPISODES = reaching(3)
 DELTAS = {"observation.state": [-1000, 0], "action": [-2, 0, 5], "observation.goal": None}
@@ -126,9 +126,9 @@ def test_what_hardly_differs_between_demonstrations_is_left_out():
 def test_of_many_demonstrations_some_are_read_spread_evenly(tmp_path, monkeypatch):
     episodes = reaching(5)
     folder = write_dataset(tmp_path / "set", episodes)
-    monkeypatch.setattr(training_samples, "MOST", 3)
-    read = training_samples.read_episodes(folder, ["action"])
+    monkeypatch.setattr(policy_base, "MOST", 3)
+    read = policy_base.read_episodes(folder, ["action"])
     assert len(read) == 3
     for found, k in zip(read, (0, 2, 4), strict=True):
         torch.testing.assert_close(found["action"], episodes[k]["action"])
-    assert len(training_samples.read_episodes(folder, ["action"], [1, 3])) == 2
+    assert len(policy_base.read_episodes(folder, ["action"], [1, 3])) == 2

@@ -7,7 +7,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.lerobot import episode_recording
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
-from hrc_learn.lerobot.policy.training_samples import read_episodes
+from hrc_learn.lerobot.policy.policy_base import read_episodes
 
 FPS = 10.0
 

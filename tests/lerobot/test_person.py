@@ -14,7 +14,7 @@ from hrc_learn.lerobot.arm_values import GRIPPER, HAND, ArmValues
 from hrc_learn.lerobot.episode_recording import add_frame, new_dataset
 from hrc_learn.lerobot.franka_panda import FrankaPandaConfig
 from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
-from hrc_learn.lerobot.policy.training_samples import read_episodes
+from hrc_learn.lerobot.policy.policy_base import read_episodes
 from hrc_learn.teleoperation import ScriptedForce
 
 JOINTS, VELOCITIES = ArmValues(panda).joints, ArmValues(panda).velocities

@@ -12,7 +12,7 @@ import torch
 from lerobot_samples import FPS, GOAL, STATE, reaching, windows, write_dataset
 
 from hrc_learn.lerobot.policy.dmp_policy import DMPPolicy
-from hrc_learn.lerobot.policy.training_samples import read_episodes
+from hrc_learn.lerobot.policy.policy_base import read_episodes
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from hrc_learn.lerobot.episode_recording import (
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
-from hrc_learn.lerobot.policy.training_samples import read_episodes
+from hrc_learn.lerobot.policy.policy_base import read_episodes
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.teleoperation.scenarios import Grasping
 

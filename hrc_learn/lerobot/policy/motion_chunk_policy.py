@@ -33,8 +33,7 @@ from hrc_learn.lerobot.policy.motion_chunks import (
     Plans,
 )
 from hrc_learn.lerobot.policy.observation_encoder import Observation, divisors
-from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig
-from hrc_learn.lerobot.policy.training_samples import SampleWindows
+from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig, SampleWindows
 
 __all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 

@@ -1,12 +1,13 @@
-"""Settings and construction common to all policies, and their demands on a dataset."""
+"""Settings and construction common to all policies, and the demonstrations they learn from."""
 
 import logging
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Int
 from lerobot.configs import NormalizationMode, PreTrainedConfig
@@ -16,6 +17,8 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from safetensors import SafetensorError
 from torch import Tensor
 
+from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
+from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.demos.read.metadata import flatten_names
 from hrc_learn.lerobot.policy.action_encoding import (
     ActionEncoding,
@@ -23,7 +26,6 @@ from hrc_learn.lerobot.policy.action_encoding import (
     rotation_triples,
 )
 from hrc_learn.lerobot.policy.observation_encoder import Observation, ObservationEncoder
-from hrc_learn.lerobot.policy.training_samples import read_episodes
 
 logger = logging.getLogger(__name__)
 
@@ -298,3 +300,84 @@ def _require_statistics(
                 f"the dataset's statistics (meta/stats.json) must have {width} finite numbers "
                 f"as {name} of {key}, got {values.tolist()}"
             )
+
+
+MOST = 256
+"""Demonstrations that say enough of a motion to start from; more are spread evenly."""
+
+
+def read_episodes(
+    root: str | Path, keys: Sequence[str], episodes: Sequence[int] | None = None
+) -> list[dict[str, Tensor]]:
+    """Columns of whole episodes, (frames, components) each, just as they are on disk.
+
+    Args:
+        root: Folder of a LeRobot dataset.
+        keys: Columns wanted.
+        episodes: Indices; None: all. Of more than 256, that many are read.
+
+    Raises:
+        DatasetError: A `ValueError` that says what of the dataset cannot be read.
+    """
+    folder = open_folder(root)
+    chosen = select_episodes(folder, episodes)
+    if len(chosen) > MOST:
+        spread = np.linspace(0, len(chosen) - 1, MOST).round().astype(int)
+        chosen = tuple(chosen[i] for i in spread)
+    entries = sorted(chosen, key=lambda entry: (entry.file, entry.start))
+    return [
+        {key: torch.from_numpy(np.array(frames[key])) for key in keys}
+        for _, frames in read_frames(folder, entries, keys)
+    ]
+
+
+class SampleWindows:
+    """Samples of all frames of episodes, with the steps around each that a policy asks for.
+
+    The same batches as of LeRobot's loader, which looks up every action of every chunk by
+    itself, some 200 samples a second; few demonstrations fit into memory, where a batch is one
+    gather.
+    """
+
+    def __init__(
+        self,
+        episodes: Sequence[Mapping[str, Tensor]],
+        deltas: Mapping[str, Sequence[int] | None],
+        fps: float | int,
+    ):
+        """Lay the episodes out.
+
+        Args:
+            episodes: Columns by key, (frames, ...) each.
+            deltas: Offsets in frames for each key; None: the frame itself, without
+                an axis of time.
+            fps: Frames a second.
+        """
+        lengths = torch.tensor([len(next(iter(episode.values()))) for episode in episodes])
+        self._columns = {key: torch.cat([e[key] for e in episodes]) for key in deltas}
+        self._deltas = deltas
+        end = lengths.cumsum(0)
+        self._start = (end - lengths).repeat_interleave(lengths)
+        self._last = (end - 1).repeat_interleave(lengths)
+        self._fps = fps
+
+    def __len__(self) -> int:
+        return len(self._start)
+
+    def batch(self, index: Int[Tensor, "B"]) -> dict[str, Tensor]:
+        """Samples by the number of their frame, counted through all episodes."""
+        start, last = self._start[index], self._last[index]
+        batch = {"timestamp": (index - start) / self._fps}
+        for key, deltas in self._deltas.items():
+            if deltas is None:
+                batch[key] = self._columns[key][index]
+                continue
+            wanted = index[:, None] + torch.tensor(deltas)
+            within = wanted.clamp(start[:, None], last[:, None])
+            batch[key] = self._columns[key][within]
+            batch[f"{key}_is_pad"] = within != wanted
+        return batch
+
+    def draw(self, size: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Samples drawn at random."""
+        return self.batch(torch.randint(len(self), (size,), generator=generator))

@@ -12,6 +12,6 @@ from .processor import SmoothActionsStep as SmoothActionsStep
 from .processor import add_smoothing as add_smoothing
 from .processor import read_pipeline as read_pipeline
 from .processor import remove_smoothing as remove_smoothing
+from .robot import ActionUpsampler as ActionUpsampler
 from .robot import SmoothRobot as SmoothRobot
 from .robot import SmoothRobotConfig as SmoothRobotConfig
-from .upsampling import ActionUpsampler as ActionUpsampler
