@@ -24,7 +24,7 @@ from rich.table import Table
 from timing import time_calls
 
 from hrc_learn import cli
-from hrc_learn.experiments.people_in_run import draw_visit
+from hrc_learn.experiments.surroundings import draw_visit
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, MotionLog, WorkerSensor, World, whole_arm
 from hrc_learn.sim.workplace import Workplace

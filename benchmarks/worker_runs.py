@@ -23,7 +23,7 @@ from hrc_learn.controller import Distances, WayMakingConfig
 from hrc_learn.controller.arm_loop import ArmLoop
 from hrc_learn.controller.arm_loop_state import ArmLoopConfig, ArmReading, FollowPath
 from hrc_learn.controller.joint_path import JointPaths
-from hrc_learn.experiments.people_in_run import margin_to_stop
+from hrc_learn.experiments.surroundings import margin_to_stop
 from hrc_learn.kinematics import CapsuleArm, Separation, panda, separation
 from hrc_learn.sim import CommandChannel, Imperfections
 from hrc_learn.sim.workplace import Workplace

@@ -41,7 +41,7 @@ from hrc_learn.experiments.real_arm import (
     placing_task,
     run_on_arm,
 )
-from hrc_learn.experiments.table_objects import workplace_for
+from hrc_learn.experiments.surroundings import workplace_for
 from hrc_learn.hardware import open_camera
 from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections

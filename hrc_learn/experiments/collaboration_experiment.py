@@ -20,7 +20,7 @@ from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_measures import worker_distance
 from hrc_learn.experiments.run_recorder import record
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
-from hrc_learn.experiments.table_objects import workplace_for
+from hrc_learn.experiments.surroundings import workplace_for
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.log import LoggedSteps, RunRecording

@@ -10,7 +10,6 @@ import numpy as np
 
 from hrc_learn.experiments.collaboration_trial import CollaborationRun
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
-from hrc_learn.experiments.people_in_run import worker_contacts
 from hrc_learn.experiments.run_measures import (
     Deviation,
     grasp_offset,
@@ -20,6 +19,7 @@ from hrc_learn.experiments.run_measures import (
     unwanted_contacts,
     worker_distance,
 )
+from hrc_learn.experiments.surroundings import worker_contacts
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.sim import Touch
 from hrc_learn.sim.hand_over import HandOver, Reach

@@ -8,13 +8,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.experiments.people_in_run import (
-    GivingPerson,
-    draw_visit,
-    separation_margin,
-    shown_hand_overs,
-    waiting_pose,
-)
 from hrc_learn.experiments.run_measures import PullEffect, pull_effects
 from hrc_learn.experiments.simulated_cell import (
     SIMULATED,
@@ -25,10 +18,15 @@ from hrc_learn.experiments.simulated_cell import (
     plan_checker,
     simulated_cell,
 )
-from hrc_learn.experiments.table_objects import (
+from hrc_learn.experiments.surroundings import (
+    GivingPerson,
     check_shelves,
     draw_object_poses,
+    draw_visit,
     points_to_see,
+    separation_margin,
+    shown_hand_overs,
+    waiting_pose,
 )
 from hrc_learn.sim import (
     CameraChange,

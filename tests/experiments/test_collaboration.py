@@ -32,7 +32,7 @@ from hrc_learn.experiments.run_measures import (
 )
 from hrc_learn.experiments.run_recorder import record
 from hrc_learn.experiments.simulated_cell import Observer
-from hrc_learn.experiments.table_objects import THREE_OBJECTS, with_objects
+from hrc_learn.experiments.surroundings import THREE_OBJECTS, with_objects
 from hrc_learn.geometry import Box, quaternion
 from hrc_learn.sim import NOWHERE, CameraChange, Imperfections, OcclusionInterval
 from hrc_learn.sim.workplace import Workplace

@@ -8,8 +8,8 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments import people_in_run
-from hrc_learn.experiments.people_in_run import (
+from hrc_learn.experiments import surroundings
+from hrc_learn.experiments.surroundings import (
     GivingPerson,
     _movements,
     shown_hand_overs,
@@ -25,7 +25,7 @@ NOMINAL = Imperfections.nominal()
 
 @shapes_unchecked()
 def test_what_was_shown_tells_movements_of_other_people_apart(monkeypatch):
-    monkeypatch.setattr(people_in_run, "_VISITS", 15)
+    monkeypatch.setattr(surroundings, "_VISITS", 15)
     model = shown_hand_overs(WORKPLACE, NOMINAL, ITEM)
     rng = np.random.default_rng(5)
     wait = waiting_pose(WORKPLACE).position.numpy()

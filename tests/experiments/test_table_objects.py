@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hrc_learn.experiments.table_objects import (
+from hrc_learn.experiments.surroundings import (
     OBJECTS_REACH,
     THREE_OBJECTS,
     random_object_poses,

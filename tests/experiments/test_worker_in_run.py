@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from hrc_learn.controller import SeparationConfig
-from hrc_learn.experiments.people_in_run import (
+from hrc_learn.experiments.surroundings import (
     draw_visit,
     separation_margin,
     worker_contacts,
