@@ -350,10 +350,12 @@ class SpeedBarrier(nn.Module):
         """
         T = self.braking_time(velocity)
         x, towards = velocity.abs(), torch.sign(velocity) * acceleration
-        ramp = (towards + x / T).clamp(min=0) ** 2
-        # Braking harder than the motion needs, it swings past zero.
-        swing = towards.clamp(max=0) ** 2 - 2 * self.jerk * x
-        excess = torch.maximum(ramp, swing) / (2 * self.jerk)
+        braking = x / T
+        # Faster than y v while the acceleration ramps down; slower if it brakes harder than
+        # that, and past zero if it cannot end the braking before.
+        ramp, hard = towards + braking, towards.clamp(max=0) ** 2
+        swing = torch.where(hard > 2 * self.jerk * x, hard, ramp.clamp(max=0) ** 2)
+        excess = torch.maximum(ramp.clamp(min=0) ** 2, swing) / (2 * self.jerk)
         rho = (self.decay * T).clamp(min=1)
         excess = excess + (1 - (1 + rho.log()) / rho) * x
         fastest = x + excess

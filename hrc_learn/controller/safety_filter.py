@@ -452,9 +452,13 @@ class SafetyFilter(nn.Module):
 
     def _easing(self, given: _Inputs) -> Tensor:
         """The velocity with which the arm brakes as the speed barrier assumes [rad/s]."""
-        v = given.state.velocity
-        T = self.speed_barrier.braking_time(v).clamp(min=given.dt)
-        return self._accelerated(given, -v / T, given.bounds)[0]
+        v, dt = given.state.velocity, given.dt
+        T = self.speed_barrier.braking_time(v).clamp(min=dt)
+        # Each joint ramps as fast as it can: a common ramp would last as long as the longest.
+        acceleration = self.barrier.nearest_acceleration(
+            -v / T, given.state.acceleration, v, given.bounds, dt
+        )
+        return v + acceleration * dt
 
     @property
     def _exits_early(self) -> bool:
