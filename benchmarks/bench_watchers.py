@@ -42,6 +42,8 @@ class Args:
     """Length of the measurement."""
     watchers: int = 24
     """Number of clients that watch."""
+    json: Path | None = None
+    """File for the measured values, one flat JSON object of numbers."""
 
 
 def main(args: Args) -> int:
@@ -56,17 +58,19 @@ def main(args: Args) -> int:
             parts = urlsplit(found[1])
             (token,) = parse_qs(parts.fragment)["token"]
             address = Address(scheme="http", host="127.0.0.1", port=parts.port, token=token)
-            asyncio.run(_measure(SimpleNamespace(address=address), program.pid, args))
+            figures = asyncio.run(_measure(SimpleNamespace(address=address), program.pid, args))
             alive = program.poll() is None
         finally:
             program.terminate()
             program.wait()
+        if args.json is not None:
+            cli.write_json(args.json, {**figures, "alive": int(alive)})
         print("alive to the end" if alive else f"the page has ended:\n{log.read_text('utf-8')}")
     return 0 if alive else 1
 
 
-async def _measure(page, pid: int, args: Args) -> None:
-    stop, delays = asyncio.Event(), []
+async def _measure(page, pid: int, args: Args) -> dict[str, float]:
+    stop, delays, figures = asyncio.Event(), [], {}
     leading = asyncio.create_task(_lead(page, stop, delays))
     await asyncio.sleep(1.0)
     watching = [asyncio.create_task(_watch(page, stop)) for _ in range(args.watchers)]
@@ -74,6 +78,7 @@ async def _measure(page, pid: int, args: Args) -> None:
         delays.clear()
         await asyncio.sleep(_REPORT_EVERY)
         median, p95 = 1e3 * np.percentile(delays or [math.inf], [50, 95])
+        figures = {"effort_p50_ms": median, "effort_p95_ms": p95, "memory_mb": _memory(pid)}
         print(
             f"{(k + 1) * _REPORT_EVERY:5.0f} s: effort p50 {median:.0f} ms, p95 {p95:.0f} ms, "
             f"memory {_memory(pid):.0f} MB, {sum(not one.done() for one in watching)} watch",
@@ -81,6 +86,7 @@ async def _measure(page, pid: int, args: Args) -> None:
         )
     stop.set()
     await asyncio.gather(leading, *watching, return_exceptions=True)
+    return figures
 
 
 async def _watch(page, stop: asyncio.Event) -> None:
