@@ -84,21 +84,20 @@ class Figures:
 
 
 BUDGET: dict[str, float] = {
-    "code": 54_200,
-    "modules": 307,
+    "code": 48_800,
+    "modules": 235,
     "long_functions": 20,
     "shared_file_names": 0,
     "circles": 0,
     "fragments": 0.03,
     "idiom": 0.3,
-    "docs_words": 46_000,
+    "docs_words": 35_300,
 }
 """Largest allowed figures. They are lowered towards `AIM` as code goes; nothing raises them but
 the lines that CONTRIBUTING.md lists for the code."""
 
 AIM: dict[str, float] = BUDGET | {
     "code": 45_000,
-    "modules": 235,
     "docs_words": 35_000,
 }
 """Figures to reach. For scale: BoTorch has 34.7k lines of code in 172 modules."""
