@@ -91,7 +91,7 @@ BUDGET: dict[str, float] = {
     "circles": 0,
     "fragments": 0.03,
     "idiom": 0.3,
-    "docs_words": 35_300,
+    "docs_words": 35_200,
 }
 """Largest allowed figures. They are lowered towards `AIM` as code goes; nothing raises them but
 the lines that CONTRIBUTING.md lists for the code."""
