@@ -13,15 +13,20 @@ _UNPRINTABLE = re.compile(
 )
 _LONGEST_TEXT, _END = 300, 120
 """Characters shown of a text from a file, and those of its end, where the advice stands."""
+_LONGEST_MESSAGE = 1000
+"""Characters shown of a message. Its commands and paths have to stay whole."""
 _FIGURE_OR_QUOTE = re.compile(r"[-+]?\d[\d.e+-]*|'[^']*'")
 
 
-def plain_text(text: str) -> str:
-    """Text from a file, safe to print in a terminal: escapes removed, length bounded."""
+def plain_text(text: str, longest: int = _LONGEST_TEXT) -> str:
+    """Text from a file, safe to print in a terminal: escapes removed, length bounded.
+
+    Args:
+        text: The text.
+        longest: Characters shown; of a longer text the beginning and the end.
+    """
     shown = _UNPRINTABLE.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
-    if len(shown) <= _LONGEST_TEXT:
-        return shown
-    return f"{shown[: _LONGEST_TEXT - _END]} ... {shown[-_END:]}"
+    return shown if len(shown) <= longest else f"{shown[: longest - _END]} ... {shown[-_END:]}"
 
 
 def aligned(rows: Sequence[tuple[str, ...]], side: Literal["<", ">"] = "<") -> Iterator[str]:
@@ -74,7 +79,8 @@ class Issue:
         episode = None if self.episode is None else f"episode {self.episode}"
         frame = None if self.frame is None else f"frame {self.frame}"
         place = ", ".join(part for part in (self.file, episode, frame, self.key) if part)
-        return plain_text(f"{place}: {self.message}" if place else self.message)
+        text = f"{place}: {self.message}" if place else self.message
+        return plain_text(text, _LONGEST_MESSAGE)
 
 
 warning = partial(Issue, level="warning")

@@ -546,8 +546,13 @@ def test_one_name_for_a_vector_names_no_component(root):
 
 def test_a_long_message_keeps_its_advice():
     text = str(warning(message=f"{'name, ' * 200}: name one of them", key="state"))
-    assert len(text) < 320
+    assert len(text) < 1010
     assert text.endswith("name one of them")
+
+
+def test_a_command_in_a_message_keeps_its_long_path():
+    command = f"`hrc recover --path /{'folder/' * 60}set`"
+    assert command in str(warning(message=f"not found. {command} makes a dataset of it"))
 
 
 def test_speed_limits_are_the_callers(root):
