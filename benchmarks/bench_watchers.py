@@ -57,6 +57,7 @@ def main(args: Args) -> int:
                 time.sleep(0.1)
             parts = urlsplit(found[1])
             (token,) = parse_qs(parts.fragment)["token"]
+            assert parts.port is not None
             address = Address(scheme="http", host="127.0.0.1", port=parts.port, token=token)
             figures = asyncio.run(_measure(SimpleNamespace(address=address), program.pid, args))
             alive = program.poll() is None
