@@ -215,8 +215,9 @@ def _source_hash() -> bytes:
     return digest.digest()
 
 
-# Memory layout of compiled steps. Inductor has no public option for the layout of results, so
-# three of its private functions, and a limit, are replaced during a compilation. They exist in
+# Memory layout of compiled steps. Inductor has no public option for the layout of results, nor
+# for the level of optimization, so four of its private functions, and a limit, are replaced
+# during a compilation. They exist in
 # all versions of torch that pyproject.toml allows; tests/deploy/test_inductor.py watches them.
 
 # Stack memory that a step may use [bytes]: allocations there are free, while those of torch
@@ -235,13 +236,25 @@ def tuned_for(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
     Yields:
         Options to compile with.
     """
+    from torch._inductor import cpp_builder
     from torch._inductor.codegen import cpp_wrapper_cpu_array_ref as wrapper
+
+    plain = cpp_builder._get_optimization_cflags
+
+    def flags_of_batches(*args: Any, **more: Any) -> tuple[list[str], list[str]]:
+        # One kernel of 26,000 lines: GCC 12.2 ends with an internal error at -O3. The loops
+        # over the batch are vectorized by inductor, at any level.
+        compiling, linking = plain(*args, **more)
+        return ["O2" if flag == "O3" else flag for flag in compiling], linking
 
     options: dict[str, Any] = {"aot_inductor.allow_stack_allocation": True}
     with ExitStack() as stack:
         stack.enter_context(_replaced(wrapper, "MAX_STACK_ALLOCATION_SIZE", _STACK))
         if batch:
             stack.enter_context(_batch_last(list(batch)))
+            stack.enter_context(
+                _replaced(cpp_builder, "_get_optimization_cflags", flags_of_batches)
+            )
             options["post_grad_custom_post_pass"] = cat_batch_last(list(batch))
         yield options
 

@@ -4,7 +4,7 @@ import inspect
 
 import pytest
 import torch
-from torch._inductor import ir
+from torch._inductor import cpp_builder, ir
 from torch._inductor.codegen import cpp_wrapper_cpu_array_ref
 
 from hrc_learn.deploy.export import tuned_for
@@ -19,6 +19,7 @@ from hrc_learn.deploy.export import tuned_for
         ),
         (ir.ComputedBuffer.get_fill_order, ["self"]),
         (ir.View.create, ["x", "new_size"]),
+        (cpp_builder._get_optimization_cflags, ["cpp_compiler", "min_optimize"]),
     ],
 )
 def test_the_installed_torch_has_the_functions_that_are_replaced(function, parameters):
@@ -39,6 +40,7 @@ def private_parts() -> list[object]:
         vars(ir.FlexibleLayout)["__init__"],
         vars(ir.ComputedBuffer)["get_fill_order"],
         vars(ir.View)["create"],
+        cpp_builder._get_optimization_cflags,
         cpp_wrapper_cpu_array_ref.MAX_STACK_ALLOCATION_SIZE,
     ]
 
@@ -57,8 +59,15 @@ def test_they_are_put_back_after_a_compilation(fails):
     assert all(a is b for a, b in zip(private_parts(), before, strict=True))
 
 
+def test_kernels_of_batches_are_compiled_without_what_breaks_gcc():
+    with tuned_for([4]):
+        flags, _ = cpp_builder._get_optimization_cflags("g++")
+    assert "O2" in flags
+    assert "O3" not in flags
+
+
 def test_one_arm_needs_no_layout_of_a_batch():
     before = private_parts()
     with tuned_for([]) as options:
-        assert private_parts()[:3] == before[:3]
+        assert private_parts()[:4] == before[:4]
         assert options == {"aot_inductor.allow_stack_allocation": True}
