@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
@@ -43,6 +44,22 @@ def test_an_object_that_is_not_seen_is_put_elsewhere():
     # The expert ends above the third place.
     np.testing.assert_allclose(frames[-1]["position"][:2], place[:2, 3], atol=0.02)
     np.testing.assert_allclose(frames[0][OBJECT_FEATURE][:2], CORNERS.mean(0))
+
+
+def test_the_gripper_turns_to_the_object_within_reach():
+    workplace, rng = Workplace(), np.random.default_rng(0)
+    place = workplace.random_object_pose(CONFIG.reach, rng, CONFIG.yaw)
+    end, hover = demonstrate(unseen=0)[-1]["orientation"], workplace.hover().orientation
+    turn = (
+        Rotation.from_quat(end, scalar_first=True)
+        * Rotation.from_quat(hover, scalar_first=True).inv()
+    )
+    yaw, low = turn.as_rotvec()[2], workplace.hover_turns[0]
+    # A box looks the same after half a turn.
+    expected = low + (np.arctan2(place[1, 0], place[0, 0]) - low) % np.pi
+    assert abs(expected - low) > 0.3
+    # The arm follows its tremor and lags by some hundredths of a radian.
+    assert yaw == pytest.approx(expected, abs=0.05)
 
 
 def test_a_camera_that_never_sees_it_is_said_to():
