@@ -1,0 +1,28 @@
+"""The true image Jacobian of a run whose camera was moved."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hrc_learn.experiments.run_measures import true_image_jacobian
+from hrc_learn.sim import World
+from hrc_learn.sim.workplace import Workplace
+
+
+def test_each_step_has_the_camera_that_watched_it():
+    workplace = Workplace()
+    world, camera = World(workplace.scene), workplace.scene.camera
+    later = replace(camera, focal=(900.0, 900.0))
+    home = workplace.home_joints().numpy()
+    log = {
+        "time": np.array([0.0, 0.5, 1.0, 1.5]),
+        "joint_position": np.stack([home + 0.1 * k for k in range(4)]),
+        "image_jacobian": np.zeros((4, 2, 6)),
+    }
+    log["image_jacobian"][1] = np.nan  # the controller did not use its estimate
+    true = true_image_jacobian(log, world, [(0.0, camera), (1.0, later)])
+    first, second = (true_image_jacobian(log, world, [(0.0, c)]) for c in (camera, later))
+    assert np.isnan(true[1]).all()
+    np.testing.assert_array_equal(true[0], first[0])
+    np.testing.assert_array_equal(true[2:], second[2:])
+    assert np.abs(first[2:] - second[2:]).max() > 1
