@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from hrc_learn.experiments.run_measures import true_image_jacobian
+from hrc_learn.log import StepLog
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 
@@ -14,12 +15,11 @@ def test_each_step_has_the_camera_that_watched_it():
     world, camera = World(workplace.scene), workplace.scene.camera
     later = replace(camera, focal=(900.0, 900.0))
     home = workplace.home_joints().numpy()
-    log = {
-        "time": np.array([0.0, 0.5, 1.0, 1.5]),
-        "joint_position": np.stack([home + 0.1 * k for k in range(4)]),
-        "image_jacobian": np.zeros((4, 2, 6)),
-    }
-    log["image_jacobian"][1] = np.nan  # the controller did not use its estimate
+    log = StepLog()
+    for k in range(4):
+        # The controller does not use its estimate in the second step.
+        used = np.full((2, 6), np.nan if k == 1 else 0.0)
+        log.append(time=0.5 * k, joint_position=home + 0.1 * k, image_jacobian=used)
     true = true_image_jacobian(log, world, [(0.0, camera), (1.0, later)])
     first, second = (true_image_jacobian(log, world, [(0.0, c)]) for c in (camera, later))
     assert np.isnan(true[1]).all()
