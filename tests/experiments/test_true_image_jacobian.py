@@ -15,6 +15,7 @@ def test_each_step_has_the_camera_that_watched_it():
     world, camera = World(workplace.scene), workplace.scene.camera
     later = replace(camera, focal=(900.0, 900.0))
     home = workplace.home_joints().numpy()
+    world.reset(home, {})
     log = StepLog()
     for k in range(4):
         # The controller does not use its estimate in the second step.
