@@ -34,6 +34,14 @@ def test_the_printed_pull_vanishes_at_the_edge_and_is_zero_beyond():
     assert outside == 0
 
 
+def test_the_printed_potential_rises_from_the_target_to_the_edge():
+    region = VisionRegion.inside_image(TARGET, IMAGE)
+    steps = torch.tensor([0.0, 1.0, 1.2], dtype=torch.float64)
+    x = region.target + steps[:, None] * region.half_size * torch.tensor([1.0, 0.0])
+    # (eq_vision_p): k_v (1 - min(0, f)^2)/2, with f = -1 at the target and k_v = 0.3.
+    assert region.potential(x).tolist() == pytest.approx([0.0, 0.15, 0.15], abs=1e-12)
+
+
 def test_the_saturated_form_agrees_near_the_target_and_never_lets_go():
     paper = VisionRegion.inside_image(TARGET, IMAGE)
     saturated = VisionRegion.inside_image(TARGET, IMAGE, formulation="saturated")
