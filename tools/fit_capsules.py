@@ -25,7 +25,13 @@ import torch
 from jaxtyping import Bool, Float
 
 from hrc_learn.kinematics import MissingModelError, arm, registered_arms
-from hrc_learn.kinematics.capsule_fit import Hull, hull_of
+from hrc_learn.kinematics.capsule_fit import (
+    Hull,
+    capsule_volume,
+    hull_of,
+    link_capsule,
+    principal_axes,
+)
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 from hrc_learn.kinematics.description import Shape
@@ -80,7 +86,7 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
         else:
             hulls[link].append(hull_of(shape))
     for link, parts in hulls.items():
-        capsules += [_named(link, *fitted) for fitted in fit_link(parts)]
+        capsules += [link_capsule(link, *fitted) for fitted in fit_link(parts)]
     return CapsuleArm(chain, capsules, _left_out(chain, capsules, hulls))
 
 
@@ -91,7 +97,7 @@ type _Fit = tuple[np.ndarray, np.ndarray, float]
 def fit_link(hulls: Sequence[Hull]) -> list[_Fit]:
     """Up to three capsules that contain convex hulls."""
     points = np.concatenate([hull.points for hull in hulls])
-    axes = _principal_axes(points)
+    axes = principal_axes(points)
     rng = np.random.default_rng(_SEED)
     best: dict[int, tuple[float, list[np.ndarray]]] = {}
     for axis in axes:
@@ -104,7 +110,7 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Fit]:
                 for a, b in pairwise(levels.tolist())
             ]
             parts = [part for part in parts if len(part)]
-            volume = sum(_volume(fit_capsule(part, rng, rounds=1)) for part in parts)
+            volume = sum(capsule_volume(fit_capsule(part, rng, rounds=1)) for part in parts)
             if len(parts) not in best or volume < best[len(parts)][0]:
                 best[len(parts)] = volume, parts
     chosen = best[min(best)]
@@ -112,11 +118,6 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Fit]:
         if best[count][0] < (1 - _WORTH) * chosen[0]:
             chosen = best[count]
     return [fit_capsule(part, rng, rounds=_ROUNDS) for part in chosen[1]]
-
-
-def _volume(fit: _Fit) -> float:
-    start, end, radius = fit
-    return math.pi * radius**2 * (float(np.linalg.norm(end - start)) + 4 / 3 * radius)
 
 
 def fit_capsule(
@@ -129,7 +130,7 @@ def fit_capsule(
     """
     everything = points
     points = np.unique(points[(points @ _DIRECTIONS.T).argmax(0)], axis=0)
-    axes = _principal_axes(points)
+    axes = principal_axes(points)
     volume, best = min(_around(points, axes), key=lambda f: f[0])
     tilt = _TILT
     for _ in range(rounds):
@@ -147,10 +148,6 @@ def fit_capsule(
     nearest = start + fraction.clip(0, 1)[:, None] * way
     furthest = float(np.linalg.norm(everything - nearest, axis=1).max())
     return start, end, max(radius, furthest) + _SLACK
-
-
-def _principal_axes(points: np.ndarray) -> np.ndarray:
-    return np.linalg.eigh(np.cov(points.T, bias=True))[1].T
 
 
 def _sphere(count: int) -> np.ndarray:
@@ -202,15 +199,10 @@ def _around(points: np.ndarray, axes: np.ndarray) -> list[tuple[float, tuple]]:
     return results
 
 
-def _named(link: int, start: np.ndarray, end: np.ndarray, radius: float) -> LinkCapsule:
-    (a, b, c), (d, e, f) = start.tolist(), end.tolist()
-    return LinkCapsule(link=link, start=(a, b, c), end=(d, e, f), radius=radius)
-
-
 def _round(link: int, shape: Shape) -> LinkCapsule:
     (radius, half), pose = shape.size, shape.pose
     start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
-    return _named(link, start, end, radius)
+    return link_capsule(link, start, end, radius)
 
 
 def _left_out(

@@ -64,7 +64,7 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
         if shape.kind in ("sphere", "capsule"):
             (radius, half), pose = shape.size, shape.pose
             start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
-            capsules.append(_named(link, start, end, radius))
+            capsules.append(link_capsule(link, start, end, radius))
         else:
             try:
                 hull = hull_of(shape)
@@ -73,11 +73,11 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
             else:
                 hulls[link].append(hull)
     for link, parts in hulls.items():
-        capsules += [_named(link, *fitted) for fitted in fit_link(parts)]
+        capsules += [link_capsule(link, *fitted) for fitted in fit_link(parts)]
     if not capsules:
         steps = [*chain.mounts, chain.flange, chain.tcp]
         capsules = [
-            _named(link, np.zeros(3), step[:3, 3].numpy(), 0.045)
+            link_capsule(link, np.zeros(3), step[:3, 3].numpy(), 0.045)
             for link, step in enumerate(steps)
         ]
     return CapsuleArm(chain, capsules, _left_out(chain, capsules))
@@ -150,7 +150,7 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Capsule]:
     """Up to three capsules that contain convex hulls."""
     points = np.concatenate([hull.points for hull in hulls])
     best: dict[int, tuple[float, list[_Capsule]]] = {}
-    for axis in _principal_axes(points):
+    for axis in principal_axes(points):
         along = points @ axis
         low, high = along.min(), along.max()
         for cuts in _CUTS:
@@ -160,7 +160,7 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Capsule]:
                 for a, b in pairwise(levels.tolist())
             ]
             fits = [_smallest_capsule(part) for part in parts if len(part)]
-            volume = sum(map(_volume, fits))
+            volume = sum(map(capsule_volume, fits))
             if len(fits) not in best or volume < best[len(fits)][0]:
                 best[len(fits)] = volume, fits
     chosen = best[min(best)]
@@ -173,7 +173,7 @@ def fit_link(hulls: Sequence[Hull]) -> list[_Capsule]:
 def _smallest_capsule(points: Float[np.ndarray, "points 3"]) -> _Capsule:
     """The smallest of the capsules around points along their principal axes."""
     fits = []
-    for axis in _principal_axes(points):
+    for axis in principal_axes(points):
         along = points @ axis
         flat = points - along[:, None] * axis
         centre = flat.mean(0)
@@ -188,19 +188,22 @@ def _smallest_capsule(points: Float[np.ndarray, "points 3"]) -> _Capsule:
         if low > high:
             low = high = (low + high) / 2
         fits.append((centre + low * axis, centre + high * axis, radius))
-    return min(fits, key=_volume)
+    return min(fits, key=capsule_volume)
 
 
-def _volume(capsule: _Capsule) -> float:
+def capsule_volume(capsule: _Capsule) -> float:
+    """Volume of a capsule (start, end, radius) [m^3]."""
     start, end, radius = capsule
     return math.pi * radius**2 * (float(np.linalg.norm(end - start)) + 4 / 3 * radius)
 
 
-def _principal_axes(points: np.ndarray) -> np.ndarray:
+def principal_axes(points: np.ndarray) -> np.ndarray:
+    """Principal axes of points (n, 3) as rows, the shortest first."""
     return np.linalg.eigh(np.cov(points.T, bias=True))[1].T
 
 
-def _named(link: int, start: np.ndarray, end: np.ndarray, radius: float) -> LinkCapsule:
+def link_capsule(link: int, start: np.ndarray, end: np.ndarray, radius: float) -> LinkCapsule:
+    """Capsule of a link, from the ends of its axis and its radius [m]."""
     (a, b, c), (d, e, f) = start.tolist(), end.tolist()
     return LinkCapsule(link=link, start=(a, b, c), end=(d, e, f), radius=radius)
 
