@@ -9,6 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
 torch.set_num_threads(1)
 
@@ -28,6 +29,15 @@ def ordinary_priority():
     left = os.sched_getscheduler(0)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     assert left == os.SCHED_OTHER, "the test leaves its thread with another scheduling"
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item):
+    """Simulations, with their fixtures, cost half as much again while shapes are checked."""
+    if item.get_closest_marker("simulation") is None:
+        return (yield)
+    with shapes_unchecked():
+        return (yield)
 
 
 NEEDED = {

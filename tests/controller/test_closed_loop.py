@@ -41,6 +41,8 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda, pseudo_inverse
 
+pytestmark = pytest.mark.simulation
+
 
 @pytest.fixture(autouse=True)
 def _no_shape_checks() -> Iterator[None]:

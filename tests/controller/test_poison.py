@@ -28,6 +28,8 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 
+pytestmark = pytest.mark.simulation
+
 POISONS = {"nan": torch.nan, "inf": torch.inf, "-inf": -torch.inf}
 DT = 0.02
 ESTIMATORS = [CompositeEstimator, KalmanEstimator]

@@ -25,6 +25,8 @@ from hrc_learn.controller import (
 from hrc_learn.deploy import EagerRunner, PackageRunner, StepRunner, open_step
 from hrc_learn.kinematics import FR3_VINTAGES, fr3, panda
 
+pytestmark = pytest.mark.simulation
+
 CONFIGS = {
     "default": SafetyConfig(),
     "no margins": SafetyConfig(margin=0.0, velocity_margin=0.0, rate=100.0),

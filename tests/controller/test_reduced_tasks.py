@@ -16,6 +16,8 @@ from hrc_learn.kinematics import Arm, arm, panda, solve_inverse, task_basis, tas
 from hrc_learn.sim.cameras import PinholeCamera
 from hrc_learn.skills.placing import follow_pose
 
+pytestmark = pytest.mark.simulation
+
 TASKS = ("position+axis", "position")
 
 # Of the kind of the SO-101: base, three hinges in a plane, and a roll about the tool's axis.

@@ -10,6 +10,8 @@ from unchecked import shapes_unchecked
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SeparationConfig
 from hrc_learn.kinematics import null_space_projector, panda
 
+pytestmark = pytest.mark.simulation
+
 READY = panda.ready
 ACROSS = torch.tensor([1.4, 0.9, 0.3, 0.8, 0.3, -0.4, 0.8], dtype=torch.float64)
 """Joint velocity that moves the tool at more than half a metre a second."""

@@ -14,6 +14,8 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.skills import ComplementaryMotion, joint_line
 
+pytestmark = pytest.mark.simulation
+
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
 

@@ -22,6 +22,8 @@ from hrc_learn.skills.servo_target import (
     vision_scale,
 )
 
+pytestmark = pytest.mark.simulation
+
 CONFIG = DrawnGoalsConfig()
 DT = 0.02
 ELSEWHERE = DrawnRegion(centre=(0.40, 0.20, 0.40), half_size=(0.06, 0.08, 0.05))

@@ -46,6 +46,8 @@ from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
 
+pytestmark = pytest.mark.simulation
+
 WORKPLACE = Workplace()
 
 

@@ -15,6 +15,8 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.skills import TaskFailedError, WorkCellConfig, joint_line
 
+pytestmark = pytest.mark.simulation
+
 PUSH = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
 
 

@@ -28,6 +28,8 @@ from hrc_learn.teleoperation.scripted_demonstrations import (
     demonstrate_placing_without_contact,
 )
 
+pytestmark = pytest.mark.simulation
+
 WORKPLACE = Workplace()
 HOME = WORKPLACE.home_joints()
 

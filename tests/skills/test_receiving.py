@@ -15,6 +15,8 @@ from hrc_learn.sim import ObjectConfig
 from hrc_learn.skills.receiving import MovementWatch, Receiving, ReceivingConfig
 from hrc_learn.skills.work_cell import MissedGraspError
 
+pytestmark = pytest.mark.simulation
+
 PARTS = ("pelvis", "hand_right")
 RATE, REST = 30.0, np.array([0.2, 0.8, 0.1])
 BESIDE = np.array([0.0, 0.15, 0.1])

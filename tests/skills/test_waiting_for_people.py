@@ -19,6 +19,8 @@ from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_li
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.teleoperation import ScriptedPerturbation
 
+pytestmark = pytest.mark.simulation
+
 ARM = whole_arm(Workplace().scene.arm)
 SEPARATION = SeparationConfig(reaction_time=0.03, clearance=0.08)
 START = Workplace().hover_joints()

@@ -23,6 +23,8 @@ from hrc_learn.teleoperation.hand_guiding import (
     capped,
 )
 
+pytestmark = pytest.mark.simulation
+
 
 class IdealArm:
     def __init__(self):

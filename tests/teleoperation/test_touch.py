@@ -18,6 +18,8 @@ from hrc_learn.skills import StoppedByPersonError, WorkCell, WorkCellConfig, joi
 from hrc_learn.teleoperation import CombinedInput, Touch, TouchConfig
 from hrc_learn.teleoperation.touch import TorqueBias, evidence_of_none, explain
 
+pytestmark = pytest.mark.simulation
+
 WORKPLACE = Workplace()
 NOMINAL = Imperfections.nominal()
 
