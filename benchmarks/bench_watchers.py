@@ -1,10 +1,10 @@
-"""The page while many watch and one drags: delay of the leader's efforts, memory, liveness.
+"""The page with many watchers while one drags: delay of efforts, memory, survival.
 
 `hrc page` runs in a process of its own. Each watcher opens what a browser opens: a session that
 wants the scene, and a view. The leader drags a link 60 times a second; the delay is the time
 until the status names the motion that was sent.
 
-python benchmarks/bench_watchers.py --minutes 10 --watchers 24
+python benchmarks/bench_watchers.py --minutes 60 --watchers 24 --figures minutes.jsonl
 """
 
 import asyncio
@@ -33,7 +33,7 @@ from hostile_clients import (  # pyright: ignore[reportMissingImports]
 from hrc_learn import cli
 from hrc_learn.teleoperation.gate import Address
 
-_REPORT_EVERY = 30.0  # [s]
+_REPORT_EVERY = 60.0  # [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +42,8 @@ class Args:
     """Length of the measurement."""
     watchers: int = 24
     """Number of clients that watch."""
+    figures: Path | None = None
+    """File for the values of every minute, one JSON object a line, written as they come."""
     json: Path | None = None
     """File for the measured values, one flat JSON object of numbers."""
 
@@ -66,28 +68,51 @@ def main(args: Args) -> int:
             program.wait()
         if args.json is not None:
             cli.write_json(args.json, {**figures, "alive": int(alive)})
+        print(json.dumps(figures))
         print("alive to the end" if alive else f"the page has ended:\n{log.read_text('utf-8')}")
-    return 0 if alive else 1
+    return 0 if alive and figures["led"] and figures["watchers"] == args.watchers else 1
 
 
 async def _measure(page, pid: int, args: Args) -> dict[str, float]:
-    stop, delays, figures = asyncio.Event(), [], {}
+    stop, delays, everything = asyncio.Event(), [], []
+    figures: dict[str, float] = {"watchers": 0}
     leading = asyncio.create_task(_lead(page, stop, delays))
     await asyncio.sleep(1.0)
     watching = [asyncio.create_task(_watch(page, stop)) for _ in range(args.watchers)]
-    for k in range(math.ceil(60 * args.minutes / _REPORT_EVERY)):
+    await asyncio.sleep(1.0)
+    began, end = time.monotonic(), time.monotonic() + 60 * args.minutes
+    memory = [_memory(pid)]
+    while not leading.done() and (left := end - time.monotonic()) > 0:
         delays.clear()
-        await asyncio.sleep(_REPORT_EVERY)
-        median, p95 = 1e3 * np.percentile(delays or [math.inf], [50, 95])
-        figures = {"effort_p50_ms": median, "effort_p95_ms": p95, "memory_mb": _memory(pid)}
-        print(
-            f"{(k + 1) * _REPORT_EVERY:5.0f} s: effort p50 {median:.0f} ms, p95 {p95:.0f} ms, "
-            f"memory {_memory(pid):.0f} MB, {sum(not one.done() for one in watching)} watch",
-            flush=True,
-        )
+        await asyncio.wait([leading], timeout=min(left, _REPORT_EVERY))
+        everything += delays
+        memory.append(_memory(pid))
+        figures = {
+            "seconds": round(time.monotonic() - began, 1),
+            **_percentiles(delays),
+            "memory_mb": memory[-1],
+            "watchers": sum(not one.done() for one in watching),
+        }
+        print(json.dumps(figures), flush=True)
+        if args.figures is not None:
+            with args.figures.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(figures) + "\n")
+    led = not leading.done()
     stop.set()
     await asyncio.gather(leading, *watching, return_exceptions=True)
-    return figures
+    return {
+        **figures,
+        **_percentiles(everything),
+        "efforts": len(everything),
+        "led": int(led),
+        "memory_begin_mb": memory[0],
+        "memory_max_mb": max(memory),
+    }
+
+
+def _percentiles(delays: list[float]) -> dict[str, float]:
+    median, p95 = 1e3 * np.percentile(delays or [math.inf], [50, 95])
+    return {"effort_p50_ms": round(median, 1), "effort_p95_ms": round(p95, 1)}
 
 
 async def _watch(page, stop: asyncio.Event) -> None:
