@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller import (
+    INITIAL_IMAGE_JACOBIAN,
     AdaptiveController,
     Command,
     ControllerState,
@@ -23,6 +24,13 @@ from hrc_learn.controller import (
     Observation,
 )
 from hrc_learn.geometry import Pose
+from hrc_learn.jacobian import RBFImageJacobian, paper_grid
+
+
+def guessed_network() -> RBFImageJacobian:
+    """The paper's initial image Jacobian, equal everywhere."""
+    guess = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
+    return RBFImageJacobian.from_jacobian(guess, paper_grid(), 0.1)
 
 
 @runtime_checkable

@@ -11,7 +11,12 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
+from closed_loop import (
+    Imperfections,
+    VirtualCamera,
+    guessed_network,
+    simulate_closed_loop,
+)
 from grasp_trials import MARKER
 from jaxtyping import Bool, Float, Int
 from limit_monitor import LimitMonitor
@@ -29,7 +34,6 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.cameras import PinholeCamera
-from hrc_learn.skills.visual_skill import guessed_network
 
 ELBOW = 4
 """Joint that is pushed."""

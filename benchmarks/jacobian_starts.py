@@ -10,7 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
+from closed_loop import (
+    Imperfections,
+    VirtualCamera,
+    guessed_network,
+    simulate_closed_loop,
+)
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -27,7 +32,7 @@ from hrc_learn.jacobian import (
 from hrc_learn.kinematics import Arm, gripper_down
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.visual_skill import VisualServoSkill, guessed_network
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.vision import CameraModel
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 

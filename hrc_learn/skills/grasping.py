@@ -8,7 +8,6 @@ starts again from home.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -17,14 +16,13 @@ from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import ImageJacobianEstimator
 from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig, no_perspective
+from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
-from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
+from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill, from_learned
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
     MissedGraspError,
@@ -59,18 +57,6 @@ _POSTURES = 9
 _AT_HOME = 0.05
 # Uncertainty of the table height before and after it was touched [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
-
-type TargetLaw = Callable[
-    [
-        Float[np.ndarray, "2"],
-        Float[np.ndarray, "2 6"],
-        Float[Tensor, "4"],
-        Float[np.ndarray, "3"],
-    ],
-    Float[np.ndarray, "2"],
-]
-"""Target of the end effector's marker [px], from the pixel of the object's marker, the image
-Jacobian, the end effector's orientation, and its offset from right above the object [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,9 +123,6 @@ class Grasping:
         workplace: Workplace,
         skill: VisualServoSkill,
         config: GraspingConfig | None = None,
-        *,
-        estimator: ImageJacobianEstimator | None = None,
-        target: TargetLaw | None = None,
         check: Callable[[Plan], None] = lambda plan: None,
     ):
         """Prepare grasping.
@@ -151,23 +134,24 @@ class Grasping:
                 one.
             skill: Learned image Jacobian and visual target.
             config: Settings of grasping.
-            estimator: Estimator of the image Jacobian; None: a Kalman filter that starts from
-                the learned one, and tolerates a camera that was moved since.
-            target: Target of the end effector's marker; None: the learned one.
             check: Function that raises if a plan must not be executed.
+
+        Raises:
+            ValueError: The skill has no visual target.
         """
         self._cell = cell
         self._workplace = workplace
-        self._target = target or skill.target_of
-        learned = skill.target
-        self._lines = (lambda _: UP) if learned is None else learned.line
-        self._depth_gradient = no_perspective if learned is None else learned.depth_gradient
+        if skill.target is None:
+            raise ValueError(
+                f"the skill has no visual target: its demonstrations lack {OBJECT_FEATURE}."
+            )
+        self._visual = skill.target
         self._config = config = config or GraspingConfig()
         self._check = check
         self._table = _TableHeight()
         controller = AdaptiveController(
             cell.chain,
-            estimator or from_learned(skill.jacobian),
+            from_learned(skill.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=replace(config.controller, safety=cell.watchful(config.controller.safety)),
         )
@@ -230,9 +214,8 @@ class Grasping:
             above=self._workplace.hover(),
             posture=posture if self._config.approach else None,
             rest=posture if self._cell.config.after_push == "return" else None,
-            target=partial(self._target, pixel),
-            lines=self._lines,
-            depth_gradient=self._depth_gradient,
+            visual=self._visual,
+            item=pixel,
             angle=angle,
             turn_range=self._workplace.hover_turns,
         )

@@ -19,6 +19,7 @@ from hrc_learn.controller import Goals
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.protocols import DrawnRegion, HumanInput
 from hrc_learn.regions import OrientationRegion, PositionRegion
+from hrc_learn.skills.visual_skill import VisualTarget
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 
@@ -376,16 +377,9 @@ class VisualServoConfig:
         )
 
 
-def no_perspective(
-    jacobian: Float[np.ndarray, "2 6"], pixel: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "3"]:
-    """Depth gradient of a camera without perspective, zero [1/m]."""
-    return np.zeros(3)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ServoTarget:
-    """Pose to servo to, and the functions that locate it in the image."""
+    """Pose to servo to, and its place in the image."""
 
     config: VisualServoConfig
     above: Pose
@@ -393,20 +387,10 @@ class ServoTarget:
     posture: Float[Tensor, " joints"] | None
     """Joint positions there, approached in joint space [rad]; None: approached by the
     Cartesian regions."""
-    target: Callable[
-        [Float[np.ndarray, "2 6"], Float[Tensor, "4"], Float[np.ndarray, "3"]],
-        Float[np.ndarray, "2"],
-    ]
-    """Target of the end effector's marker [px], from the image Jacobian there, the orientation
-    of the end effector, and its offset from right above the object [m]."""
-    lines: Callable[[Float[Tensor, "4"]], Float[np.ndarray, "3"]]
-    """Direction from the object's marker to the end effector's, base frame, upwards, from the
-    orientation of the end effector."""
-    depth_gradient: Callable[
-        [Float[np.ndarray, "2 6"], Float[np.ndarray, "2"]], Float[np.ndarray, "3"]
-    ] = no_perspective
-    """Relative change of the marker's depth with its position [1/m], from image Jacobian and
-    pixel."""
+    visual: VisualTarget
+    """Offset from the object's marker to the end effector's."""
+    item: Float[np.ndarray, "2"]
+    """Pixel of the object's marker [px]."""
     angle: float | None = None
     """Direction of the object's marker in the image [rad]; None: the gripper does not turn."""
     turn_range: tuple[float, float] = (0.0, 0.0)
@@ -417,6 +401,9 @@ class ServoTarget:
     """Posture to which the null space returns [rad]; None: it stays where it is."""
     raised: float = 0.0
     """Present height above the box, along the line [m]."""
+    kept_jacobian: Float[np.ndarray, "2 6"] | None = None
+    """Image Jacobian of a target that stays where it is while an estimate learns; None: it
+    follows the estimate."""
 
     def goals(
         self, image_jacobian: Float[np.ndarray, "2 6"], pose: Pose, *, detected: bool = True
@@ -442,7 +429,11 @@ class ServoTarget:
         self, image_jacobian: Float[np.ndarray, "2 6"], height: float
     ) -> Float[np.ndarray, "2"]:
         """Target pixel of the marker with the end effector on the line at a height [m]."""
-        return self.target(image_jacobian, self.tool_orientation, self._offset(height))
+        if self.kept_jacobian is not None:
+            return self.visual(self.item, self.kept_jacobian, self.tool_orientation)
+        return self.visual(
+            self.item, image_jacobian, self.tool_orientation, self._offset(height)
+        )
 
     def deviation(self, pose: Pose, before: Pose) -> float:
         """Sideways distance of a pose from the line through an earlier one [m]."""
@@ -456,5 +447,5 @@ class ServoTarget:
 
     def _offset(self, height: float) -> Float[np.ndarray, "3"]:
         """Offset along the line at a height above its start [m]."""
-        line = self.lines(self.tool_orientation)
+        line = self.visual.line(self.tool_orientation)
         return height / line[2] * line

@@ -214,7 +214,7 @@ class ServoStep:
     ) -> ServoState:
         """State that has learned the appearance of the line from both ends of a descent."""
         descent = (high.pose.position - low.pose.position).numpy()
-        gradient = target.depth_gradient(state.image_jacobian, low.feature.numpy())
+        gradient = target.visual.depth_gradient(state.image_jacobian, low.feature.numpy())
         # Distance of both ends in an image without perspective.
         apart = (1 + float(gradient @ descent)) * (high.feature - low.feature)
         high = replace(high, feature=low.feature + apart)
@@ -475,13 +475,7 @@ class VisualServo:
         end = self._cell.time + duration
         # Learning during the hold must not move the target; a turn by the person must.
         self._read()
-        jacobian = self.state.image_jacobian
-        held = replace(
-            target,
-            target=lambda _, orientation, offset: target.target(
-                jacobian, orientation, np.zeros(3)
-            ),
-        )
+        held = replace(target, kept_jacobian=self.state.image_jacobian)
         self.state = replace(
             self.state,
             wanted_orientation=self.state.goal_orientation,

@@ -22,7 +22,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller import INITIAL_IMAGE_JACOBIAN
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CellErrors,
@@ -31,7 +30,6 @@ from hrc_learn.jacobian import (
     KalmanEstimator,
     RBFImageJacobian,
     depth_gradient,
-    paper_grid,
 )
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.marker_sensor import MarkerAngle
@@ -115,7 +113,7 @@ class VisualTarget:
             # apart = J o / (1 - g o) is also linear in the offset o.
             rows = rows + apart[..., :, None] * _gradient(rows, tools, focal)[..., None, :]
         design = rows @ quaternion.to_matrix(orientations).numpy()
-        offset, error = _solved(design.reshape(-1, 3), apart, LONGEST_OFFSET)
+        offset, error = _solved(design.reshape(-1, 3), apart)
         return cls(offset=offset, error=error, focal=focal)
 
     def __call__(
@@ -161,12 +159,12 @@ class VisualTarget:
     def line(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
         """Direction from the object's marker to the end effector's above it, base frame.
 
-        Straight up for an offset flatter than 30 degrees, which a few demonstrations do not
-        distinguish from noise.
+        Straight up for no offset, and for one flatter than 30 degrees, which a few
+        demonstrations do not distinguish from noise.
         """
         offset = self._in_base(orientation)
         length = np.linalg.norm(offset)
-        return UP if offset[2] < 0.5 * length else offset / length
+        return UP if offset[2] <= 0.5 * length else offset / length
 
     def _in_base(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
         return quaternion.rotate(orientation, torch.from_numpy(self.offset)).numpy()
@@ -200,16 +198,30 @@ def _gradient(
 
 
 def _solved(
-    design: Float[np.ndarray, "equations unknowns"],
-    pixels: Float[np.ndarray, "demos 2"],
-    longest: float = np.inf,
+    design: Float[np.ndarray, "equations unknowns"], pixels: Float[np.ndarray, "demos 2"]
 ) -> tuple[Float[np.ndarray, " unknowns"], float]:
     """Least-squares solution for pixels, two equations a demonstration, and leave-one-out
     error.
 
-    A solution longer than `longest` is shortened by the smallest sufficient ridge penalty.
+    A solution longer than `LONGEST_OFFSET` is shortened by the smallest sufficient ridge
+    penalty.
     """
-    inverse = _ridge_inverse(design, pixels.ravel(), longest)
+    u, s, vt = np.linalg.svd(design, full_matrices=False)
+    # The factor keeps the divisions below finite for rank-deficient designs.
+    s = np.maximum(s, 1e-12 * s[0])
+    along = u.T @ pixels.ravel()
+
+    def too_long(penalty: float) -> bool:
+        return float(np.linalg.norm(s * along / (s**2 + penalty))) > LONGEST_OFFSET
+
+    low, high = 0.0, 0.0
+    if too_long(0.0):
+        high = float(s[0] * np.linalg.norm(along)) / LONGEST_OFFSET
+        # Bisection: the length falls with the penalty.
+        while high - low > 1e-6 * high:
+            middle = (low + high) / 2
+            low, high = (middle, high) if too_long(middle) else (low, middle)
+    inverse = (vt.T * (s / (s**2 + high))) @ u.T
     solution = inverse @ pixels.ravel()
     if len(pixels) < 5:
         return solution, float("nan")
@@ -219,30 +231,6 @@ def _solved(
     own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
     press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
     return solution, float(np.sqrt((press**2).sum(axis=(1, 2)).mean()))
-
-
-def _ridge_inverse(
-    design: Float[np.ndarray, "equations unknowns"],
-    values: Float[np.ndarray, " equations"],
-    longest: float,
-) -> Float[np.ndarray, "unknowns equations"]:
-    """Pseudo-inverse, damped just enough to keep the solution within a length."""
-    u, s, vt = np.linalg.svd(design, full_matrices=False)
-    # The factor keeps the divisions below finite for rank-deficient designs.
-    s = np.maximum(s, 1e-12 * s[0])
-    along = u.T @ values
-
-    def length(penalty: float) -> float:
-        return float(np.linalg.norm(s * along / (s**2 + penalty)))
-
-    low, high = 0.0, 0.0
-    if length(0.0) > longest:
-        high = float(s[0] * np.linalg.norm(along)) / longest
-        # Bisection: the length falls with the penalty.
-        while high - low > 1e-6 * high:
-            middle = (low + high) / 2
-            low, high = (middle, high) if length(middle) > longest else (low, middle)
-    return (vt.T * (s / (s**2 + high))) @ u.T
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,24 +275,6 @@ class VisualServoSkill:
             approach=Approach.load(approach) if approach.exists() else None,
             angle=MarkerAngle.load(folder) if (folder / "angle").exists() else None,
         )
-
-    def target_of(
-        self,
-        pixel: Float[np.ndarray, "2"],
-        jacobian: Float[np.ndarray, "2 6"],
-        orientation: Float[Tensor, "4"],
-        further: Float[np.ndarray, "3"] | None = None,
-    ) -> Float[np.ndarray, "2"]:
-        """Target pixel of the end effector's marker; arguments as for `VisualTarget`.
-
-        Raises:
-            ValueError: The demonstrations show no object.
-        """
-        if self.target is None:
-            raise ValueError(
-                f"the skill has no visual target: its demonstrations lack {OBJECT_FEATURE}."
-            )
-        return self.target(pixel, jacobian, orientation, further)
 
     def metrics(self) -> dict[str, float]:
         """Prediction errors of image motion and visual targets, by name.
@@ -356,9 +326,3 @@ def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
         pose_noise=POSE_NOISE, pixel_noise=PIXEL_NOISE, watched_drift=10.0, max_step=0.1
     )
     return KalmanEstimator(network, config)
-
-
-def guessed_network() -> RBFImageJacobian:
-    """The paper's initial image Jacobian, equal everywhere."""
-    guess = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
-    return RBFImageJacobian.from_jacobian(guess, paper_grid(), 0.1)

@@ -298,12 +298,14 @@ def test_a_hand_that_comes_down_along_the_line_stays_on_it():
     line = np.array([0.3, -0.2, 1.0])
     line /= np.linalg.norm(line)
     hover = WORKPLACE.hover()
+    back = quaternion.conjugate(hover.orientation)
+    offset = quaternion.rotate(back, torch.from_numpy(line)).numpy()
     target = ServoTarget(
         config=VisualServoConfig(),
         above=hover,
         posture=None,
-        target=lambda J, orientation, further: J,
-        lines=lambda orientation: line,
+        visual=VisualTarget(offset=offset, error=math.nan),
+        item=np.zeros(2),
     )
 
     def hand(along, aside=(0.0, 0.0, 0.0)):

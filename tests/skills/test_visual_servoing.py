@@ -16,13 +16,14 @@ from hrc_learn.protocols import HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MarkerObservation, ServoTarget, VisualServo, VisualServoConfig
 from hrc_learn.skills.visual_servoing import ServoReading, ServoStep
+from hrc_learn.skills.visual_skill import VisualTarget
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CONFIG = VisualServoConfig()
 ABOVE = Workplace().hover()
 MARKER = 3
 MIDDLE = np.array([700.0, 500.0])
-UP = np.array([0.0, 0.0, 1.0])
+NO_OFFSET = VisualTarget(offset=np.zeros(3), error=np.nan)
 
 
 class Estimator(FixedEstimator):
@@ -71,10 +72,17 @@ def target_above(**changes):
         config=CONFIG,
         above=ABOVE,
         posture=None,
-        target=lambda J, orientation, offset: np.zeros(2),
-        lines=lambda orientation: UP,
+        visual=NO_OFFSET,
+        item=np.zeros(2),
     )
     return replace(target, **changes)
+
+
+def offset_along(orientation, line):
+    """Visual target whose offset is a direction in the base frame, at an orientation."""
+    back = quaternion.conjugate(orientation)
+    offset = quaternion.rotate(back, torch.tensor(line, dtype=torch.float64))
+    return VisualTarget(offset=offset.numpy(), error=np.nan)
 
 
 def about_vertical(angle):
@@ -113,12 +121,11 @@ def test_a_probe_starts_no_higher_than_the_marker_stays_in_the_image(law, top, f
     """The marker leaves the image of this camera at a fraction of the probe's height."""
     edge = IMAGE_SIZE[1] - 1 - CONFIG.border
     rise = 200.0 / (top * CONFIG.probe)  # pixels a metre
-    target = target_above(
-        target=lambda J, orientation, offset: np.array(
-            [700.0, edge - 200.0 + rise * offset[2] * (1 - 1e-9)]
-        )
-    )
-    height = law.probe_height(law.initial_state(panda.ready), target)
+    jacobian = np.zeros((2, 6))
+    jacobian[1, 2] = rise * (1 - 1e-9)
+    target = target_above(item=np.array([700.0, edge - 200.0]))
+    state = replace(law.initial_state(panda.ready), image_jacobian=jacobian)
+    height = law.probe_height(state, target)
     assert height == pytest.approx(fraction * CONFIG.probe)
 
 
@@ -133,10 +140,10 @@ def test_the_end_effector_is_raised_only_after_its_marker_was_detected(detected,
 
 def pinhole(height):
     """Image Jacobian and pixel of a point below a camera of 1000 px that looks down."""
-    xi = np.array([0.2, -0.1]) / height
+    xi = np.array([0.2, 0.1]) / height
     jacobian = np.zeros((2, 6))
-    jacobian[:, :3] = 1000 / height * np.column_stack([np.eye(2), xi])
-    return jacobian, 1000 * xi
+    jacobian[:, :3] = 1000 / height * np.column_stack([np.diag([1.0, -1.0]), xi])
+    return jacobian, 1000 * xi + np.array(IMAGE_SIZE) / 2
 
 
 def test_a_descent_teaches_the_image_jacobian_at_its_lower_end(law):
@@ -155,7 +162,7 @@ def test_a_descent_teaches_the_image_jacobian_at_its_lower_end(law):
             xi_r=none,
         )
 
-    target = target_above(depth_gradient=lambda J, x: np.array([0.0, 0.0, -1 / low]))
+    target = target_above(visual=replace(NO_OFFSET, focal=1000.0))
     state = replace(law.initial_state(panda.ready), image_jacobian=jacobian)
     law.learned(state, target, at(high), at(low))
     ((above, below),) = law.controller.estimator.pairs
@@ -168,12 +175,10 @@ def test_a_descent_teaches_the_image_jacobian_at_its_lower_end(law):
 @pytest.mark.parametrize("height", [-0.004, 0.0, 0.002, 0.013])
 def test_within_the_box_the_target_is_straight_below(height):
     """Above the box it is on the line, which leans."""
-    line = np.array([0.6, 0.0, 0.8])
-    target = target_above(
-        target=lambda J, orientation, offset: J[:, :3] @ offset, lines=lambda orientation: line
-    )
     jacobian = np.zeros((2, 6))
     jacobian[:, :2] = 1000.0 * np.eye(2)
+    leaning = offset_along(ABOVE.orientation, [0.6, 0.0, 0.8])
+    target = target_above(visual=leaning, item=np.array([-600.0, 0.0]))
     up = torch.tensor([0.0, 0.0, height], dtype=torch.float64)
     pixel = target.pixel(jacobian, Pose(ABOVE.position + up, ABOVE.orientation))
     aside = 0.75 * max(height - CONFIG.half_size[2], 0.0)
@@ -357,12 +362,10 @@ def test_a_descent_is_repeated_until_it_teaches_nothing_new(astray, moves, probe
     """The line of a turned tool leads elsewhere; only deviations from that line count."""
     wanted = about_vertical(1.2)
 
-    def line(orientation):
-        """Leans by 45 degrees to the side on which the tool carries its marker."""
-        side = quaternion.to_matrix(orientation)[:, 1].numpy()
-        return np.add(side, [0.0, 0.0, 1.0]) / np.sqrt(2)
-
-    along = torch.from_numpy(line(wanted) / line(wanted)[2])
+    # Leans by 45 degrees to the side on which the tool carries its marker.
+    side = quaternion.to_matrix(wanted)[:, 1].numpy()
+    visual = offset_along(wanted, side + np.array([0.0, 0.0, 1.0]))
+    along = torch.from_numpy(visual.line(wanted) / visual.line(wanted)[2])
 
     def arrive(target, learned):
         """On the line above; below it astray, and moved by what has been learned so far."""
@@ -376,5 +379,5 @@ def test_a_descent_is_repeated_until_it_teaches_nothing_new(astray, moves, probe
     turn = lambda target: replace(target, orientation=wanted)  # noqa: E731
     step = IdealStep(cell, arrive, turn)
     with shapes_unchecked():
-        VisualServo(cell, step).servo_to(target_above(lines=line))
+        VisualServo(cell, step).servo_to(target_above(visual=visual))
     assert step.descents == probes

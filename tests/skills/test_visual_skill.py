@@ -6,13 +6,13 @@ import pytest
 import torch
 
 from hrc_learn.geometry import quaternion
+from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.jacobian.fitting import ImageJacobianFitReport
 from hrc_learn.kinematics import gripper_down
 from hrc_learn.skills.visual_skill import (
     LONGEST_OFFSET,
     VisualServoSkill,
     VisualTarget,
-    guessed_network,
 )
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
@@ -166,12 +166,16 @@ def test_other_files_are_refused(tmp_path, content):
         VisualTarget.load(path)
 
 
+def network():
+    return RBFImageJacobian.from_jacobian(torch.zeros(2, 6), paper_grid(), 0.1)
+
+
 def test_a_skill_knows_its_metrics_only_where_it_was_fitted(tmp_path):
-    VisualServoSkill(jacobian=guessed_network(), target=None).save(tmp_path)
+    VisualServoSkill(jacobian=network(), target=None).save(tmp_path)
     loaded = VisualServoSkill.load(tmp_path)
     with pytest.raises(ValueError, match="a loaded skill has no metrics"):
         loaded.metrics()
-    fitted = guessed_network()
+    fitted = network()
     fitted.report = ImageJacobianFitReport(
         pairs=9, motion=20.0, error=1.0, held_out_error=2.0, noise=1.0
     )
