@@ -218,7 +218,7 @@ class ComplementaryMotion:
             q = q + self._loop.config.dt * velocity
             reading = self._reading(q, push, explain=reading.explain)
             state, limitations = self._loop.observe(state, reading)
-            self._feedback.note(report)
+            self._feedback.note_step(report)
             self._feedback.note_limitations(limitations)
         queue = deque(self._wishes), self._progress
         self._go_on(float(state.path.progress) / self._steps)
@@ -281,7 +281,7 @@ class ComplementaryMotion:
         distance = 100 * now
         near = then < min(now, self._loop.config.clearance) - _ROUNDING
         if near:
-            self._feedback.hindrances.note("obstacle", 0.0, distance=distance)
+            self._feedback.note("obstacle", 0.0, distance=distance)
         return near
 
     def _stopped(self, state: ArmLoopState) -> ArmLoopState:

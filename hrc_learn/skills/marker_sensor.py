@@ -7,6 +7,7 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -94,34 +95,6 @@ class LatencyConfig:
             )
 
 
-class DelayedChannel:
-    """Channel that delivers observations late, in their order, and loses some."""
-
-    def __init__(self, config: LatencyConfig, rng: np.random.Generator):
-        """Start with an empty channel.
-
-        Args:
-            config: Delay and loss.
-            rng: Random generator of the losses.
-        """
-        self._config, self._rng = config, rng
-        self._pending: deque[MarkerObservation] = deque()
-
-    def send(self, observation: MarkerObservation) -> None:
-        """Put an observation into the channel."""
-        if self._rng.random() >= self._config.frame_loss:
-            self._pending.append(observation)
-
-    def newest(self, time: float) -> MarkerObservation | None:
-        """Newest observation that has arrived by a time [s] since the last call; None: none."""
-        arrived = None
-        # Clocks sum rounded steps, so a nanosecond early counts as in time.
-        taken_by = time - self._config.delay + 1e-9
-        while self._pending and self._pending[0].time <= taken_by:
-            arrived = self._pending.popleft()
-        return arrived
-
-
 # Images closer than this are one image whose age was read from another clock; and memory of
 # joint positions, longer than any camera's delay [s].
 _SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
@@ -145,7 +118,8 @@ class DelayedDetection:
             dt: Control step [s].
             rng: Random generator of the losses.
         """
-        self._sensor, self._channel = sensor, DelayedChannel(latency, rng)
+        self._sensor, self._latency, self._rng = sensor, latency, rng
+        self._pending: deque[MarkerObservation] = deque()
         self._taken = -np.inf  # the newest image [s]
         self._joints: deque[tuple[float, np.ndarray]] = deque(maxlen=round(_REMEMBERED / dt))
 
@@ -172,7 +146,9 @@ class DelayedDetection:
         # A camera that is slower than the detection returns the same image again.
         if abs(taken - self._taken) > _SAME_IMAGE:
             self._taken = taken
-        self._channel.send(
+        if self._rng.random() < self._latency.frame_loss:
+            return
+        self._pending.append(
             MarkerObservation(
                 time=self._taken,
                 joints=self._joints_at(self._taken, time, joints),
@@ -183,7 +159,12 @@ class DelayedDetection:
 
     def newest(self, time: float) -> MarkerObservation | None:
         """Newest observation that has arrived by a time [s] since the last call; None: none."""
-        return self._channel.newest(time)
+        arrived = None
+        # Clocks sum rounded steps, so a nanosecond early counts as in time.
+        taken_by = time - self._latency.delay + 1e-9
+        while self._pending and self._pending[0].time <= taken_by:
+            arrived = self._pending.popleft()
+        return arrived
 
     def _joints_at(
         self, time: float, now: float, joints: Float[Tensor, " joints"]
@@ -321,9 +302,22 @@ class _AngleFile:
     spread_rad: Radians
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AngleState:
+    """State of an alignment with an object."""
+
+    estimator: KalmanState
+    """State of the estimator of the image Jacobian."""
+    chosen: float | None = None
+    """Chosen turn of the present motion [rad]; None: none so far."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class MarkerAngle:
-    """Image Jacobian of the marker's direction, and its demonstrated difference."""
+    """Image Jacobian of the marker's direction, and its demonstrated difference.
+
+    `turned` turns the tool about the vertical until its marker is aligned with the object's.
+    """
 
     jacobian: RBFImageJacobian
     """One row [rad/m, rad/rad], equal everywhere."""
@@ -379,23 +373,9 @@ class MarkerAngle:
             spread=content.spread_rad,
         )
 
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class AngleState:
-    """State of an `AngleServo`."""
-
-    estimator: KalmanState
-    """State of the estimator of the image Jacobian."""
-    chosen: float | None = None
-    """Chosen turn of the present motion [rad]; None: none so far."""
-
-
-class AngleServo:
-    """Turns the tool about the vertical until its marker is aligned with the object's."""
-
-    def __init__(self, learned: MarkerAngle):
-        self._offset = learned.offset
-        self._estimator = _estimator(learned.jacobian)
+    @cached_property
+    def _estimator(self) -> KalmanEstimator:
+        return _estimator(self.jacobian)
 
     def initial_state(self) -> AngleState:
         """State before the first image."""
@@ -444,9 +424,10 @@ class AngleServo:
         # Bounds for a camera that looks down; cameras that look up are not supported.
         rate = math.copysign(min(max(abs(rate), 0.5), 2.0), rate)
         now = turn_about_vertical(pose.orientation, reference)
-        missing = _wrapped(item + self._offset - angle) / rate
+        missing = _wrapped(item + self.offset - angle) / rate
         chosen = _within(now + missing, now, turn_range, state.chosen)
-        return _turned(reference, chosen), replace(state, chosen=chosen)
+        about = quaternion.exp(reference.new_tensor([0.0, 0.0, chosen]))
+        return quaternion.multiply(about, reference), replace(state, chosen=chosen)
 
 
 def _within(
@@ -464,12 +445,6 @@ def _within(
             return same
     inside = [c for c in candidates if low <= c <= high]
     return min(inside or [min(max(turn, low), high)], key=lambda c: abs(c - now))
-
-
-def _turned(orientation: Float[Tensor, "4"], turn: float) -> Float[Tensor, "4"]:
-    """An orientation turned about the vertical [rad]."""
-    about = torch.tensor([0.0, 0.0, turn], dtype=torch.float64)
-    return quaternion.multiply(quaternion.exp(about), orientation)
 
 
 def _wrapped(angle: float) -> float:

@@ -9,12 +9,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller import INTERVENTIONS, Command, SafetyReport, SeparationConfig
+from hrc_learn.controller import INTERVENTIONS, SafetyReport, SeparationConfig
 from hrc_learn.controller.arm_loop_state import ArmReport, Limitation
-from hrc_learn.controller.null_space_motion import fraction_in_null_space, fraction_kept
+from hrc_learn.controller.null_space_motion import fraction_kept
 from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.protocols import HINDRANCES, ArmState, Feedback, Hindrance, Reason
-from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.person_watch import WatchedPeople
 
 # Fraction of a motion above which it counts as followed: late servos and the curvature of the
@@ -56,81 +55,6 @@ _INTERVENTIONS: Mapping[str, Hindrance] = {
 }
 
 
-class Hindrances:
-    """Causes that keep an arm from following a person, collected over one step.
-
-    Each cause leaves a fraction of what the causes before it have left; the product of all
-    fractions is what the arm follows.
-    """
-
-    def __init__(self) -> None:
-        self._kept: dict[Hindrance, float] = {}
-        self._details: dict[Hindrance, dict[str, Detail]] = {}
-        self._followed = 1.0
-
-    def note(self, cause: Hindrance, kept: float, **details: Detail) -> None:
-        """Note a cause.
-
-        Args:
-            cause: Cause of the limitation.
-            kept: Fraction of the motion that it leaves, 0 to 1.
-            details: Values for its text.
-        """
-        self._followed *= kept
-        if kept < _FOLLOWED:
-            self._add(cause, kept, details)
-
-    def mention(self, cause: Hindrance, **details: Detail) -> None:
-        """Note a cause that takes nothing from the motion, or that others account for."""
-        self._add(cause, 1.0, details)
-
-    def note_across(
-        self, requested: Float[Tensor, " joints"], projected: Float[Tensor, " joints"]
-    ) -> None:
-        """Note a push that has hardly a part in the null space.
-
-        Args:
-            requested: Joint velocity that is asked for [rad/s].
-            projected: Its null-space part [rad/s].
-        """
-        self.note("task", float(fraction_in_null_space(requested, projected)))
-
-    def clear(self) -> None:
-        """Forget all causes."""
-        self._kept.clear()
-        self._details.clear()
-        self._followed = 1.0
-
-    @property
-    def followed(self) -> float:
-        """Fraction of the motion that is left."""
-        return self._followed
-
-    @property
-    def any(self) -> bool:
-        """True if there is a cause worth reporting."""
-        return bool(self._kept)
-
-    def reasons(self, **details: Detail) -> tuple[Reason, ...]:
-        """Reasons why less than all is left, the strongest first.
-
-        Args:
-            details: Values for the texts of causes noted without them.
-        """
-        return tuple(
-            Reason(
-                hindrance=cause,
-                kept=kept,
-                text=_TEXTS[cause].format(**(details | self._details[cause])),
-            )
-            for cause, kept in sorted(self._kept.items(), key=lambda item: item[1])
-        )
-
-    def _add(self, cause: Hindrance, kept: float, details: dict[str, Detail]) -> None:
-        self._kept[cause] = self._kept.get(cause, 1.0) * kept
-        self._details[cause] = details
-
-
 def filter_hindrance(report: SafetyReport) -> Hindrance | None:
     """Cause by which a safety filter may have reduced a motion; None: at most a delay."""
     flags = report.flags.tolist()
@@ -163,8 +87,9 @@ def contact_force(
 class PersonFeedback:
     """Feedback of each step to the person who guides an arm.
 
-    Attributes:
-        hindrances: Causes noted in this step.
+    Causes that keep the arm from following the person are collected over one step. Each
+    leaves a fraction of what the causes before it have left; the product of all fractions is
+    what the arm follows.
     """
 
     def __init__(self, chain: SerialChain):
@@ -173,16 +98,34 @@ class PersonFeedback:
         Args:
             chain: Kinematics of the arm.
         """
-        self._chain, self.hindrances = chain, Hindrances()
+        self._chain = chain
         self._lower, self._upper = chain.limits.lower.numpy(), chain.limits.upper.numpy()
         self._force: np.ndarray | None = None
         self._near: tuple[str, ...] = ()
         self._nearest = 1  # joint nearest to its limit, counted from 1
         self._updated, self._load, self._width = -math.inf, None, 0.0
+        self._followed = 1.0
+        self._causes: dict[Hindrance, tuple[float, dict[str, Detail]]] = {}
 
     _load: GraspedBox | None
 
-    def note(self, report: ArmReport, *, filtered: bool = True) -> None:
+    def note(
+        self, cause: Hindrance, kept: float = 1.0, *, mention: bool = False, **details: Detail
+    ) -> None:
+        """Note a cause.
+
+        Args:
+            cause: Cause of the limitation.
+            kept: Fraction of the motion that it leaves, 0 to 1.
+            mention: Report the cause even if it takes nothing from the motion.
+            details: Values for its text.
+        """
+        self._followed *= kept
+        if kept < _FOLLOWED or mention:
+            before, _ = self._causes.get(cause, (1.0, {}))
+            self._causes[cause] = before * kept, details
+
+    def note_step(self, report: ArmReport, *, filtered: bool = True) -> None:
         """Note what the loop of an arm took from a push.
 
         Args:
@@ -194,7 +137,7 @@ class PersonFeedback:
             return
         cause = "person" if report.slowed_by_people else filter_hindrance(report.safety)
         if cause is not None:
-            self.hindrances.note(cause, float(fraction_kept(*report.null_motion)))
+            self.note(cause, float(fraction_kept(*report.null_motion)))
 
     def note_limitations(self, limitations: Iterable[Limitation]) -> None:
         """Note what limits a push."""
@@ -204,9 +147,8 @@ class PersonFeedback:
                 details["joint"] = int(joint) + 1
             if distance is not None:
                 details["distance"] = 100 * float(distance)
-            self.hindrances.note(cause, float(kept), **details)
-            if mentioned is not None and bool(mentioned):
-                self.hindrances.mention(cause, **details)
+            mention = mentioned is not None and bool(mentioned)
+            self.note(cause, float(kept), mention=mention, **details)
 
     def told(
         self,
@@ -239,12 +181,19 @@ class PersonFeedback:
         followed, reasons = 1.0, ()
         if pushed:
             if person_distance is not None and pace < _FOLLOWED:
-                self.hindrances.mention("person")
-            followed = self.hindrances.followed
-            if self.hindrances.any:
-                person = _person_text(person_distance, pace)
-                reasons = self.hindrances.reasons(joint=self._nearest, person=person)
-        self.hindrances.clear()
+                self.note("person", mention=True)
+            known = {"joint": self._nearest, "person": _person_text(person_distance, pace)}
+            strongest_first = sorted(self._causes.items(), key=lambda item: item[1][0])
+            followed, reasons = (
+                self._followed,
+                tuple(
+                    Reason(
+                        hindrance=cause, kept=kept, text=_TEXTS[cause].format(**known | details)
+                    )
+                    for cause, (kept, details) in strongest_first
+                ),
+            )
+        self._followed, self._causes = 1.0, {}
         return Feedback(
             pushed=pushed,
             followed=followed,
@@ -294,16 +243,26 @@ NO_VISION: dict[str, Any] = {
 """Columns of a step without a camera in the loop."""
 
 
-def motion_columns(
-    state: ArmState, velocity: Float[Tensor, " joints"], effort: Float[np.ndarray, " joints"]
+def step_columns(
+    state: ArmState,
+    velocity: Float[Tensor, " joints"],
+    effort: Float[np.ndarray, " joints"],
+    report: ArmReport,
+    feedback: Feedback,
 ) -> dict[str, Any]:
-    """Columns of the arm.
+    """Columns of the arm, of its loop, and of the feedback to the person.
+
+    The components of "hindered" are `HINDRANCES`, those of "safety" `INTERVENTIONS`.
 
     Args:
         state: Reading of the arm.
         velocity: Joint velocity sent to it [rad/s].
         effort: Null-space input [N m].
+        report: Report of the loop.
+        feedback: Feedback to the person.
     """
+    goal, path = report.goal, report.path_joints
+    reasons = {reason.hindrance for reason in feedback.reasons}
     return {
         "time": state.time,
         "joint_position": state.joint_position,
@@ -311,53 +270,11 @@ def motion_columns(
         "command_velocity": velocity.numpy(),
         "nullspace_input": effort,
         "gripper": state.gripper_width,
-    }
-
-
-def report_columns(report: ArmReport, feedback: Feedback, joints: int) -> dict[str, Any]:
-    """Columns of the loop, and of the feedback to the person.
-
-    The components of "hindered" are `HINDRANCES`, those of "safety" `INTERVENTIONS`.
-
-    Args:
-        report: Report of the loop.
-        feedback: Feedback to the person.
-        joints: Number of joints.
-    """
-    goal, path = report.goal, report.path_joints
-    reasons = {reason.hindrance for reason in feedback.reasons}
-    return {
         "followed": feedback.followed if feedback.pushed else math.nan,
         "hindered": np.array([hindrance in reasons for hindrance in HINDRANCES]),
         "safety": report.safety.flags.numpy(),
         "goal_position": np.full(3, math.nan) if goal is None else goal.position.numpy(),
-        "path_joints": np.full(joints, math.nan) if path is None else path.numpy(),
-    }
-
-
-def servo_columns(
-    command: Command,
-    target: Float[np.ndarray, "2"],
-    feature: np.ndarray,
-    approach: float,
-    *,
-    region: PositionRegion,
-    drawn: bool,
-    turn: Float[np.ndarray, "3"] | None,
-) -> dict[str, Any]:
-    """Columns of the adaptive controller; arguments are those of `WorkCell.execute`."""
-    return {
-        "feature": feature,
-        "target": target,
-        "image_jacobian": command.image_jacobian.numpy(),
-        "weight_norm": float(command.weight_norm),
-        "potential": float(command.potential),
-        "potential_rate": float(command.potential_rate),
-        "vision_activation": float(command.vision_level),
-        "approach": approach,
-        "region": torch.cat([region.centre, region.half_size]).numpy(),
-        "drawn": drawn,
-        "turn": np.zeros(3) if turn is None else turn,
+        "path_joints": np.full(len(effort), math.nan) if path is None else path.numpy(),
     }
 
 

@@ -7,7 +7,7 @@ controller; `VisualServo` runs it in a work cell until the marker is at its targ
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -28,7 +28,6 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import Measurement
 from hrc_learn.protocols import HumanInput
 from hrc_learn.skills.marker_sensor import (
-    AngleServo,
     AngleState,
     MarkerAngle,
     MarkerConsistency,
@@ -131,6 +130,23 @@ class ServoCommand(NamedTuple):
     remark: str
     """Message to the person; empty: none."""
 
+    def columns(self, drawn: DrawnGoalsState) -> dict[str, Any]:
+        """Columns of the log."""
+        command, region = self.command, self.goals.position
+        return {
+            "feature": self.feature,
+            "target": self.goals.vision.target.numpy(),
+            "image_jacobian": command.image_jacobian.numpy(),
+            "weight_norm": float(command.weight_norm),
+            "potential": float(command.potential),
+            "potential_rate": float(command.potential_rate),
+            "vision_activation": float(command.vision_level),
+            "approach": self.approach,
+            "region": torch.cat([region.centre, region.half_size]).numpy(),
+            "drawn": bool(drawn.active),
+            "turn": quaternion.log(drawn.turn).numpy(),
+        }
+
 
 class ServoStep:
     """Pure step of visual servoing round the adaptive controller."""
@@ -156,7 +172,7 @@ class ServoStep:
         """
         self.controller, self.chain = controller, controller.chain
         self.marker, self.config = marker, config or VisualServoConfig()
-        self._angle = None if angle is None else AngleServo(angle)
+        self._angle = angle
         self._drawn = DrawnGoals(self.config.drawn, refusal)
 
     def initial_state(self, joints: Float[Tensor, " joints"]) -> ServoState:
@@ -536,17 +552,12 @@ class VisualServo:
         result, self.state = self._law.step(self.state, self._read(), target)
         if result.remark:
             cell.tell(result.remark)
-        drawn = self.state.drawn
+        explained = result.approach == 0
+        columns = result.columns(self.state.drawn)
         cell.execute(
-            result.command,
-            result.goals.vision.target.numpy(),
-            result.feature,
-            result.approach,
-            region=result.goals.position,
-            drawn=bool(drawn.active),
-            turn=quaternion.log(drawn.turn).numpy(),
+            result.command, result.goals.position, explained=explained, columns=columns
         )
-        if drawn.away:
+        if self.state.drawn.away:
             self._override_time += cell.task_time - clock
 
     def _read(self) -> ServoReading:

@@ -15,9 +15,7 @@ from hrc_learn.controller import Command, Distances, SafetyConfig
 from hrc_learn.controller.arm_loop import ArmLoop
 from hrc_learn.controller.arm_loop_state import (
     ArmLoopConfig,
-    ArmLoopState,
     ArmReading,
-    ArmReport,
     ArmRequest,
     FollowPath,
     MoveJoints,
@@ -43,10 +41,8 @@ from hrc_learn.skills.step_report import (
     NO_VISION,
     PersonFeedback,
     contact_force,
-    motion_columns,
-    report_columns,
     separation_columns,
-    servo_columns,
+    step_columns,
 )
 
 # Time for joints to return at the end of a path [s].
@@ -101,17 +97,6 @@ class KeptImage:
     image: UInt8[np.ndarray, "height width 3"]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Sensed:
-    """All that was read at the beginning of a control step."""
-
-    arm: ArmState
-    reading: ArmReading
-    watched: WatchedPeople | None
-    pushing: bool
-    """True while a person asks for a motion of the null space."""
-
-
 class WorkCell:
     """Control loop of a work cell: read, command, let time pass, detect, log.
 
@@ -123,6 +108,8 @@ class WorkCell:
         chain: Kinematics of the arm.
         config: Settings of the loop.
         gripper: Driver of the gripper.
+        state: Newest reading of the arm.
+        loop_state: State of the control loop: safety filter, pace, null space, path.
         human: Person near the arm; may be replaced between two steps.
         human_input: Newest input of that person, its null-space part smoothed.
         observation: Newest detection of markers that has arrived.
@@ -136,6 +123,9 @@ class WorkCell:
     """
 
     load: GraspedBox | None
+    state: ArmState
+    _reading: ArmReading
+    _watched: WatchedPeople | None
 
     def __init__(
         self,
@@ -193,17 +183,12 @@ class WorkCell:
         state = arm.read()
         asked = human.read(state)
         self.human_input = replace(asked, nullspace_input=np.zeros(len(chain.joint_names)))
-        self._sensed = self._sense(state, self.human_input)
-        self._state = self._loop.initial_state(
+        self._sense(state, self.human_input)
+        self.loop_state = self._loop.initial_state(
             self.joints, state.time, torch.from_numpy(state.joint_velocity.copy())
         )
 
     # Readings.
-
-    @property
-    def state(self) -> ArmState:
-        """Newest reading of the arm."""
-        return self._sensed.arm
 
     @property
     def time(self) -> float:
@@ -213,32 +198,27 @@ class WorkCell:
     @property
     def joints(self) -> Float[Tensor, " joints"]:
         """Measured joint positions [rad]."""
-        return self._sensed.reading.joint_position
+        return self._reading.joint_position
 
     @property
     def pose(self) -> Pose:
         """Pose of the end effector, from the measured joints."""
-        return self._sensed.reading.pose
+        return self._reading.pose
 
     @property
     def jacobian(self) -> Float[Tensor, "6 joints"]:
         """Geometric Jacobian of the end effector, at the measured joints."""
-        return self._sensed.reading.jacobian
+        return self._reading.jacobian
 
     @property
     def distances(self) -> Distances | None:
         """Distances from people, for a safety filter to keep; None: people are not tracked."""
-        return self._sensed.reading.distances
-
-    @property
-    def loop_state(self) -> ArmLoopState:
-        """State of the control loop: safety filter, pace of the task, null space, path."""
-        return self._state
+        return self._reading.distances
 
     @property
     def pace(self) -> TaskPace:
         """Speed of the task, as people near the arm and pauses allow."""
-        return self._state.pace
+        return self.loop_state.pace
 
     @property
     def task_time(self) -> float:
@@ -287,34 +267,20 @@ class WorkCell:
     def execute(
         self,
         command: Command,
-        target: Float[np.ndarray, "2"],
-        feature: np.ndarray,
-        approach: float = 0.0,
-        *,
         region: PositionRegion,
-        drawn: bool = False,
-        turn: Float[np.ndarray, "3"] | None = None,
+        *,
+        explained: bool = True,
+        columns: dict[str, Any] = NO_VISION,
     ) -> None:
         """Send a command of the adaptive controller, which has its own safety filter.
 
         Args:
             command: Command of the controller.
-            target: Pixel that the feature should have [px].
-            feature: Pixel that it has; NaN if it is not detected [px].
-            approach: Fraction of a joint-space approach in the command, 0 to 1.
             region: Region of the end effector's position.
-            drawn: True if a person has drawn that region, or a target in it.
-            turn: Rotation that a person has added to the planned orientation, as a rotation
-                vector [rad]; None: none.
+            explained: Tell the person what the safety filter takes from a push.
+            columns: Columns of the controller for the log.
         """
-        self._act(
-            SendCommand(command),
-            explained=approach == 0,
-            region=region,
-            columns=servo_columns(
-                command, target, feature, approach, region=region, drawn=drawn, turn=turn
-            ),
-        )
+        self._act(SendCommand(command), explained=explained, region=region, columns=columns)
 
     def track_pose(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
         """One step of tracking a moving pose; the null space yields to the person.
@@ -379,8 +345,8 @@ class WorkCell:
         line, begun = StraightLine(self.pose, goal, speed), self.task_time
         while (passed := self.task_time - begun) < line.duration:
             self._contact_expected = self.time + _LEAVING
-            if self._state.pushed:
-                self._feedback.hindrances.mention("task_waits")
+            if self.loop_state.pushed:
+                self._feedback.note("task_waits", mention=True)
                 self.track_pose(line.at(passed)[0], _STILL)
                 begun, moving = self.task_time - passed, 0
                 waited += self.config.dt
@@ -391,7 +357,8 @@ class WorkCell:
                     )
                 continue
             self._track_line(line, passed)
-            felt.append(-float(self._contact_force() @ along))
+            force_now = contact_force(self.jacobian, self.state)
+            felt.append(0.0 if force_now is None else -float(force_now @ along))
             before.append(self.pose)
             # An arm that waits for people gets under way again.
             moving = moving + 1 if self.pace.at_full_speed else 0
@@ -445,14 +412,14 @@ class WorkCell:
     ) -> int:
         paths = JointPaths.of(self.chain, [path], self.config.dt)
         request = FollowPath(paths=paths, path=torch.tensor(0))
-        self._state = self._loop.begin_path(self._state, self.joints, request)
-        while not self._state.path.finished:
+        self.loop_state = self._loop.begin_path(self.loop_state, self.joints, request)
+        while not self.loop_state.path.finished:
             if until():
-                return int(self._state.path.progress)
+                return int(self.loop_state.path.progress)
             self._act(request)
         if self.config.after_push == "return":
             deadline = self.time + _LONGEST_RETURN
-            while self._state.aside and not self._state.pushed and self.time < deadline:
+            while self.loop_state.aside and not self.loop_state.pushed and self.time < deadline:
                 self._act(request)
         return len(path)
 
@@ -470,11 +437,6 @@ class WorkCell:
     def _settle(self, goal: Pose, duration: float) -> None:
         for _ in range(round(duration / self.config.dt)):
             self.track_pose(goal, _STILL)
-
-    def _contact_force(self) -> Float[np.ndarray, "3"]:
-        """Estimate of the force on the end effector [N]; zero if the arm has none."""
-        force = contact_force(self.jacobian, self.state)
-        return np.zeros(3) if force is None else force
 
     # One step.
 
@@ -494,13 +456,16 @@ class WorkCell:
             region: Region of the controller's command.
             columns: For the log.
         """
-        reading = self._sensed.reading
-        velocity, self._state, report = self._loop.act(self._state, reading, request)
+        reading = self._reading
+        velocity, self.loop_state, report = self._loop.act(self.loop_state, reading, request)
         self._give_up_if_blocked()
         self.region = region
-        self._feedback.note(report, filtered=explained)
-        told = self._told()
-        self._log(velocity, report, told, columns)
+        self._feedback.note_step(report, filtered=explained)
+        if (watched := self._watched) is not None:
+            separation, scale = self.config.safety.separation, float(self.pace.people_scale)
+            columns = columns | separation_columns(watched, separation, velocity, scale)
+        effort, told = self.human_input.effort(len(self.joints)), self._told()
+        self.log.append(**step_columns(self.state, velocity, effort, report, told), **columns)
         self._arm.command(velocity.numpy())
         self.human.tell(told)
         self._advance(self.config.dt)
@@ -511,11 +476,11 @@ class WorkCell:
         state = self._arm.read()
         self._markers.remember(state.time, state.joint_position)
         asked = self.human.read(state)
-        self._sensed = self._sense(state, asked)
+        self._sense(state, asked)
         before = self.pace.speed_override
-        self._state, limitations = self._loop.observe(self._state, self._sensed.reading)
+        self.loop_state, limitations = self._loop.observe(self.loop_state, self._reading)
         self._feedback.note_limitations(limitations)
-        smooth = self.config.damping * self._state.null_velocity
+        smooth = self.config.damping * self.loop_state.null_velocity
         self.human_input = replace(asked, nullspace_input=smooth.numpy())
         self.observation = self._markers.newest(self.time) or self.observation
         self._take_images()
@@ -525,23 +490,23 @@ class WorkCell:
             self._come_to_rest()
             raise StoppedByPersonError(f"stopped: {asked.stop}")
         self._tell_of_pause(asked.pause, before)
-        if float(self._state.path.held) > self.config.longest_wait:
+        if (held := float(self.loop_state.path.held)) > self.config.longest_wait:
             raise TaskFailedError(
-                f"the arm was held aside for {float(self._state.path.held):.0f} s while its "
+                f"the arm was held aside for {held:.0f} s while its "
                 "path waited: let it go, or raise longest_wait."
             )
 
-    def _sense(self, state: ArmState, asked: HumanInput) -> _Sensed:
-        """Kinematics of a reading, and the people near the arm."""
+    def _sense(self, state: ArmState, asked: HumanInput) -> None:
+        """Take in a reading with its kinematics, and the people near the arm."""
         joints = torch.from_numpy(state.joint_position)
         watched = None
         if self._watch is not None:
             watched = self._watch.look(state.time, joints, self.load)
         push, way = asked.effort(len(joints)), self.config.way_making
-        pushing = bool(push.any()) and (way is None or way.expert)
         pose, jacobian = self.chain.forward_and_jacobian(joints)
         scale = None if watched is None else joints.new_tensor(watched.speed_scale)
-        reading = ArmReading(
+        self.state, self._watched = state, watched
+        self._reading = ArmReading(
             joint_position=joints,
             pose=pose,
             jacobian=jacobian,
@@ -549,9 +514,8 @@ class WorkCell:
             pause=torch.tensor(asked.pause),
             distances=None if watched is None else watched.distances,
             person_speed_scale=scale,
-            explain=pushing,
+            explain=bool(push.any()) and (way is None or way.expert),
         )
-        return _Sensed(arm=state, reading=reading, watched=watched, pushing=pushing)
 
     def _take_images(self) -> None:
         """Detect markers and keep images in the steps meant for it."""
@@ -570,7 +534,7 @@ class WorkCell:
                 f"a person has been in the way of the arm for {blocked_for:.0f} s: clear its "
                 "path, or raise longest_wait."
             )
-        if self._state.path.direct_return.blocked:
+        if self.loop_state.path.direct_return.blocked:
             raise BlockedPathError(
                 "path: the arm was pushed aside and finds no way back that is clear of its "
                 "surroundings."
@@ -580,7 +544,7 @@ class WorkCell:
         """Brake until the arm is at rest, whatever the person asks for meanwhile."""
         self._stopping, deadline = True, self.time + _COMING_TO_REST
         self.step(torch.zeros_like(self.joints))
-        while self._state.safety.velocity.any() and self.time < deadline:
+        while self.loop_state.safety.velocity.any() and self.time < deadline:
             self.step(torch.zeros_like(self.joints))
         self._stopping = False
 
@@ -594,31 +558,13 @@ class WorkCell:
 
     def _told(self) -> Feedback:
         """Feedback to the person in this step."""
-        watched = self._sensed.watched
+        watched = self._watched
         return self._feedback.told(
             self.state,
             self.jacobian,
-            pushed=self._sensed.pushing,
+            pushed=self._reading.explain,
             person_distance=None if watched is None else watched.nearest,
             pace=float(self.pace.scale),
             load=self.load,
             contact_expected=self.time < self._contact_expected,
-        )
-
-    def _log(
-        self,
-        velocity: Float[Tensor, " joints"],
-        report: ArmReport,
-        told: Feedback,
-        columns: dict[str, Any],
-    ) -> None:
-        """Append a row to the log."""
-        watched, n = self._sensed.watched, len(self.joints)
-        if watched is not None:
-            separation, scale = self.config.safety.separation, float(self.pace.people_scale)
-            columns = columns | separation_columns(watched, separation, velocity, scale)
-        self.log.append(
-            **motion_columns(self.state, velocity, self.human_input.effort(n)),
-            **report_columns(report, told, n),
-            **columns,
         )

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
-from hrc_learn.controller.null_space_motion import fraction_kept
+from hrc_learn.controller.null_space_motion import fraction_in_null_space, fraction_kept
 from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import null_projection
@@ -359,12 +359,14 @@ class HandGuidedArm:
         )
         command = velocity.numpy()
         self._arm.command(command)
-        hindrances, pushed = self._feedback.hindrances, bool(human_input.twist.any())
+        pushed = bool(human_input.twist.any())
         if effort.any():
             pushed = True
-            hindrances.note_across(null_velocity, null_projection(J, null_velocity))
+            projected = null_projection(J, null_velocity)
+            in_null_space = float(fraction_in_null_space(null_velocity, projected))
+            self._feedback.note("task", in_null_space)
         if (cause := filter_hindrance(report)) is not None:
-            hindrances.note(cause, float(fraction_kept(desired, velocity)))
+            self._feedback.note(cause, float(fraction_kept(desired, velocity)))
         self._human.tell(self._feedback.told(state, J, pushed=pushed))
         return GuidedStep(state=state, human_input=human_input, pose=pose, command=command)
 

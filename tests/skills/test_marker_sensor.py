@@ -7,10 +7,9 @@ from hrc_learn.kinematics import panda
 from hrc_learn.log import StepLog
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import (
-    DelayedChannel,
+    DelayedDetection,
     LatencyConfig,
     MarkerConsistency,
-    MarkerObservation,
     longest_occlusion,
 )
 
@@ -20,12 +19,12 @@ WORKPLACE = Workplace()
 
 def arrivals(config, images=400, step=0.01, seed=0):
     """Times at which images were taken and at which they arrived [s]."""
-    channel = DelayedChannel(config, np.random.default_rng(seed))
+    detection = DelayedDetection(None, config, step, np.random.default_rng(seed))
     times, every = [], round(PERIOD / step)
     for k in range(images * every):
         if k % every == 0:
-            channel.send(MarkerObservation(time=k * step))
-        arrived = channel.newest(k * step)
+            detection.detect(k * step, panda.ready)
+        arrived = detection.newest(k * step)
         if arrived is not None:
             times.append((arrived.time, k * step))
     return np.array(times)

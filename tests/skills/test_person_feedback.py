@@ -15,7 +15,7 @@ from hrc_learn.protocols import HINDRANCES, ArmState, Human, HumanInput, PersonO
 from hrc_learn.sim import ArmModelConfig, whole_arm
 from hrc_learn.skills import WorkCell
 from hrc_learn.skills.person_watch import PersonWatch
-from hrc_learn.skills.step_report import Hindrances, PersonFeedback
+from hrc_learn.skills.step_report import PersonFeedback
 
 Q = panda.ready
 
@@ -219,25 +219,26 @@ def test_an_object_slips_by_as_much_as_the_gripper_closes_while_it_holds_it():
 
 
 def test_shares_multiply_and_the_worst_comes_first():
-    hindrances = Hindrances()
-    hindrances.note("speed", 0.5)
-    hindrances.note("obstacle", 0.2, distance=3.2)
-    hindrances.note("singularity", 0.99)  # nothing worth a word
-    hindrances.mention("task_waits")
-    assert hindrances.followed == pytest.approx(0.5 * 0.2 * 0.99)
-    told = [(reason.hindrance, reason.kept) for reason in hindrances.reasons()]
-    assert told == [("obstacle", 0.2), ("speed", 0.5), ("task_waits", 1.0)]
-    assert hindrances.reasons()[0].text == "an obstacle is 3 cm away"
-    hindrances.clear()
-    assert hindrances.followed == 1.0
-    assert hindrances.reasons() == ()
+    feedback = PersonFeedback(panda)
+    feedback.note("speed", 0.5)
+    feedback.note("obstacle", 0.2, distance=3.2)
+    feedback.note("singularity", 0.99)  # nothing worth a word
+    feedback.note("task_waits", mention=True)
+    told = feedback.told(state(), pushed=True)
+    assert told.followed == pytest.approx(0.5 * 0.2 * 0.99)
+    reasons = [(reason.hindrance, reason.kept) for reason in told.reasons]
+    assert reasons == [("obstacle", 0.2), ("speed", 0.5), ("task_waits", 1.0)]
+    assert told.reasons[0].text == "an obstacle is 3 cm away"
+    told = feedback.told(state(), pushed=True)
+    assert told.followed == 1.0
+    assert told.reasons == ()
 
 
 def test_every_hindrance_has_words():
     for hindrance in HINDRANCES:
-        hindrances = Hindrances()
-        hindrances.note(hindrance, 0.0)
-        (reason,) = hindrances.reasons(joint=3, distance=2.0, person="a person is near")
+        feedback = PersonFeedback(panda)
+        feedback.note(hindrance, 0.0, distance=2.0)
+        (reason,) = feedback.told(state(), pushed=True).reasons
         assert len(reason.text) > 10
         assert "{" not in reason.text
 
@@ -268,7 +269,7 @@ def test_during_visual_servoing_it_is_told_as_well(room):
                     dt=cell.config.dt,
                 ),
             )
-            cell.execute(command, np.zeros(2), np.zeros(2), region=controller.goals.position)
+            cell.execute(command, controller.goals.position)
     # What the joints' own gradient adds counts neither for nor against the push.
     n, told = self_motion(cell.log["joint_position"][-1]), person.told[-1]
     own = -n @ command.xi_q.numpy() / cell.config.damping

@@ -323,12 +323,11 @@ class IdealStep:
     def step(self, state, now, target):
         self.heights.append(target.raised)
         self.cell.pose = self.arrive(target, self.descents)
-        goals = SimpleNamespace(
-            vision=SimpleNamespace(target=torch.from_numpy(MIDDLE)), position=None
+        goals = SimpleNamespace(position=None)
+        result = SimpleNamespace(
+            command=None, goals=goals, approach=0.0, remark="", columns=lambda drawn: {}
         )
-        return SimpleNamespace(
-            command=None, goals=goals, feature=MIDDLE, approach=0.0, remark=""
-        ), state
+        return result, state
 
 
 def raised_by(height):
