@@ -163,7 +163,7 @@ def their_final_velocity() -> float:
 def our_final_velocity() -> float:
     t = torch.linspace(0, 1, 101, dtype=F64)
     y = torch.stack([(torch.pi * t).cos(), -(torch.pi * t).cos()], -1)
-    dmp, worst = MovingGoalDMP.fit(t, y, 10), 0.0
+    dmp, worst = MovingGoalDMP(JointDMP.fit(t, y, 10)), 0.0
     for wanted in (0.0, 1.0, 2.0):
         end = dmp.rollout([1.0], end_velocity=torch.full((2,), wanted, dtype=F64)).velocity
         worst = max(worst, (end - wanted).abs().max().item())

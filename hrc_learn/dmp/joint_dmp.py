@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypedDict, Unpack
+from typing import TypedDict, Unpack
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,13 +14,8 @@ from hrc_learn.dmp._arguments import Mask, Points, Scalars, Times, Vectors, posi
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.dynamics import Basis, GaussianBasis, SpringDamper
 from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling, find_scaling
-from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive, check_names
-from hrc_learn.dmp.motion_primitive import (
-    ColumnPoints,
-    MotionPrimitive,
-    Retargeted,
-    via_columns,
-)
+from hrc_learn.dmp.linear_primitive import LinearPrimitive, check_names
+from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.response import Response, response_of
 from hrc_learn.dmp.samples import Samples, check_samples, padded, smoothed, warn_of_few_samples
 from hrc_learn.dmp.solvers import (
@@ -30,7 +25,6 @@ from hrc_learn.dmp.solvers import (
     solve_normal,
 )
 from hrc_learn.dmp.trajectory import Trajectory
-from hrc_learn.model_files import SavedModel
 
 LIMIT_SAMPLES = 2001
 """Times at which limits are checked: 40 per basis function, between which a peak is higher by
@@ -221,35 +215,6 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
                 ratio = values.abs().amax(-2) / positive("a limit", limit, values)
                 factors.append(ratio.amax(-1) ** (1 / order))
         return self.duration * torch.stack(torch.broadcast_tensors(*factors)).amax(0)
-
-    def with_motion[S: "JointDMP"](self: S, motion: Any, frame: None = None) -> S:
-        """The given motion."""
-        return motion
-
-    def state_of(self, columns: DMPState, frame: None) -> DMPState:
-        """The state of the columns."""
-        return columns
-
-    def _columns(self, state: DMPState) -> tuple[DMPState, None]:
-        return state, None
-
-    def _boundary(self, given: Boundary, duration: Tensor) -> tuple[Boundary, None]:
-        return given, None
-
-    def _trajectory(self, columns: Trajectory, frame: None) -> Trajectory:
-        return columns
-
-    def _retarget(self, columns: DMPState, frame: None, goal: Vectors | None) -> Retargeted:
-        return Retargeted(columns, None, goal)
-
-    def _via(
-        self, now: ColumnPoints, value: Points | None, velocity: Points | None
-    ) -> ColumnPoints:
-        return via_columns(now, value, velocity)
-
-    @classmethod
-    def _restored[S: "JointDMP"](cls: type[S], saved: SavedModel) -> S:
-        return cls.restore(saved)
 
 
 @dataclass(frozen=True, kw_only=True)

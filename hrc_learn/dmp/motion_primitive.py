@@ -5,7 +5,6 @@ joints are columns themselves, an orientation becomes its error to a reference, 
 position, orientation error and body, and a moving goal is the frame in which joints are seen.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -76,7 +75,7 @@ class Retargeted(NamedTuple):
     """New goal in columns; None keeps that of `columns`."""
 
 
-class MotionPrimitive[Value, Path, State](nn.Module, ABC):
+class MotionPrimitive[Value, Path, State](nn.Module):
     """Learned motion that start, goal, duration and via points reshape.
 
     Kinds differ in their values: joints, a quaternion, a `Pose`. The class of each kind
@@ -93,9 +92,9 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
     """Arguments of this kind beyond start, goal and start velocity."""
 
     # The frame is what columns are relative to and may differ between motions: the reference
-    # of an orientation error, the velocity of a moving goal; None where there is none.
+    # of an orientation error, the velocity of a moving goal; None where there is none. What
+    # follows is right for values that are columns themselves; other kinds override it.
 
-    @abstractmethod
     def with_motion[S: "MotionPrimitive"](self: S, motion: Any, frame: Any = None) -> S:
         """Primitive of the same kind around another linear one.
 
@@ -103,16 +102,16 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             motion: Replaces the linear primitive.
             frame: Frame of the columns; None keeps that of this primitive.
         """
+        return motion
 
-    @abstractmethod
-    def state_of(self, columns: DMPState, frame: Any) -> State:
+    def state_of(self, columns: DMPState, frame: Any) -> Any:
         """State in closed loop from its columns and their frame."""
+        return columns
 
-    @abstractmethod
-    def _columns(self, state: State) -> tuple[DMPState, Any]:
+    def _columns(self, state: Any) -> tuple[DMPState, Any]:
         """Columns and frame of a state; the inverse of `state_of`."""
+        return state, None
 
-    @abstractmethod
     def _boundary(
         self, given: Boundary, duration: Tensor, **options: Any
     ) -> tuple[Boundary, Any]:
@@ -124,15 +123,13 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             duration: [s].
             options: Arguments of this kind.
         """
+        return given, None
 
-    @abstractmethod
-    def _trajectory(self, columns: Trajectory, frame: Any) -> Path:
+    def _trajectory(self, columns: Trajectory, frame: Any) -> Any:
         """Result of a rollout."""
+        return columns
 
-    @abstractmethod
-    def _retarget(
-        self, columns: DMPState, frame: Any, goal: Value | None, **options: Any
-    ) -> Retargeted:
+    def _retarget(self, columns: DMPState, frame: Any, goal: Any, **options: Any) -> Retargeted:
         """Columns and frame with a new goal, for the same value and velocity.
 
         Args:
@@ -141,8 +138,8 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             goal: New goal; None if only `options` are new.
             options: Goals of this kind.
         """
+        return Retargeted(columns, frame, goal)
 
-    @abstractmethod
     def _via(
         self, now: ColumnPoints, value: Any, velocity: Any, **options: Any
     ) -> ColumnPoints:
@@ -154,23 +151,25 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             velocity: Velocities from the caller, per second; None or NaN leaves them free.
             options: Values of this kind.
         """
+        position = via_values(value, now.position)
+        return ColumnPoints(position, via_values(velocity, now.velocity, "velocity"))
 
     def _acceleration(self, columns: DMPState, frame: Any, coupling: Any) -> Any:
         """Second derivatives of the columns [1/s^2] for a coupling term."""
         return coupling
 
     @classmethod
-    @abstractmethod
-    def _restored[S: "MotionPrimitive"](cls: type[S], saved: SavedModel) -> S:
+    def restore[S: "MotionPrimitive"](cls: type[S], saved: SavedModel) -> S:
         """Primitive from a saved model."""
+        raise NotImplementedError
 
-    @abstractmethod
     def tensors(self) -> dict[str, Tensor]:
         """Tensors of the primitive, fit report included, by the names used in files."""
+        return self.motion.tensors()
 
-    @abstractmethod
     def with_tensors[S: "MotionPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
         """Primitive with other tensors, named as in `tensors`, and the same parts and names."""
+        return self.with_motion(self.motion.with_tensors(tensors))
 
     def __len__(self) -> int:
         """Number of primitives along the first batch axis.
@@ -458,7 +457,7 @@ class MotionPrimitive[Value, Path, State](nn.Module, ABC):
             FileNotFoundError: The folder holds no saved primitive.
             ValueError: A wrong field; the message names the file and the field.
         """
-        return cls._restored(SavedModel(folder, cls.__name__))
+        return cls.restore(SavedModel(folder, cls.__name__))
 
     def _resolved(
         self, given: Boundary, duration: Scalars | None, speed: Scalars | None, **options: Any
@@ -502,22 +501,6 @@ class WrappedPrimitive[Value, Path, State](MotionPrimitive[Value, Path, State]):
     def fit_report(self) -> FitReport | None:
         """Residuals of the columns."""
         return self.motion.fit_report
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Tensors of the columns."""
-        return self.motion.tensors()
-
-    def with_tensors[S: "WrappedPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
-        """Primitive with other tensors of the columns."""
-        return self.with_motion(self.motion.with_tensors(tensors))
-
-
-def via_columns(
-    now: ColumnPoints, value: Points | None, velocity: Points | None
-) -> ColumnPoints:
-    """Via points of values that are columns themselves."""
-    position = via_values(value, now.position)
-    return ColumnPoints(position, via_values(velocity, now.velocity, "velocity"))
 
 
 def via_values(

@@ -7,59 +7,42 @@ velocity in the damping term). The goal passes g at s = 1 with velocity v. Relat
 x = y - (s - 1) v, this is the equation of a goal at rest: rollouts and steps stay exact.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Unpack
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, to_tensor
+from hrc_learn.dmp._arguments import Vectors, to_tensor
 from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.joint_dmp import FitOptions, JointDMP
+from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary
 from hrc_learn.dmp.motion_primitive import (
-    ColumnPoints,
-    Retargeted,
     WrappedPrimitive,
-    via_columns,
 )
-from hrc_learn.dmp.trajectory import ArrayOutputs, Trajectory, output
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.model_files import SavedModel
 
 
-class MovingTrajectory(ArrayOutputs):
+class MovingTrajectory(Trajectory):
     """Motion to a moving goal; each output is computed on first access."""
-
-    outputs = Trajectory.outputs
 
     def __init__(self, relative: Trajectory, velocity: Float[Tensor, "*#batch D"]):
         """Add the motion of the goal at this velocity [1/s] to the motion relative to it."""
-        self._relative = relative
-        self._velocity = velocity[..., None, :]
+        super().__init__(
+            coordinates=relative._given,
+            s=relative.s,
+            duration=relative.duration,
+            response=relative._response,
+        )
+        self._goal_velocity = velocity[..., None, :]
 
-    @property
-    def time(self) -> Float[Tensor, "*batch T"]:
-        """Time since the start of the motion [s]."""
-        return self._relative.time
-
-    @output
-    def position(self) -> Float[Tensor, "*batch T D"]:
-        """Position in the units of the demonstration."""
-        s = self._relative.s.to(self._velocity)
-        remaining = (s[..., None] - 1) * self._relative.duration[..., None, None]
-        return self._relative.position + remaining * self._velocity
-
-    @output
-    def velocity(self) -> Float[Tensor, "*batch T D"]:
-        """Velocity, position units per second."""
-        return self._relative.velocity + self._velocity
-
-    @property
-    def acceleration(self) -> Float[Tensor, "*batch T D"]:
-        """Acceleration, position units per second squared."""
-        return self._relative.acceleration
+    def _derivative(self, order: int) -> Float[Tensor, "*batch T D"]:
+        y, v = super()._derivative(order), self._goal_velocity
+        if order == 0:
+            v = (self.s.to(v)[..., None] - 1) * self.duration[..., None, None] * v
+        return y + v if order < 2 else y
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,27 +92,6 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         if motion.forcing_scale.depends_on_boundary:
             raise ValueError("a moving goal needs a scaling that does not depend on start")
         self.motion = motion
-
-    @classmethod
-    def fit(
-        cls,
-        time: Times,
-        position: Points,
-        n_basis: int | None = None,
-        velocity: Points | None = None,
-        mask: Mask | None = None,
-        *,
-        scaling: str = "none",
-        joint_names: Sequence[str] | None = None,
-        units: str = "rad",
-        **options: Unpack[FitOptions],
-    ) -> "MovingGoalDMP":
-        """Fit one primitive to each demonstration; arguments as in `JointDMP.fit`."""
-        names = {"joint_names": joint_names, "units": units}
-        motion = JointDMP.fit(
-            time, position, n_basis, velocity, mask, scaling=scaling, **names, **options
-        )
-        return cls(motion)
 
     @property
     def start(self) -> Float[Tensor, "*batch D"]:
@@ -182,15 +144,6 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     def _trajectory(self, columns: Trajectory, frame: Tensor) -> MovingTrajectory:
         return MovingTrajectory(columns, frame)
 
-    def _retarget(self, columns: DMPState, frame: Tensor, goal: Vectors | None) -> Retargeted:
-        return Retargeted(columns, frame, goal)
-
-    def _via(
-        self, now: ColumnPoints, value: Points | None, velocity: Points | None
-    ) -> ColumnPoints:
-        # The goal rests for the demonstrated end velocity.
-        return via_columns(now, value, velocity)
-
     @classmethod
-    def _restored[S: "MovingGoalDMP"](cls: type[S], saved: SavedModel) -> S:
+    def restore[S: "MovingGoalDMP"](cls: type[S], saved: SavedModel) -> S:
         return cls(JointDMP.restore(saved))

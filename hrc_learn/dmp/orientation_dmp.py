@@ -311,7 +311,7 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         )
 
     @classmethod
-    def _restored[S: "OrientedPrimitive"](cls: type[S], saved: SavedModel) -> S:
+    def restore[S: "OrientedPrimitive"](cls: type[S], saved: SavedModel) -> S:
         return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
 
 

@@ -420,7 +420,7 @@ def test_steps_refuse_what_no_loop_means(kind):
         "joint": lambda: JointDMP.fit(time, position, 12),
         "orientation": lambda: OrientationDMP.fit(time, turning, 12),
         "pose": lambda: PoseDMP.fit(time, position[:, :3], turning, 12),
-        "moving goal": lambda: MovingGoalDMP.fit(time, position, 12),
+        "moving goal": lambda: MovingGoalDMP(JointDMP.fit(time, position, 12)),
     }[kind]()
     loops = [dmp] if kind == "moving goal" else [dmp, Stepper(dmp)]
     nan = float("nan")

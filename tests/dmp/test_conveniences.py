@@ -30,6 +30,8 @@ def fit_kind(kind):
     time, position, turns = demonstrations()
     if kind is OrientationDMP:
         return kind.fit(time, turns, 8)
+    if kind is MovingGoalDMP:
+        return kind(JointDMP.fit(time, position, 8))
     columns = (position, turns) if kind is PoseDMP else (position,)
     return kind.fit(time, *columns, 8)
 

@@ -28,7 +28,7 @@ KINDS = {
     "joint": lambda: JointDMP.fit(TIME, POSITION, 12),
     "orientation": lambda: OrientationDMP.fit(TIME, TURN, 12),
     "pose": lambda: PoseDMP.fit(TIME, POSITION[:, :3], TURN, 12, POSITION[:, 3:]),
-    "moving goal": lambda: MovingGoalDMP.fit(TIME, POSITION, 12),
+    "moving goal": lambda: MovingGoalDMP(JointDMP.fit(TIME, POSITION, 12)),
 }
 RHYTHMS = {
     "rhythm": lambda: fit_rhythmic(ROUND, SWING, 8, period=1.0),
