@@ -1,4 +1,4 @@
-"""A small made-up run and fit with every field filled, for the tests of `hrc_learn.viz`."""
+"""A small made-up run with every field filled, for the tests of `hrc_learn.viz`."""
 
 from dataclasses import fields
 
@@ -7,7 +7,6 @@ import numpy as np
 from hrc_learn.geometry import Body, Box, Capsule
 from hrc_learn.log import CameraRecording, Event, JointRanges, RunRecording
 from hrc_learn.vision import CameraModel
-from hrc_learn.viz import FitRecording
 
 STEPS = 200
 OPTIONAL = (
@@ -127,23 +126,3 @@ def _cut(recorded, steps: int) -> dict:
         name: value[:steps] if isinstance(value, np.ndarray) and len(value) == STEPS else value
         for name, value in values.items()
     }
-
-
-def sample_fit(**changes) -> FitRecording:
-    """Three demonstrations of different lengths."""
-    times = tuple(np.linspace(0.0, 2.0 + i, 80 + 10 * i) for i in range(3))
-    demos = tuple(np.sin(t[:, None] + np.arange(7)) for t in times)
-    paths = tuple(demo[:, :3] for demo in demos)
-    values = {
-        "title": "Placing",
-        "joint_names": NAMES,
-        "time": times,
-        "demos": demos,
-        "reproductions": tuple(demo + 1e-3 for demo in demos),
-        "demo_paths": paths,
-        "reproduction_paths": tuple(path + 1e-3 for path in paths),
-        "joint_limits": LIMITS,
-        "residual": {10: 1e-2, 30: 1e-3, 50: 1e-4},
-        "n_basis": 50,
-    }
-    return FitRecording(**(values | changes))

@@ -101,7 +101,7 @@ LIBRARIES: dict[str, set[str]] = {
     },
     "sim": {"torch", "jaxtyping", "numpy", "mujoco"},
     "skills": {"torch", "jaxtyping", "numpy"},
-    "learning": {"torch", "jaxtyping", "numpy"},
+    "learning": {"torch", "jaxtyping", "numpy", "rerun", "matplotlib"},
     "hardware": {"torch", "jaxtyping", "numpy"},
     "teleoperation": {"torch", "jaxtyping", "numpy", "scipy", "msgspec"},
     "experiments": {"torch", "jaxtyping", "numpy", "matplotlib"},

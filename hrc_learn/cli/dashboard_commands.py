@@ -79,8 +79,7 @@ _WITH_TAB = 8
 def _record_demonstrations(args: Show, out: Path) -> None:
     # Rerun and PyTorch, which a report does not need.
     from hrc_learn.demos import open_demos, thumbnails
-    from hrc_learn.learning.fit_recordings import demonstrations_recording
-    from hrc_learn.viz.learning_dashboards import record_demonstrations
+    from hrc_learn.learning.demonstration_dashboard import record_demonstrations
 
     source = open_demos(args.dataset, episodes=args.episodes or None)
     shown = source
@@ -90,7 +89,7 @@ def _record_demonstrations(args: Show, out: Path) -> None:
     demos = shown.load()
     title = f"Demonstrations in {args.dataset.resolve().name}"
     images, missing = thumbnails(source.folder, demos[:_WITH_TAB])
-    record_demonstrations(out, demonstrations_recording(demos, title, images), most=_WITH_TAB)
+    record_demonstrations(out, demos, title, images, most=_WITH_TAB)
     for image in missing:
         print(f"left out: {image}")
     if len(demos) < len(source):

@@ -15,7 +15,7 @@ from hrc_learn.cli.arguments import FitPrimitives
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.learning.channels import CHANNELS
-from hrc_learn.learning.fit_recordings import fit_recording, fit_report
+from hrc_learn.learning.fit_dashboards import fit_report, record_fit, shown_fit
 from hrc_learn.learning.model_choice import best_models, fit_contextual, keep_best
 from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
@@ -25,7 +25,6 @@ from hrc_learn.learning.primitive_fitting import (
 )
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit
 from hrc_learn.store import new_folder, write_json
-from hrc_learn.viz.learning_dashboards import record_fit
 from hrc_learn.viz.report import (
     PAGE,
     Measurement,
@@ -208,7 +207,7 @@ def _draw(
     """Write report and recording of the fit, unless only orientations were learned."""
     if set(fitted.each) == {"orientation"}:
         return
-    shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
+    shown = shown_fit(fitted, f"Fit of {args.dataset.name}")
     record_fit(folder / "fit.rrd", shown)
     write_report(folder, fit_report(shown, _rows(metrics), configuration(args), command_line()))
 

@@ -19,11 +19,10 @@ from hrc_learn.jacobian import (
     RBFImageJacobian,
     paper_grid,
 )
-from hrc_learn.learning.fit_recordings import learning_recording
+from hrc_learn.learning.fit_dashboards import record_learning
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
-from hrc_learn.viz.learning_dashboards import record_learning
 from hrc_learn.viz.report import Measurement, show_command, show_measurements
 
 # Key in JSON, title, factor, unit, largest value that passes, resolution. Half of a relative
@@ -98,7 +97,7 @@ def _write(
         skill.save(folder)
         write_json(folder / "metrics.json", metrics)
         title = f"Image Jacobian from {args.dataset.name}"
-        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
+        record_learning(folder / "fit.rrd", skill, demos, title)
     rows = [
         Measurement(
             name=name,

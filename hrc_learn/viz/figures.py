@@ -21,7 +21,6 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from hrc_learn.geometry import Box
 from hrc_learn.log import JointRanges, RunRecording
-from hrc_learn.log.recordings import FitRecording
 from hrc_learn.viz import palette
 
 STYLE: dict[Any, Any] = {
@@ -235,20 +234,6 @@ def joints_figure(run: RunRecording) -> Figure:
     return joint_grid_figure(run.joint_names, motions, run.joint_limits)
 
 
-def fit_joints_figure(fit: FitRecording) -> Figure:
-    """Joint positions of the first four demonstrations and of their reproductions."""
-    demos = [
-        demonstrated_joints(time, position)
-        for time, position in zip(fit.time, fit.demos, strict=True)
-    ]
-    reproductions = [
-        JointCurves(label="reproduction", time=time, position=position)
-        for time, position in zip(fit.time, fit.reproductions, strict=True)
-    ]
-    motions = [*demos[:4], *reproductions[:4]]
-    return joint_grid_figure(fit.joint_names, motions, fit.joint_limits, fit.unit)
-
-
 def person_figure(run: RunRecording) -> Figure:
     """Effort of the person, elbow motion, and deviation of the end effector.
 
@@ -319,28 +304,20 @@ def image_jacobian_figure(run: RunRecording) -> Figure:
     return figure
 
 
-def residual_figure(fit: FitRecording) -> Figure:
-    """Residual of the fit against the number of basis functions."""
-    if not fit.residual:
-        raise ValueError("residual is empty: fit with several numbers of basis functions.")
-    counts = sorted(fit.residual)
+def residual_figure(residual: Mapping[int, float], used: int) -> Figure:
+    """Held-out error against the number of basis functions, and the number used."""
+    counts = sorted(residual)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(0.62 * WIDTH, 2.7))
         axes = figure.subplots()
-        axes.plot(counts, [fit.residual[n] for n in counts], "o-", color=palette.RUN, ms=4)
-        if fit.n_basis is not None and fit.n_basis in fit.residual:
-            _ring(axes, fit.n_basis, fit.residual[fit.n_basis], f"used: {fit.n_basis}")
+        axes.plot(counts, [residual[n] for n in counts], "o-", color=palette.RUN, ms=4)
+        axes.plot(used, residual[used], "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
+        offset = {"xytext": (8, 8), "textcoords": "offset points"}
+        axes.annotate(f"used: {used}", (used, residual[used]), color=palette.LIMIT, **offset)
         axes.set(yscale="log", xlabel="basis functions N", ylabel="normalised RMS error [-]")
         axes.set_title("Error of the primitive on the demonstrations")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
-
-
-def _ring(axes: Axes, x: float | int, y: float, words: str) -> None:
-    """Draw a ring around a point, with a label next to it."""
-    axes.plot(x, y, "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
-    offset = {"xytext": (8, 8), "textcoords": "offset points"}
-    axes.annotate(words, (x, y), color=palette.LIMIT, **offset)
 
 
 def measures_figure(

@@ -21,6 +21,8 @@ from hrc_learn.viz.panels import Curves, Plot, Tab
 TIMELINE = "time"
 """All that is recorded lies on this timeline [s]: the viewer shows one at a time."""
 
+POSE_RATE = 30.0
+"""Poses and dots sent a second: as many as the eye sees."""
 _PATH_POINTS = 400
 
 
@@ -168,6 +170,34 @@ def send_poses(
     )
 
 
+def send_strips(
+    stream: rr.RecordingStream,
+    path: str,
+    strips: Sequence[Float[np.ndarray, "_ 3"]],
+    colour: str,
+    radius: float,
+) -> None:
+    """Send static lines [m], if there are any."""
+    if strips:
+        colours, thinned = [palette.rgba(colour)], [thin(strip) for strip in strips]
+        stream.log(path, rr.LineStrips3D(thinned, radii=radius, colors=colours), static=True)
+
+
+def send_dot(
+    stream: rr.RecordingStream,
+    name: str,
+    time: Float[np.ndarray, " time"],
+    path: Float[np.ndarray, "time 3"],
+    colour: str,
+) -> None:
+    """Send a dot that moves along a path."""
+    look = rr.Points3D.from_fields(radii=[0.012], colors=[palette.rgba(colour)])
+    stream.log(f"world/now/{name}", look, static=True)
+    at = samples(time, POSE_RATE)
+    columns = rr.Points3D.columns(positions=path[at])
+    stream.send_columns(f"world/now/{name}", seconds(time[at]), columns)
+
+
 def boxes(shapes: tuple[Box, ...]) -> rr.Boxes3D:
     """Solid boxes."""
     return rr.Boxes3D(
@@ -268,18 +298,26 @@ def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> li
     return [f"| {' | '.join(map(str, row))} |" for row in cells]
 
 
-def frame_view(path: Float[np.ndarray, "n 3"], *, base: bool = True) -> rrb.EyeControls3D:
-    """Viewpoint in front of the robot, to its left, that shows the whole path.
+def frame_view(
+    path: Float[np.ndarray, "n 3"],
+    *,
+    base: bool = True,
+    direction: tuple[float, float, float] = (1.05, 0.65, 0.6),
+    nearest: float = 0.5,
+) -> rrb.EyeControls3D:
+    """Viewpoint that shows the whole path, by default in front of the robot, to its left.
 
     Args:
         path: Points to show [m].
         base: Show the base of the robot as well.
+        direction: From the middle of the points to the eye, relative to their extent.
+        nearest: Smallest extent [m].
     """
     points = np.concatenate([path, np.zeros((1, 3))]) if base else path
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), nearest)
     return rrb.EyeControls3D(
-        position=middle + reach * np.array([1.05, 0.65, 0.6]),
+        position=middle + reach * np.array(direction),
         look_target=middle,
         eye_up=(0.0, 0.0, 1.0),
     )

@@ -20,6 +20,7 @@ from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Plot, run_tabs, several, without_empty_plots
 from hrc_learn.viz.rerun_stream import (
+    POSE_RATE,
     CameraStream,
     StaticShapes,
     begin,
@@ -82,7 +83,6 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
     return dashboard(left, [tabs_and_text], row_shares=(3, 2))
 
 
-_POSE_RATE = 30.0  # robot poses sent a second
 _PATH_RATE = 6.0  # times a second at which the growing path is sent anew
 
 
@@ -150,7 +150,7 @@ class RunStream:
 
     def _send_rows(self, run: RunRecording, first: int) -> None:
         time = run.time
-        at = first + samples(time[first:], _POSE_RATE)
+        at = first + samples(time[first:], POSE_RATE)
         ends = first + samples(time[first:], _PATH_RATE)
         for body in run.bodies:
             send_poses(self._stream, time, body, at)

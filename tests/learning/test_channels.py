@@ -6,7 +6,6 @@ from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.franka import panda_bodies
 from hrc_learn.learning.channels import Motions
-from hrc_learn.learning.fit_recordings import demonstrations_recording
 
 
 @pytest.fixture
@@ -36,27 +35,6 @@ def rotated(orientation, point):
     w, v = orientation[:, :1], orientation[:, 1:]
     turned = np.cross(v, point)
     return point + 2 * (w * turned + np.cross(v, turned))
-
-
-def test_a_pandas_path_is_found_from_its_joints(joints):
-    shown = demonstrations_recording(DemonstrationSet([demonstration(joints)]), "Demos")
-    (demo,) = shown.demonstrations
-    expected = panda.forward(torch.from_numpy(joints)).position.numpy()
-    np.testing.assert_allclose(demo.position, expected, atol=1e-12)
-    assert shown.joint_limits is not None
-    assert demo.bodies
-
-
-def test_what_was_not_seen_and_other_robots_are_left_out(joints):
-    visible = np.array([True, False, True, True, False, True])
-    names = tuple(f"arm_{i}" for i in range(7))
-    feature = np.ones((6, 2))
-    demo = demonstration(joints, joint_names=names, feature=feature, feature_visible=visible)
-    shown = demonstrations_recording(DemonstrationSet([demo]), "Demos")
-    np.testing.assert_array_equal(np.isfinite(shown.demonstrations[0].feature[:, 0]), visible)
-    assert shown.joint_limits is None
-    assert shown.demonstrations[0].bodies == ()
-    assert shown.demonstrations[0].position is None
 
 
 def test_a_recorded_position_is_learned_as_it_is_and_no_pose_of_two_frames(joints):

@@ -408,7 +408,7 @@ def test_a_figure_is_shown_as_vector_graphics_that_do_not_change(tmp_path):
 
 def test_a_figure_of_many_points_stays_a_picture():
     crowded = Figure()
-    x, y = np.random.default_rng(0).uniform(size=(2, 20_000))
+    x, y = np.random.default_rng(0).uniform(size=(2, 16_000))
     crowded.subplots().plot(x, y)
     assert Picture("crowded", crowded, "").drawn().svg is None
 

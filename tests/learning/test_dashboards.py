@@ -1,0 +1,317 @@
+"""Recordings of demonstrations, fits and rounds of learning, read again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from rrd_reading import Rrd
+from sample_runs import LIMITS, NAMES
+
+from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.geometry import quaternion
+from hrc_learn.jacobian import (
+    EvidenceResult,
+    EvidenceRound,
+    ImageJacobianFitConfig,
+    RBFCenters,
+    RBFImageJacobian,
+    cross_validate,
+)
+from hrc_learn.kinematics import panda
+from hrc_learn.kinematics.franka import panda_bodies
+from hrc_learn.learning import fit_primitives
+from hrc_learn.learning.demonstration_dashboard import record_demonstrations
+from hrc_learn.learning.fit_dashboards import (
+    ShownFit,
+    fit_report,
+    record_fit,
+    record_learning,
+    shown_fit,
+)
+from hrc_learn.learning.visual_servo_fitting import feature_trajectories
+from hrc_learn.skills.visual_skill import VisualServoSkill
+
+
+def demonstration(episode: int, steps: int, **changes) -> Demonstration:
+    time = np.arange(steps) / 50
+    motion = 0.1 * np.sin(time[:, None] + np.arange(7) + episode)
+    values = {
+        "joint_names": panda.joint_names,
+        "joint_position": panda.ready.numpy() + motion,
+        "feature": np.stack([100 + time, 200 - time], axis=-1),
+        "feature_visible": (time < 0.06) | (time > 0.11),
+        "human_effort": np.ones((steps, 7)),
+        "gripper": np.full(steps, 0.04),
+    }
+    values |= changes
+    return Demonstration(episode=episode, task="place", fps=50, time=time, **values)
+
+
+@pytest.fixture(scope="module")
+def demos() -> DemonstrationSet:
+    way = np.stack([np.linspace(0, 1, 90), np.zeros(90), np.ones(90)], axis=-1)
+    second = demonstration(5, 90, human_effort=None, feature=None, position=way)
+    return DemonstrationSet([demonstration(2, 100), second, demonstration(7, 80)])
+
+
+@pytest.fixture(scope="module")
+def rrd(demos, tmp_path_factory) -> Rrd:
+    path = tmp_path_factory.mktemp("rrd") / "demos.rrd"
+    record_demonstrations(path, demos, "Placing", most=2)
+    return Rrd(path)
+
+
+def tool_path(demo: Demonstration) -> np.ndarray:
+    return panda.forward(torch.from_numpy(demo.joint_position)).position.numpy()
+
+
+def test_joints_and_features_of_all_lie_over_one_another(demos, rrd):
+    for demo in demos:
+        path = f"together/joint_position_4/{demo.episode}"
+        np.testing.assert_array_equal(rrd.scalars(path)[:, 0], demo.joint_position[:, 4])
+        np.testing.assert_allclose(rrd.time(path), demo.time, atol=1e-9)
+    v = rrd.scalars("together/feature_1/7")[:, 0]
+    seen = demos[2].feature_visible
+    assert 0 < (~seen).sum() < len(seen)
+    np.testing.assert_array_equal(v, np.where(seen, demos[2].feature[:, 1], np.nan))
+    assert "together/feature_1/5" not in rrd.entities
+    bounds = [float(panda.limits.lower[0]), float(panda.limits.upper[0])]
+    np.testing.assert_array_equal(rrd.scalars("together/limits_0")[0], bounds)
+
+
+def test_the_first_have_tabs_with_what_was_recorded(demos, rrd):
+    np.testing.assert_array_equal(rrd.scalars("episode_2/effort"), demos[0].human_effort)
+    np.testing.assert_array_equal(rrd.scalars("episode_2/gripper")[:, 0], demos[0].gripper)
+    alone = {entity for entity in rrd.entities if entity.startswith("episode_")}
+    both = {f"episode_{k}/{name}" for k in (2, 5) for name in ("joints", "position", "gripper")}
+    assert alone == both | {"episode_2/feature", "episode_2/effort"}
+
+
+def test_recorded_or_computed_paths_are_drawn_and_the_arm_moves(demos, rrd):
+    for demo in demos:
+        path = tool_path(demo) if demo.position is None else demo.position
+        entity = f"world/paths/{demo.episode}"
+        ((strip,),) = rrd.column(entity, "LineStrips3D:strips", static=True)
+        np.testing.assert_allclose(strip, path, atol=1e-6)
+        last = rrd.column(f"world/now/{demo.episode}", "Points3D:positions")[-1]
+        np.testing.assert_allclose(last[0], path[-1], atol=1e-6)
+    for body in panda_bodies(demos[0].joint_position):
+        moved = np.array(rrd.column(f"world/bodies/{body.name}", "Transform3D:translation"))
+        np.testing.assert_allclose(moved[-1, 0], body.position[-1], atol=1e-6)
+
+
+def test_the_summary_lists_demonstrations_and_notes(rrd):
+    ((text,),) = rrd.column("summary", "TextDocument:text", static=True)
+    assert "# Placing" in text
+    assert "| 5 | place | 1.78 | 90 | 1.00 |" in text
+
+
+def test_images_stand_in_the_tab_of_their_episode(demos, tmp_path):
+    images = {2: {"front": (np.array([0.0, 0.5]), (b"one", b"two"))}}
+    record_demonstrations(tmp_path / "demos.rrd", demos, "Placing", images)
+    rrd = Rrd(tmp_path / "demos.rrd")
+    blobs = rrd.column("episode_2/cameras/front", "EncodedImage:blob")
+    assert [bytes(blob) for (blob,) in blobs] == [b"one", b"two"]
+    np.testing.assert_allclose(rrd.time("episode_2/cameras/front"), [0.0, 0.5], atol=1e-9)
+
+
+def test_other_robots_with_few_columns_are_recorded_without_limits(tmp_path):
+    bare = dict.fromkeys(("feature", "human_effort", "gripper"))
+    one = demonstration(0, 20, joint_names=tuple(f"arm_{i}" for i in range(7)), **bare)
+    record_demonstrations(tmp_path / "bare.rrd", DemonstrationSet([one]), "")
+    rrd = Rrd(tmp_path / "bare.rrd")
+    assert not {e for e in rrd.entities if e.startswith(("world/", "together/limits"))}
+    assert "episode_0/joints" in rrd.entities
+
+
+def sample_fit(**changes) -> ShownFit:
+    """Three demonstrations of different lengths."""
+    times = tuple(np.linspace(0.0, 2.0 + i, 80 + 10 * i) for i in range(3))
+    demos = tuple(np.sin(t[:, None] + np.arange(7)) for t in times)
+    paths = tuple(demo[:, :3] for demo in demos)
+    fit = ShownFit(
+        title="Placing",
+        names=NAMES,
+        unit="rad",
+        time=times,
+        demos=demos,
+        reproductions=tuple(demo + 1e-3 for demo in demos),
+        paths=paths,
+        reproduced_paths=tuple(path + 1e-3 for path in paths),
+        limits=LIMITS,
+        residual={10: 1e-2, 30: 1e-3, 50: 1e-4},
+        n_basis=50,
+    )
+    return replace(fit, **changes)
+
+
+@pytest.mark.parametrize("joints", [True, False])
+def test_a_fit_is_shown_with_each_motion_at_its_own_length(demos, joints):
+    names = panda.joint_names if joints else ("a1", "a2", "a3", "a4", "a5", "a6", "a7")
+    named = [replace(demo, joint_names=names, position=None) for demo in demos]
+    fit = shown_fit(fit_primitives(DemonstrationSet(named), 30, channels=["joint"]), "Fit")
+    assert [len(demo) for demo in fit.demos] == [100, 90, 80]
+    for demo, shown, made in zip(named, fit.demos, fit.reproductions, strict=True):
+        np.testing.assert_array_equal(shown, demo.joint_position)
+        np.testing.assert_allclose(made, shown, atol=0.01)
+    assert (fit.limits is not None) == joints
+    assert len(fit.paths) == 3 * joints
+    if joints:
+        np.testing.assert_allclose(fit.paths[1], tool_path(named[1]), atol=1e-9)
+
+
+def test_the_report_shows_four_demonstrations_and_the_number_of_functions():
+    report = fit_report(sample_fit(), [], {"n_basis": 50}, "hrc fit")
+    joints, n_basis = report.pictures
+    assert (joints.name, n_basis.name) == ("joints", "n_basis")
+    drawn = [axes for axes in joints.drawing.axes if axes.axison]
+    assert len(drawn) == 7
+    labels = [line.get_label() for line in drawn[0].get_lines()]
+    assert labels.count("demonstration") == labels.count("reproduction") == 3
+    alone = fit_report(sample_fit(residual={}), [], {}, "")
+    assert [picture.name for picture in alone.pictures] == ["joints"]
+
+
+def test_demonstrations_and_reproductions_are_recorded(tmp_path):
+    fit = sample_fit()
+    record_fit(tmp_path / "fit.rrd", fit)
+    rrd = Rrd(tmp_path / "fit.rrd")
+    assert rrd.blueprints == 1
+    for i, time in enumerate(fit.time):
+        for j, name in enumerate(NAMES):
+            root = f"demonstration_{i + 1}/{name}"
+            demo, done = rrd.scalars(f"{root}/demonstration"), rrd.scalars(f"{root}/position")
+            np.testing.assert_array_equal(demo[:, 0], fit.demos[i][:, j])
+            np.testing.assert_array_equal(done[:, 0], fit.reproductions[i][:, j])
+            np.testing.assert_allclose(rrd.time(f"{root}/position"), time, atol=1e-9)
+        error = rrd.scalars(f"demonstration_{i + 1}/error")
+        np.testing.assert_allclose(error, 1.0, atol=1e-9)  # 1 mrad everywhere
+    (strips,) = rrd.column("world/demonstrations", "LineStrips3D:strips", static=True)
+    assert [len(strip) for strip in strips] == [len(path) for path in fit.paths]
+
+
+def test_the_summary_lists_every_residual(tmp_path):
+    record_fit(tmp_path / "fit.rrd", sample_fit())
+    ((text,),) = Rrd(tmp_path / "fit.rrd").column("summary", "TextDocument:text", static=True)
+    for line in ("# Placing", "| 50 (used) | 0.0001 |", "| 10 | 0.01 |", "| 2 | 3.00 | 1 |"):
+        assert line in text.splitlines()
+
+
+@pytest.mark.parametrize("most", [1, 2, 10])
+def test_only_the_first_demonstrations_get_a_tab(tmp_path, most):
+    record_fit(tmp_path / "fit.rrd", sample_fit(), most=most)
+    entities = Rrd(tmp_path / "fit.rrd").entities
+    shown = {e.split("/")[0] for e in entities if e.startswith("demonstration_")}
+    assert len(shown) == min(most, 3)
+
+
+def test_a_fit_of_an_unknown_robot_has_no_paths(tmp_path):
+    fit = sample_fit(paths=(), reproduced_paths=(), limits=None, residual={})
+    record_fit(tmp_path / "fit.rrd", fit)
+    entities = Rrd(tmp_path / "fit.rrd").entities
+    assert not {e for e in entities if e.startswith("world/")}
+    assert not {e for e in entities if e.endswith("/limits")}
+
+
+@pytest.fixture(scope="module")
+def watched() -> DemonstrationSet:
+    """Poses and pixels of a camera with a nearly constant image Jacobian."""
+    rng, time = np.random.default_rng(0), np.arange(30) / 30
+    demos = []
+    for episode in range(4):
+        way = 0.1 * np.sin(time[:, None] * rng.uniform(0.5, 2, 3) + rng.uniform(0, 6, 3))
+        turn = 0.1 * np.sin(time[:, None] * rng.uniform(0.5, 2, 3))
+        pixels = 500 * (way[:, :2] + 0.3 * way[:, :2] * way[:, 2:]) + 200
+        demos.append(
+            Demonstration(
+                episode=episode,
+                fps=30,
+                time=time,
+                position=way + np.array([0.5, 0.0, 0.3]),
+                orientation=quaternion.exp(torch.from_numpy(turn)).numpy(),
+                feature=pixels,
+                feature_visible=np.full(30, True),
+            )
+        )
+    return DemonstrationSet(demos)
+
+
+@pytest.fixture(scope="module")
+def skill(watched):
+    """Fit of the watched demonstrations, with three made-up rounds of learning."""
+    rng = torch.Generator().manual_seed(0)
+    rounds = tuple(
+        EvidenceRound(
+            evidence=1.0 - k,
+            held_out_error=error,
+            neurons=RBFCenters(
+                centers=torch.randn(4, 3, generator=rng).double(),
+                width=0.1 + 0.01 * k,
+                input_indices=(0, 1, 2),
+            ),
+            config=ImageJacobianFitConfig(pixel_noise=0.5 - 0.1 * k),
+        )
+        for k, error in enumerate((0.5, 0.2, 0.4))
+    )
+    camera, config = feature_trajectories(watched), ImageJacobianFitConfig()
+    network = RBFImageJacobian.fit(camera, RBFCenters.around(camera), config)
+    return VisualServoSkill(
+        jacobian=network,
+        target=None,
+        learned=EvidenceResult(rounds=rounds, best=1),
+        cells=cross_validate(camera, network, config).by_cell(),
+    )
+
+
+@pytest.fixture(scope="module")
+def learning(skill, watched, tmp_path_factory) -> Rrd:
+    path = tmp_path_factory.mktemp("learning") / "fit.rrd"
+    record_learning(path, skill, watched, "Image Jacobian")
+    return Rrd(path)
+
+
+def test_every_round_is_one_step_and_the_one_kept_is_marked(skill, learning):
+    learned, error = skill.learned, "learning/Error_on_held_out_demonstrations_px"
+    errors = [state.held_out_error for state in learned.rounds]
+    np.testing.assert_array_equal(learning.scalars(error)[:, 0], errors)
+    np.testing.assert_array_equal(learning.scalars(f"{error}/kept"), [[errors[learned.best]]])
+    assert learning.column(error, "round") == list(range(len(errors)))
+    assert learning.column(f"{error}/kept", "round") == [learned.best]
+    widths = [float(state.neurons.width) for state in learned.rounds]
+    name = "learning/Width_of_the_neurons_m_rad"
+    np.testing.assert_allclose(learning.scalars(name)[:, 0], widths)
+
+
+def test_neurons_are_followed_from_round_to_round(skill, learning):
+    positions = np.array(learning.column("world/neurons", "Points3D:positions"))
+    centres = np.stack([state.neurons.centers[:, :3] for state in skill.learned.rounds])
+    np.testing.assert_allclose(positions, centres, atol=1e-6)
+
+
+def test_cells_show_their_error_in_percent(skill, learning):
+    (labels,) = learning.column("world/errors", "Boxes3D:labels", static=True)
+    relative = skill.cells.relative[skill.cells.relative.isfinite()]
+    assert labels == [f"{100 * value:.1f} %" for value in relative.tolist()]
+    (centres,) = learning.column("world/errors", "Boxes3D:centers", static=True)
+    (halves,) = learning.column("world/errors", "Boxes3D:half_sizes", static=True)
+    edges = skill.cells.edges.numpy()
+    low, high = np.subtract(centres, halves)[:, :2], np.add(centres, halves)[:, :2]
+    np.testing.assert_allclose(low.min(axis=0), edges[0], atol=1e-6)
+    np.testing.assert_allclose(high.max(axis=0), edges[-1], atol=1e-6)
+
+
+def test_the_summary_says_what_was_kept_and_measured(skill, learning):
+    ((text,),) = learning.column("summary", "TextDocument:text", static=True)
+    rounds = skill.learned.rounds
+    assert f"Round {skill.learned.best} of {len(rounds) - 1} was kept" in text
+    assert f"| pairs | {skill.metrics()['pairs']:.4g} |" in text.splitlines()
+
+
+def test_a_fit_without_rounds_shows_where_it_errs(skill, watched, tmp_path):
+    record_learning(tmp_path / "fit.rrd", replace(skill, learned=None), watched, "Bare")
+    rrd = Rrd(tmp_path / "fit.rrd")
+    assert "world/errors" in rrd.entities
+    assert not {e for e in rrd.entities if e.startswith(("learning", "world/neurons"))}
+    ((text,),) = rrd.column("summary", "TextDocument:text", static=True)
+    assert "Round" not in text
