@@ -25,7 +25,7 @@ from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.orientation_dmp import OrientationState
 from hrc_learn.dmp.orientation_error import to_orientation
 from hrc_learn.dmp.pose_dmp import BODY, POSITION, PoseDMP, PoseState
-from hrc_learn.dmp.stepper import STATES, Stepper
+from hrc_learn.dmp.stepper import STATES, Stepper, can_step
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.model_files import saved_kind
 
@@ -49,7 +49,8 @@ class ExportedDMP:
 
     dmp: MotionPrimitive
     stepper: Stepper | None
-    """One motion in NumPy, float64; None for a moving goal, which only the program steps."""
+    """One motion in NumPy, float64; None for kinds that only the program steps: moving goals
+    and `formulation="ude"`."""
     program: ExportedProgram
     """Maps (state, dt, inputs) to a state: dictionaries of tensors (B, ...), dt (B,) [s].
 
@@ -83,7 +84,7 @@ def export_dmp(dmp: MotionPrimitive, *, goal_filter: float | None = None) -> Exp
     """
     if dmp.duration.ndim:
         raise ValueError(f"export takes one primitive, got a batch {tuple(dmp.duration.shape)}")
-    stepper = Stepper(dmp) if isinstance(dmp, tuple(STATES)) else None
+    stepper = Stepper(dmp) if can_step(dmp) else None  # pyright: ignore[reportArgumentType]
     return ExportedDMP(dmp=dmp, stepper=stepper, program=_program(dmp, goal_filter))
 
 
@@ -101,7 +102,10 @@ def load_stepper(folder: str | Path) -> Stepper:
     kind = saved_kind(folder)
     if kind not in kinds:
         raise ValueError(f"{folder}: a stepper takes {', '.join(kinds)}, got {kind!r}")
-    return Stepper(kinds[kind].load(folder))  # pyright: ignore[reportAttributeAccessIssue]
+    dmp: Any = kinds[kind].load(folder)  # pyright: ignore[reportAttributeAccessIssue]
+    if not can_step(dmp):
+        raise ValueError(f"{folder}: its formulation has no stepper, run the program instead")
+    return Stepper(dmp)
 
 
 class StepModule(nn.Module):

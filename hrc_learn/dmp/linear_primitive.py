@@ -508,8 +508,6 @@ class LinearPrimitive(nn.Module):
         Raises:
             ValueError: A wrong field; the message names the file and the field.
         """
-        if (formulation := saved.config.get("formulation", "log")) != "log":
-            raise saved.invalid_field("formulation", f"{formulation!r} is not supported")
         names = [*TENSORS, *(name for name in saved.tensors if name.startswith(REPORT))]
         arguments = _tensor_arguments({name: saved.tensor(name) for name in names})
         shape = arguments["weights"].shape

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp import orientation_error
+from hrc_learn.dmp import orientation_error, ude_formulation
 from hrc_learn.dmp._arguments import (
     Mask,
     Points,
@@ -39,8 +39,9 @@ from hrc_learn.dmp.orientation_error import (
     to_orientation,
     unit_quaternion,
 )
-from hrc_learn.dmp.samples import padded
+from hrc_learn.dmp.samples import check_samples, padded
 from hrc_learn.dmp.trajectory import ArrayOutputs, Trajectory, output
+from hrc_learn.dmp.ude_formulation import UdePrimitive
 from hrc_learn.geometry import quaternion
 from hrc_learn.model_files import SavedModel
 
@@ -319,11 +320,11 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
     """Movement primitive of an orientation.
 
     The error e to a reference, the goal by default, is the state of a linear primitive that is
-    exact at all angles. Both signs of a quaternion give the same motion. Values are unit
-    quaternions (w, x, y, z), (*batch, 4); velocities and couplings are angular, in the base
-    frame, (*batch, 3). A new start or goal is reached in the sense of rotation of the
-    demonstration. The fit report has residuals of the components of the error [rad], which
-    bound those of the angle.
+    exact at all angles, or of the formulation of Ude et al. 2014. Both signs of a quaternion
+    give the same motion. Values are unit quaternions (w, x, y, z), (*batch, 4); velocities and
+    couplings are angular, in the base frame, (*batch, 3). A new start or goal is reached in the
+    sense of rotation of the demonstration. The fit report has residuals of the components of
+    the error [rad], which bound those of the angle.
     """
 
     error_columns: ClassVar[slice] = slice(0, 3)
@@ -337,6 +338,8 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
         orientation: Quaternions,
         n_basis: int | None = None,
         mask: Mask | None = None,
+        *,
+        formulation: str = "log",
         **options: Unpack[FitOptions],
     ) -> "OrientationDMP":
         """Fit one primitive to each demonstration.
@@ -347,15 +350,24 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
                 must be less than half a turn apart.
             n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
             mask: (*B, T), false at samples to ignore.
+            formulation: `"log"`, or `"ude"` for the state of Ude et al. 2014.
             options: Options of the fit; see `FitOptions`.
 
         Raises:
-            ValueError: Bad samples; the message names them.
+            ValueError: Bad samples (the message names them), or an unknown formulation.
         """
+        kind = _formulated(formulation)
         time, mask, (orientation,) = padded(time, mask, orientation)
         error, goal = fitted_error(time, orientation, mask)
         motion = JointDMP.fit(time, error, n_basis, mask=mask, **options)
+        if kind is UdePrimitive:
+            motion = kind.refitted(motion, check_samples(time, error, mask=mask))
         return cls(motion, goal)
+
+    @property
+    def formulation(self) -> str:
+        """State on which forcing term and spring act: `"log"` or `"ude"`."""
+        return "ude" if isinstance(self.motion, UdePrimitive) else "log"
 
     @property
     def start(self) -> Float[Tensor, "*batch 4"]:
@@ -369,6 +381,34 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
 
     def _parts(self, name: str, value: Any) -> tuple[None, Any]:
         return None, value
+
+    def _to_reference(self, columns: DMPState, old: Tensor, new: Tensor) -> DMPState:
+        if isinstance(self.motion, UdePrimitive):
+            return ude_formulation.to_reference(columns, old, new)
+        return super()._to_reference(columns, old, new)
+
+    def _acceleration(self, columns: DMPState, frame: Tensor, coupling: Any) -> Tensor:
+        if isinstance(self.motion, UdePrimitive):
+            # v is minus the angular velocity.
+            return -to_tensor(coupling, frame.dtype, frame.device)
+        return super()._acceleration(columns, frame, coupling)
+
+    @classmethod
+    def _restored[S: "OrientationDMP"](cls: type[S], saved: SavedModel) -> S:
+        try:
+            kind = _formulated(saved.config.get("formulation", "log"))
+        except ValueError as error:
+            raise saved.invalid_field("formulation", error) from None
+        return cls(kind.restore(saved), saved.tensor("goal_orientation"))
+
+
+def _formulated(name: Any) -> type[JointDMP]:
+    """Class of the motion of the error in a formulation."""
+    formulations = {"log": JointDMP, "ude": UdePrimitive}
+    if name not in formulations:
+        known = ", ".join(formulations)
+        raise ValueError(f"unknown formulation {name!r}; choose from {known}")
+    return formulations[name]
 
 
 def _via_errors(reference: Tensor, error: Tensor, value: Any, velocity: Any) -> ColumnPoints:

@@ -130,12 +130,13 @@ class Stepper:
         """Freeze a primitive; later changes of it have no effect.
 
         Raises:
-            ValueError: The primitive is a batch or of another kind.
+            ValueError: The primitive is a batch, of another kind, or of the formulation of Ude
+                et al.
         """
-        if not isinstance(dmp, tuple(STATES)):
+        if not can_step(dmp):
             raise ValueError(
-                f"a stepper takes {', '.join(kind.__name__ for kind in STATES)}, got "
-                f"{type(dmp).__name__}: use the exported program"
+                f"a stepper takes {', '.join(kind.__name__ for kind in STATES)} of the "
+                f"formulation 'log', got {type(dmp).__name__}: use the exported program"
             )
         if dmp.duration.ndim:
             raise ValueError(
@@ -277,6 +278,11 @@ class Stepper:
         E[0, 0] += C
         E[1, 1] += C
         return E
+
+
+def can_step(dmp: Any) -> bool:
+    """True if a `Stepper` steps this kind; other kinds need the exported program."""
+    return isinstance(dmp, tuple(STATES)) and getattr(dmp, "formulation", "log") == "log"
 
 
 def _array(x: Tensor) -> Float64[np.ndarray, "..."]:

@@ -1,10 +1,13 @@
 """Every kind of primitive, held to the same contract."""
 
+import pytest
 import torch
 from demo_motions import arm_motion, turning_motion
 from dmp_contract import DMPContract
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, SplineBasis
+from hrc_learn.dmp import ude_formulation as ude
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -147,3 +150,54 @@ class TestJointOnSplines(TestJoint):
 
     def fit(self, *demonstration, n_basis=50, **kwargs):
         return JointDMP.fit(*demonstration, basis=SplineBasis(count=n_basis), **kwargs)
+
+
+class TestOrientationOfUde(TestOrientation):
+    """Integrated: what is exact elsewhere holds to the error of the method here.
+
+    What does not depend on the formulation is tested with the other one.
+    """
+
+    reproduction = 1e-4
+    fast_gradients = True
+    test_a_batch_is_a_loop = None
+    test_masked_samples_do_not_matter = None
+    test_rates_are_derivatives = None
+    test_motion_settles_at_the_goal_from_anywhere = None
+    test_slowing_down_stays_on_the_path = None
+    test_times_and_durations_of_their_own_are_a_loop = None
+    test_maps_and_derives_in_any_way = None
+    test_files_of_another_kind_are_refused = None
+    test_numpy_demonstrations_are_taken = None
+    test_float32_in_float32_out = None
+
+    def test_reversed_goes_the_same_way_back(self, dmp):
+        with pytest.raises(ValueError, match="not linear"):
+            dmp.reversed()
+
+    @pytest.fixture(autouse=True)
+    def coarse(self, monkeypatch):
+        monkeypatch.setattr(ude, "MAXIMUM_STEP", 1 / 80)
+        # Its many short steps take four times as long with their shapes checked, which the
+        # tests of the formulation do.
+        with shapes_unchecked():
+            yield
+
+    def fit(self, *demonstration, **kwargs):
+        return OrientationDMP.fit(*demonstration, formulation="ude", **kwargs)
+
+    def test_gradients_are_exact(self, monkeypatch):
+        # Coarse: the derivative of what is computed is exact at any step length.
+        monkeypatch.setattr(ude, "MAXIMUM_STEP", 0.1)
+        super().test_gradients_are_exact()
+
+    @pytest.mark.parametrize("n_steps", [150])
+    def test_steps_end_where_the_rollout_does(self, dmp, n_steps):
+        arguments = self.arguments(*self.ends(4))
+        state = dmp.initial_state(**arguments, duration=2.0)
+        with torch.no_grad(), shapes_unchecked():
+            for _ in range(n_steps):
+                state = dmp.step(state, 1.7 / n_steps)
+            there = self.outputs(dmp.rollout(time=[1.7], **arguments, duration=2.0))
+        for name, value in self.state_outputs(state).items():
+            torch.testing.assert_close(value, there[name][0], rtol=0, atol=1e-5, msg=name)

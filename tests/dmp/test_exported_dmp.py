@@ -187,6 +187,12 @@ def test_what_cannot_be_stepped_is_refused(tmp_path):
     complaint = r"takes JointDMP, .* got MovingGoalDMP: use the exported program"
     with shapes_unchecked(), pytest.raises(ValueError, match=complaint):
         Stepper(MovingGoalDMP(make("joint")))
+    ude = make("orientation", formulation="ude")
+    with pytest.raises(ValueError, match="formulation 'log', got OrientationDMP"):
+        Stepper(ude)
+    ude.save(tmp_path / "ude")
+    with pytest.raises(ValueError, match="has no stepper, run the program"):
+        load_stepper(tmp_path / "ude")
     with pytest.raises(FileNotFoundError, match="no model was saved here"):
         load_stepper(tmp_path / "nothing")
     make("joint").save(tmp_path / "joint")

@@ -113,7 +113,6 @@ def test_a_flipped_bit_is_noticed(saved, name):
         ("spring", {"gamma": 1.0}, "field 'spring': .*gamma"),
         ("approach", 2.0, "approach must be a fraction"),
         ("joint_names", ["only"], "1 joint names for 2"),
-        ("formulation", "ude", "field 'formulation': 'ude' is not supported"),
     ],
 )
 def test_a_wrong_config_names_file_and_field(saved, field, value, complaint):

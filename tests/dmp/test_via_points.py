@@ -225,3 +225,6 @@ def test_what_cannot_be_is_refused():
     swing = fit_rhythmic(time, torch.sin(8 * time), period=np.pi / 4)
     with pytest.raises(ValueError, match="a rhythm has no via points"):
         swing.condition([1.0], [[0.0]])
+    turning = OrientationDMP.fit(*turning_motion(), formulation="ude")
+    with pytest.raises(ValueError, match="'ude' is not linear"):
+        turning.condition([1.0], orientation(0.0, 0.0, 0.0)[None])
