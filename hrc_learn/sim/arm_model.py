@@ -16,7 +16,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import Arm, CapsuleArm, LinkCapsule
 from hrc_learn.protocols import ArmState
-from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections, Imperfections
+from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections
 from hrc_learn.vision import Marker, marker_texture
 
 # pyright: reportAttributeAccessIssue=false
@@ -322,32 +322,6 @@ def _add_hand(spec: mujoco.MjSpec, hand, config: ArmModelConfig) -> None:
     coupling.data[:5] = (0.0, 1.0, 0.0, 0.0, 0.0)
 
 
-class _UnknownWeights:
-    """Weights that the arm does not compensate: an unknown load, and errors of its own model's
-    link masses.
-    """
-
-    def __init__(self, model: mujoco.MjModel, joints: tuple[str, ...]):
-        self._joints = np.array([model.joint(name).id for name in joints])
-        self._links = links = model.jnt_bodyid[self._joints]
-        mass = model.body_mass * (1.0 - model.body_gravcomp)
-        carried = np.zeros((len(links), model.nbody), dtype=bool)
-        for body in range(1, model.nbody):  # parents come before children
-            carried[:, body] = carried[:, model.body_parentid[body]]
-            carried[links == body, body] = True
-        self._carried = carried * mass
-        self._any = bool((np.abs(self._carried) > 1e-9).any())
-        self._gravity = model.opt.gravity
-
-    def torque(self, data: mujoco.MjData) -> Float[np.ndarray, " joints"]:
-        """Joint torques exerted by these weights [N m]."""
-        if not self._any:
-            return np.zeros(len(self._links))
-        anchor, axis = data.xanchor[self._joints], data.xaxis[self._joints]
-        arm = self._carried @ data.xipos - self._carried.sum(axis=1)[:, None] * anchor
-        return (np.cross(arm, self._gravity) * axis).sum(axis=1)
-
-
 class MujocoArm:
     """A simulated arm as an `Arm` and a `Gripper`."""
 
@@ -356,7 +330,7 @@ class MujocoArm:
         model: mujoco.MjModel,
         data: mujoco.MjData,
         robot: Arm,
-        imperfections: DrawnImperfections | None = None,
+        imperfections: DrawnImperfections,
     ):
         """Find its joints and servos.
 
@@ -364,12 +338,10 @@ class MujocoArm:
             model: Model with the arm of `add_arm`.
             data: State of the model.
             robot: The arm's kinematics and limits.
-            imperfections: Errors of encoders, driver and joints; None: none.
+            imperfections: Errors of encoders, driver and joints.
         """
         self.robot = robot
-        self._errors = imperfections or Imperfections().draw(
-            np.random.default_rng(0), robot.joints
-        )
+        self._errors = imperfections
         self._channel = CommandChannel(self._errors, robot.limits.acceleration.numpy())
         self._model = model
         self._data = data
@@ -382,7 +354,10 @@ class MujocoArm:
         self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
         self._finger_servos = np.array([model.actuator(n).id for n in fingers])
         self._reference = np.zeros(len(names))
-        self._weights = _UnknownWeights(model, names)
+        # Mass of each body of the arm that it does not compensate [kg]: an unknown load, and
+        # errors of its own model's link masses.
+        own = model.body_rootid == model.body("link0").id
+        self._unknown = np.where(own, model.body_mass * (1.0 - model.body_gravcomp), 0.0)
         # Estimate of the external torques, as the filter has it [N m]; None: it starts anew.
         self._felt: np.ndarray | None = None
         # Position errors [rad] from which on the servos pull no harder.
@@ -409,11 +384,12 @@ class MujocoArm:
         """
         data = self._data
         torque = data.qfrc_constraint + data.qfrc_applied
-        for body in np.flatnonzero(data.xfrc_applied.any(axis=1)):
-            force, moment = np.split(data.xfrc_applied[body], 2)
-            at = data.xipos[body]
-            mujoco.mj_applyFT(self._model, data, force, moment, at, body, torque)
-        return torque[self._velocities] + self._weights.torque(data)
+        wrench = data.xfrc_applied.copy()
+        wrench[:, :3] += self._unknown[:, None] * self._model.opt.gravity
+        for body in np.flatnonzero(wrench.any(axis=1)):
+            force, moment = np.split(wrench[body], 2)
+            mujoco.mj_applyFT(self._model, data, force, moment, data.xipos[body], body, torque)
+        return torque[self._velocities]
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
         """Set the joint velocities to hold from now on [rad/s]."""

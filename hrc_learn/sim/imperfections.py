@@ -32,68 +32,67 @@ _FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 
 @dataclass(frozen=True, kw_only=True)
 class Imperfections:
-    """Sizes of the errors of a run; each field of zero is the ideal.
+    """Sizes of the errors of a run, by default those of an ordinary laboratory.
 
-    Standard deviations belong to normal distributions. Ranges are uniform, to both sides.
+    docs/concepts/experiments.md gives the sources. Standard deviations belong to normal
+    distributions. Ranges are uniform, to both sides.
     """
 
-    encoder_noise: float = 0.0
-    """Standard deviation of a joint position reading [rad]. Nominal 1e-4 rad."""
-    encoder_offset: float = 0.0
-    """Range of the constant error of each joint's zero [rad]. Nominal 2 mrad."""
-    command_delay: float = 0.0
-    """Delay between a command and the motion of the servos [s]. Nominal 20 ms."""
-    command_jitter: float = 0.0
-    """Standard deviation of that delay from one command to the next [s]. Nominal 2 ms."""
-    servo_lag: float = 0.0
-    """Time constant with which the servos follow a changed velocity [s]. Nominal 10 ms."""
-    slowness: float = 0.0
+    encoder_noise: float = 1e-4
+    """Standard deviation of a joint position reading [rad]."""
+    encoder_offset: float = 2e-3
+    """Range of the constant error of each joint's zero [rad]."""
+    command_delay: float = 0.020
+    """Delay between a command and the motion of the servos [s]."""
+    command_jitter: float = 0.002
+    """Standard deviation of that delay from one command to the next [s]."""
+    servo_lag: float = 0.010
+    """Time constant with which the servos follow a changed velocity [s]."""
+    slowness: float = 0.3
     """Fraction of the acceleration limits that the driver leaves unused, 0 to 1: drivers such
-    as franky plan with reduced limits. Nominal 0.3.
+    as franky plan with reduced limits.
     """
-    joint_friction: float = 0.0
-    """Dry friction of every joint [N m]. Nominal 1 N m."""
-    gravity_error: float = 0.0
-    """Range of the error of the arm's own gravity compensation, a fraction of its weight.
-    Nominal 2 %."""
-    payload: float = 0.0
-    """Largest mass at the hand of which the arm does not know [kg]. Nominal 0.5 kg."""
-    torque_noise: float = 0.0
-    """Standard deviation of an estimated external joint torque [N m]. Nominal 0.2 N m."""
-    torque_lag: float = 0.0
-    """Time constant of the low-pass filter of that estimate [s]. Nominal 10 ms."""
-    base_error: float = 0.0
-    """Range of the position of the base along each axis [m]. Nominal 1 mm."""
-    base_turn: float = 0.0
-    """Range of the turn of the base about the vertical [rad]. Nominal 1 mrad."""
-    tool_error: float = 0.0
-    """Range of the tool centre point along each axis [m]. Nominal 1 mm."""
-    tool_turn: float = 0.0
-    """Range of the turn of the tool about each axis [rad]. Nominal 3 mrad."""
-    image_delay: float = 0.0
-    """Delay between exposure and detected markers [s]. Nominal 80 ms."""
-    image_loss: float = 0.0
-    """Fraction of the images that never arrive. Nominal 20 %."""
-    image_noise: float = 0.0
-    """Standard deviation of the sensor noise, grey levels of 255, beyond the camera's own.
-    Nominal 2."""
-    image_blur: float = 0.0
-    """Standard deviation of the blur, beyond the camera's own [px]. Nominal 0.5 px."""
-    table_height: float = 0.0
-    """Range of the height of the table's top [m]. Nominal 2 cm."""
-    object_height: float = 0.0
-    """Range of the height of each object [m]. Nominal 5 mm."""
-    object_yaw: float = 0.0
-    """Range of the yaw of objects on the table [rad]. Nominal: any."""
-    teaching_error: float = 0.0
-    """Range of a place to which a person leads the arm, along each axis [m]. Nominal 0.5 mm."""
+    joint_friction: float = 1.0
+    """Dry friction of every joint [N m]."""
+    gravity_error: float = 0.02
+    """Range of the error of the arm's own gravity compensation, a fraction of its weight."""
+    payload: float = 0.5
+    """Largest mass at the hand of which the arm does not know [kg]."""
+    torque_noise: float = 0.2
+    """Standard deviation of an estimated external joint torque [N m]."""
+    torque_lag: float = 0.010
+    """Time constant of the low-pass filter of that estimate [s]."""
+    base_error: float = 1e-3
+    """Range of the position of the base along each axis [m]."""
+    base_turn: float = 1e-3
+    """Range of the turn of the base about the vertical [rad]."""
+    tool_error: float = 1e-3
+    """Range of the tool centre point along each axis [m]."""
+    tool_turn: float = 3e-3
+    """Range of the turn of the tool about each axis [rad]."""
+    image_delay: float = 0.080
+    """Delay between exposure and detected markers [s]."""
+    image_loss: float = 0.20
+    """Fraction of the images that never arrive."""
+    image_noise: float = 2.0
+    """Standard deviation of the sensor noise, grey levels of 255, beyond the camera's own."""
+    image_blur: float = 0.5
+    """Standard deviation of the blur, beyond the camera's own [px]."""
+    table_height: float = 0.02
+    """Range of the height of the table's top [m]."""
+    object_height: float = 0.005
+    """Range of the height of each object [m]."""
+    object_yaw: float = math.pi
+    """Range of the yaw of objects on the table [rad]."""
+    teaching_error: float = 5e-4
+    """Range of a place to which a person leads the arm, along each axis [m]."""
 
-    person_noise: float = 0.0
-    """Standard deviation of where a person is seen, along each axis [m]. Nominal 1 cm."""
-    person_delay: float = 0.0
-    """Delay between exposure and the estimated body pose of a person [s]. Nominal 80 ms."""
-    person_loss: float = 0.0
-    """Fraction of images in which a person present is missed. Nominal 20 %."""
+    person_noise: float = 0.01
+    """Standard deviation of where a person is seen, along each axis [m]."""
+    person_delay: float = 0.080
+    """Delay between exposure and the estimated body pose of a person [s]."""
+    person_loss: float = 0.20
+    """Fraction of images in which a person present is missed."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -108,40 +107,13 @@ class Imperfections:
 
     @classmethod
     def ideal(cls) -> Imperfections:
-        """None at all."""
-        return cls()
+        """No imperfections."""
+        return cls().scaled(0.0)
 
     @classmethod
     def nominal(cls) -> Imperfections:
-        """Those of an ordinary laboratory; docs/concepts/experiments.md gives the sources."""
-        return cls(
-            encoder_noise=1e-4,
-            encoder_offset=2e-3,
-            command_delay=0.020,
-            command_jitter=0.002,
-            servo_lag=0.010,
-            slowness=0.3,
-            joint_friction=1.0,
-            gravity_error=0.02,
-            payload=0.5,
-            torque_noise=0.2,
-            torque_lag=0.010,
-            base_error=1e-3,
-            base_turn=1e-3,
-            tool_error=1e-3,
-            tool_turn=3e-3,
-            image_delay=0.080,
-            image_loss=0.20,
-            image_noise=2.0,
-            image_blur=0.5,
-            table_height=0.02,
-            object_height=0.005,
-            object_yaw=math.pi,
-            teaching_error=5e-4,
-            person_noise=0.01,
-            person_delay=0.080,
-            person_loss=0.20,
-        )
+        """Imperfections of an ordinary laboratory: the defaults of all fields."""
+        return cls()
 
     def scaled(self, factor: float) -> Imperfections:
         """All of them so many times as large, fractions up to 0.9, the yaw up to any.
@@ -157,7 +129,7 @@ class Imperfections:
 
     @property
     def camera_noise(self) -> ImageNoise:
-        """Delay of images, the camera's own included [s]."""
+        """Blur and noise of images, the camera's own included."""
         return ImageNoise(
             blur=ImageNoise.blur + self.image_blur, noise=ImageNoise.noise + self.image_noise
         )

@@ -58,11 +58,11 @@ class World:
             config: Nominal scene.
             imperfections: Deviations from the nominal scene; None: none.
         """
-        self.config = config or SceneConfig()
-        self.imperfections = imperfections or Imperfections().draw(
-            np.random.default_rng(0), (config or SceneConfig()).arm.robot.joints
+        nominal = config or SceneConfig()
+        self.imperfections = imperfections or Imperfections.ideal().draw(
+            np.random.default_rng(0), nominal.arm.robot.joints
         )
-        self.config = _as_it_is(self.config, self.imperfections)
+        self.config = _as_it_is(nominal, self.imperfections)
         self.model = self.describe().compile()
         self.data = mujoco.MjData(self.model)
         self._watch = PhysicsWatch(self.model, self.data)

@@ -114,7 +114,7 @@ def test_a_delay_that_is_none_is_not_told():
 
 
 def test_a_marker_that_is_not_seen_is_told():
-    world = at_the_table(Imperfections())
+    world = at_the_table(Imperfections.ideal())
     camera = LateCamera(world, 0.0, 0.05)
     with pytest.raises(CameraError, match="marker 49 in 0 different images"):
         measure_delay(

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -329,7 +330,8 @@ def test_a_pressed_user_stop_says_what_to_release(reflexing):
 
 def test_external_torques_are_the_arms_own_estimate():
     # Dry friction acts on the simulated joints as a load from outside does.
-    drawn = Imperfections(joint_friction=2.0).draw(np.random.default_rng(0))
+    sizes = replace(Imperfections.ideal(), joint_friction=2.0)
+    drawn = sizes.draw(np.random.default_rng(0))
     world = World(SceneConfig(objects=()), drawn)
     world.reset(READY)
     with served_world(world) as served:

@@ -2,6 +2,7 @@
 
 import threading
 from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -223,11 +224,11 @@ def test_servers_beside_each_other_take_addresses_of_their_own():
 
 def test_a_controller_is_told_of_the_drivers_delay_and_acceleration():
     access = through_franky(FrankyConfig(dynamics=0.4, realtime="ignore"))
-    sizes = Imperfections(command_delay=0.02, slowness=0.3)
+    sizes = replace(Imperfections.ideal(), command_delay=0.02, slowness=0.3)
     told = access.declared(sizes)
     assert told.command_delay == pytest.approx(0.02 + PROTOCOL_DELAY)
     assert told.slowness == pytest.approx(0.6)
-    assert access.declared(Imperfections(slowness=0.8)).slowness == 0.8
+    assert access.declared(replace(sizes, slowness=0.8)).slowness == 0.8
     assert SIMULATED.declared(sizes) == sizes
 
 

@@ -18,7 +18,7 @@ LIMIT = panda.limits.acceleration.numpy()
 
 
 def draw(seed=0, **sizes):
-    return Imperfections(**sizes).draw(np.random.default_rng(seed))
+    return replace(Imperfections.ideal(), **sizes).draw(np.random.default_rng(seed))
 
 
 def world(seed=0, **sizes):

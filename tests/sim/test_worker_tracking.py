@@ -1,5 +1,7 @@
 """What a tracker makes of the worker, against the truth and the sizes of its errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,9 @@ class Clock:
 
 def readings(times, seed=0, **sizes):
     clock = Clock()
-    sensor = WorkerSensor(VISIT, clock, Imperfections(**sizes), np.random.default_rng(seed))
+    sensor = WorkerSensor(
+        VISIT, clock, replace(Imperfections.ideal(), **sizes), np.random.default_rng(seed)
+    )
     assert isinstance(sensor, PersonTracker)
     read = []
     for clock.time in times:
@@ -90,7 +94,7 @@ def test_noise_of_velocities_is_that_of_two_images_a_tenth_of_a_second_apart():
     late = np.arange(0.0, 6.0, 0.03) + VISIT.end + 1.0
     clock = Clock()
     clock.time = late[0]
-    noisy = Imperfections(person_noise=0.01)
+    noisy = replace(Imperfections.ideal(), person_noise=0.01)
     sensor = WorkerSensor(VISIT, clock, noisy, np.random.default_rng(0))
     velocities = {}
     for clock.time in late:
