@@ -167,7 +167,7 @@ def matmul(
     """A B."""
     if not torch.compiler.is_compiling():
         return A @ B
-    return unrolled_matmul(A, B)
+    return (A.unsqueeze(-1) * B.unsqueeze(-3)).sum(-2)
 
 
 def inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
@@ -175,7 +175,20 @@ def inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
     if not torch.compiler.is_compiling():
         factor, _ = torch.linalg.cholesky_ex(A)
         return torch.linalg.matrix_norm(torch.cholesky_inverse(factor))
-    return unrolled_inverse_norm(A)
+    # From the entries of A^-1 = M^T D^-1 M with M = L^-1.
+    L, inverse_d = _factors(A)
+    n = len(inverse_d)
+    M: list[list[Tensor]] = [[] for _ in range(n)]
+    for i in range(n):
+        for j in range(i):
+            M[i].append(-_sum([L[i][j], *(L[i][k] * M[k][j] for k in range(j + 1, i))]))
+        M[i].append(torch.ones_like(inverse_d[i]))
+    square = []
+    for i in range(n):
+        for j in range(i + 1):
+            entry = _sum([M[k][i] * M[k][j] * inverse_d[k] for k in range(i, n)])
+            square.append(entry * entry * (1 if i == j else 2))
+    return _sum(square).sqrt()
 
 
 def solve_positive(
@@ -185,7 +198,17 @@ def solve_positive(
     if not torch.compiler.is_compiling():
         factor, _ = torch.linalg.cholesky_ex(A)
         return torch.cholesky_solve(B, factor)
-    return unrolled_solve(A, B)
+    # Row by row from A = L D L^T, with unit lower triangular L.
+    L, inverse_d = _factors(A)
+    rows = list(B.unbind(-2))
+    for i in range(len(rows)):  # L y = b
+        for j in range(i):
+            rows[i] = rows[i] - L[i][j].unsqueeze(-1) * rows[j]
+    for i in reversed(range(len(rows))):  # L^T x = D^-1 y
+        rows[i] = rows[i] * inverse_d[i].unsqueeze(-1)
+        for j in range(i + 1, len(rows)):
+            rows[i] = rows[i] - L[j][i].unsqueeze(-1) * rows[j]
+    return torch.stack(rows, dim=-2)
 
 
 def null_projection(
@@ -204,7 +227,15 @@ def null_projection(
     if not torch.compiler.is_compiling():
         Q = torch.linalg.qr(J.mT).Q
         return w - (Q @ (Q.mT @ w.unsqueeze(-1))).squeeze(-1)
-    return unrolled_null_projection(J, w)
+    # By the reflections that make J^T triangular, there and back.
+    m = J.shape[-2]
+    reflections = _reflections(J)
+    for k, (v, factor) in enumerate(reflections):
+        w = _reflected(w, k, v, factor)
+    w = torch.cat([torch.zeros_like(w[..., :m]), w[..., m:]], dim=-1)
+    for k in reversed(range(m)):
+        w = _reflected(w, k, *reflections[k])
+    return w
 
 
 def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n"]:
@@ -217,65 +248,6 @@ def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n
     """
     if not torch.compiler.is_compiling():
         return torch.linalg.qr(J.mT, mode="complete").Q
-    return unrolled_orthonormal_basis(J)
-
-
-def unrolled_matmul(
-    A: Float[Tensor, "*#batch m k"], B: Float[Tensor, "*#batch k n"]
-) -> Float[Tensor, "*batch m n"]:
-    """`matmul` as a sum of products."""
-    return (A.unsqueeze(-1) * B.unsqueeze(-3)).sum(-2)
-
-
-def unrolled_solve(
-    A: Float[Tensor, "*batch n n"], B: Float[Tensor, "*batch n k"]
-) -> Float[Tensor, "*batch n k"]:
-    """`solve_positive` row by row from A = L D L^T, with unit lower triangular L."""
-    L, inverse_d = _factors(A)
-    rows = list(B.unbind(-2))
-    for i in range(len(rows)):  # L y = b
-        for j in range(i):
-            rows[i] = rows[i] - L[i][j].unsqueeze(-1) * rows[j]
-    for i in reversed(range(len(rows))):  # L^T x = D^-1 y
-        rows[i] = rows[i] * inverse_d[i].unsqueeze(-1)
-        for j in range(i + 1, len(rows)):
-            rows[i] = rows[i] - L[j][i].unsqueeze(-1) * rows[j]
-    return torch.stack(rows, dim=-2)
-
-
-def unrolled_inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
-    """`inverse_norm` from the entries of A^-1 = M^T D^-1 M with M = L^-1."""
-    L, inverse_d = _factors(A)
-    n = len(inverse_d)
-    M: list[list[Tensor]] = [[] for _ in range(n)]
-    for i in range(n):
-        for j in range(i):
-            M[i].append(-_sum([L[i][j], *(L[i][k] * M[k][j] for k in range(j + 1, i))]))
-        M[i].append(torch.ones_like(inverse_d[i]))
-    square = []
-    for i in range(n):
-        for j in range(i + 1):
-            entry = _sum([M[k][i] * M[k][j] * inverse_d[k] for k in range(i, n)])
-            square.append(entry * entry * (1 if i == j else 2))
-    return _sum(square).sqrt()
-
-
-def unrolled_null_projection(
-    J: Float[Tensor, "*batch m n"], w: Float[Tensor, "*batch n"]
-) -> Float[Tensor, "*batch n"]:
-    """`null_projection` by the reflections that make J^T triangular, there and back."""
-    m = J.shape[-2]
-    reflections = _reflections(J)
-    for k, (v, factor) in enumerate(reflections):
-        w = _reflected(w, k, v, factor)
-    w = torch.cat([torch.zeros_like(w[..., :m]), w[..., m:]], dim=-1)
-    for k in reversed(range(m)):
-        w = _reflected(w, k, *reflections[k])
-    return w
-
-
-def unrolled_orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n"]:
-    """`orthonormal_basis` by the same reflections."""
     n = J.shape[-1]
     Q = torch.eye(n, dtype=J.dtype, device=J.device).expand(*J.shape[:-2], n, n)
     for k, (v, factor) in enumerate(_reflections(J)):
