@@ -13,7 +13,6 @@ from hrc_learn.kinematics.collision import GraspedBox as GraspedBox
 from hrc_learn.kinematics.collision import LinkCapsule as LinkCapsule
 from hrc_learn.kinematics.collision import Separation as Separation
 from hrc_learn.kinematics.collision import separation as separation
-from hrc_learn.kinematics.franka import FR3_VINTAGES as FR3_VINTAGES
 from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
 from hrc_learn.kinematics.franka import TOOL_LINK as TOOL_LINK
 from hrc_learn.kinematics.franka import fr3 as fr3

@@ -8,11 +8,11 @@ wherever something is mounted on a link.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 import torch
@@ -61,15 +61,9 @@ class UnreachableError(ValueError):
     """No joint positions within the limits reach a pose."""
 
 
-@runtime_checkable
-class ClosedForm(Protocol):
-    """Closed-form inverse kinematics of a seven-joint arm."""
-
-    def branches(
-        self, arm: SerialChain, pose: Pose, q7: Float[Tensor, "*#batch"] | float
-    ) -> Float[Tensor, "*batch 4 7"]:
-        """All solutions within the limits for a position of joint 7 [rad], then rows of NaN."""
-        ...
+type ClosedForm = Callable[[SerialChain, Pose, Tensor | float], Tensor]
+"""Closed-form inverse of a seven-joint arm: all solutions (*batch, 4, 7) within limits for a
+position of joint 7 [rad], then rows of NaN."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +160,6 @@ class Arm(SerialChain):
     def joints(self) -> int:
         """Number of joints."""
         return len(self.joint_names)
-
-    @property
-    def tool_link(self) -> int:
-        """Number of the tool centre point's frame."""
-        return self.joints + 2
 
     @property
     def is_franka(self) -> bool:
@@ -316,7 +305,7 @@ class Arm(SerialChain):
             return self._numerical_solutions(pose, near.double(), samples)
         if q7 is not None:
             angles = q7 if isinstance(q7, float) else as_tensor(q7)
-            return self._closed_form.branches(self, pose, angles)
+            return self._closed_form(self, pose, angles)
         lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
         batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
         # A margin from the limits leaves room for corrections.
@@ -324,9 +313,7 @@ class Arm(SerialChain):
             lower + _MARGIN, upper - _MARGIN, samples, dtype=torch.float64, device=near.device
         )
         scan = torch.cat([near[..., 6:7].expand(*batch, 1), scan.expand(*batch, samples)], -1)
-        return self._closed_form.branches(self, _repeated(pose, scan.shape), scan).flatten(
-            -3, -2
-        )
+        return self._closed_form(self, _repeated(pose, scan.shape), scan).flatten(-3, -2)
 
     def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
         """Distinct joint positions for one pose, the most comfortable first [rad].
@@ -345,7 +332,7 @@ class Arm(SerialChain):
             lower, upper = float(self.limits.lower[6]), float(self.limits.upper[6])
             scan = torch.linspace(lower, upper, _POSTURE_SCAN, dtype=torch.float64)
             many = _repeated(pose, scan.shape)
-            found = self._closed_form.branches(self, many, scan).flatten(0, 1)
+            found = self._closed_form(self, many, scan).flatten(0, 1)
         found = found[found.isfinite().all(-1)]
         if len(found) == 0:
             raise UnreachableError(_explain(self.name, pose, None, torch.tensor(True)))

@@ -25,7 +25,7 @@ from hrc_learn.kinematics.description import (
     Joint,
     Shape,
     Transform,
-    transform,
+    motion,
     turn_to,
 )
 from hrc_learn.kinematics.limits import JointLimits, complete_limits, read_limits
@@ -251,22 +251,14 @@ def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transfor
     """
     lower, upper = joint.lower or 0.0, joint.upper or 0.0
     closed, opened = (lower, upper) if abs(upper) >= abs(lower) else (upper, lower)
-    turn = turn_to(joint.axis)
     poses = [
-        parent @ joint.origin @ turn @ _motion(joint.kind, value) @ turn.T
+        parent @ joint.origin @ motion(joint.kind, joint.axis, value)
         for value in np.linspace(closed, opened, _FINGER_POSTURES).tolist()
     ]
     kind = "prismatic" if joint.kind == "prismatic" else "revolute"
     follows = joint.follows
     finger = FingerJoint(joint.name, kind, closed=closed, opened=opened, follows=follows)
     return finger, poses
-
-
-def _motion(kind: str, value: float) -> Transform:
-    if kind == "prismatic":
-        return transform(np.eye(3), np.array([0.0, 0.0, value]))
-    c, s = np.cos(value), np.sin(value)
-    return transform(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.zeros(3))
 
 
 def _meshes(

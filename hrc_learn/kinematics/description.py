@@ -359,6 +359,15 @@ def turn_to(axis: Float[np.ndarray, "3"]) -> Transform:
     return turn
 
 
+def motion(kind: str, axis: Float[np.ndarray, "3"], value: float) -> Transform:
+    """Motion of a joint along or about a unit axis by a value [m] or [rad] (Rodrigues)."""
+    if kind == "prismatic":
+        return transform(np.eye(3), value * axis)
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return transform(np.eye(3) + np.sin(value) * K + (1 - np.cos(value)) * K @ K, np.zeros(3))
+
+
 def transform(R: Float[np.ndarray, "3 3"], p: Float[np.ndarray, "3"]) -> Transform:
     """Homogeneous transform of a rotation and an origin [m]."""
     T = np.eye(4)

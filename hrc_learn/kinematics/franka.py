@@ -19,7 +19,7 @@ Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at mo
 from __future__ import annotations
 
 from collections import defaultdict
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, distribution
 from math import cos, pi, sin
 from pathlib import Path
@@ -53,63 +53,29 @@ PANDA_LIMITS = _limits(
 )
 """Franka's "Robot and interface specifications", control-parameters-joint-fer.csv."""
 
-# Limits that all sources for the Research 3 agree on.
-_FR3 = {
-    "velocity": (2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
-    "acceleration": (10.0,) * 7,
-    "jerk": (5000.0,) * 7,
-    "torque": (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
-    "deceleration": (6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0),
-}
-# The range of the mechanical stops, in the newer sources.
-_STOPS = {
-    "lower": (-2.9007, -1.8361, -2.9007, -3.0770, -2.8763, 0.4398, -3.0508),
-    "upper": (2.9007, 1.8361, 2.9007, -0.1169, 2.8763, 4.6216, 3.0508),
-}
-FR3_VINTAGES = {
-    "libfranka": _limits(
-        "Franka Research 3, compute{Upper,Lower}LimitsJointVelocity in rate_limiting.h of "
-        "libfranka 0.10 to 0.21, and the robot's URDF in franka-sim 1.1.7",
-        lower=(-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196),
-        upper=(2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196),
-        velocity_offset=(0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35),
-        **_FR3,
-    ),
-    "description": _limits(
-        "Franka Research 3, URDF with position-based velocity limits, as in franky-sim 1.0.4",
-        velocity_offset=(0.652, 0.25, 0.2005, 0.3542, 0.5738, 0.4885, 0.4592),
-        **_STOPS,
-        **_FR3,
-    ),
-    "documentation": _limits(
-        "Franka Research 3, control-parameters-joint-fr3.csv of Franka's documentation, as "
-        "revised in a76efff, read in May 2026",
-        velocity_offset=(0.6599, 0.2517, 0.2000, 0.3533, 0.5757, 0.4878, 0.4628),
-        **_STOPS,
-        **_FR3,
-    ),
-}
-"""Limits by source. They differ in the position limits and in the offsets of the position-based
-velocity limits. A robot uses those of the URDF that it sends to its driver, hence of its system
-image.
-"""
-
-
 FR3_LIMITS = _limits(
-    "the strictest of: " + "; ".join(limits.vintage for limits in FR3_VINTAGES.values()),
+    "the strictest of libfranka 0.10 to 0.21 (rate_limiting.h), the URDF with position-based "
+    "velocity limits of franky-sim 1.0.4, and control-parameters-joint-fr3.csv of Franka's "
+    "documentation in a76efff, read in May 2026",
     lower=(-2.7501, -1.7918, -2.9007, -3.0481, -2.8101, 0.54092, -3.0196),
     upper=(2.7501, 1.7918, 2.9007, -0.1458, 2.8101, 4.5205, 3.0196),
-    # With the distance w from here to the position limit of a vintage, d the deceleration and v
+    velocity=(2.62, 2.62, 2.62, 2.62, 5.26, 4.18, 5.26),
+    acceleration=(10.0,) * 7,
+    jerk=(5000.0,) * 7,
+    torque=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
+    deceleration=(6.0, 2.585, 3.5, 4.0, 17.0, 5.5, 17.0),
+    # With the distance w from here to the position limit of a table, d the deceleration and v
     # the velocity, the curves meet where v is reached: sqrt((v + its offset)^2 - 2 d w) - v, of
     # which these are the largest.
     velocity_offset=(
         *(0.37174598019283733, 0.21154196331256925, 0.2004999999999999, 0.31507506547958686),
         *(0.3795562316551111, 0.36783379753482226, 0.36935518865171524),
     ),
-    **_FR3,
 )
-"""The innermost position limits of all tables, and the smallest velocity offsets whose curves
-stay below all others: kept by every Research 3, whichever of these tables it has."""
+"""The innermost position limits of these tables, and the smallest velocity offsets whose curves
+stay below all others: kept by every Research 3. The tables differ in the position limits and in
+the offsets; a robot uses those of the URDF that it sends to its driver, hence of its system
+image."""
 
 
 # Craig's modified Denavit-Hartenberg parameters, as published in Franka's "Robot and interface
@@ -131,48 +97,43 @@ _HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad
 _TOLERANCE = 1e-6
 
 
-class FrankaInverse:
-    """Closed-form inverse of a Franka arm."""
+def franka_branches(
+    arm: SerialChain,
+    pose: Pose,
+    q7: Float[Tensor, "*#batch"] | float,
+    ranges: tuple[bool, ...] = (False,),
+) -> Float[Tensor, "*batch 4 7"]:
+    """All branches within the limits for a position of joint 7 [rad], then rows of NaN.
 
-    def __init__(self, ranges: tuple[bool, ...]):
-        """Choose the joint ranges that frankik is asked with.
+    Args:
+        arm: Chain with Franka's geometry.
+        pose: Poses of the tool centre point in the base frame.
+        q7: Position of joint 7 [rad].
+        ranges: Joint ranges that frankik is asked with. It drops branches outside the Panda's
+            range (False) or outside the narrow range of the FR3 for which the velocity limits
+            hold at all positions (True). The FR3's full range is in neither; both together
+            leave out the least.
+    """
+    import frankik  # only here: the rest of the package works without it
 
-        frankik drops branches outside the Panda's range (False) or outside the narrow range of
-        the FR3 for which the velocity limits hold at all positions (True). The FR3's full range
-        is in neither; both together leave out the least.
-        """
-        self._ranges = ranges
-
-    def branches(
-        self, arm: SerialChain, pose: Pose, q7: Float[Tensor, "*#batch"] | float
-    ) -> Float[Tensor, "*batch 4 7"]:
-        """All branches within the limits for a position of joint 7 [rad], then rows of NaN.
-
-        Args:
-            arm: Chain with Franka's geometry.
-            pose: Poses of the tool centre point in the base frame.
-            q7: Position of joint 7 [rad].
-        """
-        import frankik  # only here: the rest of the package works without it
-
-        position = pose.position.detach().double().cpu()
-        orientation = pose.orientation.detach().double().cpu()
-        tip = Pose(position, orientation).matrix()
-        flange = tip @ torch.linalg.inv(arm.tcp)
-        q7 = torch.as_tensor(q7, dtype=torch.float64).cpu()
-        # torch's broadcast_shapes imports sympy on its first call, which takes seconds.
-        shape = np.broadcast_shapes(flange.shape[:-2], q7.shape)
-        flanges = flange.expand(*shape, 4, 4).reshape(-1, 4, 4).numpy()
-        angles = q7.expand(shape).reshape(-1).tolist()
-        # The default posture only selects among branches when a joint is indeterminate.
-        branches = np.full((len(flanges), 4, 7), np.nan)
-        for is_fr3 in self._ranges:
-            for row, T, angle in zip(branches, flanges, angles, strict=True):
-                # A branch has the same row in either answer, or is NaN.
-                found = frankik.ik_full(T, frankik.kQDefault, angle, is_fr3)
-                np.copyto(row, found, where=np.isnan(row))
-        q = torch.from_numpy(branches).reshape(*shape, 4, 7)
-        return _valid_first(arm, q, tip.expand(*shape, 4, 4)).to(pose.position)
+    position = pose.position.detach().double().cpu()
+    orientation = pose.orientation.detach().double().cpu()
+    tip = Pose(position, orientation).matrix()
+    flange = tip @ torch.linalg.inv(arm.tcp)
+    q7 = torch.as_tensor(q7, dtype=torch.float64).cpu()
+    # torch's broadcast_shapes imports sympy on its first call, which takes seconds.
+    shape = np.broadcast_shapes(flange.shape[:-2], q7.shape)
+    flanges = flange.expand(*shape, 4, 4).reshape(-1, 4, 4).numpy()
+    angles = q7.expand(shape).reshape(-1).tolist()
+    # The default posture only selects among branches when a joint is indeterminate.
+    branches = np.full((len(flanges), 4, 7), np.nan)
+    for is_fr3 in ranges:
+        for row, T, angle in zip(branches, flanges, angles, strict=True):
+            # A branch has the same row in either answer, or is NaN.
+            found = frankik.ik_full(T, frankik.kQDefault, angle, is_fr3)
+            np.copyto(row, found, where=np.isnan(row))
+    q = torch.from_numpy(branches).reshape(*shape, 4, 7)
+    return _valid_first(arm, q, tip.expand(*shape, 4, 4)).to(pose.position)
 
 
 def _valid_first(
@@ -189,22 +150,16 @@ def _valid_first(
 
 def _craig(a: float, d: float, alpha: float) -> Tensor:
     """Rx(alpha) Tx(a) Tz(d): a joint frame at zero in the frame before it."""
-    c, s = _exact_cos_sin(alpha)
-    return torch.tensor(
-        [[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1]], dtype=torch.float64
-    )
+    # Multiples of a right angle, without the 6e-17 of rounding.
+    c, s = round(cos(alpha)), round(sin(alpha))
+    rows = [[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1]]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 def _along_z(distance: float, angle: float = 0.0) -> Tensor:
     c, s = cos(angle), sin(angle)
-    return torch.tensor(
-        [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, distance], [0, 0, 0, 1]], dtype=torch.float64
-    )
-
-
-def _exact_cos_sin(angle: float) -> tuple[float, float]:
-    """Cosine and sine of a multiple of a right angle without the 6e-17 of rounding."""
-    return float(round(cos(angle))), float(round(sin(angle)))
+    rows = [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, distance], [0, 0, 0, 1]]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 TOOL_LINK = 9
@@ -260,7 +215,7 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
         shape=ArmShape(masses=(None, *LINK_MASSES, 0.0, HAND_MASS)),
         capsules=LINK_CAPSULES + hand_capsules(TOOL_LINK),
         overlapping=OVERLAPPING,
-        closed_form=FrankaInverse(ranges),
+        closed_form=partial(franka_branches, ranges=ranges),
     )
 
 

@@ -9,11 +9,13 @@ import numpy as np
 
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.kinematics.description import (
+    MOVING,
     Description,
     Joint,
     Link,
     Shape,
     Transform,
+    motion,
     transform,
 )
 
@@ -110,15 +112,16 @@ class _Reader:
             name = bytes(model.paths[place_of_name:]).partition(b"\0")[0]
             path = Path(name.decode())
             return Shape(kind="mesh", path=path, scale=(sx, sy, sz), **place)
-        if kind == kinds.mjGEOM_BOX:
-            return Shape(kind="box", size=(x, y, z), **place)
-        if kind == kinds.mjGEOM_SPHERE:
-            return Shape(kind="sphere", size=(x, 0.0), **place)
-        if kind == kinds.mjGEOM_CAPSULE:
-            return Shape(kind="capsule", size=(x, y), **place)
-        if kind == kinds.mjGEOM_CYLINDER:
-            return Shape(kind="cylinder", size=(x, y), **place)
-        return None  # planes, height fields and the like are no part of an arm
+        known = {
+            kinds.mjGEOM_BOX: ("box", (x, y, z)),
+            kinds.mjGEOM_SPHERE: ("sphere", (x, 0.0)),
+            kinds.mjGEOM_CAPSULE: ("capsule", (x, y)),
+            kinds.mjGEOM_CYLINDER: ("cylinder", (x, y)),
+        }
+        if kind not in known:  # planes, height fields and the like are no part of an arm
+            return None
+        name, size = known[kind]
+        return Shape(kind=name, size=size, **place)
 
     def _colour(self, g: int) -> Colour:
         material = int(self.model.geom_matid[g])
@@ -140,7 +143,8 @@ class _Reader:
             anchor[:3, 3] = model.jnt_pos[j]
             # A joint's position counts from the reference that the file gives it.
             moving = f"{name} ({self._joint_name(j)})"
-            zero = _moved(kind, model.jnt_axis[j], -float(model.qpos0[model.jnt_qposadr[j]]))
+            at = float(model.qpos0[model.jnt_qposadr[j]]) if kind in MOVING else 0.0
+            zero = motion(kind, model.jnt_axis[j], -at) if at else np.eye(4)
             limited = bool(model.jnt_limited[j])
             lower, upper = model.jnt_range[j].tolist() if limited else (None, None)
             if kind == "revolute" and not limited:
@@ -208,15 +212,3 @@ class _Reader:
 def _fixed(name: str, parent: str, child: str, origin: Transform) -> Joint:
     axis = np.array([0.0, 0.0, 1.0])
     return Joint(name=name, kind="fixed", parent=parent, child=child, origin=origin, axis=axis)
-
-
-def _moved(kind: str, axis: np.ndarray, by: float) -> Transform:
-    """Motion of a joint, as a transform."""
-    if by == 0 or kind not in ("revolute", "prismatic"):
-        return np.eye(4)
-    if kind == "prismatic":
-        return transform(np.eye(3), by * axis)
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    R = np.eye(3) + np.sin(by) * K + (1 - np.cos(by)) * K @ K  # Rodrigues
-    return transform(R, np.zeros(3))

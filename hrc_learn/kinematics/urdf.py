@@ -19,7 +19,7 @@ from hrc_learn.kinematics.description import (
     Link,
     Shape,
     Transform,
-    transform,
+    motion,
 )
 
 _BOUNDS = ("lower", "upper", "velocity", "effort")
@@ -202,8 +202,13 @@ class _Reader:
         if origin is None:
             return np.eye(4)
         zero = (0.0, 0.0, 0.0)
-        p = self._numbers(origin, "xyz", zero, what)
-        return transform(_rotation(*self._numbers(origin, "rpy", zero, what)), p)
+        x, y, z = np.eye(3)
+        roll, pitch, yaw = self._numbers(origin, "rpy", zero, what)
+        # About the fixed axes x, y, z in turn.
+        turn = motion("revolute", z, yaw) @ motion("revolute", y, pitch)
+        pose = turn @ motion("revolute", x, roll)
+        pose[:3, 3] = self._numbers(origin, "xyz", zero, what)
+        return pose
 
     def _colour(self, material: ElementTree.Element) -> Colour | None:
         colour = material.find("color")
@@ -244,15 +249,3 @@ class _Reader:
                 f"{'s' if count > 1 else ''}"
             )
         return np.array(values)
-
-
-def _rotation(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Rz(yaw) Ry(pitch) Rx(roll): about the fixed axes x, y, z in turn."""
-    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )

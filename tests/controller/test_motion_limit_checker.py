@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fr3_tables import FR3_TABLES
 from hostile_streams import (
     HostileStreams,
     StreamConfig,
@@ -16,7 +17,7 @@ from hostile_streams import (
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyFilter
-from hrc_learn.kinematics import FR3_VINTAGES, JointLimits, panda
+from hrc_learn.kinematics import JointLimits, panda
 
 ROOT = Path(__file__).parents[2]
 PYTHON = ROOT / ".venv-franka-sim" / "bin" / "python"
@@ -28,8 +29,8 @@ pytestmark = pytest.mark.skipif(
 JUDGES = {
     "panda": ("panda", panda.limits),
     "fr3 as it is": ("fr3", None),
-    "fr3 documentation": ("fr3", FR3_VINTAGES["documentation"]),
-    "fr3 description": ("fr3", FR3_VINTAGES["description"]),
+    "fr3 documentation": ("fr3", FR3_TABLES["documentation"]),
+    "fr3 description": ("fr3", FR3_TABLES["description"]),
 }
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fr3_tables import FR3_TABLES
 from hostile_streams import (
     STREAMS,
     StreamConfig,
@@ -23,7 +24,7 @@ from hrc_learn.controller import (
     SafetyFilter,
 )
 from hrc_learn.deploy import EagerRunner, PackageRunner, StepRunner, open_step
-from hrc_learn.kinematics import FR3_VINTAGES, fr3, panda
+from hrc_learn.kinematics import fr3, panda
 
 pytestmark = pytest.mark.simulation
 
@@ -46,10 +47,10 @@ def _no_shape_checks() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("config", CONFIGS.values(), ids=CONFIGS)
-@pytest.mark.parametrize("vintage", FR3_VINTAGES)
+@pytest.mark.parametrize("vintage", FR3_TABLES)
 def test_whatever_the_filter_allows_is_allowed(vintage, config):
     """At each position, the fastest a joint may be there as it brakes as hard as it can."""
-    limits = FR3_VINTAGES[vintage]
+    limits = FR3_TABLES[vintage]
     safety = SafetyFilter(fr3.limits, config)
     share = torch.linspace(-0.02, 1.02, 20_001, dtype=torch.float64)[:, None]
     q = torch.lerp(limits.lower, limits.upper, share)

@@ -189,7 +189,7 @@ def test_fingers_are_where_mujoco_has_them_from_closed_to_open(tmp_path):
             assert abs(finger.opened) > abs(finger.closed)
             values = np.linspace(finger.closed, finger.opened, 5)
             for value, (link, shape) in zip(values, a.shape.shapes, strict=True):
-                assert link == a.tool_link
+                assert link == a.joints + 2
                 data.joint("grip").qpos[0] = value
                 mujoco.mj_kinematics(model, data)
                 tip, moved = data.body("tip"), data.body("finger")

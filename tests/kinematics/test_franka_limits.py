@@ -8,15 +8,16 @@ from xml.etree import ElementTree
 
 import pytest
 import torch
+from fr3_tables import FR3_TABLES
 from sampling import generator, within
 from torch.testing import assert_close
 
-from hrc_learn.kinematics import FR3_VINTAGES, JointLimits, fr3, panda
+from hrc_learn.kinematics import JointLimits, fr3, panda
 
 
 def everywhere(*batch: int) -> torch.Tensor:
     """Joint positions within any vintage's limits and up to 0.2 rad past them."""
-    limits = FR3_VINTAGES["documentation"]
+    limits = FR3_TABLES["documentation"]
     return within(limits.lower, limits.upper, *batch, rng=generator(), margin=-0.2)
 
 
@@ -43,9 +44,9 @@ def published(limits: JointLimits, q: list[float]) -> tuple[list[float], list[fl
     return lower, upper
 
 
-@pytest.mark.parametrize("vintage", FR3_VINTAGES)
+@pytest.mark.parametrize("vintage", FR3_TABLES)
 def test_velocity_limits_are_those_of_the_published_formula(vintage):
-    limits = FR3_VINTAGES[vintage]
+    limits = FR3_TABLES[vintage]
     q = everywhere(300)
     lower, upper = limits.velocity_bounds(q)
     for k, row in enumerate(q.tolist()):
@@ -93,7 +94,7 @@ def test_the_arm_keeps_the_limits_of_every_vintage_and_no_tighter_ones():
     limits = fr3.limits
     q = torch.lerp(limits.lower, limits.upper, torch.linspace(0, 1, 20_001).double()[:, None])
     lower, upper = limits.velocity_bounds(q)
-    strict = [k.velocity_bounds(q) for k in FR3_VINTAGES.values()]
+    strict = [k.velocity_bounds(q) for k in FR3_TABLES.values()]
     room_up = torch.stack([k[1] for k in strict]).amin(0) - upper
     room_down = lower - torch.stack([k[0] for k in strict]).amax(0)
     assert float(room_up.min()) > -1e-12
@@ -103,7 +104,7 @@ def test_the_arm_keeps_the_limits_of_every_vintage_and_no_tighter_ones():
     bolder = replace(limits, velocity_offset=limits.velocity_offset - 1e-3)
     up = bolder.velocity_bounds(q)[1] > torch.stack([k[1] for k in strict]).amin(0) + 1e-9
     assert bool(up.any(0).all())
-    for k in FR3_VINTAGES.values():
+    for k in FR3_TABLES.values():
         assert bool((limits.lower >= k.lower).all())
         assert bool((limits.upper <= k.upper).all())
 
@@ -133,7 +134,7 @@ def test_the_numbers_are_those_of_the_urdf_with_franky_sim():
     assert spec is not None
     assert spec.submodule_search_locations is not None
     path = Path(spec.submodule_search_locations[0]) / "assets" / "fr3_clean.urdf"
-    limits = FR3_VINTAGES["description"]
+    limits = FR3_TABLES["description"]
     assert limits.velocity_offset is not None
     assert limits.deceleration is not None
     joints = {j.get("name"): j for j in ElementTree.parse(path).getroot().iter("joint")}
