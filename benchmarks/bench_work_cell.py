@@ -107,7 +107,9 @@ def work_cell_step(seed: int, *parts: str) -> Callable[[], None]:
     if visit is not None:
         # There at once: two seconds before he lets go of it.
         world.data.time = visit.released - 2.0
-        tracker = WorkerSensor(visit, lambda: world.time, sizes, rng)
+        tracker = WorkerSensor(
+            visit.ends_at, visit.worker.radius, lambda: world.time, sizes, rng
+        )
         watch = PersonWatch(tracker, whole_arm(workplace.scene.arm), config.safety.separation)
     motion = MotionLog(world)
 

@@ -143,24 +143,20 @@ class WorkerTables:
         return workers, torch.where(known, age, torch.nan)
 
 
-class _Computed:
-    """A visit whose capsules at the times of all images were computed at once."""
-
-    def __init__(self, visit: WorkerVisit, rate: float, duration: float):
-        self.worker, self._rate = visit.worker, rate
-        self._ends = visit.ends_at(np.arange(int(duration * rate) + 2) / rate)
-
-    def ends_at(self, time: float) -> Float[np.ndarray, "parts 2 3"]:
-        return self._ends[round(time * self._rate)]
-
-
 def _images(
     visit: WorkerVisit, sizes: Imperfections, chance: np.random.Generator, dt: float
 ) -> tuple[list[PersonObservation], Int[np.ndarray, " steps"]]:
     """Observations of a visit, and the newest one at each control step."""
     duration, now = visit.end + _AFTER, 0.0
-    computed = _Computed(visit, IMAGE_RATE, duration)
-    sensor = WorkerSensor(computed, lambda: now, sizes, chance)
+    # The capsules at the times of all images, computed at once.
+    ends = visit.ends_at(np.arange(int(duration * IMAGE_RATE) + 2) / IMAGE_RATE)
+    sensor = WorkerSensor(
+        lambda time: ends[round(time * IMAGE_RATE)],
+        visit.worker.radius,
+        lambda: now,
+        sizes,
+        chance,
+    )
     images: list[PersonObservation] = []
     newest = np.empty(int(duration / dt), dtype=np.int64)
     for step in range(len(newest)):

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Capsule, quaternion
 from hrc_learn.kinematics import Arm, CapsuleArm, LinkCapsule
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections
@@ -23,9 +23,7 @@ from hrc_learn.vision import Marker, marker_texture
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 
-_CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 _SHORTEST = 1e-6  # length of a capsule from which on it is no ball [m]
-_BOX = mujoco.mjtGeom.mjGEOM_BOX
 
 _HIDDEN = 4  # sites of this group are not drawn
 _WHITE = (0.92, 0.93, 0.95, 1.0)
@@ -97,7 +95,19 @@ def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
 
 def add_box(body, name: str, half_size, colour, **more):
     """Add a box to a body, by half edges [m] and colour (RGBA)."""
-    return body.add_geom(name=name, type=_BOX, size=half_size, rgba=colour, **more)
+    return body.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half_size, rgba=colour, **more
+    )
+
+
+def add_capsule(body, name: str, capsule: LinkCapsule | Capsule, colour):
+    """Add a capsule to a body, a ball if it has no length, as MuJoCo takes no such capsule."""
+    is_ball = math.dist(capsule.start, capsule.end) < _SHORTEST
+    along = {"pos": capsule.start} if is_ball else {"fromto": (*capsule.start, *capsule.end)}
+    kind = mujoco.mjtGeom.mjGEOM_SPHERE if is_ball else mujoco.mjtGeom.mjGEOM_CAPSULE
+    return body.add_geom(
+        name=name, type=kind, size=(capsule.radius, 0, 0), rgba=colour, **along
+    )
 
 
 def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
@@ -241,17 +251,8 @@ def _add_capsules(body, robot: Arm, link: int, mass: float | None) -> None:
             group=_HIDDEN,
         )
     for k, capsule in enumerate(capsules):
-        # MuJoCo takes no capsule without a length.
-        is_ball = math.dist(capsule.start, capsule.end) < _SHORTEST
-        along = (
-            {"pos": capsule.start} if is_ball else {"fromto": (*capsule.start, *capsule.end)}
-        )
-        geom = body.add_geom(
-            name=f"link{link}_{k}" if mass or k else f"link{link}",
-            type=mujoco.mjtGeom.mjGEOM_SPHERE if is_ball else _CAPSULE,
-            size=(capsule.radius, 0, 0),
-            rgba=_WHITE,
-            **along,
+        geom = add_capsule(
+            body, f"link{link}_{k}" if mass or k else f"link{link}", capsule, _WHITE
         )
         if mass is not None:
             geom.mass = mass / len(capsules)

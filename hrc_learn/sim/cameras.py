@@ -26,8 +26,6 @@ from hrc_learn.sim.scene import (
     HAND_MARKER,
     NOWHERE,
     OCCLUDER,
-    OCCLUDER_COLOUR,
-    OCCLUDER_HALF_SIZE,
 )
 from hrc_learn.sim.world import World
 from hrc_learn.vision import (
@@ -35,7 +33,6 @@ from hrc_learn.vision import (
     ImageNoise,
     Lens,
     Marker,
-    OccludingBoard,
     SyntheticCamera,
 )
 
@@ -70,15 +67,9 @@ class Arrow:
         if scene.ngeom == scene.maxgeom:
             return
         kind = mujoco.mjtGeom.mjGEOM_ARROW if self.head else mujoco.mjtGeom.mjGEOM_CAPSULE
-        geom = scene.geoms[scene.ngeom]
-        nothing = np.zeros(3)
+        geom, zero, colour = scene.geoms[scene.ngeom], np.zeros(3), np.array(self.colour)
         mujoco.mjv_initGeom(
-            geom,
-            kind,
-            nothing,
-            nothing,
-            np.eye(3).ravel(),
-            np.array(self.colour, dtype=np.float32),
+            geom, kind, zero, zero, np.eye(3).ravel(), colour.astype(np.float32)
         )
         mujoco.mjv_connector(geom, kind, self.width, np.array(self.start), np.array(self.end))
         scene.ngeom += 1
@@ -277,7 +268,6 @@ def open_camera(
         rng=rng,
         noise=noise,
         hidden=lambda: hidden_markers(world, model, markers),
-        occluders=lambda: occluding_boards(world, model),
     )
 
 
@@ -402,29 +392,17 @@ class ScriptedOcclusion:
 
     def update(self) -> None:
         """Move the board to where it belongs now."""
-        now = self._world.time
-        for interval in self._intervals:
-            if interval.start <= now < interval.start + interval.duration:
-                marker = self._world.marker_poses()[interval.marker][:3, 3]
-                towards = self._world.config.camera.pose[:3, 3] - marker
-                offset = _BOARD_HEIGHT * towards / np.linalg.norm(towards)
-                self._world.move_obstacle(OCCLUDER, marker + offset)
-                self._held = True
-                return
-        if self._held:
-            self._world.move_obstacle(OCCLUDER, NOWHERE)
-            self._held = False
-
-
-def occluding_boards(world: World, model: CameraModel) -> list[OccludingBoard]:
-    """The board as a camera without OpenGL is to draw it, if it is in the scene."""
-    centre = world.data.body(OCCLUDER).xpos
-    x, y, z = OCCLUDER_HALF_SIZE
-    corners = centre + np.array([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
-    # Taken away it lies under the floor, which hides it from every camera.
-    if np.array_equal(centre, NOWHERE) or not model.in_view(corners).any():
-        return []
-    return [OccludingBoard(corners=corners, colour=OCCLUDER_COLOUR[:3])]
+        world, held = self._world, self._held
+        now = [i for i in self._intervals if 0 <= world.time - i.start < i.duration]
+        self._held = bool(now)
+        if now:
+            marker = world.marker_poses()[now[0].marker][:3, 3]
+            towards = world.config.camera.pose[:3, 3] - marker
+            world.move_obstacle(
+                OCCLUDER, marker + _BOARD_HEIGHT * towards / np.linalg.norm(towards)
+            )
+        elif held:
+            world.move_obstacle(OCCLUDER, NOWHERE)
 
 
 OVERHEAD = (0.0, 0.0, 1.0, 0.0)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile, read_mesh
 from hrc_learn.kinematics.franka import arm_meshes
 from hrc_learn.log import RunRecording
+from hrc_learn.sim.arm_model import add_box, add_capsule
 from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM, add_surroundings
 from hrc_learn.sim.step_checks import body_geoms
 from hrc_learn.sim.world import World
@@ -47,20 +48,21 @@ class MovingBodies:
         orientations: Float[np.ndarray, "time bodies 4"],
     ) -> tuple[Body, ...]:
         """The bodies as they are to be drawn, along poses collected over time."""
-        bodies = []
-        for i, index in enumerate(self._indices):
-            capsules, boxes = _shapes(self._world.model, index)
-            bodies.append(
-                Body(
-                    name=self.names[i],
-                    position=positions[:, i],
-                    orientation=orientations[:, i],
-                    capsules=capsules,
-                    boxes=boxes,
-                    meshes=arm_meshes(self._world.arm.robot, self.names[i]),
-                )
+        robot, shapes = (
+            self._world.arm.robot,
+            [_shapes(self._world.model, index) for index in self._indices],
+        )
+        return tuple(
+            Body(
+                name=name,
+                position=positions[:, i],
+                orientation=orientations[:, i],
+                capsules=shapes[i][0],
+                boxes=shapes[i][1],
+                meshes=arm_meshes(robot, name),
             )
-        return tuple(bodies)
+            for i, name in enumerate(self.names)
+        )
 
 
 def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tuple[Box, ...]]:
@@ -68,7 +70,7 @@ def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tupl
     capsules, boxes = [], []
     for g in np.flatnonzero(model.geom_bodyid == body):
         kind, size, centre = model.geom_type[g], model.geom_size[g], model.geom_pos[g]
-        r, green, b, opacity = (float(c) for c in model.geom_rgba[g])
+        r, green, b, opacity = model.geom_rgba[g].tolist()
         colour = (r, green, b, opacity)
         R = np.empty(9)
         mujoco.mju_quat2Mat(R, model.geom_quat[g])
@@ -79,17 +81,11 @@ def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tupl
             capsules.append(Capsule(start=start, end=end, radius=float(size[0]), colour=colour))
         elif kind == mujoco.mjtGeom.mjGEOM_BOX:
             # All boxes of ours are turned by multiples of a quarter turn.
-            half_size = _triple(np.abs(R @ size))
-            name = model.geom(g).name
+            half_size, name = _triple(np.abs(R @ size)), model.geom(g).name
             # Meshes of the arm show all but the markers on it.
-            boxes.append(
-                Box(
-                    centre=_triple(centre),
-                    half_size=half_size,
-                    colour=colour,
-                    name=name if name.endswith("_plate") else "",
-                )
-            )
+            name = name if name.endswith("_plate") else ""
+            box = Box(centre=_triple(centre), half_size=half_size, colour=colour, name=name)
+            boxes.append(box)
     return tuple(capsules), tuple(boxes)
 
 
@@ -170,22 +166,19 @@ class MotionLog:
         self._let_pass = advance or world.advance
         self._bodies = MovingBodies(world)
         self._distance = None if world.config.worker is None else WorkerDistance(world)
-        self._positions: list[np.ndarray] = []
-        self._orientations: list[np.ndarray] = []
+        self._poses: list[tuple[np.ndarray, np.ndarray]] = []
         self._nearest: list[NearestPair] = []
         self._held: list[tuple[str, ...]] = []
 
     def __len__(self) -> int:
-        return len(self._orientations)
+        return len(self._poses)
 
     def advance(self, duration: float) -> None:
         """Note where everything is, then let the world go on [s]."""
         if self._distance is not None:
             self._held.append(self._world.held())
             self._nearest.append(self._distance.now(self._held[-1]))
-        position, orientation = self._bodies.poses()
-        self._positions.append(position)
-        self._orientations.append(orientation)
+        self._poses.append(self._bodies.poses())
         self._let_pass(duration)
 
     def bodies(self, steps: int | None = None) -> tuple[Body, ...]:
@@ -194,8 +187,8 @@ class MotionLog:
         Args:
             steps: The first steps only.
         """
-        positions = np.stack(self._positions[:steps])
-        return self._bodies.drawn(positions, np.stack(self._orientations[:steps]))
+        positions, orientations = zip(*self._poses[:steps], strict=True)
+        return self._bodies.drawn(np.stack(positions), np.stack(orientations))
 
     def nearest(self, steps: int | None = None) -> tuple[NearestPair, ...]:
         """Nearest points of worker and robot, its load included, at each step.
@@ -268,7 +261,7 @@ class RecordedWorld:
         spec.compiler.degree = False
         add_surroundings(spec)
         for box in recording.boxes:
-            _add_drawn_box(spec.worldbody, box)
+            add_box(spec.worldbody, "", box.half_size, box.colour, pos=box.centre)
         for number, body in enumerate(recording.bodies):
             _add_drawn_body(spec, body, f"body{number}")
         self.model = spec.compile()
@@ -294,32 +287,9 @@ def _add_drawn_body(spec: mujoco.MjSpec, body: Body, name: str) -> None:
         add_mesh(spec, drawn, mesh)
     for box in body.boxes:
         if box.name or not body.meshes:  # as in every other picture of a body
-            _add_drawn_box(drawn, box)
+            add_box(drawn, "", box.half_size, box.colour, pos=box.centre)
     for capsule in () if body.meshes else body.capsules:
-        ends = np.array([*capsule.start, *capsule.end])
-        if np.allclose(ends[:3], ends[3:]):  # a capsule without a length has no direction
-            drawn.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_SPHERE,
-                size=(capsule.radius, 0, 0),
-                pos=capsule.start,
-                rgba=capsule.colour,
-            )
-            continue
-        drawn.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            size=(capsule.radius, 0, 0),
-            fromto=ends,
-            rgba=capsule.colour,
-        )
-
-
-def _add_drawn_box(body: mujoco.MjsBody, box: Box) -> None:
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=box.half_size,
-        pos=box.centre,
-        rgba=box.colour,
-    )
+        add_capsule(drawn, "", capsule, capsule.colour)
 
 
 def add_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, mesh: MeshFile) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -347,20 +346,6 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-@runtime_checkable
-class Seen(Protocol):
-    """A worker's visit, as seen by a tracker."""
-
-    @property
-    def worker(self) -> Worker:
-        """Body of the worker."""
-        ...
-
-    def ends_at(self, time: float) -> Float[np.ndarray, "parts 2 3"]:
-        """Ends of the axes of all capsules at a time [s], in the base frame [m]."""
-        ...
-
-
 class WorkerSensor:
     """Implements the `PersonTracker` protocol: a body tracker on an RGB-D camera.
 
@@ -370,7 +355,8 @@ class WorkerSensor:
 
     def __init__(
         self,
-        visit: Seen,
+        ends_at: Callable[[float], Float[np.ndarray, "parts 2 3"]],
+        radius: Float[np.ndarray, " parts"],
         clock: Callable[[], float],
         sizes: Imperfections,
         rng: np.random.Generator,
@@ -378,12 +364,14 @@ class WorkerSensor:
         """Begin to watch now.
 
         Args:
-            visit: True motion of the worker.
+            ends_at: True ends of the axes of all capsules at a time [s], in the base frame [m].
+            radius: Radii of the capsules [m].
             clock: Current time [s].
             sizes: Sizes of noise, delay and loss.
             rng: Source of noise and loss.
         """
-        self._visit, self._clock, self._sizes, self._rng = visit, clock, sizes, rng
+        self._ends_at, self._radius, self._clock = ends_at, radius, clock
+        self._sizes, self._rng = sizes, rng
         self._first, self._taken = clock(), 0
         self._pending: deque[PersonObservation] = deque()
         self._before: deque[PersonObservation] = deque()
@@ -402,7 +390,7 @@ class WorkerSensor:
     def _take(self, time: float) -> None:
         """One image."""
         self._taken += 1
-        ends = self._visit.ends_at(time)
+        ends = self._ends_at(time)
         noise = self._sizes.person_noise * self._rng.standard_normal(ends.shape)
         if self._rng.uniform() < self._sizes.person_loss:
             return
@@ -412,7 +400,6 @@ class WorkerSensor:
         if self._before:
             old = self._before[0]
             velocity = (ends - old.ends) / (time - old.time)
-        radius = self._visit.worker.radius
-        seen = PersonObservation(time=time, ends=ends, radius=radius, velocity=velocity)
+        seen = PersonObservation(time=time, ends=ends, radius=self._radius, velocity=velocity)
         self._before.append(seen)
         self._pending.append(seen)

@@ -1,7 +1,5 @@
 """Cameras on the workplace: rendered images, occluded markers, cameras that are moved."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -24,7 +22,6 @@ from hrc_learn.sim import (
     cameras,
     open_camera,
 )
-from hrc_learn.sim.cameras import occluding_boards
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.vision import MarkerDetector, SyntheticCamera, centre
@@ -142,32 +139,6 @@ def test_a_marker_is_hidden_for_a_spell_and_seen_again(board_world, kind):
         )
         board_world.advance(0.1)
     assert [found for _, found, _ in seen] == [True, False, False, True]
-
-
-def test_the_board_is_drawn_between_camera_and_marker(board_world):
-    board_world.reset(WORKPLACE.hover_joints().numpy())
-    camera = open_camera(board_world, "synthetic", rng=np.random.default_rng(0))
-    before = camera.read()
-    u, v = WORKPLACE.scene.camera.project(board_world.marker_poses()[HAND_MARKER][:3, 3])
-    ScriptedOcclusion(board_world, [OcclusionInterval(start=0.0, duration=1.0)]).update()
-    pixel = camera.read()[round(v), round(u)].astype(float)
-    np.testing.assert_allclose(pixel / 255, (0.55, 0.36, 0.30), atol=0.06)
-    board_world.move_obstacle("occluder", NOWHERE)
-    assert (camera.read()[:40] == before[:40]).all()
-
-
-def test_a_board_that_is_taken_away_is_seen_by_no_camera(board_world):
-    """Not even by one that would see it through the floor."""
-    camera = WORKPLACE.scene.camera
-    pose = camera.pose.copy()
-    pose[:2, 3] = NOWHERE[:2]
-    above = replace(camera, pose=pose)
-    assert above.in_view(np.array([NOWHERE])).all()
-    board_world.move_obstacle("occluder", NOWHERE)
-    assert occluding_boards(board_world, above) == []
-    board_world.move_obstacle("occluder", (*NOWHERE[:2], 0.5))
-    assert len(occluding_boards(board_world, above)) == 1
-    board_world.move_obstacle("occluder", NOWHERE)
 
 
 def test_nothing_touches_the_board(board_world):

@@ -27,8 +27,9 @@ class Clock:
 
 def readings(times, seed=0, **sizes):
     clock = Clock()
+    sizes = replace(Imperfections.ideal(), **sizes)
     sensor = WorkerSensor(
-        VISIT, clock, replace(Imperfections.ideal(), **sizes), np.random.default_rng(seed)
+        VISIT.ends_at, VISIT.worker.radius, clock, sizes, np.random.default_rng(seed)
     )
     assert isinstance(sensor, PersonTracker)
     read = []
@@ -95,7 +96,8 @@ def test_noise_of_velocities_is_that_of_two_images_a_tenth_of_a_second_apart():
     clock = Clock()
     clock.time = late[0]
     noisy = replace(Imperfections.ideal(), person_noise=0.01)
-    sensor = WorkerSensor(VISIT, clock, noisy, np.random.default_rng(0))
+    radius = VISIT.worker.radius
+    sensor = WorkerSensor(VISIT.ends_at, radius, clock, noisy, np.random.default_rng(0))
     velocities = {}
     for clock.time in late:
         seen = sensor.read()

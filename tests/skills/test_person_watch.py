@@ -259,7 +259,9 @@ def test_a_hand_that_sets_off_meets_an_arm_at_rest(gap):
     sizes = replace(Imperfections.nominal(), person_noise=0.0, person_loss=0.0)
     separation = sizes.plant(SafetyConfig()).separation
     hand, now, rests = Hand(gap), 0.0, None
-    sensor = WorkerSensor(hand, lambda: now, sizes, np.random.default_rng(0))
+    sensor = WorkerSensor(
+        hand.ends_at, hand.worker.radius, lambda: now, sizes, np.random.default_rng(0)
+    )
     watch = PersonWatch(sensor, panda.whole, separation)
     while hand.gap(now) > 0:
         found = watch.look(now, WORKPLACE.hover_joints())
