@@ -75,7 +75,7 @@ def figures_of(summaries: dict[float, Summary], keys: tuple[str, ...]) -> dict[s
         figures[f"success_rate_at_{size:g}"] = summary.successes / summary.trials
         for key in keys:
             if key in summary.spread:
-                figures[f"{key}_p95_at_{size:g}"] = summary.spread[key].p95
+                figures[f"{key}_p95_at_{size:g}"] = summary.spread[key]["p95"]
     return figures
 
 
@@ -95,7 +95,7 @@ def curve_figure(summaries: dict[float, Summary], keys: tuple[str, ...]) -> Figu
         for axes, key in zip(others, keys, strict=True):
             for kind, style in (("p95", "o--"), ("median", "o-")):
                 values = [
-                    getattr(s.spread[key], kind) if key in s.spread else np.nan
+                    s.spread[key][kind] if key in s.spread else np.nan
                     for s in summaries.values()
                 ]
                 axes.plot(sizes, values, style, color=palette.RUN, label=kind)

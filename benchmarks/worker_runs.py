@@ -393,9 +393,9 @@ class _Batch:
         elbow = [k for k, link in enumerate(self._job.arm.links) if link in _ELBOW_LINKS]
         for rows, near, columns in self._near(q, holding, workers, bound, relevant):
             speed = workers.velocity[rows.unsqueeze(-1), columns]
-            spare, moves = margin_to_stop(near, v[rows], speed, self._separation)
+            spare = margin_to_stop(near, v[rows], speed, self._separation)
             margin, runs = spare.amin((-2, -1)), live[rows]
-            closing = near.distance.masked_fill(~moves, torch.inf)
+            closing = near.distance.masked_fill(spare.isinf(), torch.inf)
             least = near.distance.amin((-2, -1))
             for kept, value in (
                 (found.margin, margin),

@@ -7,7 +7,6 @@ from typing import ClassVar, Literal
 
 from hrc_learn.demos import Demonstration, load_demos
 from hrc_learn.experiments.collaboration_metrics import TRIAL_METRICS, collaboration_metrics
-from hrc_learn.experiments.collaboration_report import collaboration_sections
 from hrc_learn.experiments.collaboration_trial import (
     DRAGS_NEAR_WORKER,
     NULL_SPACE_FORCES,
@@ -18,10 +17,10 @@ from hrc_learn.experiments.collaboration_trial import (
 from hrc_learn.experiments.experiment import RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_measures import worker_distance
-from hrc_learn.experiments.run_recorder import record
+from hrc_learn.experiments.run_recorder import record, region_of_vision
+from hrc_learn.experiments.run_report import run_sections
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.experiments.surroundings import workplace_for
-from hrc_learn.geometry import Box
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import Imperfections
@@ -106,9 +105,6 @@ class CollaborationExperiment(CollaborationScenario):
 
     def recordings(self, run: CollaborationRun) -> Mapping[str, RunRecording]:
         """Recording of the whole job."""
-        # Box above the table in which the vision region takes over.
-        x, y, z = run.workplace.hover().position.tolist()
-        region = Box(centre=(x, y, z), half_size=self.config.grasping.servo.half_size)
         recording = record(
             f"Collaboration, placing on {', '.join(self.shelves)}",
             run.cell,
@@ -116,7 +112,7 @@ class CollaborationExperiment(CollaborationScenario):
             run.motion,
             plans=[pick.plan for pick in run.picks if pick.plan is not None],
             cameras=run.cameras,
-            region=region,
+            region=region_of_vision(run.workplace, self.config.grasping.servo),
             demonstration=self._demonstration(),
         )
         return {"run": recording}
@@ -131,8 +127,14 @@ class CollaborationExperiment(CollaborationScenario):
     def sections(
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]
     ) -> Sequence[Section]:
-        """Report sections: timeline, grasping, person, worker, placing."""
-        return collaboration_sections(run, recordings["run"])
+        """Report sections: timeline, grasping, person, worker, motion."""
+        notes = [
+            f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
+            for pick in run.picks
+            for note in pick.recoveries
+        ]
+        spans = {pick.item.name: pick.span for pick in run.picks}
+        return run_sections(recordings["run"], spans, notes)
 
     def study(self) -> Study:
         """Trials with other object poses, imperfections and noise."""

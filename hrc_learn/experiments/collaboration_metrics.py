@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 
 from hrc_learn.experiments.collaboration_trial import CollaborationRun
-from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
+from hrc_learn.experiments.metric_table import Metric, median, never, p95, success_rate
 from hrc_learn.experiments.run_measures import (
     Deviation,
     grasp_offset,
@@ -23,15 +23,9 @@ from hrc_learn.experiments.surroundings import worker_contacts
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.sim import Touch
 from hrc_learn.sim.hand_over import HandOver, Reach
-from hrc_learn.skills.pick_and_place import RELEASE, Mishap, PickPlaceJob
+from hrc_learn.skills.pick_and_place import RELEASE, Mishap
 from hrc_learn.skills.receiving import Receipt
 
-_CONTACTS = {
-    "cabinet": "contacts with the cabinet",
-    "table": "contacts with the table",
-    "arm itself": "contacts of the arm with itself",
-}
-"""Names of metrics, by the object that was hit."""
 _SAME_TASK = "main task not affected (Experiment 3)"
 
 
@@ -50,71 +44,65 @@ def collaboration_metrics(
             lambda run: reproduction_nrmse,
             at_most=1e-3,
         ),
-        *_GRASPING,
+        Metric("servoing time", lambda run: _worst(run, "servo_time"), "s"),
         Metric(
-            "objects held flat between both pads",
-            lambda run: len(run.held_flat),
-            at_least=objects,
-            essential=True,
-            detail=lambda run: _all_but(run, run.held_flat),
+            "pixel error at descent", lambda run: _worst(run, "pixel_error"), "px", at_most=5.0
         ),
+        Metric("grasp offset", lambda run: max(_grasp_offsets(run), default=None), "mm"),
+        _delivered("objects held flat between both pads", lambda run: run.held_flat, objects),
         *_SAFETY,
         *_HAND_OVER,
         *_COURSE,
-        Metric(
+        _delivered(
             "objects that stand on their shelf",
-            lambda run: len(_standing(run)),
-            at_least=objects,
+            _standing,
+            objects,
             claim="three objects, one after the other (Experiment 3)",
-            essential=True,
-            detail=lambda run: _all_but(run, _standing(run)),
         ),
         *_PULLS,
     ]
 
 
-_GRASPING: Sequence[Metric[CollaborationRun]] = (
-    Metric("servoing time", lambda run: _worst(run, lambda e: e.servo_time), "s"),
-    Metric(
-        "pixel error at descent",
-        lambda run: _worst(run, lambda e: e.pixel_error),
-        "px",
-        at_most=5.0,
-    ),
-    Metric("grasp offset", lambda run: max(_grasp_offsets(run), default=None), "mm"),
-)
+def _delivered(
+    name: str, of: Callable[[CollaborationRun], Collection[str]], count: int, claim: str = ""
+) -> Metric[CollaborationRun]:
+    """Metric of the number of objects for which something is true, which must be all."""
+
+    def others(run: CollaborationRun) -> str:
+        names = [item.name for item in run.workplace.scene.objects]
+        return f"not {', '.join(name for name in names if name not in of(run))}"
+
+    return Metric(
+        name,
+        lambda run: len(of(run)),
+        at_least=count,
+        claim=claim,
+        essential=True,
+        detail=others,
+    )
+
+
+def _touches(hit: str, name: str) -> Metric[CollaborationRun]:
+    """Metric of the unwanted contacts with something."""
+    return never(
+        name,
+        lambda run: len(_contacts(run)[hit]),
+        detail=lambda run: f"first {_contacts(run)[hit][0]}",
+    )
+
 
 _SAFETY: Sequence[Metric[CollaborationRun]] = (
     Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
     Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
-    Metric(
-        "joint limit violations",
-        lambda run: limit_violations(run.cell),
-        at_most=0,
-        essential=True,
-    ),
-    *(
-        Metric[CollaborationRun](
-            name,
-            lambda run, hit=hit: len(_contacts(run)[hit]),
-            at_most=0,
-            essential=True,
-            detail=lambda run, hit=hit: f"first {_contacts(run)[hit][0]}",
-        )
-        for hit, name in _CONTACTS.items()
-    ),
+    never("joint limit violations", lambda run: limit_violations(run.cell)),
+    _touches("cabinet", "contacts with the cabinet"),
+    _touches("table", "contacts with the table"),
+    _touches("arm itself", "contacts of the arm with itself"),
     # Not listed, as the rows above name what was hit.
     Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
     Metric("contacts with the worker", lambda run: _worker_contacts(run)),
     Metric("min distance", lambda run: _min_distance(run), "mm"),
-    Metric(
-        "separation violations",
-        lambda run: (
-            None if run.separation_margin is None else int((run.separation_margin < 0).sum())
-        ),
-        at_most=0,
-        essential=True,
-    ),
+    never("separation violations", lambda run: _violations(run)),
     Metric(
         "waited for the worker",
         lambda run: (
@@ -128,9 +116,12 @@ _SAFETY: Sequence[Metric[CollaborationRun]] = (
 
 
 def _handed(
+    name: str,
     of: Callable[[Receipt, Reach, HandOver], float],
-) -> Callable[[CollaborationRun], float | None]:
-    """Measure of the hand-over of a run; None without one, or if it was not recognised."""
+    unit: str = "",
+    at_most: float | int | None = None,
+) -> Metric[CollaborationRun]:
+    """Metric of a hand-over; left out without one, or if it was not recognised."""
 
     def measure(run: CollaborationRun) -> float | None:
         receipt = next((p.receipt for p in run.picks if p.receipt is not None), None)
@@ -139,41 +130,31 @@ def _handed(
         value = float(of(receipt, run.hand_over.reaches[-1], run.hand_over))
         return None if np.isnan(value) else value
 
-    return measure
-
-
-def _distance(place: np.ndarray | None, other: np.ndarray) -> float:
-    """Distance between two places [mm]; NaN without the first."""
-    return float("nan") if place is None else 1e3 * float(np.linalg.norm(place - other))
+    return Metric(name, measure, unit, at_most=at_most)
 
 
 _HAND_OVER: Sequence[Metric[CollaborationRun]] = (
-    Metric(
+    _handed(
         "hand-over recognised before it began",
-        _handed(lambda receipt, reach, _: float(receipt.seen < reach.begin)),
+        lambda receipt, reach, _: float(receipt.seen < reach.begin),
         at_most=0,
     ),
-    Metric(
-        "other movements passed over",
-        _handed(lambda receipt, _, __: receipt.passed_over),
-    ),
-    Metric(
+    _handed("other movements passed over", lambda receipt, _, __: receipt.passed_over),
+    _handed(
         "hand-over recognised at this fraction of the movement",
-        _handed(
-            lambda receipt, reach, _: (
-                100 * (receipt.recognised - reach.begin) / (reach.end - reach.begin)
-            )
+        lambda receipt, reach, _: (
+            100 * (receipt.recognised - reach.begin) / (reach.end - reach.begin)
         ),
         "%",
     ),
-    Metric(
+    _handed(
         "hand-over place, error when recognised",
-        _handed(lambda receipt, _, plan: _distance(receipt.predicted, plan.place)),
+        lambda receipt, _, plan: 1e3 * float(np.linalg.norm(receipt.predicted - plan.place)),
         "mm",
     ),
-    Metric(
+    _handed(
         "time until the object was held",
-        _handed(lambda receipt, reach, _: receipt.taken - reach.begin),
+        lambda receipt, reach, _: receipt.taken - reach.begin,
         "s",
     ),
 )
@@ -243,6 +224,12 @@ def _worker_contacts(run: CollaborationRun) -> int | None:
     return len(worker_contacts(run.world, run.cell.log, run.motion))
 
 
+def _violations(run: CollaborationRun) -> int | None:
+    """Steps in which the arm could not have stopped before the worker; None without one."""
+    margin = run.separation_margin
+    return None if margin is None else int((margin < 0).sum())
+
+
 def _min_distance(run: CollaborationRun) -> float | None:
     """True smallest distance of the worker from robot and load [mm]; None without a worker."""
     distance = worker_distance(run.motion, len(run.cell.log))
@@ -261,10 +248,10 @@ def _elbow_pulled(run: CollaborationRun) -> float | None:
     return 1e3 * float(np.median(moved)) if moved else None
 
 
-def _worst(run: CollaborationRun, measured: Callable[[PickPlaceJob], float]) -> float | None:
+def _worst(run: CollaborationRun, name: str) -> float | None:
     """Largest value over the objects released on a shelf; None if there were none."""
     grasped = [e for e in run.picks if e.release is not None and e.receipt is None]
-    return max((float(measured(e)) for e in grasped), default=None)
+    return max((float(getattr(job, name)) for job in grasped), default=None)
 
 
 def _pushed(run: CollaborationRun, of: Callable[[Deviation], np.ndarray]) -> float | None:
@@ -309,11 +296,6 @@ def _standing(run: CollaborationRun) -> list[str]:
     """Objects that stand on their shelf, clear of the arm."""
     places = {pick.item.name: f"board_{pick.shelf}" for pick in run.picks}
     return [name for name, place in places.items() if run.world.rests_on(name, place)]
-
-
-def _all_but(run: CollaborationRun, names: Collection[str]) -> str:
-    objects = [item.name for item in run.workplace.scene.objects]
-    return f"not {', '.join(name for name in objects if name not in names)}"
 
 
 def _contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:

@@ -1,6 +1,6 @@
 """One collaboration in simulation: the scenario, the run, and its result."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -14,7 +14,6 @@ from hrc_learn.experiments.simulated_cell import (
     UNOBSERVED,
     ArmAccess,
     Observer,
-    grasping_allows_for,
     plan_checker,
     simulated_cell,
 )
@@ -189,7 +188,6 @@ def simulate_collaboration(
     access: ArmAccess = SIMULATED,
     seed: int = 0,
     observer: Observer = UNOBSERVED,
-    on_phase: Callable[[str, float], None] | None = None,
 ) -> CollaborationRun:
     """Grasp objects at random poses and put them on shelves, in MuJoCo.
 
@@ -202,8 +200,6 @@ def simulate_collaboration(
         access: Access to the arm.
         seed: Seed of object poses, imperfections, people and image noise.
         observer: Live dashboard and messages.
-        on_phase: Called with name and start time [s] of each phase; by default the observer
-            shows them.
 
     Raises:
         ValueError: If not every object has a shelf of its own, a shelf is unknown or out of
@@ -215,21 +211,15 @@ def simulate_collaboration(
     if scenario.worker and scenario.handover:
         raise ValueError("only one person comes: give --worker or --handover, not both.")
     rng, sizes = np.random.default_rng(seed), scenario.imperfections
-    plant = access.declared(sizes)
-    config = scenario.config
-    config = replace(config, grasping=grasping_allows_for(config.grasping, plant))
     # Scripted forces wait for the robot; random ones do not, and the robot does not wait.
+    config, forces, begin = scenario.config, scenario.forces, None
     pulls: tuple[ScriptedForce, ...] = ()
-    if scenario.forces == "random":
+    if forces == "random":
         # A generator of its own keeps runs with and without pulls alike otherwise.
-        pulls = random_pulls(np.random.default_rng([seed, 1]))
-        config = replace(config, interactions=0)
-    person = ScriptedPerturbation(
-        workplace.robot.chain,
-        pulls if scenario.forces == "random" else scenario.forces,
-        0.0 if scenario.forces == "random" else None,
-    )
-    stage = _Stage(workplace, scenario, plant, seed, rng)
+        forces = pulls = random_pulls(np.random.default_rng([seed, 1]))
+        config, begin = replace(config, interactions=0), 0.0
+    person = ScriptedPerturbation(workplace.robot.chain, forces, begin)
+    stage = _Stage(workplace, scenario, access, seed, rng)
     world, items = stage.world, workplace.scene.objects
     eyes = ChangingCamera(
         workplace.scene.camera,
@@ -240,7 +230,7 @@ def simulate_collaboration(
     held_flat: dict[str, set[str]] = {HOME: set(), RELEASE: set()}
 
     def begin_phase(phase: str, time: float) -> None:
-        (on_phase or observer.tell_phase)(phase, time)
+        observer.tell(f"  {time:6.2f} s  {phase}")
         if phase in held_flat:
             held_flat[phase] |= {item.name for item in items if world.holds_flat(item.name)}
         if phase == RECEIVE and stage.giving is not None:
@@ -268,8 +258,7 @@ def simulate_collaboration(
         rng=rng,
         clearance=workplace.arm_clearance,
         watch=stage.watch,
-    ) as simulated:
-        cell = simulated.cell
+    ) as (cell, motion):
         task = PickAndPlace(
             cell,
             workplace,
@@ -280,17 +269,16 @@ def simulate_collaboration(
             stage.receiving(cell),
         )
         picks = task.run(list(zip(items, shelves, strict=True)), change_camera)
-    giving = stage.giving
     return CollaborationRun(
         workplace=workplace,
         world=world,
         cell=cell,
-        motion=simulated.motion,
+        motion=motion,
         picks=tuple(picks),
         cameras=tuple(eyes.history),
         pulls=pulls,
-        visit=stage.visit if giving is None else giving.hand_over.visit,
-        hand_over=None if giving is None else giving.hand_over,
+        visit=stage.visit,
+        hand_over=None if stage.giving is None else stage.giving.hand_over,
         held_flat=frozenset(held_flat[HOME] & held_flat[RELEASE]),
     )
 
@@ -300,67 +288,74 @@ class _Stage:
 
     Attributes:
         world: World at rest, with all objects at their random poses.
-        visit: Visit of the worker; None without a worker.
         giving: Person who hands over the last object; None without a hand-over.
-        watch: Watch for that person by the robot's tracker; None without a person.
+        watch: Watch for a person by the robot's tracker; None without a person.
     """
 
     def __init__(
         self,
         workplace: Workplace,
         scenario: CollaborationScenario,
-        plant: Imperfections,
+        access: ArmAccess,
         seed: int,
         rng: np.random.Generator,
     ):
         self._workplace, self._sizes = workplace, scenario.imperfections
         # Generators of their own keep runs with and without a person alike otherwise.
         person_rng = np.random.default_rng([seed, 2])
-        self.visit: WorkerVisit | None = None
-        scene = workplace.scene
+        scene, worker = workplace.scene, None
         if scenario.worker:
-            self.visit = draw_visit(workplace, person_rng)
-            scene = replace(scene, worker=self.visit.worker.config)
-        if scenario.handover:
-            giver = WorkerConfig.draw(np.random.default_rng([seed, 4]))
-            scene = replace(scene, worker=giver)
-        self.world = World(scene, self._sizes.draw(rng, workplace.robot.joints))
-        poses = draw_object_poses(workplace, self.world, self._sizes.object_yaw, rng)
-        self.world.reset(workplace.home_joints().numpy(), poses)
+            self._visit = draw_visit(workplace, person_rng)
+            worker = self._visit.worker.config
+        elif scenario.handover:
+            worker = WorkerConfig.draw(np.random.default_rng([seed, 4]))
+        scene = replace(scene, worker=worker)
+        self.world = world = World(scene, self._sizes.draw(rng, workplace.robot.joints))
+        poses = draw_object_poses(workplace, world, self._sizes.object_yaw, rng)
+        world.reset(workplace.home_joints().numpy(), poses)
         self.giving: GivingPerson | None = None
+        expected = PersonWatchConfig()
         if scenario.handover:
             self.giving = GivingPerson(
-                self.world, scene.objects[-1], np.random.default_rng([seed, 3])
+                world, scene.objects[-1], np.random.default_rng([seed, 3])
             )
-        self._tracker: WorkerSensor | None = None
+            expected = PersonWatchConfig(acceleration=_GIVER_ACCELERATION)
         self.watch: PersonWatch | None = None
-        person = self.giving or self.visit
-        if person is not None:
-            world = self.world
-            self._tracker = WorkerSensor(person, lambda: world.time, self._sizes, person_rng)
-            expected = None
-            if scenario.handover:
-                expected = PersonWatchConfig(acceleration=_GIVER_ACCELERATION)
-            separation = plant.plant(scenario.cell.safety).separation
-            self.watch = PersonWatch(self._tracker, whole_arm(scene.arm), separation, expected)
-        self._occluder = ScriptedOcclusion(self.world, scenario.disturbances.occlusions)
-        self._move_worker()
+        if worker is not None:
+            person = self.giving or self._visit
+            self._tracker = WorkerSensor(
+                person.ends_at,
+                person.worker.radius,
+                lambda: world.time,
+                self._sizes,
+                person_rng,
+            )
+            plant = access.declared(self._sizes).plant(scenario.cell.safety)
+            self.watch = PersonWatch(
+                self._tracker, whole_arm(scene.arm), plant.separation, expected
+            )
+        self._occluder = ScriptedOcclusion(world, scenario.disturbances.occlusions)
+        self.update()
+
+    @property
+    def visit(self) -> WorkerVisit | None:
+        """Motion of the person, as far as decided; None without one."""
+        if self.watch is None:
+            return None
+        return self._visit if self.giving is None else self.giving.hand_over.visit
 
     def update(self) -> None:
         """Move occluder and person to where they are now."""
         self._occluder.update()
-        self._move_worker()
         if self.giving is not None:
             self.giving.update()
-
-    def _move_worker(self) -> None:
-        if self.visit is not None:
-            ends = self.visit.ends_at(self.world.time)
-            self.world.move_worker(ends, self.visit.item_at(self.world.time, ends))
+        elif self.watch is not None:
+            ends = self._visit.ends_at(self.world.time)
+            self.world.move_worker(ends, self._visit.item_at(self.world.time, ends))
 
     def receiving(self, cell: WorkCell) -> dict[str, Receiving]:
         """Skill that receives the last object, by its name; empty without a hand-over."""
-        if self.giving is None or self._tracker is None:
+        if self.giving is None:
             return {}
         item = self._workplace.scene.objects[-1]
         model = shown_hand_overs(self._workplace, self._sizes, item)

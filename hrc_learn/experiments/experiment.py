@@ -9,9 +9,9 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
 from hrc_learn.experiments.run_recorder import film, record
@@ -25,7 +25,6 @@ from hrc_learn.viz.report import (
     FILM,
     PAGE,
     Film,
-    Measurement,
     Report,
     Section,
     show_command,
@@ -34,9 +33,6 @@ from hrc_learn.viz.report import (
     write_report,
 )
 from hrc_learn.viz.run_dashboard import record_run
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 RUN = "run"
 """Name of the recording of the run itself, among the recordings of an experiment."""
@@ -117,48 +113,24 @@ class RepeatedRun:
     def __call__(self, seed: int) -> Mapping[str, Any]:
         """Run once and measure."""
         run = self.experiment.run(seed)
-        evaluation = evaluate(self.experiment.metrics(), run)
-        failure = failure_of(self.experiment.failure(run), evaluation)
-        return {**evaluation.values, "failure": failure}
+        found = evaluate(self.experiment.metrics(), run, self.experiment.failure(run))
+        return {**found.values, "failure": found.failure}
 
 
-def failure_of(given_up: str, evaluation: Evaluation) -> str:
-    """Reasons of a failed run: the task gave up, or an essential bound was missed."""
-    return "; ".join(filter(None, (given_up, *evaluation.faults)))
+def evaluate_all[Run](
+    experiment: Experiment[Run], run: Run, seed: int, trials: Sequence[Trial]
+) -> Evaluation:
+    """Evaluate a run and its trials.
 
-
-@dataclass(frozen=True, kw_only=True)
-class Results:
-    """Evaluated results of a run and its trials."""
-
-    table: tuple[Measurement, ...]
-    values: dict[str, float | int]
-    """Values of run and trials, as written to JSON."""
-    failure: str
-    """Reason of a failed run; empty after a success."""
-
-    @classmethod
-    def of[Run](
-        cls, experiment: Experiment[Run], run: Run, seed: int, trials: Sequence[Trial]
-    ) -> "Results":
-        """Evaluate a run and its trials.
-
-        Without trials the run itself counts as the only one, so that the keys of the values do
-        not depend on the number of trials.
-        """
-        total = evaluate(experiment.metrics(), run)
-        failure = failure_of(experiment.failure(run), total)
-        single = Trial(seed=seed, values=total.values, failure=failure)
-        values = Summary.of(trials or [single]).figures()
-        if trials:
-            total += evaluate(experiment.study().metrics, trials)
-        # Totals over all trials replace the counts of the single run.
-        return cls(table=total.table, values=total.values | values, failure=failure)
-
-    @property
-    def ok(self) -> bool:
-        """True if the run succeeded and every bound of the table is met."""
-        return not self.failure and all(m.ok is not False for m in self.table)
+    Without trials the run itself counts as the only one, so that the keys of the values do not
+    depend on the number of trials. Totals over all trials replace the counts of the single run.
+    """
+    total = evaluate(experiment.metrics(), run, experiment.failure(run))
+    single = Trial(seed=seed, values=total.values, failure=total.failure)
+    values = Summary.of(trials or [single]).figures()
+    if trials:
+        total += evaluate(experiment.study().metrics, trials)
+    return replace(total, values=total.values | values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,73 +190,58 @@ def run_experiment[Run](
     if options.trials < 0:
         raise ValueError(f"--trials must not be negative, but is {options.trials}.")
     configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
-    console, study = Console(), experiment.study()
+    console, study, view = Console(), experiment.study(), no_live_view
+    if options.serve:
+        view = live_view(
+            experiment.title, options.serving, lambda at: console.print(f"Dashboard at {at}")
+        )
     # Next to the folder, which exists only when all is done: interrupted trials resume.
     trial_file = options.out.with_name(f"{options.out.name}.{TRIALS}.jsonl")
     try:
         with new_folder(options.out, configuration, options.overwrite) as folder:
             with console.status(f"{experiment.title}: running"):
-                run = experiment.run(options.seed, _observer(experiment, options, console))
+                run = experiment.run(options.seed, Observer(view=view, tell=console.print))
             trials = _run_trials(study, trial_file, options) if options.trials else []
-            results = Results.of(experiment, run, options.seed, trials)
+            results = evaluate_all(experiment, run, options.seed, trials)
             with console.status("Writing recordings and report"):
-                run_film = _write_report(
-                    folder, experiment, run, results, trials, options, configuration, command
+                parts = _write_recordings(folder, experiment, run, options.film)
+                report = Report(
+                    title=experiment.title,
+                    summary=experiment.summary,
+                    table=results.table,
+                    film=parts[0],
+                    sections=[*parts[1], *([study.section(trials)] if trials else [])],
+                    configuration=configuration,
+                    versions=software_versions(),
+                    command=command,
                 )
+                write_report(folder, report)
+                write_json(folder / "measured.json", results.values)
             if trials:
                 shutil.copy(trial_file, folder / f"{TRIALS}.jsonl")
     except PhysicsError as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
-    if trials:
-        trial_file.unlink()
     if options.json is not None:
         write_json(options.json, results.values)
     show_measurements(results.table)
     if trials:
+        trial_file.unlink()
         console.print(Summary.of(trials).table(study.title))
-    _print_outputs(options.out, results, run_film is not None)
+    _print_outputs(options.out, results, report.film is not None)
     return 0 if results.ok else 1
 
 
-def _write_report[Run](
-    folder: Path,
-    experiment: Experiment[Run],
-    run: Run,
-    results: Results,
-    trials: Sequence[Trial],
-    options: RunOptions,
-    configuration: Mapping[str, object],
-    command: str,
-) -> Film | None:
-    """Write log, recordings and report; returns the film of the run, if asked for."""
+def _write_recordings[Run](
+    folder: Path, experiment: Experiment[Run], run: Run, make_film: bool
+) -> tuple[Film | None, Sequence[Section]]:
+    """Write log and recordings; returns the film, if asked for, and sections of the report."""
     experiment.log(run).save(folder / "log.npz")
     recordings = experiment.recordings(run)
-    run_film = _write_recordings(folder, recordings, options.film)
-    sections = [*experiment.sections(run, recordings)]
-    sections += [experiment.study().section(trials)] if trials else []
-    report = Report(
-        title=experiment.title,
-        summary=experiment.summary,
-        table=results.table,
-        film=run_film,
-        sections=sections,
-        configuration=configuration,
-        versions=software_versions(),
-        command=command,
-    )
-    write_report(folder, report)
-    write_json(folder / "measured.json", results.values)
-    return run_film
-
-
-def _observer(experiment: Experiment[Any], options: RunOptions, console: "Console") -> Observer:
-    view = no_live_view
-    if options.serve:
-        view = live_view(
-            experiment.title, options.serving, lambda at: console.print(f"Dashboard at {at}")
-        )
-    return Observer(view=view, tell=console.print)
+    for name, recording in recordings.items():
+        record_run(folder / f"{name}.rrd", recording)
+    run_film = film(recordings[RUN]) if make_film and RUN in recordings else None
+    return run_film, experiment.sections(run, recordings)
 
 
 def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]) -> LiveView:
@@ -328,17 +285,7 @@ def _run_trials(study: Study, file: Path, options: RunOptions) -> list[Trial]:
     )
 
 
-def _write_recordings(
-    folder: Path, recordings: Mapping[str, RunRecording], make_film: bool
-) -> Film | None:
-    """Write all recordings; returns the film of the run, if asked for."""
-    for name, recording in recordings.items():
-        record_run(folder / f"{name}.rrd", recording)
-    recording = recordings.get(RUN)
-    return film(recording) if make_film and recording is not None else None
-
-
-def _print_outputs(out: Path, results: Results, has_film: bool) -> None:
+def _print_outputs(out: Path, results: Evaluation, has_film: bool) -> None:
     if results.failure:
         print(f"failed: {results.failure}", file=sys.stderr)
     # On lines of their own and unbroken, to be copied at any width of the terminal.

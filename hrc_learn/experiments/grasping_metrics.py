@@ -3,7 +3,6 @@
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,10 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.experiments.grasping_trial import GraspingRun
-from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
+from hrc_learn.experiments.metric_table import Metric, median, never, p95, success_rate
 from hrc_learn.experiments.run_measures import (
     grasp_offset,
     limit_violations,
+    spans,
     true_tool,
     unwanted_contacts,
 )
@@ -36,33 +36,27 @@ REACH = 0.02
 """Points this close to a demonstrated one are inside the demonstrated workspace [m]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Descent:
-    """State at the start of the last descent onto the object. NaN if it never descended."""
+def descent(run: GraspingRun) -> tuple[float, float]:
+    """State at the start of the last descent onto the object; NaN if it never descended.
 
-    offset: float = math.nan
-    """Horizontal distance of the end effector from the object [m]."""
-    angle: float = math.nan
-    """Angle between the actual and the demonstrated direction of the end effector [rad]."""
-
-    @classmethod
-    def of(cls, run: GraspingRun) -> "Descent":
-        """Measure the last descent of a grasp."""
-        log = run.cell.log
-        descents = [event.time for event in log.events if event.text == "grasp"]
-        if not descents:
-            return cls()
-        last = int(np.searchsorted(log["time"], descents[-1])) - 1
-        tool = true_tool(run.motion, run.world, len(log))[last]
-        actual, demonstrated = (
-            quaternion.rotate(q, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-            for q in (tool.orientation, run.scene.workplace.hover().orientation)
-        )
-        normal = torch.linalg.cross(actual, demonstrated)
-        return cls(
-            offset=grasp_offset(log, run.motion, run.world, run.item.name, descents[-1]),
-            angle=float(torch.atan2(normal.norm(), actual @ demonstrated)),
-        )
+    Returns:
+        Horizontal distance of the end effector from the object [mm], and angle between the
+        actual and the demonstrated direction of the end effector [deg].
+    """
+    log = run.cell.log
+    starts = [begin for begin, _ in spans(log, "grasp")]
+    if not starts:
+        return math.nan, math.nan
+    last = int(np.searchsorted(log["time"], starts[-1])) - 1
+    tool = true_tool(run.motion, run.world, len(log))[last]
+    actual, demonstrated = (
+        quaternion.to_matrix(q)[:, 2]
+        for q in (tool.orientation, run.scene.workplace.hover().orientation)
+    )
+    normal = torch.linalg.cross(actual, demonstrated)
+    angle = float(torch.atan2(normal.norm(), actual @ demonstrated))
+    offset = grasp_offset(log, run.motion, run.world, run.item.name, starts[-1])
+    return 1e3 * offset, math.degrees(angle)
 
 
 def _contacts(run: GraspingRun) -> tuple[Touch, ...]:
@@ -126,27 +120,21 @@ def grasping_metrics() -> list[Metric[GraspingRun]]:
             at_most=5.0,
             claim="the desired position is reached (Experiment 2)",
         ),
-        Metric(
-            "grasp offset", lambda run: 1e3 * Descent.of(run).offset, "mm", at_most=GRASP_OFFSET
-        ),
+        Metric("grasp offset", lambda run: descent(run)[0], "mm", at_most=GRASP_OFFSET),
         Metric(
             "angle to the demonstrated approach at descent",
-            lambda run: math.degrees(Descent.of(run).angle),
+            lambda run: descent(run)[1],
             "deg",
             at_most=1.0,
         ),
-        Metric(
+        never(
             "joint limit violations",
             lambda run: limit_violations(run.cell),
-            at_most=0,
             claim="the joint-space region prevents them",
-            essential=True,
         ),
-        Metric(
+        never(
             "contacts",
             lambda run: len(_contacts(run)),
-            at_most=0,
-            essential=True,
             detail=lambda run: str(_contacts(run)[0]),
         ),
         Metric(

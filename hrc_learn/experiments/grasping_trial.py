@@ -13,7 +13,6 @@ from hrc_learn.experiments.simulated_cell import (
     UNOBSERVED,
     ArmAccess,
     Observer,
-    grasping_allows_for,
     plan_checker,
     simulated_cell,
 )
@@ -172,7 +171,6 @@ def simulate_grasp(
     world = scene.world()
     item, sizes = workplace.scene.objects[0], world.imperfections.sizes
     eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
-    config = grasping_allows_for(config or GraspingConfig(), access.declared(sizes))
     result, failure = None, ""
     with simulated_cell(
         world,
@@ -183,8 +181,8 @@ def simulate_grasp(
         title="Grasping",
         observer=observer,
         rng=rng,
-    ) as simulated:
-        task = Grasping(simulated.cell, workplace, aiming, config, check=plan_checker(world))
+    ) as (cell, motion):
+        task = Grasping(cell, workplace, aiming, config, check=plan_checker(world))
         try:
             result = task.grasp(item)
             task.go_home()
@@ -193,8 +191,8 @@ def simulate_grasp(
     return GraspingRun(
         scene=scene,
         world=world,
-        cell=simulated.cell,
-        motion=simulated.motion,
+        cell=cell,
+        motion=motion,
         item=item,
         result=result,
         failure=failure,

@@ -109,7 +109,17 @@ class Evaluation:
     values: dict[str, float | int]
     """Every measured value by its key."""
     faults: tuple[str, ...]
-    """Essential bounds that were missed, in words."""
+    """Reason for which the task was given up, and essential bounds that were missed."""
+
+    @property
+    def failure(self) -> str:
+        """All faults in one line; empty after a success."""
+        return "; ".join(self.faults)
+
+    @property
+    def ok(self) -> bool:
+        """True without faults and if every bound of the table is met."""
+        return not self.faults and all(m.ok is not False for m in self.table)
 
     def __add__(self, other: "Evaluation") -> "Evaluation":
         """Concatenation of both tables."""
@@ -120,9 +130,15 @@ class Evaluation:
         )
 
 
-def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run) -> Evaluation:
-    """Measure a run by each of the metrics."""
-    table, values, faults = [], {}, []
+def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run, given_up: str = "") -> Evaluation:
+    """Measure a run by each of the metrics.
+
+    Args:
+        metrics: The metrics.
+        run: The run.
+        given_up: Reason for which its task was given up; empty if it was not.
+    """
+    table, values, faults = [], {}, [given_up] if given_up else []
     for metric in metrics:
         measured = metric.measure(run)
         if measured is None:
@@ -163,21 +179,14 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Spread:
-    """Quantiles of one measured value over the trials that measured it."""
-
-    median: float
-    p95: float
-    min: float
-    max: float
-
-    @classmethod
-    def of(cls, values: Float[np.ndarray, " trials"]) -> "Spread":
-        """Quantiles of finite values, at least one."""
-        # "higher": a measured value, with at least the requested fraction below it.
-        median, p95 = (float(np.quantile(values, q, method="higher")) for q in (0.5, 0.95))
-        return cls(median=median, p95=p95, min=float(values.min()), max=float(values.max()))
+def spread(values: Float[np.ndarray, " trials"]) -> dict[str, float]:
+    """Quantiles of finite values, at least one: median, p95, min and max."""
+    # "higher": a measured value, with at least the requested fraction below it.
+    levels = {"median": 0.5, "p95": 0.95, "min": 0.0, "max": 1.0}
+    return {
+        name: float(np.quantile(values, level, method="higher"))
+        for name, level in levels.items()
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +196,7 @@ class Summary:
     trials: int
     failed: Mapping[int, str]
     """Reason by seed."""
-    spread: Mapping[str, Spread]
+    spread: Mapping[str, Mapping[str, float]]
     """Quantiles of the values that are no counts, by key; failed trials are included."""
     totals: Mapping[str, int]
     """Sums of the counts, by key."""
@@ -212,7 +221,7 @@ class Summary:
         return cls(
             trials=len(trials),
             failed={trial.seed: trial.failure for trial in trials if trial.failure},
-            spread={key: Spread.of(values) for key, values in known.items() if len(values)},
+            spread={key: spread(values) for key, values in known.items() if len(values)},
             totals={
                 key: sum(int(trial.values.get(key, 0)) for trial in trials) for key in counts
             },
@@ -248,9 +257,9 @@ class Summary:
             "success_rate_high": high,
             **self.totals,
         }
-        for key, spread in self.spread.items():
+        for key, quantiles in self.spread.items():
             stem, _, unit = key.rpartition("_")
-            for kind, value in vars(spread).items():
+            for kind, value in quantiles.items():
                 name = f"{stem}_{kind}_{unit}" if unit in _UNITS else f"{key}_{kind}"
                 values[name] = value
         return values
@@ -269,9 +278,9 @@ class Summary:
         )
         for column in ("median", "p95", "min", "max"):
             table.add_column(column, justify="right")
-        for key, spread in self.spread.items():
-            numbers = vars(spread).values()
-            table.add_row(key.replace("_", " "), *(f"{number:.4g}" for number in numbers))
+        for key, quantiles in self.spread.items():
+            numbers = (f"{number:.4g}" for number in quantiles.values())
+            table.add_row(key.replace("_", " "), *numbers)
         for key, count in self.totals.items():
             table.add_row(f"{key.replace('_', ' ')}, in all", f"{count}")
         return table
@@ -281,6 +290,16 @@ def column(trials: Sequence[Trial], key: str) -> Float[np.ndarray, " trials"]:
     """One value of every trial; NaN where a trial has no such number."""
     values = (trial.values.get(key, math.nan) for trial in trials)
     return np.array([math.nan if isinstance(v, str) else v for v in values], dtype=float)
+
+
+def never[Run](
+    name: str,
+    of: Callable[[Run], int | None],
+    claim: str = "",
+    detail: Callable[[Run], str] = lambda run: "",
+) -> Metric[Run]:
+    """Metric of a count that must be zero; otherwise the run is a failure."""
+    return Metric(name, of, at_most=0, claim=claim, essential=True, detail=detail)
 
 
 # Statistics make metrics over trials: `Metric("place error, p95", p95("place_error_mm"))`.
@@ -294,19 +313,11 @@ def success_rate(trials: Sequence[Trial]) -> float:
     return sum(not trial.failure for trial in trials) / len(trials)
 
 
-def median(key: str) -> Statistic:
+def median(key: str, kind: str = "median") -> Statistic:
     """Median over the trials that measured the value."""
-    return _spread(key, "median")
+    return lambda trials: Summary.of(trials).spread.get(key, {}).get(kind)
 
 
 def p95(key: str) -> Statistic:
     """95th percentile over the trials that measured the value."""
-    return _spread(key, "p95")
-
-
-def _spread(key: str, kind: str) -> Statistic:
-    def statistic(trials: Sequence[Trial]) -> float | None:
-        spread = Summary.of(trials).spread.get(key)
-        return None if spread is None else getattr(spread, kind)
-
-    return statistic
+    return median(key, "p95")

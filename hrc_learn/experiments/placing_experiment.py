@@ -267,7 +267,7 @@ class RandomStart:
             )
             outcomes[shelf] = PlacingOutcome.of(placed, scene.workplace, scene.demonstration)
         evaluation = evaluate(placing_metrics(scene.workplace.shelf_names()), outcomes)
-        return {**evaluation.values, "failure": "; ".join(evaluation.faults)}
+        return {**evaluation.values, "failure": evaluation.failure}
 
 
 def dataset_of(placing: Path) -> Path:

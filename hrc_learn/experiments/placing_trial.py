@@ -123,8 +123,7 @@ def place(
     world = world or World(workplace.scene)
     world.hold(item.name, start.numpy())
     human = ScriptedPerturbation(workplace.robot.chain, ())
-    with simulated_cell(world, human=human, access=access, observer=observer) as simulated:
-        cell = simulated.cell
+    with simulated_cell(world, human=human, access=access, observer=observer) as (cell, motion):
         plan = skill.plan(
             cell.joints, measured_goal, space=space, dt=cell.config.dt, speed=speed
         )
@@ -138,7 +137,7 @@ def place(
         plan=plan,
         world=world,
         cell=cell,
-        motion=simulated.motion,
+        motion=motion,
         object_pose=world.object_pose(item.name),
         contacts=sum(contacts.values(), ()),
         placed=world.rests_on(item.name, f"board_{shelf}"),

@@ -200,10 +200,7 @@ def grasping_task(
     """
 
     def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
-        law = replace(config.controller, safety=cell.config.safety)
-        grasping = Grasping(
-            cell, workplace, servoing, replace(config, controller=law), check=check
-        )
+        grasping = Grasping(cell, workplace, servoing, config, check=check)
         grasping.grasp(workplace.scene.objects[0])
         grasping.go_home()
         return ""
@@ -229,9 +226,7 @@ def collaboration_task(
     """
 
     def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
-        law = replace(config.grasping.controller, safety=cell.config.safety)
-        settings = replace(config, grasping=replace(config.grasping, controller=law))
-        job = PickAndPlace(cell, workplace, servoing, placing, check, settings)
+        job = PickAndPlace(cell, workplace, servoing, placing, check, config)
         jobs = job.run(list(zip(workplace.scene.objects, shelves, strict=True)))
         return "; ".join(done.failure for done in jobs if done.failure)
 

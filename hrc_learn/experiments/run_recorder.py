@@ -36,8 +36,10 @@ from hrc_learn.sim import (
     RenderingUnavailableError,
     World,
 )
+from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import HOME, INTERACT, RELEASE, TRANSFER
 from hrc_learn.skills.placing import Plan
+from hrc_learn.skills.servo_target import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
@@ -158,6 +160,12 @@ def record(
         phases=tuple(log.events),
         remarks=tuple(cell.remarks),
     )
+
+
+def region_of_vision(workplace: Workplace, servo: VisualServoConfig) -> Box:
+    """Box above the table in which the vision region takes over."""
+    x, y, z = workplace.hover().position.tolist()
+    return Box(centre=(x, y, z), half_size=servo.half_size)
 
 
 def joint_ranges(chain: SerialChain) -> JointRanges:

@@ -1,7 +1,7 @@
 """The simulated work cell of all three experiments, and the access to its arm.
 
-with simulated_cell(world, human=person, sensor=sensor, access=through_franky()) as simulated:
-    PickAndPlace(simulated.cell, ...).run(jobs)
+with simulated_cell(world, human=person, sensor=sensor, access=through_franky()) as (cell, _):
+    PickAndPlace(cell, ...).run(jobs)
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,6 @@ from hrc_learn.hardware.protocol_server import ArmServer, ServedArm, serve_world
 from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import Imperfections, MotionLog, World
-from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.placing import Plan, check_plan
@@ -145,21 +144,8 @@ class Observer:
     tell: Callable[[str], None] = lambda text: None
     """Shows a line about the next step."""
 
-    def tell_phase(self, phase: str, time: float) -> None:
-        """Show the name and start time [s] of a phase."""
-        self.tell(f"  {time:6.2f} s  {phase}")
-
 
 UNOBSERVED = Observer()
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulatedCell:
-    """A work cell in simulation."""
-
-    cell: WorkCell
-    motion: MotionLog
-    """Poses of everything that moves."""
 
 
 @contextmanager
@@ -179,8 +165,10 @@ def simulated_cell(
     clearance: Callable[[Float[torch.Tensor, "*batch joints"]], Float[torch.Tensor, "*batch"]]
     | None = None,
     watch: PersonWatch | None = None,
-) -> Iterator[SimulatedCell]:
+) -> Iterator[tuple[WorkCell, MotionLog]]:
     """Connect a work cell to a world, without gradients, until the block ends.
+
+    Yields the cell, and the poses of everything that moves in the world.
 
     Args:
         world: World with arm, camera and objects, at rest.
@@ -245,13 +233,7 @@ def simulated_cell(
         if task is not None:
             task.follow(cell)
         stack.enter_context(observer.view(cell, world, motion))
-        yield SimulatedCell(cell=cell, motion=motion)
-
-
-def grasping_allows_for(config: GraspingConfig, sizes: Imperfections) -> GraspingConfig:
-    """Grasping whose controller allows for the plant in its own safety filter."""
-    safety = sizes.plant(config.controller.safety)
-    return replace(config, controller=replace(config.controller, safety=safety))
+        yield cell, motion
 
 
 def plan_checker(world: World) -> Callable[[Plan], None]:

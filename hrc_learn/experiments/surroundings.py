@@ -300,7 +300,7 @@ def margin_to_stop(
     joint_velocity: Float[Tensor, "*batch joints"],
     person_velocity: Float[Tensor, "*batch H 2 3"],
     config: SeparationConfig,
-) -> tuple[Float[Tensor, "*batch C H"], Bool[Tensor, "*batch C H"]]:
+) -> Float[Tensor, "*batch C H"]:
     """Margin of each distance over the one within which the arm can stop before a person [m].
 
     Args:
@@ -310,15 +310,13 @@ def margin_to_stop(
         config: Protective distance, with the deceleration of the arm.
 
     Returns:
-        d - v_h v/a - v^2/(2 a), infinite where the arm does not approach; and True where it
-        does.
+        d - v_h v/a - v^2/(2 a), infinite where the arm does not approach.
     """
     stop = replace(config, reaction_time=0.0, clearance=0.0)
     closing = -found.rate(joint_velocity, torch.zeros_like(person_velocity))
     coming = -found.person_rate(person_velocity)
     spare = found.distance - stop.protective_distance(closing, coming)
-    moves = closing > _AT_REST
-    return torch.where(moves, spare, torch.inf), moves
+    return torch.where(closing > _AT_REST, spare, torch.inf)
 
 
 def separation_margin(
@@ -355,8 +353,7 @@ def separation_margin(
         ends, speed = torch.from_numpy(there.ends), torch.from_numpy(there.velocity)
         radius = torch.from_numpy(there.radius).expand(len(steps), -1)
         found = separation(arm, q[steps], ends, radius, load)
-        spare, _ = margin_to_stop(found, v[steps], speed, config)
-        margin[steps] = spare.amin((-2, -1)).numpy()
+        margin[steps] = margin_to_stop(found, v[steps], speed, config).amin((-2, -1)).numpy()
 
     rest = np.ones(len(time), dtype=bool)
     for load, held in [*loads.values(), (None, rest)]:
@@ -482,7 +479,7 @@ def _movements(
 ) -> Sequence[tuple[np.ndarray, np.ndarray, np.ndarray, str]]:
     """Times, hand of the person, hand of the robot, and kind of each movement of one visit."""
     now = plan.visit.begin
-    sensor = WorkerSensor(plan.visit, lambda: now, sizes, rng)
+    sensor = WorkerSensor(plan.visit.ends_at, plan.visit.worker.radius, lambda: now, sizes, rng)
     watch, found = MovementWatch(ReceivingConfig(), *_WATCHED), []
     newest: PersonObservation | None = None
     for reach in plan.reaches:

@@ -241,28 +241,13 @@ def _progress(
     title: str, total: int, done: Iterable[Trial]
 ) -> Iterator[Callable[[Trial], None]]:
     """Progress bar with the number of failures; yields a function to call after each trial."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import Progress
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[failed]} failed"),
-        TimeRemainingColumn(),
-    )
-    failed = 0
-    with Progress(*columns) as bar:
+    with Progress(*Progress.get_default_columns(), "{task.fields[failed]} failed") as bar:
         task = bar.add_task(title, total=total, failed=0)
 
         def tell(trial: Trial) -> None:
-            nonlocal failed
-            failed += bool(trial.failure)
+            failed = bar.tasks[task].fields["failed"] + bool(trial.failure)
             bar.update(task, advance=1, failed=failed)
 
         for trial in done:

@@ -153,7 +153,7 @@ class Grasping:
             cell.chain,
             from_learned(skill.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
-            config=replace(config.controller, safety=cell.watchful(config.controller.safety)),
+            config=replace(config.controller, safety=cell.watchful(cell.config.safety)),
         )
         law = ServoStep(
             controller, workplace.tool_marker, config.servo, skill.angle, self.refusal

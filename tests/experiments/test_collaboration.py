@@ -16,7 +16,6 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.experiments import collaboration_experiment as experiment
 from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
-from hrc_learn.experiments.collaboration_report import collaboration_sections
 from hrc_learn.experiments.collaboration_trial import (
     NULL_SPACE_FORCES,
     CollaborationScenario,
@@ -31,6 +30,7 @@ from hrc_learn.experiments.run_measures import (
     worker_distance,
 )
 from hrc_learn.experiments.run_recorder import record
+from hrc_learn.experiments.run_report import run_sections
 from hrc_learn.experiments.simulated_cell import Observer
 from hrc_learn.experiments.surroundings import THREE_OBJECTS, with_objects
 from hrc_learn.geometry import Box, quaternion
@@ -60,7 +60,7 @@ SHELVES = ("lower", "middle", "upper")
 WORKPLACE = Workplace()
 
 
-RUN_OPTIONS = ("workplace", "access", "seed", "observer", "on_phase")
+RUN_OPTIONS = ("workplace", "access", "seed", "observer")
 
 
 def simulate(aiming, placing, shelves, **options):
@@ -273,6 +273,10 @@ def test_a_person_who_keeps_away_changes_nothing(skills):
     assert job.world.rests_on("box", "board_middle")
 
 
+def spans(job):
+    return {pick.item.name: pick.span for pick in job.picks}
+
+
 def moved_camera(dx, dy):
     scene = WORKPLACE.scene
     pose = scene.camera.pose.copy()
@@ -296,10 +300,10 @@ def test_what_the_camera_cannot_see_is_reported(skills, shift, reason):
     assert all("(not box)" in fault for fault in evaluation.faults)
     # There is a report of it all the same.
     recording = record("failed", job.cell, job.world, job.motion, cameras=job.cameras)
-    figures = [f for s in collaboration_sections(job, recording) for f in s.figures]
+    figures = [f for s in run_sections(recording, spans(job)) for f in s.figures]
     names = {figure.name for figure in figures}
-    assert {"timeline", "marker", "person", "trajectories"} <= names
-    assert "worker" not in names
+    assert {"timeline", "marker", "trajectories", "joints"} <= names
+    assert names.isdisjoint({"person", "worker"})
 
 
 def test_a_worker_is_measured_logged_and_shown(skills):
@@ -322,7 +326,7 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     np.testing.assert_array_equal(run.worker_distance["true"], distance)
     gap = np.linalg.norm(run.worker_nearest[:, 1] - run.worker_nearest[:, 0], axis=-1)
     np.testing.assert_allclose(gap, distance, atol=1e-6)
-    figures = [f.name for section in collaboration_sections(job, run) for f in section.figures]
+    figures = [f.name for section in run_sections(run, spans(job)) for f in section.figures]
     assert "worker" in figures
     # Somebody else comes with another seed, nobody without the option.
     other = provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True, seed=1)
@@ -387,28 +391,24 @@ class Meddler:
 
     def __init__(self, phase, deed, after=0.0):
         self._phase, self._deed, self._after = phase, deed, after
-        self._begun, self._done = None, False
+        self._done = False
 
     def hooks(self):
-        return {"observer": Observer(view=self.watch), "on_phase": self.phase}
+        return {"observer": Observer(view=self.watch)}
 
     @contextmanager
     def watch(self, cell, world, motion):
         advance = motion.advance
 
         def meddled(duration):
-            due = self._begun is not None and world.time >= self._begun + self._after
-            if due and not self._done:
+            begun = [event.time for event in cell.log.events if event.text == self._phase]
+            if begun and world.time >= begun[0] + self._after and not self._done:
                 self._done = True
                 self._deed(world)
             advance(duration)
 
         motion.advance = meddled
         yield
-
-    def phase(self, name, time):
-        if name == self._phase and self._begun is None:
-            self._begun = time
 
 
 def shifted(dx, dy, dz=0.0):

@@ -12,9 +12,9 @@ from sample_runs import sample_run
 
 from hrc_learn.experiments.experiment import (
     RepeatedRun,
-    Results,
     RunOptions,
     Study,
+    evaluate_all,
     run_experiment,
 )
 from hrc_learn.experiments.metric_table import Metric, evaluate, p95
@@ -214,11 +214,11 @@ def test_an_older_run_is_replaced_only_on_request(tmp_path, work):
 
 def test_a_study_is_not_evaluated_without_trials():
     run = Throw(1.0)
-    results = Results.of(ThrowExperiment(), run, 0, [])
+    results = evaluate_all(ThrowExperiment(), run, 0, [])
     assert [m.name for m in results.table] == ["error", "throws"]
     assert results.ok
     trials = [Trial(seed=k, values={"error_mm": 2e3}) for k in range(3)]
-    results = Results.of(ThrowExperiment(), run, 0, trials)
+    results = evaluate_all(ThrowExperiment(), run, 0, trials)
     assert [m.ok for m in results.table] == [True, None, False]
     assert not results.ok
 

@@ -1,16 +1,15 @@
-"""Report of a collaboration: sections, and figures after those of the paper's Experiment 3.
+"""Report of a run: sections, and figures after those of the paper's Experiments 2 and 3.
 
 Each figure takes the recording of the run and the time interval of each object, by its name.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
-from hrc_learn.experiments.collaboration_trial import CollaborationRun
 from hrc_learn.log import Event, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import (
@@ -38,83 +37,80 @@ CARRYING = ("transfer", "release")
 _HIDDEN = "#8D8F94"
 
 
-def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> list[Section]:
-    """Report sections: timeline, grasping, person, worker if one came, placing."""
-    objects: Spans = {pick.item.name: pick.span for pick in run.picks}
-    notes = [
-        f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
-        for pick in run.picks
-        for note in pick.recoveries
+def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -> list[Section]:
+    """Report sections: timeline, servoing, person and worker if they came, motion.
+
+    Args:
+        run: Recording of a run that servoed with a camera.
+        objects: Start and end of the work on each object [s].
+        notes: Recoveries, in words.
+    """
+
+    def section(heading: str, text: str, *figures: tuple[str, Figure, str]) -> Section:
+        return Section(heading=heading, text=text, figures=[Picture(*f) for f in figures])
+
+    sections = [
+        section(
+            "The job",
+            f"A state machine. {' '.join(notes) or 'No recovery was needed.'}",
+            ("timeline", timeline_figure(run, objects), "Phases over time."),
+        ),
+        section(
+            "Grasping with an uncalibrated camera",
+            "Visual servoing moves the marker of the gripper to its demonstrated place above "
+            "the object. The image Jacobian was learned from the demonstrations and adapts "
+            "online, also to a moved camera.",
+            (
+                "marker",
+                marker_figure(run, objects),
+                "Paths of the marker over the camera's first image, and its distance from the "
+                "target.",
+            ),
+            (
+                "image_jacobian",
+                image_jacobian_figure(run),
+                "Image Jacobian: estimate of the controller, and truth in the simulator.",
+            ),
+        ),
     ]
-    timeline = Picture("timeline", timeline_figure(recording, objects), "Phases over time.")
-    marker = Picture(
-        "marker",
-        marker_figure(recording, objects),
-        "Paths of the marker over the camera's first image, and its distance from the target.",
-    )
-    jacobian = Picture(
-        "image_jacobian",
-        image_jacobian_figure(recording),
-        "Image Jacobian: estimate of the controller, and truth in the simulator.",
-    )
-    person = Picture(
-        "person", person_figure(recording), "Effort of the person, elbow and end effector."
-    )
-    trajectories = Picture(
-        "trajectories", trajectories_figure(recording, objects), "Paths of the end effector."
-    )
-    joints = Picture("joints", joints_figure(recording), "Joint positions and limits.")
-    return [
-        Section(
-            heading="The job",
-            text=(
-                "A state machine: detect, servo, wait for the person, grasp, carry home, "
-                f"transfer, release, retreat. {' '.join(notes) or 'No recovery was needed.'}"
-            ),
-            figures=(timeline,),
-        ),
-        Section(
-            heading="Grasping with an uncalibrated camera",
-            text=(
-                "Visual servoing moves the marker of the gripper to its demonstrated place "
-                "above the object. The image Jacobian was learned from the demonstrations and "
-                "adapts online, also to a moved camera."
-            ),
-            figures=(marker, jacobian),
-        ),
-        Section(
-            heading="The person",
-            text=(
+    if run.nullspace_input is not None and run.nullspace_input.any():
+        sections.append(
+            section(
+                "The person",
                 "The force of the person acts in the null space of the task: the elbow yields, "
-                "the end effector stays."
-            ),
-            figures=(person,),
-        ),
-        *([_worker_section(recording)] if recording.worker_distance else []),
-        Section(
-            heading="Carrying and placing",
-            text="The demonstration, and the motion of the arm with every object.",
-            figures=(trajectories, joints),
-        ),
-    ]
-
-
-def _worker_section(recording: RunRecording) -> Section:
-    caption = (
-        "Smallest distance from the robot and its load: true, seen by the robot, and the "
-        "protective distance of the part with the smallest margin."
+                "the end effector stays.",
+                (
+                    "person",
+                    person_figure(run),
+                    "Effort of the person, elbow and end effector.",
+                ),
+            )
+        )
+    if run.worker_distance:
+        sections.append(
+            section(
+                "The worker",
+                "A worker comes to the table, puts something down, reaches for markers under "
+                "the arm and leaves, without regard to the robot. The robot sees the worker "
+                "late and with noise, keeps the protective distance of ISO/TS 15066 and waits "
+                "if necessary. The expert drags joint 4 forward and back twice to make space.",
+                (
+                    "worker",
+                    worker_figure(run),
+                    "Smallest distance from the robot and its load: true, as the robot sees "
+                    "it, and the protective distance of the part with the smallest margin.",
+                ),
+            )
+        )
+    sections.append(
+        section(
+            "Motion",
+            "The motion of the arm with every object, and the demonstration if there is one.",
+            ("trajectories", trajectories_figure(run, objects), "Paths of the end effector."),
+            ("joints", joints_figure(run), "Joint positions and limits."),
+        )
     )
-    return Section(
-        heading="The worker",
-        text=(
-            "A worker comes to the table, puts something down, reaches for markers under the "
-            "arm and leaves, without regard to the robot. The robot sees the worker late and "
-            "with noise, keeps the protective distance of ISO/TS 15066 from every part of the "
-            "body, and waits if necessary. The expert drags joint 4 forward and back twice to "
-            "make space."
-        ),
-        figures=(Picture("worker", worker_figure(recording), caption),),
-    )
+    return sections
 
 
 def worker_figure(run: RunRecording) -> Figure:

@@ -6,8 +6,7 @@ import pytest
 from PIL import Image
 from sample_runs import sample_run
 
-from hrc_learn.experiments import collaboration_report as collaboration_figures
-from hrc_learn.experiments.collaboration_report import (
+from hrc_learn.experiments.run_report import (
     marker_figure,
     timeline_figure,
     trajectories_figure,
@@ -56,7 +55,7 @@ def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
 
 def test_runs_without_a_camera_are_refused_where_it_is_needed(run):
     with pytest.raises(ValueError, match="needs camera"):
-        collaboration_figures.marker_figure(replace(run, camera=None), OBJECTS)
+        marker_figure(replace(run, camera=None), OBJECTS)
 
 
 def test_figures_of_a_job_that_never_saw_its_marker_are_drawn_all_the_same(run):
