@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 Channel = Literal["joint", "position", "orientation", "pose"]
-"""Keys of `hrc_learn.learning.channels.CHANNELS`."""
+"""Keys of `hrc_learn.learning.primitive_fitting.CHANNELS`."""
 Scaling = Literal["none", "paper", "amplitude", "rotation"]
 """Keys of `hrc_learn.dmp.forcing_scale.SCALINGS`."""
 

@@ -14,15 +14,10 @@ from hrc_learn.cli._run import command_line, configuration, refuse_repeats, writ
 from hrc_learn.cli.arguments import FitPrimitives
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.source import open_dataset
-from hrc_learn.learning.channels import CHANNELS
 from hrc_learn.learning.fit_dashboards import fit_report, record_fit, shown_fit
+from hrc_learn.learning.large_datasets import fit_all, fit_streamed, sampled
 from hrc_learn.learning.model_choice import best_models, fit_contextual, keep_best
-from hrc_learn.learning.primitive_fitting import (
-    FittedPrimitives,
-    fit_all,
-    fit_streamed,
-    sampled,
-)
+from hrc_learn.learning.primitive_fitting import CHANNELS, FittedPrimitives
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz.report import (

@@ -16,15 +16,10 @@ from hrc_learn.cli.arguments import Evaluate, FitPrimitives, Smooth, columns
 from hrc_learn.cli.fit_command import fit_silently
 from hrc_learn.demos import DemonstrationSet, open_demos
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.channels import (
-    CHANNELS,
-    Motions,
-    ReproductionError,
-    load_primitive,
-    reproduction_error,
-)
+from hrc_learn.learning.large_datasets import sampled
 from hrc_learn.learning.model_choice import best_models, predict
-from hrc_learn.learning.primitive_fitting import sampled
+from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, load_primitive
+from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
 
@@ -102,7 +97,7 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
         motions.require(channel)
         primitive = load_primitive(model / channel, channel)
         made = predict(model, channel, motions, demos)
-        errors[channel] = reproduction_error(channel, motions, made)
+        errors[channel] = motions.error(channel, made)
         figures |= errors[channel].summary(channel)
         figures[f"{channel}_duration_ratio_median"] = _duration_ratio(
             motions, primitive.duration

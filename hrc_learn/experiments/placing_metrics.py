@@ -5,16 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
+from hrc_learn.demos.quality.ranking import log_dimensionless_jerk
 from hrc_learn.experiments.metric_table import Metric, never, p95, success_rate
 from hrc_learn.experiments.placing_trial import SPACES, SimulatedPlacing, demonstrated_path
 from hrc_learn.experiments.run_measures import limit_violations, place_angle
 from hrc_learn.experiments.run_recorder import demonstrated_joints
 from hrc_learn.experiments.trials import Trial
-from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import Touch
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlanningSpace
@@ -59,11 +58,8 @@ class PlacingOutcome:
         error = run.object_pose[:3, 3] - run.goal.position.numpy()
         speed = np.abs(run.cell.log["joint_velocity"]) / run.cell.chain.limits.velocity.numpy()
         done, demonstrated = (
-            dimensionless_jerk(torch.from_numpy(time), torch.from_numpy(path))
-            for time, path in (
-                (run.time, run.path),
-                (demonstration.time, shown),
-            )
+            log_dimensionless_jerk(time, path)
+            for time, path in ((run.time, run.path), (demonstration.time, shown))
         )
         return cls(
             deviation=approach_deviation(run.path, run.goal.position.numpy(), shown, edge),
@@ -72,7 +68,7 @@ class PlacingOutcome:
             violations=limit_violations(run.cell),
             contacts=run.contacts,
             peak_speed=float(speed.max()),
-            jerk=float(done / demonstrated),
+            jerk=math.exp(done - demonstrated),
             placed=run.placed,
         )
 

@@ -1,15 +1,14 @@
 """Models of datasets: movement primitives and image Jacobians, with their errors."""
 
-from hrc_learn.learning.channels import CHANNELS as CHANNELS
-from hrc_learn.learning.channels import Motions as Motions
-from hrc_learn.learning.channels import ReproductionError as ReproductionError
-from hrc_learn.learning.channels import load_primitive as load_primitive
-from hrc_learn.learning.channels import reproduction_error as reproduction_error
+from hrc_learn.learning.large_datasets import fit_streamed as fit_streamed
 from hrc_learn.learning.model_choice import HeldOutErrors as HeldOutErrors
 from hrc_learn.learning.model_choice import fit_contextual as fit_contextual
 from hrc_learn.learning.model_choice import held_out_errors as held_out_errors
 from hrc_learn.learning.model_choice import predict as predict
+from hrc_learn.learning.primitive_fitting import CHANNELS as CHANNELS
 from hrc_learn.learning.primitive_fitting import FittedPrimitives as FittedPrimitives
+from hrc_learn.learning.primitive_fitting import Motions as Motions
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit_primitives
-from hrc_learn.learning.primitive_fitting import fit_streamed as fit_streamed
+from hrc_learn.learning.primitive_fitting import load_primitive as load_primitive
+from hrc_learn.learning.reproduction_error import ReproductionError as ReproductionError
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo as fit_visual_servo

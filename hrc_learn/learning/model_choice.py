@@ -15,13 +15,13 @@ from torch import Tensor
 
 from hrc_learn.demos import DemonstrationSet
 from hrc_learn.dmp import ContextualDMP, JointDMP, fit_ridge
-from hrc_learn.learning.channels import (
+from hrc_learn.learning.primitive_fitting import (
+    EACH,
+    FittedPrimitives,
     Motions,
-    Reproduction,
     load_primitive,
-    reproduction_error,
 )
-from hrc_learn.learning.primitive_fitting import EACH, FittedPrimitives
+from hrc_learn.learning.reproduction_error import Reproduction
 from hrc_learn.store import read_json, write_json
 
 CONTEXTUAL = "contextual"
@@ -171,8 +171,7 @@ def held_out_errors(
 
     def error(coordinates: Tensor) -> Tensor:
         made = fitted.motions.adapted(channel, each.with_coordinates(coordinates))
-        measured = reproduction_error(channel, fitted.motions, made).columns()
-        return measured["nrmse"].double()
+        return fitted.motions.error(channel, made).columns()["nrmse"].double()
 
     others = (x.sum(0) - x) / (n - 1)
     found = {"mean": error(others), "nearest": error(x[_nearest(context, context, True)])}

@@ -1,11 +1,7 @@
-"""Movement primitives of demonstrations by channel: of each, and their mean.
+"""Movement primitives of demonstrations by channel: of each, and their mean."""
 
-Datasets larger than memory are fitted from a sample, in batches, or streamed.
-"""
-
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,34 +10,206 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.demos import (
-    Demonstration,
-    DemonstrationSet,
-    DemonstrationSource,
-    PaddedDemonstrations,
-)
+from hrc_learn.demos import Demonstration, DemonstrationSet, PaddedDemonstrations
 from hrc_learn.dmp import (
     BasisSelection,
-    ProbabilisticDMP,
-    SharedFit,
-    fit_shared,
+    JointDMP,
+    OrientationDMP,
+    PoseDMP,
     mean_primitive,
     select_basis_count,
 )
-from hrc_learn.dmp.motion_primitive import concatenate
-from hrc_learn.learning.channels import (
-    CHANNELS,
-    LazyMap,
-    Motions,
-    Primitive,
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import arm_angle, fr3, panda
+from hrc_learn.learning.reproduction_error import (
+    Reproduction,
     ReproductionError,
     reproduction_error,
-    require_motion,
-    select_channels,
 )
 
+type Channel = Literal["joint", "position", "orientation", "pose"]
+type Primitive = JointDMP | OrientationDMP | PoseDMP
+
+CHANNELS: dict[str, tuple[str, ...]] = {
+    "joint": ("joint_position",),
+    "position": ("position",),
+    "orientation": ("orientation",),
+    "pose": ("position", "orientation"),
+}
+"""Columns that each channel is learned from."""
+CLASSES = {
+    "joint": JointDMP,
+    "position": JointDMP,
+    "orientation": OrientationDMP,
+    "pose": PoseDMP,
+}
 EACH = "each"
 """Folder of the primitives of single demonstrations."""
+_LEAST_MOTION = 1e-4
+"""Smallest motion above the noise of encoders and trackers [rad, m, quaternion components]."""
+
+
+def require_motion(demo: Demonstration, source: str) -> None:
+    """Refuse a demonstration without motion, as its relative errors are not defined.
+
+    Raises:
+        ValueError: Neither joints nor pose move, or values are not finite.
+    """
+    columns = (demo.joint_position, demo.position, demo.orientation)
+    shown = [column for column in columns if column is not None and column.size]
+    place = f"{source}, episode {demo.episode}"
+    if any(not np.isfinite(column).all() for column in shown):
+        raise ValueError(f"{place}: values are not finite; `hrc check` names them")
+    if shown and max(float(np.ptp(column, axis=0).max()) for column in shown) < _LEAST_MOTION:
+        raise ValueError(f"{place}: nothing moves; leave it out (--episodes names the others)")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motions:
+    """Demonstrations of one motion, padded to one batch."""
+
+    demos: PaddedDemonstrations
+    joint_names: tuple[str, ...]
+    source: str
+
+    @classmethod
+    def of(cls, demos: DemonstrationSet) -> "Motions":
+        """Pad demonstrations to one batch.
+
+        A Panda's end-effector pose is computed from its joints, unless a position or an
+        orientation was recorded, which may refer to another frame.
+
+        Raises:
+            ValueError: A demonstration has no motion, or values that are not finite.
+        """
+        for demo in demos:
+            require_motion(demo, demos.source)
+        padded = demos.padded()
+        joints = padded.joint_position if demos.joint_names == panda.joint_names else None
+        if joints is not None and padded.position is None and padded.orientation is None:
+            tool = panda.forward(joints)
+            pose = {"position": tool.position, "orientation": tool.orientation}
+            padded = PaddedDemonstrations(**(vars(padded) | pose))
+        return cls(demos=padded, joint_names=demos.joint_names, source=demos.source)
+
+    def available(self) -> tuple[str, ...]:
+        """Channels whose columns were recorded."""
+        return tuple(
+            channel
+            for channel, columns in CHANNELS.items()
+            if all(getattr(self.demos, column) is not None for column in columns)
+        )
+
+    def column(self, name: str) -> Tensor:
+        """Column of all demonstrations, (demos, frames, components)."""
+        values = getattr(self.demos, name)
+        assert values is not None, name
+        return values
+
+    def position(self, channel: str) -> Float[Tensor, "demos frames D"]:
+        """Linear coordinates of a channel: joint positions [rad] or position [m]."""
+        return self.column(CHANNELS[channel][0])
+
+    def naming(self, channel: str) -> dict[str, Any]:
+        """Arguments of `JointDMP.fit` that name the coordinates and their unit."""
+        if channel == "joint":
+            return {"joint_names": self.joint_names or None, "units": "rad"}
+        return {"joint_names": ("x", "y", "z"), "units": "m"}
+
+    def fit(self, channel: str, n_basis: int, **options: Any) -> Primitive:
+        """Fit one primitive to each demonstration.
+
+        Args:
+            channel: One of `available()`.
+            n_basis: Number of basis functions.
+            options: Fields of `FitOptions`.
+
+        Raises:
+            ValueError: The demonstrations lack a column of the channel.
+        """
+        self.require(channel)
+        time, mask = self.demos.time, self.demos.mask
+        if channel == "orientation":
+            turn = self.column("orientation")
+            return OrientationDMP.fit(time, turn, n_basis, mask=mask, **options)
+        position = self.position(channel)
+        if channel == "pose":
+            turn, body = self.column("orientation"), self._body_shape()
+            return PoseDMP.fit(time, position, turn, n_basis, body=body, mask=mask, **options)
+        return JointDMP.fit(
+            time, position, n_basis, mask=mask, **self.naming(channel), **options
+        )
+
+    def require(self, channel: str) -> None:
+        """Raise ValueError unless the columns of a channel were recorded."""
+        missing = [name for name in CHANNELS[channel] if getattr(self.demos, name) is None]
+        if missing:
+            raise ValueError(
+                f"{self.source}: the demonstrations have no {' and no '.join(missing)}, which "
+                f"channel {channel!r} needs. hrc check lists the columns."
+            )
+
+    @torch.no_grad()
+    def adapted(self, channel: str, primitive: Primitive) -> "Reproduction":
+        """Motion of a common primitive with start, goal and duration of each demonstration."""
+        last = (self.demos.length - 1)[:, None]
+        columns = [self.column(name) for name in CHANNELS[channel]]
+        starts = [x[:, 0] for x in columns]
+        goals = [x.take_along_dim(last[..., None], dim=1)[:, 0] for x in columns]
+        start, goal = (Pose(*x) if channel == "pose" else x[0] for x in (starts, goals))
+        time = self.demos.time
+        lasting = time.take_along_dim(last, dim=1)[:, 0]
+        return Reproduction.of(cast(Any, primitive).rollout(time, start, goal, lasting))
+
+    @torch.no_grad()
+    def own(self, primitive: Primitive) -> "Reproduction":
+        """Motion of each demonstration's own primitive."""
+        return Reproduction.of(primitive.rollout())
+
+    def error(self, channel: str, made: Reproduction) -> ReproductionError:
+        """Errors of reproductions of a channel at the time stamps of the demonstrations."""
+        return reproduction_error(self.demos, CHANNELS[channel][0], made)
+
+    def _body_shape(self) -> Tensor | None:
+        """Arm angle of a Franka arm [rad], continuous, in the same turn at the start."""
+        franka = {arm.joint_names: arm for arm in (panda, fr3)}
+        if self.demos.joint_position is None or self.joint_names not in franka:
+            return None
+        chain = franka[self.joint_names]
+        angle = np.unwrap(arm_angle(chain, self.demos.joint_position).numpy(), axis=1)
+        start = np.unwrap(angle[:, :1], axis=0) - angle[:, :1]
+        return torch.from_numpy(angle + start)[..., None]
+
+
+def load_primitive(folder: Path, channel: str) -> Primitive:
+    """Load the primitive of a channel.
+
+    Raises:
+        FileNotFoundError: The folder holds no saved primitive.
+        ValueError: The primitive belongs to another channel.
+    """
+    return CLASSES[channel].load(folder)
+
+
+def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
+    """Channels to learn: those given, or else joints and pose as far as they were recorded.
+
+    Raises:
+        ValueError: The demonstrations lack a column of a channel, or hold no motion at all.
+    """
+    for channel in wanted:
+        motions.require(channel)
+    if wanted:
+        return tuple(wanted)
+    available = motions.available()
+    if not available:
+        raise ValueError(
+            f"{motions.source}: the demonstrations hold neither joint positions nor "
+            "end-effector poses. hrc check lists the columns."
+        )
+    whole = [channel for channel in ("joint", "pose") if channel in available]
+    parts = [channel for channel in ("position", "orientation") if channel in available]
+    return tuple(whole if "pose" in whole else whole + parts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,14 +251,6 @@ class FittedPrimitives:
         for channel, primitives in {**self.each, **self.every}.items() if each else ():
             primitives.save(folder / EACH / channel)
 
-    def distribution(self, channel: str) -> ProbabilisticDMP:
-        """Gaussian distribution over the primitives of one channel.
-
-        Raises:
-            ValueError: There are fewer than two demonstrations, or the primitives are scaled.
-        """
-        return ProbabilisticDMP.fit({**self.each, **self.every}[channel])
-
     def metrics(self) -> dict[str, float]:
         """Errors of the primitives, by name.
 
@@ -103,7 +263,7 @@ class FittedPrimitives:
             values["demonstrations_sampled"] = count
         for channel, primitives in self.each.items():
             own, mean = (
-                reproduction_error(channel, self.motions, made)
+                self.motions.error(channel, made)
                 for made in (
                     self.motions.own(primitives),
                     self.motions.adapted(channel, self.common[channel]),
@@ -183,156 +343,3 @@ def _select(
         mask=motions.demos.mask,
         **options,
     )
-
-
-HELD_AT_ONCE = 700_000
-"""Values of a channel (padded frames times joints, or 7 of a pose) that are held at once. Their
-fit and the comparison of models take up to 300 MB."""
-FITTED_AT_ONCE = 140_000
-"""Values per batch in `fit_all`, large enough for fast matrix products."""
-LONGEST = 5_000
-"""Largest number of frames of one demonstration, up to 100 basis functions."""
-_SAMPLES = 50
-"""Frames for each basis function of more than 100: more add nothing that they can follow."""
-
-
-def sampled(source: DemonstrationSource) -> DemonstrationSet:
-    """All demonstrations, or an evenly spread sample of a dataset that is too large.
-
-    Demonstrations of more than twice the median length are thinned. A note describes this.
-
-    Args:
-        source: Demonstrations on disk.
-    """
-    lengths = source.lengths
-    if len(lengths) * max(lengths) * _width(source) <= HELD_AT_ONCE:
-        return source.load()
-    longest = min(LONGEST, 2 * int(np.median(lengths)), max(lengths))
-    count = min(len(lengths), max(1, HELD_AT_ONCE // (longest * _width(source))))
-    demos = [_thinned(demo, longest) for demo in source.spread(count)]
-    note = "the demonstrations are too long for memory"
-    if count < len(lengths):
-        note = f"{count} of {len(lengths)} demonstrations, evenly spread, are a sample"
-    if max(lengths) > longest:
-        note += f"; of longer ones {longest} frames are used"
-    return DemonstrationSet(demos, notes=(*source.notes, note), source=source.source)
-
-
-def fit_all(fitted: FittedPrimitives, source: DemonstrationSource) -> FittedPrimitives:
-    """Fit every demonstration with the options of a sample's fit, batch by batch.
-
-    The mean, `every` and `every_error` of the result cover all demonstrations; `motions` and
-    `each` stay those of the sample.
-
-    Args:
-        fitted: Fit of the sample that `sampled` returns.
-        source: All demonstrations on disk.
-
-    Raises:
-        ValueError: A demonstration cannot be read or holds no motion; the message names it.
-    """
-    found = {channel: _fit_channel(fitted, source, channel) for channel in fitted.each}
-    every = {channel: primitives for channel, (primitives, _) in found.items()}
-    return replace(
-        fitted,
-        every=every,
-        every_error={channel: error for channel, (_, error) in found.items()},
-        common={k: mean_primitive(cast(Any, primitives)) for k, primitives in every.items()},
-    )
-
-
-def _fit_channel(
-    fitted: FittedPrimitives, source: DemonstrationSource, channel: str
-) -> tuple[Primitive, ReproductionError]:
-    """Primitives of all demonstrations with their errors."""
-    errors: list[dict[str, Tensor]] = []
-
-    def batches() -> Iterator[Primitive]:
-        for demos in _batches(source, max(LONGEST, _SAMPLES * fitted.n_basis)):
-            motions = Motions.of(demos)
-            primitives = motions.fit(channel, fitted.n_basis, **fitted.options)
-            error = reproduction_error(channel, motions, motions.own(primitives))
-            errors.append(error.columns())
-            yield primitives
-
-    primitives = concatenate(batches(), fitted.motions.demos.mask.shape[1])
-    columns = {name: torch.cat([e[name] for e in errors]) for name in errors[0]}
-    return primitives, ReproductionError(**columns)
-
-
-def _batches(source: DemonstrationSource, longest: int) -> Iterator[DemonstrationSet]:
-    """Batches of demonstrations within `FITTED_AT_ONCE`."""
-    batch: list[Demonstration] = []
-    for demo in source:
-        demo = _thinned(demo, longest)
-        padded = max(len(one) for one in (*batch, demo)) * (len(batch) + 1)
-        if batch and padded * _width(source) > FITTED_AT_ONCE:
-            yield DemonstrationSet(batch, source=source.source)
-            batch = []
-        batch.append(demo)
-    if batch:
-        yield DemonstrationSet(batch, source=source.source)
-
-
-def _width(source: DemonstrationSource) -> int:
-    """Number of columns of the widest channel."""
-    return max(7, len(source.joint_names))
-
-
-def _thinned(demo: Demonstration, longest: int) -> Demonstration:
-    """Demonstration with at most that many frames, including the first and the last."""
-    if len(demo) <= longest:
-        return demo
-    kept = np.linspace(0, len(demo) - 1, longest).round().astype(int)
-    return replace(
-        demo,
-        **{name: getattr(demo, name)[kept] for name in demo.recorded},
-        fps=demo.fps * (longest - 1) / (len(demo) - 1),
-        extra={key: values[kept] for key, values in demo.extra.items()},
-    )
-
-
-def fit_streamed(
-    demos: DemonstrationSource, n_basis: int, *, channels: Sequence[str] = ()
-) -> tuple[dict[str, SharedFit], dict[str, float]]:
-    """Fit one primitive to all demonstrations in a single pass, one in memory at a time.
-
-    Args:
-        demos: Demonstrations on disk.
-        n_basis: Number of basis functions.
-        channels: "joint", "position" or both. Default: joint.
-
-    Returns:
-        Fits by channel, and measured values by name.
-
-    Raises:
-        ValueError: Another channel, whose coordinates depend on the goal of a demonstration.
-    """
-    fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
-    for channel in channels or ("joint",):
-        if channel not in ("joint", "position"):
-            raise ValueError(
-                f"channel {channel!r} cannot be streamed, only joint and position."
-            )
-        names = demos.joint_names if channel == "joint" else ("x", "y", "z")
-        column = partial(_stamped_column, name=CHANNELS[channel][0], source=demos.source)
-        fit = fit_shared(
-            LazyMap(demos, column),
-            n_basis,
-            joint_names=names,
-            units="rad" if channel == "joint" else "m",
-        )
-        fits[channel] = fit
-        metrics[f"mean_{channel}_rmse"] = float(fit.rmse.square().mean().sqrt())
-    return fits, metrics
-
-
-def _stamped_column(
-    demo: Demonstration, name: str, source: str
-) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T D"]]:
-    """Time stamps [s] and one column of a demonstration."""
-    require_motion(demo, source)
-    values = getattr(demo, name)
-    if values is None:
-        raise ValueError(f"{source}, episode {demo.episode}: no {name}.")
-    return demo.time, values

@@ -25,7 +25,7 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.learning.channels import LazyMap
+from hrc_learn.learning.large_datasets import LazyMap
 from hrc_learn.skills.marker_sensor import AngleDemonstration, MarkerAngle
 from hrc_learn.skills.visual_skill import (
     ANGLE_FEATURE,

@@ -23,7 +23,7 @@ from hrc_learn.cli._commands import COMMANDS
 from hrc_learn.cli._settings import with_settings
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.kinematics import MissingModelError
-from hrc_learn.learning.channels import CHANNELS
+from hrc_learn.learning.primitive_fitting import CHANNELS
 from hrc_learn.sim.workplace import Workplace
 
 HEAVY = (

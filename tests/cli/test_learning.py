@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from commands import done
 
-from hrc_learn.learning.channels import ReproductionError
+from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.viz.report import read_report
 
 

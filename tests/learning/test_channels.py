@@ -5,7 +5,7 @@ import torch
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.franka import panda_bodies
-from hrc_learn.learning.channels import Motions
+from hrc_learn.learning.primitive_fitting import Motions
 
 
 @pytest.fixture

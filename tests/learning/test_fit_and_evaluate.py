@@ -9,16 +9,16 @@ import torch
 from hrc_learn.demos import DatasetWriter, Demonstration, DemonstrationSet, open_demos
 from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
-from hrc_learn.learning import primitive_fitting
-from hrc_learn.learning.channels import (
-    Motions,
-    Reproduction,
-    dimensionless_jerk,
-    load_primitive,
-    reproduction_error,
-)
+from hrc_learn.learning import large_datasets
+from hrc_learn.learning.large_datasets import fit_all, sampled
 from hrc_learn.learning.model_choice import contexts, fit_contextual
-from hrc_learn.learning.primitive_fitting import EACH, fit_all, fit_primitives, sampled
+from hrc_learn.learning.primitive_fitting import (
+    EACH,
+    Motions,
+    fit_primitives,
+    load_primitive,
+)
+from hrc_learn.learning.reproduction_error import Reproduction
 
 
 def demonstration(episode, frames=120):
@@ -118,7 +118,7 @@ def test_errors_of_a_known_offset(demos):
     made = torch.where(mask, shown + offset, 1e6)
     tilt = quaternion.exp(torch.tensor([math.radians(2.0), 0.0, 0.0], dtype=torch.float64))
     turned = quaternion.multiply(tilt, turn)
-    error = reproduction_error("pose", motions, Reproduction(made, turned))
+    error = motions.error("pose", Reproduction(made, turned))
     columns = error.columns()
     span = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)
     expected = 0.03 / 3**0.5 / span
@@ -128,20 +128,10 @@ def test_errors_of_a_known_offset(demos):
     torch.testing.assert_close(columns["jerk"], torch.ones(3).double(), rtol=1e-6, atol=0)
 
 
-def test_dimensionless_jerk_of_a_minimum_jerk_motion():
-    """720 for any length and duration: the integral of (60 - 360 s + 360 s^2)^2."""
-    for reach, duration in ((1.0, 1.0), (0.2, 7.0)):
-        s = torch.linspace(0, 1, 4000, dtype=torch.float64)
-        way = reach * s**3 * (10 - 15 * s + 6 * s**2)
-        jerk = dimensionless_jerk(duration * s, way[:, None])
-        # Differences are of first order at both ends, where the jerk is largest.
-        assert float(jerk) == pytest.approx(720, rel=0.01)
-
-
 def big_set(root, monkeypatch, episodes=11):
     """Poses on disk, of several lengths, of which three and no more fit into memory."""
     for name, numbers in (("HELD_AT_ONCE", 3 * 110 * 7), ("FITTED_AT_ONCE", 4 * 120 * 7)):
-        monkeypatch.setattr(primitive_fitting, name, numbers)
+        monkeypatch.setattr(large_datasets, name, numbers)
     with DatasetWriter(root, fps=60, robot_type="hand", joint_names=[]) as writer:
         for episode in range(episodes):
             demo = demonstration(episode, 90 + 10 * (episode % 3))
@@ -183,9 +173,9 @@ def test_more_than_fit_into_memory_give_what_all_of_them_give(tmp_path, monkeypa
 
 
 def test_of_demonstrations_too_long_to_hold_some_frames_are_fitted(tmp_path, monkeypatch):
-    monkeypatch.setattr(primitive_fitting, "LONGEST", 60)
+    monkeypatch.setattr(large_datasets, "LONGEST", 60)
     source = big_set(tmp_path / "set", monkeypatch, episodes=2)
-    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 60 * 7)
+    monkeypatch.setattr(large_datasets, "HELD_AT_ONCE", 60 * 7)
     (demo,) = sampled(source)
     whole = source[0]
     assert len(demo) == 60
@@ -200,6 +190,6 @@ def test_of_demonstrations_too_long_to_hold_some_frames_are_fitted(tmp_path, mon
 
 def test_few_are_loaded_as_they_are(tmp_path, monkeypatch):
     source = big_set(tmp_path / "set", monkeypatch)
-    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 11 * 110 * 7)
+    monkeypatch.setattr(large_datasets, "HELD_AT_ONCE", 11 * 110 * 7)
     assert len(sampled(source)) == 11
     assert sampled(source).notes == source.notes

@@ -8,7 +8,7 @@ import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.dmp import ContextualDMP, JointDMP, mean_primitive
-from hrc_learn.learning import fit_primitives, held_out_errors, predict, reproduction_error
+from hrc_learn.learning import fit_primitives, held_out_errors, predict
 from hrc_learn.learning.model_choice import CHOICE, best_models, contexts, keep_best
 
 
@@ -65,7 +65,7 @@ def test_held_out_errors_are_those_of_models_fitted_without_each():
         alone = fit_primitives(DemonstrationSet([demos[i]]), 20).motions
         others = torch.arange(len(demos)) != i
         mean = alone.adapted("joint", mean_primitive(rest.each["joint"]))
-        truth = reproduction_error("joint", alone, mean).nrmse[0]
+        truth = alone.error("joint", mean).nrmse[0]
         # The mean start velocity is taken per second in one, per duration in the other.
         assert errors.nrmse["mean"][i] == pytest.approx(float(truth), rel=0.05)
         model = ContextualDMP.fit(
@@ -77,7 +77,7 @@ def test_held_out_errors_are_those_of_models_fitted_without_each():
             **rest.options,
         )
         made = alone.adapted("joint", model.at(context[i]))
-        truth = reproduction_error("joint", alone, made).nrmse[0]
+        truth = alone.error("joint", made).nrmse[0]
         assert errors.nrmse["contextual"][i] == pytest.approx(float(truth), abs=2e-3)
 
 
@@ -97,8 +97,7 @@ def test_the_model_that_predicts_is_chosen_kept_and_used(tmp_path, bend, best):
     predicted = predict(tmp_path, "joint", unseen, new)
     mean = unseen.adapted("joint", JointDMP.load(tmp_path / "joint"))
     error, of_mean = (
-        float(reproduction_error("joint", unseen, made).nrmse.median())
-        for made in (predicted, mean)
+        float(unseen.error("joint", made).nrmse.median()) for made in (predicted, mean)
     )
     assert error < {"contextual": 0.3, "nearest": 0.5, "mean": 1.0001}[best] * of_mean
 
