@@ -204,22 +204,14 @@ def test_lerobots_action_queue_runs_without_a_jump():
     assert change < 0.2 * jump
 
 
-def test_left_over_actions_of_others_are_gone_on_with():
-    """As fast as they change, also where LeRobot fills them up with zeros."""
+def test_a_chunk_without_left_over_actions_begins_at_the_end_of_the_last():
     policy = wild(chunk_policy(SHOWN))
-    time = torch.arange(6)[:, None] / FPS
-    others = torch.tensor([0.3, -0.4]) + time * torch.tensor([1.0, -0.5])
     seen = {STATE: torch.zeros(1, 3), GOAL: torch.ones(1, 2)}
-    for left in (others, torch.cat([others, torch.zeros(4, 2)])):
-        policy.reset()
-        chunk = policy.predict_action_chunk(seen, inference_delay=3, prev_chunk_left_over=left)[
-            0
-        ]
-        torch.testing.assert_close(chunk[:4], others[:4], rtol=0, atol=1e-5)
-    # Nothing left over: the arm stands at the end of the last chunk.
-    end = chunk[-1]
-    chunk = policy.predict_action_chunk(seen, prev_chunk_left_over=others[:0])[0]
-    torch.testing.assert_close(chunk[0], end, rtol=0, atol=0.3)
+    end = policy.predict_action_chunk(seen)[0, -1]
+    for left in (torch.zeros(0, 2), torch.zeros(4, 2)):  # LeRobot fills up with zeros
+        chunk = policy.predict_action_chunk(seen, prev_chunk_left_over=left)[0]
+        torch.testing.assert_close(chunk[0], end, rtol=0, atol=0.3)
+        end = chunk[-1]
 
 
 def test_who_does_not_say_what_was_carried_out_is_found_on_the_chunk():

@@ -213,7 +213,7 @@ class MotionChunkPolicy(MotionPolicy):
             hidden=config.hidden_dim,
             dropout=config.dropout,
         )
-        self.motion = ContinuedMotion(self.decoder, self._compose, self._decompose)
+        self.motion = ContinuedMotion(self.decoder, self._compose)
         if config.pretrained_path is None:
             self._fit_dataset(dataset_meta)
         self.reset()
@@ -411,12 +411,6 @@ class MotionChunkPolicy(MotionPolicy):
         coordinates[..., self._smooth] = position.to(coordinates)
         coordinates[..., self._stepped] = low + upper * (high - low)
         return self.encoding.to_actions(coordinates)
-
-    def _decompose(self, actions: Float[Tensor, "B samples A"]) -> tuple[Tensor, Tensor]:
-        coordinates = self.encoding.to_coordinates(actions.to(self.encoding.mean))
-        low, high = self.levels[:, self._stepped]
-        upper = (coordinates[..., self._stepped] > (low + high) / 2).to(coordinates)
-        return coordinates[..., self._smooth], upper
 
     def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None, dataset_meta: Any) -> None:
         """Take spreads, levels, and the columns with two levels only, from statistics."""

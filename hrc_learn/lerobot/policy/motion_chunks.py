@@ -299,22 +299,16 @@ class ContinuedMotion:
     chunk: MotionChunk | None
     """The last one; None: nothing is under way."""
 
-    def __init__(
-        self,
-        decoder: ChunkDecoder,
-        compose: Callable[[Tensor, Tensor], Tensor],
-        decompose: Callable[[Tensor], tuple[Tensor, Tensor]],
-    ):
+    def __init__(self, decoder: ChunkDecoder, compose: Callable[[Tensor, Tensor], Tensor]):
         """Begin with nothing under way.
 
         Args:
             decoder: Decoder of coefficients to the samples of a chunk.
             compose: Function from smooth columns (B, samples, D) and those that jump (B,
                 samples, G) to actions (B, samples, A).
-            decompose: And back.
         """
         self.decoder = decoder
-        self._compose, self._decompose = compose, decompose
+        self._compose = compose
         self.reset()
 
     def reset(self) -> None:
@@ -339,32 +333,23 @@ class ContinuedMotion:
         return self.chunk.after(off.square().sum(-1).argmin(1) + 1)
 
     def left_over(self, actions: Float[Tensor, "*one n A"]) -> MotionChunk | None:
-        """Continuation of the last chunk, or of other given actions."""
-        samples = self.decoder.samples
+        """Continuation of the last chunk from the first of its actions that are left over.
+
+        None for actions of another source, which have no known velocity.
+        """
+        if self.chunk is None:
+            return None
         actions = actions.reshape(-1, actions.shape[-1])
         # LeRobot fills short ones up with zeros.
         there = actions.any(-1).nonzero().flatten()
-        actions = actions[: int(there[-1]) + 1] if len(there) else actions[:0]
-        if self.chunk is not None:
-            if not len(actions):
-                return self.after(samples)
-            for k in range(samples):
-                same = self.chunk.actions[0, k : k + len(actions)]
-                if len(same) and torch.equal(same, actions[: len(same)]):
-                    return self.after(k)
-        if not len(actions):
-            return None
-        # Actions of another source: velocity by differences, at rest after the last.
-        index = torch.arange(samples, device=actions.device).clamp(max=len(actions) - 1)
-        position, stepped = self._decompose(actions[index][None])
-        position = position.double()
-        (velocity,) = torch.gradient(position, spacing=self.decoder.step, dim=1)
-        (acceleration,) = torch.gradient(velocity, spacing=self.decoder.step, dim=1)
-        return MotionChunk(
-            states=torch.stack([position, velocity, acceleration], dim=2),
-            stepped=stepped,
-            actions=actions[index][None],
-        )
+        if not len(there):
+            return self.after(self.decoder.samples)
+        actions = actions[: int(there[-1]) + 1]
+        for k in range(self.decoder.samples):
+            same = self.chunk.actions[0, k : k + len(actions)]
+            if len(same) and torch.equal(same, actions[: len(same)]):
+                return self.after(k)
+        return None
 
     def go_on(
         self,
