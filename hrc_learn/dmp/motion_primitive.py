@@ -5,7 +5,7 @@ joints are columns themselves, an orientation becomes its error to a reference, 
 position, orientation error and body, and a moving goal is the frame in which joints are seen.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any, ClassVar, NamedTuple, TypedDict, Unpack
@@ -539,12 +539,9 @@ def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
     """
     if not primitives:
         raise ValueError("there are no primitives to stack")
-    first, *others = (_description(primitive) for primitive in primitives)
-    for i, other in enumerate(others, start=1):
-        _check_equal(first, other, f"primitive {i}")
-    tensors = [primitive.tensors() for primitive in primitives]
-    common = set.intersection(*(set(each) for each in tensors))
-    columns = {name: [each[name] for each in tensors] for name in tensors[0] if name in common}
+    for i, primitive in enumerate(primitives):
+        _check_alike(primitives[0], primitive, f"primitive {i}")
+    columns = _columns([primitive.tensors() for primitive in primitives])
     return primitives[0].with_tensors(
         {
             name: _padded(rows) if name == "timestamps" else torch.stack(rows)
@@ -566,31 +563,47 @@ def concatenate[P: MotionPrimitive](batches: Iterable[P], samples: int) -> P:
     Raises:
         ValueError: There is no batch, or they differ; the message says in what.
     """
-    first, described = None, {}
+    first = None
     parts: list[dict[str, Tensor]] = []
     for batch in batches:
-        own = _description(batch)
-        own["shape of the weights"] = own["shape of the weights"][1:]
         if first is None:
             # A copy, so that the memory behind the batch is released.
-            first, described = batch[:1], own
-        _check_equal(described, own, f"batch {len(parts)}")
+            first = batch[:1]
+        _check_alike(first, batch, f"batch {len(parts)}", axis=1)
         parts.append({name: x.detach().clone() for name, x in batch.tensors().items()})
     if first is None:
         raise ValueError("there are no primitives to concatenate")
-    common = set.intersection(*(set(part) for part in parts)) - {"timestamps"}
-    joined = {name: torch.cat([part[name] for part in parts]) for name in common}
+    joined = {name: torch.cat(rows) for name, rows in _columns(parts, {"timestamps"}).items()}
     joined["timestamps"] = torch.linspace(0, 1, samples).to(first.motion.timestamps)
     return first.with_tensors(joined)
 
 
-def _check_equal(first: dict[str, Any], other: dict[str, Any], label: str) -> None:
-    for name, value in first.items():
-        if other[name] != value:
+def _check_alike(
+    first: MotionPrimitive, other: MotionPrimitive, label: str, axis: int = 0
+) -> None:
+    """Raise ValueError unless two primitives agree in kind, parts and, from an axis, shape."""
+    described, found = (
+        {
+            "kind": type(each).__name__,
+            **each.motion.config(),
+            "shape of the weights": tuple(each.motion.weights.shape[axis:]),
+        }
+        for each in (first, other)
+    )
+    for name, value in described.items():
+        if found[name] != value:
             raise ValueError(
                 f"primitives of one batch must be alike, but {name} of {label} is "
-                f"{other[name]}, of the first {value}"
+                f"{found[name]}, of the first {value}"
             )
+
+
+def _columns(
+    tensors: list[dict[str, Tensor]], without: Set[str] = frozenset()
+) -> dict[str, list[Tensor]]:
+    """Tensors that all primitives have, by name."""
+    common = set.intersection(*(set(each) for each in tensors)) - without
+    return {name: [each[name] for each in tensors] for name in tensors[0] if name in common}
 
 
 def _padded(rows: list[Tensor]) -> Tensor:
@@ -602,11 +615,3 @@ def _padded(rows: list[Tensor]) -> Tensor:
         torch.cat([x, x[..., -1:].expand(*x.shape[:-1], T - x.shape[-1])], -1) for x in rows
     ]
     return torch.stack(torch.broadcast_tensors(*rows))
-
-
-def _description(primitive: MotionPrimitive) -> dict[str, Any]:
-    return {
-        "kind": type(primitive).__name__,
-        **primitive.motion.config(),
-        "shape of the weights": tuple(primitive.motion.weights.shape),
-    }

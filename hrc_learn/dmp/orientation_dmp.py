@@ -33,7 +33,6 @@ from hrc_learn.dmp.motion_primitive import (
     via_values,
 )
 from hrc_learn.dmp.orientation_error import (
-    error_boundary,
     fitted_error,
     reference_of,
     to_orientation,
@@ -203,17 +202,12 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         goal, goal_rotation = self._parts("goal", given.goal)
         like, demonstrated = motion.start, motion.start_velocity
         demonstrated = demonstrated * (motion.duration / duration)[..., None]
-        twist = given.start_velocity
+        twist, omega = given.start_velocity, None
         if twist is not None:
             twist = to_tensor(twist, like.dtype, like.device)
-        error, rate, reference = error_boundary(
-            like[..., E],
-            demonstrated[..., E],
-            motion.goal[..., E],
-            self.goal_orientation,
-            rotation,
-            goal_rotation,
-            None if twist is None else twist[..., P.stop :],
+            omega = twist[..., P.stop :]
+        error, rate, reference = self._error_boundary(
+            demonstrated[..., E], rotation, goal_rotation, omega
         )
         start_columns = _join(
             like[..., P] if start is None else start,
@@ -236,6 +230,33 @@ class OrientedPrimitive[Value, Path, State: OrientationState](
         # A twist does not include the body, which starts as demonstrated.
         velocity = _join(linear, rate, demonstrated[..., B], like)
         return Boundary(start_columns, goal_columns, velocity), reference
+
+    def _error_boundary(
+        self,
+        rate: Float[Tensor, "*#batch 3"],
+        start: Quaternions | None,
+        goal: Quaternions | None,
+        omega: Float[Tensor, "*#batch 3"] | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Error at the start of a motion, its rate [rad/s], and the reference of the error.
+
+        Args:
+            rate: Demonstrated rate, for the duration of the motion.
+            start: New start; None keeps the demonstrated one, as for all that follow.
+            goal: New goal.
+            omega: New angular velocity at the start [rad/s].
+        """
+        E, reference = self.error_columns, self.reference
+        error = self.motion.start[..., E]
+        if start is None and goal is None and omega is None:
+            return error, rate, reference
+        if omega is None:
+            omega = orientation_error.angular_velocity(*torch.broadcast_tensors(error, rate))
+        q = to_orientation(error, reference) if start is None else unit_quaternion(start, error)
+        if goal is not None:
+            reference = reference_of(self.motion.goal[..., E], unit_quaternion(goal, error))
+        error = orientation_error.nearest_turn(orientation_error.to_error(q, reference), error)
+        return error, orientation_error.error_rate(error, omega), reference
 
     def _retarget(
         self,

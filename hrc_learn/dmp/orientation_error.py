@@ -8,9 +8,9 @@ goal, e = 0. A rotation of the tool frame that moves start and goal alike leaves
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, broadcast_tensors
+from torch import Tensor
 
-from hrc_learn.dmp._arguments import Mask, Quaternions, Times, Vectors, readable, to_tensor
+from hrc_learn.dmp._arguments import Mask, Quaternions, Times, readable, to_tensor
 from hrc_learn.dmp.samples import check_samples, demo_label
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
@@ -130,43 +130,6 @@ def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4
     if not (shaped and (not readable(q) or ((norm > 0.5) & (norm < torch.inf)).all())):
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
     return quaternion.normalize(q)
-
-
-def error_boundary(
-    error: Float[Tensor, "*#batch 3"],
-    rate: Float[Tensor, "*#batch 3"],
-    goal_error: Float[Tensor, "*#batch 3"],
-    demonstrated_goal: Float[Tensor, "*#batch 4"],
-    start: Quaternions | None,
-    goal: Quaternions | None,
-    velocity: Vectors | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Error at the start of a motion, its rate [rad/s], and the reference of the error.
-
-    Args:
-        error: Error at the start of the demonstration.
-        rate: Its rate, for the duration of the motion.
-        goal_error: Error at the goal; zero if the goal is the reference.
-        demonstrated_goal: Orientation at the end of the demonstration.
-        start: New start; None keeps the demonstrated one, as for all that follow.
-        goal: New goal.
-        velocity: New angular velocity at the start [rad/s].
-    """
-    if start is None and goal is None and velocity is None:
-        return error, rate, reference_of(goal_error, demonstrated_goal)
-    if velocity is None:
-        error_all, rate = broadcast_tensors(error, rate)
-        omega = angular_velocity(error_all, rate)
-    else:
-        omega = to_tensor(velocity, dtype=error.dtype, device=error.device)
-    if start is None:
-        q = to_orientation(error, reference_of(goal_error, demonstrated_goal))
-    else:
-        q = unit_quaternion(start, error)
-    goal = demonstrated_goal if goal is None else unit_quaternion(goal, error)
-    reference = reference_of(goal_error, goal)
-    error = nearest_turn(to_error(q, reference), error)
-    return error, error_rate(error, omega), reference
 
 
 def intrinsic_mean(

@@ -60,8 +60,9 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
     if columns is None:
         return primitives.with_motion(motion)
     goal: Any = primitives.goal
-    goal = _mean_quaternion(goal.orientation if isinstance(goal, Pose) else goal)
-    return primitives.with_motion(motion, reference_of(motion.goal[..., columns], goal))
+    q = goal.orientation if isinstance(goal, Pose) else goal
+    middle = intrinsic_mean(q.reshape(-1, 4))
+    return primitives.with_motion(motion, reference_of(motion.goal[..., columns], middle))
 
 
 def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
@@ -94,13 +95,6 @@ def with_common_reference[P: MotionPrimitive](primitives: P) -> P:
     x[..., columns, :] = fitted.coordinates().detach()
     motion = motion.with_coordinates(x, motion.duration)
     return primitives.with_motion(motion, middle.expand_as(own))
-
-
-def _mean_quaternion(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "4"]:
-    q = q.reshape(-1, 4)
-    # Both signs are the same orientation: take the sign closest to the first.
-    q = q * torch.where((q @ q[0])[:, None] < 0, -1.0, 1.0).to(q)
-    return torch.nn.functional.normalize(q.mean(dim=0), dim=-1)
 
 
 def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
