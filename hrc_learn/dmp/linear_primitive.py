@@ -253,15 +253,18 @@ class LinearPrimitive(nn.Module):
 
     def with_tensors[S: "LinearPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
         """Primitive with other tensors, named as in `tensors`, and the same parts and names."""
-        return type(self)(
-            **_tensor_arguments(tensors),
-            basis=self.basis,
-            spring=self.spring,
-            scaling=self.forcing_scale,
-            approach=self.response.approach,
-            joint_names=self.joint_names,
-            units=self.units,
-        )
+        return type(self)(**self.arguments() | _tensor_arguments(tensors))
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments that make this primitive again."""
+        return _tensor_arguments(self.tensors()) | {
+            "basis": self.basis,
+            "spring": self.spring,
+            "scaling": self.forcing_scale,
+            "approach": self.response.approach,
+            "joint_names": self.joint_names,
+            "units": self.units,
+        }
 
     def rollout_columns(
         self,

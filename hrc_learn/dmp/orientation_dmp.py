@@ -415,7 +415,7 @@ class OrientationDMP(OrientedPrimitive[Quaternions, OrientationTrajectory, Orien
         return super()._acceleration(columns, frame, coupling)
 
     @classmethod
-    def _restored[S: "OrientationDMP"](cls: type[S], saved: SavedModel) -> S:
+    def restore[S: "OrientationDMP"](cls: type[S], saved: SavedModel) -> S:
         try:
             kind = _formulated(saved.config.get("formulation", "log"))
         except ValueError as error:

@@ -26,16 +26,16 @@ from hrc_learn.dmp import orientation_error
 from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
-    broadcast_shapes,
     normalised_time,
     to_tensor,
 )
 from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.dynamics import SpringDamper
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary
 from hrc_learn.dmp.samples import Samples
 from hrc_learn.dmp.solvers import REGULARIZATION, ridge_inverse
-from hrc_learn.dmp.trajectory import Trajectory, output
+from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 MAXIMUM_STEP = 1 / 200
@@ -59,11 +59,12 @@ class UdePrimitive(JointDMP):
             ValueError: The demonstration passes a whole turn from its goal, where e' has no
                 bound.
         """
-        motion = UdePrimitive.of(linear)
+        motion = cls(**linear.arguments())
         count = SAMPLES_PER_FUNCTION * motion.basis.count
         s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
         with torch.no_grad():
-            shown = linear.rollout_columns(Boundary(), _unit_duration(motion), s)
+            unit = linear.resolve_duration(1.0, None)
+            shown = linear.rollout_columns(Boundary(), unit, s)
             e, rate, second = (
                 x.double() for x in (shown.position, shown.velocity, shown.acceleration)
             )
@@ -79,11 +80,6 @@ class UdePrimitive(JointDMP):
             motion.weights = torch.nn.Parameter(motion.weights + change.to(motion.weights))
             motion.fit_report = errors.compare(motion.rollout().position)
         return motion
-
-    @classmethod
-    def of(cls, linear: JointDMP) -> "UdePrimitive":
-        """Primitive that shares the weights of a linear one."""
-        return cls(**linear.arguments())
 
     def config(self) -> dict[str, Any]:
         """Contents of a saved primitive besides its tensors, as JSON values."""
@@ -111,7 +107,12 @@ class UdePrimitive(JointDMP):
         """Motion of the error, of order 4 in `MAXIMUM_STEP`."""
         s = self.timestamps if time is None else normalised_time(time, duration)
         start, _, per_s = self.resolve_boundary(boundary, duration)
-        return UdeMotion(self, s, start, duration, per_s, forcing_gain)
+        start, per_s = torch.broadcast_tensors(start, per_s)
+        # The state (e, v) of a motion of unit duration, whose velocity is v.
+        linear = Boundary(start, None, drift_free_rate(start, per_s))
+        unit = self.resolve_duration(1.0, None).expand(self.duration.shape)
+        x = self._motion_coordinates(linear, unit, forcing_gain)
+        return UdeMotion(coordinates=x, s=s, duration=duration, response=self.response)
 
     def step_columns(self, state: DMPState, dt: Scalars, **inputs: Any) -> DMPState:
         """State of the error after `dt` [s], of order 4 in it."""
@@ -121,7 +122,7 @@ class UdePrimitive(JointDMP):
         middle = super().step_columns(begin, half, **inputs)
         end = super().step_columns(middle, half, **inputs)
         linear = [torch.stack([x.position, x.rate], dim=-2) for x in (begin, middle, end)]
-        change = deviation(torch.zeros_like(linear[0]), end.s - state.s, self, linear)
+        change = deviation(torch.zeros_like(linear[0]), end.s - state.s, self.spring, linear)
         e, v = (linear[2] + change).unbind(-2)
         return replace(end, position=e, rate=v + axis_drift(e, v))
 
@@ -142,91 +143,49 @@ def to_reference(state: DMPState, old: Tensor, new: Tensor) -> DMPState:
 
 
 class UdeMotion(Trajectory):
-    """Error over time: linear motion plus deviation, integrated once on a fixed grid."""
+    """Error over time: linear motion plus deviation, integrated once on a fixed grid.
 
-    def __init__(
-        self,
-        motion: UdePrimitive,
-        s: Float[Tensor, "*#batch T"],
-        start: Float[Tensor, "*#batch 3"],
-        duration: Float[Tensor, "*#batch"],
-        per_s: Float[Tensor, "*#batch 3"],
-        forcing_gain: Scalars | None,
-    ):
-        """Describe a motion.
+    Its coordinates are those of the linear state (e, v) for unit duration.
+    """
 
-        Args:
-            motion: Weights and gains.
-            s: Normalised times.
-            start: Error at the start [rad].
-            duration: [s].
-            per_s: Rate de/ds of the error at the start [rad].
-            forcing_gain: Factor on the forcing term.
-        """
-        start, per_s = torch.broadcast_tensors(start, per_s)
-        self._motion = motion
-        self._forcing_gain = forcing_gain
-        self._s = s
-        self._duration = duration[..., None, None]
-        self._start = start
-        self._first = drift_free_rate(start, per_s)
-        self._batch = broadcast_shapes(
-            motion.weights.shape[:-2], start.shape[:-1], duration.shape, s.shape[:-1]
-        )
-
-    @output
-    def time(self) -> Float[Tensor, "*batch T"]:
-        """Time since the start of the motion [s]."""
-        return (self._s * self._duration[..., 0]).to(self._start).expand(*self._batch, -1)
-
-    @cached_property
-    def position(self) -> Float[Tensor, "*batch T 3"]:
-        """Error [rad]."""
-        return self._state[..., 0, :]
-
-    @cached_property
-    def velocity(self) -> Float[Tensor, "*batch T 3"]:
-        """Rate of the error [rad/s]."""
-        return self._rate / self._duration
-
-    @cached_property
-    def acceleration(self) -> Float[Tensor, "*batch T 3"]:
-        """Second derivative of the error [rad/s^2]."""
+    def _derivative(self, order: int) -> Float[Tensor, "*batch T 3"]:
         e, v = self._state.unbind(-2)
-        linear = self._rolled_out(self._s)
+        if order == 0:
+            return e
+        rate, tau = v + axis_drift(e, v), self.duration[..., None, None]
+        if order == 1:
+            return rate / tau
+        if order > 2:
+            raise ValueError("formulation 'ude' has no jerk: fit with 'log' instead")
+        linear = self._rolled_out(self.s)
         z = self._state - torch.stack([linear.position, linear.velocity], dim=-2)
-        free = self._motion.spring.acceleration(z[..., 0, :], z[..., 1, :])
+        free = self._response.spring.acceleration(z[..., 0, :], z[..., 1, :])
         slope = linear.acceleration + free
-        drift = torch.func.jvp(axis_drift, (e, v), (self._rate, slope))[1]
-        return (slope + drift) / self._duration**2
-
-    @property
-    def _rate(self) -> Tensor:
-        e, v = self._state.unbind(-2)
-        return v + axis_drift(e, v)
+        drift = torch.func.jvp(axis_drift, (e, v), (rate, slope))[1]
+        return (slope + drift) / tau**2
 
     @cached_property
     def _state(self) -> Float[Tensor, "*batch T 2 3"]:
         """State (e, v) at the requested times: one step from the knot before each."""
         # No longer than the interval on which the forcing is smooth.
-        size = min(MAXIMUM_STEP, self._motion.response.forced.interval / 2)
-        s = self._s.expand(*self._batch, -1) if self._s.ndim > 1 else self._s
+        size = min(MAXIMUM_STEP, self._response.forced.interval / 2)
+        s = self.s.expand(*self._batch, -1) if self.s.ndim > 1 else self.s
         knot = (s.detach() / size).floor()
         z = self._deviations(int(knot.max()), size)
         index = knot.long()[..., None, None].expand(*self._batch, -1, 2, 3)
         z = z.expand(*self._batch, *z.shape[-3:]).gather(-3, index)
         h = s - knot * size
         linear = [self._linear(x) for x in (knot * size, s - h / 2, s)]
-        return linear[2] + deviation(z, h, self._motion, linear)
+        return linear[2] + deviation(z, h, self._response.spring, linear)
 
     def _deviations(self, count: int, size: float) -> Float[Tensor, "*batch K 2 3"]:
         """Deviations at the knots 0 to `count`, which are `size` apart."""
         halves = size / 2 * torch.arange(2 * count + 1, dtype=torch.float64)
-        linear = self._linear(halves.to(self._s.device)).unbind(-3)
+        linear = self._linear(halves.to(self.s.device)).unbind(-3)
         z = [torch.zeros_like(linear[0])]
-        h = torch.tensor(size, dtype=torch.float64, device=self._s.device)
+        h = torch.tensor(size, dtype=torch.float64, device=self.s.device)
         for k in range(count):
-            z.append(deviation(z[-1], h, self._motion, linear[2 * k : 2 * k + 3]))
+            z.append(deviation(z[-1], h, self._response.spring, linear[2 * k : 2 * k + 3]))
         return torch.stack(z, dim=-3)
 
     def _linear(self, s: Tensor) -> Float[Tensor, "*#batch T 2 3"]:
@@ -235,18 +194,14 @@ class UdeMotion(Trajectory):
         return torch.stack([motion.position, motion.velocity], dim=-2)
 
     def _rolled_out(self, s: Tensor) -> Trajectory:
-        boundary, duration = (
-            Boundary(self._start, None, self._first),
-            _unit_duration(self._motion),
-        )
-        linear = super(UdePrimitive, self._motion).rollout_columns
-        return linear(boundary, duration, s, self._forcing_gain)
+        unit = torch.ones_like(self.duration)
+        return Trajectory(coordinates=self._given, s=s, duration=unit, response=self._response)
 
 
 def deviation(
     z: Float[Tensor, "*#batch 2 3"],
     h: Float[Tensor, "*#batch"],
-    motion: JointDMP,
+    spring: SpringDamper,
     linear: list[Tensor] | tuple[Tensor, ...],
 ) -> Float[Tensor, "*batch 2 3"]:
     """Deviation z = (e, v) - linear after a step of `h`, with z' = A z + (n, 0).
@@ -254,11 +209,11 @@ def deviation(
     Args:
         z: Deviation before the step.
         h: Step in normalised time.
-        motion: Primitive with the spring of A.
+        spring: Spring of A.
         linear: Linear (e, v) at the beginning, the middle and the end of the step.
     """
     begin, middle, end = linear
-    E = motion.spring.propagator(h.double() / 2).to(z)
+    E = spring.propagator(h.double() / 2).to(z)
     h = h.to(z)[..., None, None]
     # The spring propagates each slope by half a step.
     k1 = _slope(begin + z)
@@ -273,8 +228,3 @@ def _slope(x: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch 2 3"]:
     """Nonlinear part (n, 0) of the derivative."""
     drift = axis_drift(x[..., 0, :], x[..., 1, :])
     return torch.stack([drift, torch.zeros_like(drift)], dim=-2)
-
-
-def _unit_duration(motion: JointDMP) -> Tensor:
-    """Duration of one, for which times are s and velocities derivatives by s."""
-    return motion.resolve_duration(1.0, None)

@@ -76,7 +76,7 @@ def test_a_turn_about_one_axis_is_exact_in_one_step():
     axis = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     q = quaternion.exp((3.0 * minimum_jerk(s))[:, None] * axis)
     log = OrientationDMP.fit(s, q)
-    ude = OrientationDMP(UdePrimitive.of(log.motion), log.goal)
+    ude = OrientationDMP(UdePrimitive(**log.motion.arguments()), log.goal)
     expected = log.rollout(time=[0.6]).orientation[0]
     got = ude.step(ude.initial_state(), 0.6).orientation
     assert (got - expected).abs().max() < 1e-9
@@ -167,3 +167,8 @@ def test_unknown_formulations_are_refused():
         ValueError, match="unknown formulation 'hamilton'; choose from log, ude"
     ):
         OrientationDMP.fit(*turning_motion(), formulation="hamilton")
+
+
+def test_jerk_is_refused(dmp):
+    with pytest.raises(ValueError, match="'ude' has no jerk"):
+        _ = dmp.motion.rollout().jerk
