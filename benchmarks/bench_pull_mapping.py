@@ -31,7 +31,7 @@ from hrc_learn.teleoperation import (
     ScriptedForce,
     random_pulls,
 )
-from hrc_learn.teleoperation.hand_guiding import pull_to_nullspace_input
+from hrc_learn.teleoperation.hand_guiding import force_to_nullspace_input
 from hrc_learn.teleoperation.scripted_demonstrations import ELBOW_FORCES
 
 _MAPPINGS: tuple[ForceMapping, ...] = get_args(ForceMapping)
@@ -146,7 +146,7 @@ def _pulled(
 def _null_velocity(
     q: Tensor, joint: int, force: np.ndarray, config: InteractionForceConfig
 ) -> Tensor:
-    d = pull_to_nullspace_input(panda, q.numpy(), joint, force, config)
+    d = force_to_nullspace_input(panda, q.numpy(), joint, force, config)
     return null_projection(panda.jacobian(q), torch.from_numpy(d) / config.damping)
 
 

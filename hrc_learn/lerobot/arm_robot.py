@@ -123,7 +123,7 @@ class LoopWatch:
             in_real_time: True if the arm keeps moving while the loop is late.
         """
         self._name, self._clock, self._in_real_time = name, clock, in_real_time
-        self._fps, self._quality = fps, RecordingQuality(fps, chain, LATE)
+        self._fps, self._quality = fps, RecordingQuality(fps, chain)
 
     def tick(self, state: ArmState | None = None, touching: Collection[str] = ()) -> None:
         """Count an action.
@@ -133,27 +133,28 @@ class LoopWatch:
             touching: Unexpected contacts of the arm, as text.
         """
         now = self._clock()
-        if self._in_real_time and self._quality.ticks.gap(now) > PAUSE:
+        arrivals = self._quality.arrivals
+        if self._in_real_time and arrivals and now - arrivals[-1] > PAUSE:
             self.end()
         if state is None:
-            self._quality.ticks.tick(now)
+            self._quality.arrivals.append(now)
         else:
             q, width = state.joint_position, state.gripper_width
             self._quality.add(now, state.time, q, width, touching)
 
     def end(self) -> None:
         """Report doubts about the actions since the last end."""
-        ticks = self._quality.ticks
-        if self._in_real_time and ticks.late_ticks > TOLERATED * ticks.ticks:
+        late, actions = self._quality.late(LATE), len(self._quality.arrivals)
+        if self._in_real_time and len(late) > TOLERATED * actions:
             logger.warning(
                 "%s: %d of %d actions came late, by %.0f ms at most: what was recorded lacks "
                 "about %d frames, and moves faster there than the arm did. Record again with "
                 "fewer or smaller images, a lower --dataset.fps, or nothing else to compute",
                 self._name,
-                ticks.late_ticks,
-                ticks.ticks,
-                1e3 * ticks.latest,
-                ticks.lost,
+                len(late),
+                actions,
+                1e3 * (late.max() - 1 / self._fps),
+                (np.rint(late * self._fps) - 1).sum(),
             )
         doubts = self._quality.met()
         if len(self._quality.states) >= EPISODE * self._fps:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import struct
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,6 +12,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
@@ -157,15 +157,14 @@ class CurationPage:
                     error = self._written.exception()
                     written["failed"] = error is not None
                     written["said"] = str(error) if error else self._written.result()
-            decided = {str(index): asdict(d) for index, d in self.decisions.items()}
-        return {"decisions": decided, "written": written}
+            return {"decisions": self.decisions, "written": written}
 
     def curves(self, episode: int) -> dict[str, Any]:
         """All that moves in an episode, over time."""
         (demo,) = open_demos(self.ranking.path, [episode], **self._options)
         frames = _stretches(demo)
         return {
-            "time": demo.time.tolist(),
+            "time": demo.time,
             "charts": [
                 {
                     "name": plain_text(name),
@@ -207,7 +206,7 @@ class CurationPage:
                 told = self.state()
             except (ValueError, OSError) as error:
                 told = {"refused": str(error)}
-            await connection.send(_json(told).body.decode())
+            await connection.send(_encode(told).decode())
 
     def act(self, message: CurationMessage) -> None:
         """Take a decision, or begin to write the cleaned dataset.
@@ -242,27 +241,12 @@ class CurationPage:
         )
 
 
+_encode = msgspec.json.Encoder(enc_hook=lambda array: array.tolist()).encode
+"""JSON of plain values, arrays and dataclasses; values that are not finite become null."""
+
+
 def _json(content: Any) -> Content:
-    # NaN is no JSON: browsers refuse it.
-    text = json.dumps(_finite(content), allow_nan=False)
-    return Content(body=text.encode(), kind="application/json")
-
-
-def _finite(content: Any) -> Any:
-    if isinstance(content, float):
-        return content if np.isfinite(content) else None
-    if isinstance(content, dict):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_finite(value) for value in content]
-    return content
-
-
-_JOINT_LINES = {
-    "joint_position": ("state", "rad"),
-    "command_position": ("command", "rad"),
-}
-_OTHER_CHARTS = {"position": ("xyz", "m"), "feature": ("uv", "px")}
+    return Content(body=_encode(content), kind="application/json")
 
 
 def _charts(
@@ -270,19 +254,15 @@ def _charts(
 ) -> list[tuple[str, str, dict[str, np.ndarray]]]:
     """Name, unit and lines of each chart; columns without a meaning go by their own names."""
     charts = []
-    for number, joint in enumerate(demo.joint_names):
-        lines = {
-            label: getattr(demo, name)[:, number]
-            for name, (label, _) in _JOINT_LINES.items()
-            if getattr(demo, name) is not None
-        }
+    moved = {"state": demo.joint_position, "command": demo.command_position}
+    for k, joint in enumerate(demo.joint_names):
+        lines = {name: values[:, k] for name, values in moved.items() if values is not None}
         if lines:
             charts.append((joint, "rad", lines))
-    for name, (letters, unit) in _OTHER_CHARTS.items():
-        values = getattr(demo, name)
-        if values is not None:
-            lines = {letter: values[:, i] for i, letter in enumerate(letters)}
-            charts.append((name, unit, lines))
+    others = (("position", "m", "xyz"), ("feature", "px", "uv"))
+    for name, unit, letters in others:
+        if (values := getattr(demo, name)) is not None:
+            charts.append((name, unit, dict(zip(letters, values.T, strict=False))))
     if demo.gripper is not None:
         charts.append(("gripper", "", {"state": demo.gripper}))
     for key, values in demo.extra.items():
@@ -299,12 +279,12 @@ def _stretches(demo: Demonstration) -> np.ndarray | None:
     return np.linspace(0, len(demo), _MOST_POINTS // 2 + 1).astype(int)
 
 
-def _points(values: np.ndarray, edges: np.ndarray | None) -> tuple[list[int], list[float]]:
+def _points(values: np.ndarray, edges: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Frames and values of a curve: its extremes within every stretch, so that none is lost."""
     if edges is None:
-        return list(range(len(values))), values.tolist()
+        return np.arange(len(values)), values
     chosen: list[int] = []
     for first, last in pairwise(edges.tolist()):
         part = values[first:last]
         chosen += sorted({first + int(part.argmin()), first + int(part.argmax())})
-    return chosen, values[chosen].tolist()
+    return np.array(chosen), values[chosen]

@@ -45,68 +45,29 @@ _PRESSES = 60.0
 17 N, a gripper that sets something down presses with 20 to 40 N."""
 
 
-@dataclass
-class LateTicks:
-    """Counts the frames that came late."""
-
-    period: float
-    """Between two frames [s]."""
-    late: float
-    """Periods after which a frame is late."""
-    ticks: int = 0
-    late_ticks: int = 0
-    lost: int = 0
-    """Frames that there should have been meanwhile."""
-    latest: float = 0.0
-    """Largest delay [s]."""
-    first: float | None = None
-    """Time of the first frame [s]."""
-    last: float | None = None
-    """Time of the last frame [s]."""
-
-    def gap(self, now: float) -> float:
-        """Time since the last frame [s]; 0 before the first."""
-        return 0.0 if self.last is None else now - self.last
-
-    def tick(self, now: float) -> None:
-        """Note a frame that comes now [s]."""
-        gap = self.gap(now)
-        self.first, self.last = now if self.first is None else self.first, now
-        self.ticks += 1
-        if gap > self.late * self.period:
-            self.late_ticks += 1
-            self.lost += round(gap / self.period) - 1
-            self.latest = max(self.latest, gap - self.period)
-
-
 class RecordingQuality:
     """Statistics of the frames since the start of the demonstration.
 
     Attributes:
-        ticks: Time of each frame.
+        arrivals: Time at which each frame arrived [s].
         states: Joint positions [rad] and gripper width [m] of each frame.
     """
 
-    def __init__(self, fps: float, chain: SerialChain | None = None, late: float = 2.0):
+    def __init__(self, fps: float, chain: SerialChain | None = None):
         """Begin with nothing.
 
         Args:
             fps: Frames a second that there should be.
             chain: Kinematics of the arm, for checking joint limits; None skips this check.
-            late: Periods after which a frame is late.
         """
-        self._period, self._late, self._chain = 1 / fps, late, chain
-        if chain is not None:
-            limits = chain.limits
-            self._lower, self._upper = limits.lower.numpy(), limits.upper.numpy()
+        self._period, self._chain = 1 / fps, chain
         self.clear()
 
     def clear(self) -> None:
         """Forget all frames."""
-        self.ticks = LateTicks(self._period, self._late)
+        self.arrivals: list[float] = []
         self._stamps: list[float] = []
         self.states: list[np.ndarray] = []
-        self._at_limit: Counter[str] = Counter()
         self._touched: Counter[str] = Counter()
 
     def add(
@@ -126,16 +87,15 @@ class RecordingQuality:
             gripper: Opening [m].
             touching: Unexpected contacts of the arm, as text.
         """
-        self.ticks.tick(now)
+        self.arrivals.append(now)
         self._stamps.append(stamp)
         self.states.append(np.append(joint_position, gripper))
         self._touched.update({*touching})
-        chain = self._chain
-        if chain is not None and len(joint_position) == len(self._lower):
-            margin = np.minimum(joint_position - self._lower, self._upper - joint_position)
-            self._at_limit.update(
-                chain.joint_names[k] for k in np.flatnonzero(margin < _AT_LIMIT)
-            )
+
+    @property
+    def seconds(self) -> float:
+        """Duration by the arm's clock [s]."""
+        return self._stamps[-1] - self._stamps[0] if self._stamps else 0.0
 
     @property
     def pace(self) -> float:
@@ -144,20 +104,28 @@ class RecordingQuality:
         A simulation slower than real time makes the recorded motion faster than the
         demonstrated one.
         """
-        first, last = self.ticks.first, self.ticks.last
-        if first is None or last is None or last == first:
-            return 1.0
-        return (self._stamps[-1] - self._stamps[0]) / (last - first)
+        passed = self.arrivals[-1] - self.arrivals[0]
+        return self.seconds / passed if passed else 1.0
+
+    def late(self, periods: float) -> Float[np.ndarray, " late"]:
+        """Gap before each frame that came later than so many periods [s]."""
+        gaps = np.diff(self.arrivals)
+        return gaps[gaps > periods * self._period]
+
+    def moving(self) -> slice | None:
+        """Frames from shortly before the arm begins to move until shortly after it has stopped;
+        None: it does not move.
+        """
+        return moving_part(np.array(self._stamps), np.stack(self.states))
 
     def worthless(self) -> str:
         """Why the frames show nothing at all; empty if they show something."""
         if not self._stamps:
             return "the demonstration has no frames"
-        time, state = np.array(self._stamps), np.stack(self.states)
-        part = moving_part(time, state)
-        if part is None:
+        if (part := self.moving()) is None:
             return "the arm has not moved"
-        if (seconds := float(time[part][-1] - time[part][0])) < _SHORTEST:
+        shown = self._stamps[part]
+        if (seconds := shown[-1] - shown[0]) < _SHORTEST:
             return f"the arm has moved for {seconds:.1f} s only"
         return ""
 
@@ -177,12 +145,16 @@ class RecordingQuality:
 
     def met(self) -> list[str]:
         """Limits and contacts that a demonstration is doubted for, in words."""
-        stood = {k: n * self._period for k, n in self._at_limit.items()}
-        doubts = [
-            f"{joint} was at its limit for {seconds:.1f} s"
-            for joint, seconds in stood.items()
-            if seconds > _LONGEST_AT_LIMIT
-        ]
+        doubts, chain = [], self._chain
+        if chain is not None and self.states:
+            q, limits = np.stack(self.states)[:, :-1], chain.limits
+            margin = np.minimum(q - limits.lower.numpy(), limits.upper.numpy() - q)
+            stood = (margin < _AT_LIMIT).sum(axis=0) * self._period
+            doubts = [
+                f"{joint} was at its limit for {seconds:.1f} s"
+                for joint, seconds in zip(chain.joint_names, stood, strict=True)
+                if seconds > _LONGEST_AT_LIMIT
+            ]
         return doubts + [
             f"{name} for {frames * self._period:.2f} s"
             for name, frames in self._touched.most_common(_NAMED)
@@ -282,7 +254,7 @@ class DemonstrationRecorder:
         """
         self._writer, self._task, self._clock = writer, task, clock
         self._frames: list[Frame] = []
-        self._quality = RecordingQuality(writer.fps, chain, _LATE)
+        self._quality = RecordingQuality(writer.fps, chain)
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
         self._writing: list[Future[int]] = []
         self._draft: Future[float] | None = None
@@ -317,8 +289,9 @@ class DemonstrationRecorder:
         saved = sum(w.done() and w.exception() is None for w in self._writing)
         failed = next((w.exception() for w in self._writing[::-1] if w.done()), None)
         note = self._note if failed is None else f"not saved: {failed}"
-        seconds = _duration(self._frames)
-        return RecorderStatus(state=self._state, seconds=seconds, saved=saved, note=note)
+        return RecorderStatus(
+            state=self._state, seconds=self._quality.seconds, saved=saved, note=note
+        )
 
     @property
     def recording(self) -> bool:
@@ -382,7 +355,6 @@ class DemonstrationRecorder:
         self._quality.clear()
 
     def _save(self, task: str) -> None:
-        frames = self._frames
         if not task.strip():
             self._state = "stopped"
             self._note = "not saved yet: say in Task what is demonstrated"
@@ -395,20 +367,18 @@ class DemonstrationRecorder:
             self._state, self._insists = "stopped", True
             self._note = f"not saved yet: {doubt}. Save again to keep it all the same"
             return
+        frames = self._frames[self._quality.moving() or slice(None)]
         self._clear()
         self._note = "saved"
-        self._writing.append(self._thread.submit(self._write, without_rest(frames), task))
+        self._writing.append(self._thread.submit(self._write, frames, task))
 
     def _doubt(self) -> str:
         """Why a demonstration should rather be shown again; empty if it is good."""
         if lost := self._quality.lost():
             return lost
-        late = self._quality.ticks
-        if late.late_ticks > _MOST_LATE * (late.ticks - 1):
-            return (
-                f"the loop was late at {late.late_ticks} of {late.ticks} frames: this machine "
-                f"is busy"
-            )
+        late, frames = len(self._quality.late(_LATE)), len(self._frames)
+        if late > _MOST_LATE * (frames - 1):
+            return f"the loop was late at {late} of {frames} frames: this machine is busy"
         if (pace := self._quality.pace) < _SLOWEST:
             return (
                 f"the arm moved at {100 * pace:.0f} % of real time, so what was shown is "
@@ -435,18 +405,3 @@ class DemonstrationRecorder:
             raise
         finally:
             self._writer.discard_episode()
-
-
-def _duration(frames: list[Frame]) -> float:
-    return float(frames[-1]["time"]) - float(frames[0]["time"]) if frames else 0.0
-
-
-def without_rest(frames: list[Frame]) -> list[Frame]:
-    """Frames from shortly before the arm begins to move until shortly after it has stopped.
-
-    All of them where it never moves.
-    """
-    time = np.array([float(frame["time"]) for frame in frames])
-    state = [np.append(f["joint_position"], f.get("gripper", 0.0)) for f in frames]
-    part = moving_part(time, np.stack(state))
-    return frames if part is None else frames[part]

@@ -16,13 +16,13 @@ import time
 from collections.abc import Callable
 from threading import Event, Thread
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.kinematics import SerialChain, coarse_orientation
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput, Request
 from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
@@ -46,16 +46,6 @@ BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
 """Request sent by each button: A starts, B stops, X saves, Y discards, "back" returns home,
 "start" finishes.
 """
-
-
-@runtime_checkable
-class Controller(Protocol):
-    """Part of pygame's SDL game controller that is used here."""
-
-    def get_axis(self, axis: int) -> int: ...
-    def get_button(self, button: int) -> bool: ...
-    def attached(self) -> bool: ...
-    def rumble(self, low_frequency: float, high_frequency: float, duration: int) -> bool: ...
 
 
 # Rumble: the slow motor reports contact and nearby people, the quick one an input that the arm
@@ -113,7 +103,7 @@ class Gamepad(Human):
     def __init__(
         self,
         chain: SerialChain,
-        controller: Controller,
+        controller: Any,
         update: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ):
@@ -121,7 +111,7 @@ class Gamepad(Human):
 
         Args:
             chain: The arm that is guided.
-            controller: The gamepad.
+            controller: The gamepad, as `pygame._sdl2.controller.Controller`.
             update: Lets the library read the device.
             clock: Monotonic clock [s].
         """
@@ -131,18 +121,15 @@ class Gamepad(Human):
         self._gripper: float | None = None
 
     @classmethod
-    def open(cls, chain: SerialChain, index: int = 0) -> Gamepad:
-        """Open a gamepad by pygame, which the extra `gamepad` brings.
+    def open(cls, chain: SerialChain) -> Gamepad:
+        """Open the first gamepad by pygame, which the extra `gamepad` brings.
 
         Args:
             chain: The arm that is guided.
-            index: Index of the gamepad, from 0.
 
         Raises:
-            ValueError: There is no such gamepad.
+            ValueError: There is none.
         """
-        import os
-
         # No window is opened, so events must come without one in front.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
@@ -152,26 +139,24 @@ class Gamepad(Human):
 
         pygame.display.init()
         library.init()
-        count = library.get_count()
-        if not (0 <= index < count and library.is_controller(index)):
+        found = [k for k in range(library.get_count()) if library.is_controller(k)]
+        if not found:
             raise ValueError(
-                f"no gamepad {index}: SDL finds {count} devices. Plug one in, and see that "
-                "this user may read /dev/input."
+                "SDL finds no gamepad: plug one in, and see that this user may read /dev/input."
             )
-        return cls(chain, library.Controller(index), pygame.event.pump)
+        return cls(chain, library.Controller(found[0]), pygame.event.pump)
 
     def read(self, state: ArmState) -> HumanInput:
         """Motion of the end effector, gripper and requests, as sticks and buttons are now."""
         self._update()
         if not self._controller.attached():
             self._held = set()
-            return HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
+            return HumanInput()
         pressed = self._pressed()
         for button, width in ((_LEFT_SHOULDER, OPEN), (_RIGHT_SHOULDER, 0.0)):
             if button in pressed:
                 self._gripper = width
         return HumanInput(
-            nullspace_input=np.zeros(len(state.joint_position)),
             twist=self._twist(state),
             gripper=self._gripper,
             requests=tuple(BUTTONS[b] for b in sorted(pressed & BUTTONS.keys())),
@@ -193,9 +178,7 @@ class Gamepad(Human):
         )
         # A stick that points forward or up reads negative; the base's y axis points left.
         stick = np.array([-y, -x, -z])
-        return steering_twist(
-            self._chain, state.joint_position, deflection(stick), InteractionForceConfig()
-        )
+        return steering_twist(self._chain, state, deflection(stick))
 
     def _pressed(self) -> set[int]:
         """Buttons that have gone down since the last reading."""
@@ -232,21 +215,14 @@ class KeyboardState:
         Args:
             holds_for: Time that a press counts [s].
             clock: Monotonic clock [s].
-
-        Raises:
-            ValueError: `holds_for` is not positive.
         """
-        if not holds_for > 0:
-            raise ValueError(f"holds_for must be positive, but is {holds_for}.")
         self._holds_for, self._clock = holds_for, clock
         self._until = dict.fromkeys(DIRECTIONS, float("-inf"))
 
-    def press(self, key: str) -> bool:
-        """Note a press or repeat; whether the key has a direction."""
-        if key not in self._until:
-            return False
-        self._until[key] = self._clock() + self._holds_for
-        return True
+    def press(self, key: str) -> None:
+        """Note a press or repeat; other keys than those of `DIRECTIONS` have no effect."""
+        if key in self._until:
+            self._until[key] = self._clock() + self._holds_for
 
     def direction(self) -> Float[np.ndarray, "3"]:
         """The direction asked for now: a unit vector, or zero."""
@@ -282,8 +258,7 @@ class TerminalKeyboard(Human):
             typed: Characters typed since it was last asked; does not wait.
             keys: State of the keys.
         """
-        self._chain, self._typed = chain, typed
-        self._keys, self._config = keys or KeyboardState(), InteractionForceConfig()
+        self._chain, self._typed, self._keys = chain, typed, keys or KeyboardState()
         self._gripper: float | None = None
 
     @classmethod
@@ -308,10 +283,8 @@ class TerminalKeyboard(Human):
                 self._gripper = _GRIPPER[key]
             else:
                 self._keys.press(key)
-        direction = self._keys.direction()
         return HumanInput(
-            nullspace_input=np.zeros(len(state.joint_position)),
-            twist=steering_twist(self._chain, state.joint_position, direction, self._config),
+            twist=steering_twist(self._chain, state, self._keys.direction()),
             gripper=self._gripper,
             requests=tuple(requests),
         )
@@ -339,20 +312,6 @@ def _typed_in_terminal() -> str:
     return text
 
 
-@runtime_checkable
-class ForceDevice(Protocol):
-    """Part of `forcedimension_core.dhd` that is used here, under its names; -1 reports a
-    failure.
-    """
-
-    def getPosition(self, out: Any, ID: int = -1) -> int: ...
-    def getLinearVelocity(self, out: Any, ID: int = -1) -> int: ...
-    def setForce(self, f: Any, ID: int = -1) -> int: ...
-    def getButton(self, index: int, ID: int = -1) -> int: ...
-    def enableForce(self, enable: bool, ID: int = -1) -> int: ...
-    def close(self, ID: int = -1) -> int: ...
-
-
 _HAPTIC_SCALE = 2.5
 """Motion of the end effector for that of the hand: an Omega's workspace is 0.16 m wide."""
 _HAPTIC_STIFFNESS = 120.0
@@ -369,17 +328,6 @@ _HAPTIC_STALE = 0.1
 """Time without feedback from the control loop after which the force vanishes [s]."""
 _HAPTIC_CLUTCH = 0
 """Button that closes the clutch while it is held."""
-
-
-class _Pull(NamedTuple):
-    """Input of the force thread, exchanged as one reference."""
-
-    rest: Float[np.ndarray, "3"]
-    """Position of the device that corresponds to the present end-effector position [m]."""
-    push: Float[np.ndarray, "3"]
-    """Force of what the arm meets, as the hand feels it [N]."""
-    until: float
-    """Time from which on this reference is stale [s]."""
 
 
 class HapticDevice(Human):
@@ -405,7 +353,7 @@ class HapticDevice(Human):
     def __init__(
         self,
         chain: SerialChain,
-        device: ForceDevice,
+        device: Any,
         *,
         number: int = -1,
         clock: Callable[[], float] = time.monotonic,
@@ -414,7 +362,7 @@ class HapticDevice(Human):
 
         Args:
             chain: Kinematics of the guided arm.
-            device: Interface of Force Dimension's library.
+            device: Interface of Force Dimension's library, `forcedimension_core.dhd`.
             number: Number of the device; -1: the one opened last.
             clock: Monotonic clock [s].
         """
@@ -423,7 +371,9 @@ class HapticDevice(Human):
         # Positions of hand and tool at which the clutch was closed.
         self._clutched: tuple[np.ndarray, np.ndarray] | None = None
         self._tool = np.zeros(3)
-        self._pull: _Pull | None = None
+        # For the thread of forces, as one reference: position at which the device would rest
+        # [m], force of what the arm meets [N], and the time at which both are stale [s].
+        self._pull: tuple[np.ndarray, np.ndarray, float] | None = None
         self._closing = Event()
         self._thread = Thread(target=self._push_back, name="haptic device", daemon=True)
 
@@ -463,20 +413,18 @@ class HapticDevice(Human):
 
     def read(self, state: ArmState) -> HumanInput:
         """Motion of the end effector as the hand is now."""
-        still = HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
         hand = self._vector(self._device.getPosition)
         tool = self._chain.forward(torch.from_numpy(state.joint_position))
         self._tool = tool.position.numpy()
         if hand is None or self._device.getButton(_HAPTIC_CLUTCH, self._number) != 1:
             self._clutched = None
-            return still
+            return HumanInput()
         if self._clutched is None:
             self._clutched = hand, self._tool
         began, start = self._clutched
         pointer = start + _HAPTIC_SCALE * (hand - began)
         velocity = self._forces.rate * (pointer - self._tool)
-        twist = guiding_twist(tool, velocity, coarse_orientation(tool.position), self._forces)
-        return HumanInput(nullspace_input=still.nullspace_input, twist=twist)
+        return HumanInput(twist=guiding_twist(tool, velocity, self._forces))
 
     def tell(self, feedback: Feedback) -> None:
         """Let the hand feel how far the arm is behind, and what it meets."""
@@ -488,17 +436,18 @@ class HapticDevice(Human):
         push = np.zeros(3)
         if feedback.contact_force is not None and not feedback.contact_expected:
             push = _HAPTIC_CONTACT * feedback.contact_force
-        self._pull = _Pull(rest, push, self._clock() + _HAPTIC_STALE)
+        self._pull = rest, push, self._clock() + _HAPTIC_STALE
 
     def force(self) -> Float[np.ndarray, "3"]:
         """Force on the hand now [N]; none where the clutch is open or the loop is silent."""
         pull = self._pull
         hand = self._vector(self._device.getPosition)
         velocity = self._vector(self._device.getLinearVelocity)
-        if pull is None or hand is None or velocity is None or self._clock() > pull.until:
+        if pull is None or hand is None or velocity is None or self._clock() > pull[2]:
             return np.zeros(3)
-        spring = _HAPTIC_STIFFNESS * (pull.rest - hand) - _HAPTIC_DAMPING * velocity
-        return capped(spring + pull.push, _HAPTIC_MAX_FORCE)
+        rest, push, _ = pull
+        spring = _HAPTIC_STIFFNESS * (rest - hand) - _HAPTIC_DAMPING * velocity
+        return capped(spring + push, _HAPTIC_MAX_FORCE)
 
     def _vector(self, read: Callable[..., int]) -> Float[np.ndarray, "3"] | None:
         out = [0.0, 0.0, 0.0]

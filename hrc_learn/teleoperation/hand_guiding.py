@@ -8,7 +8,7 @@ gizmo of the end effector guides the end effector.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,43 +32,15 @@ against the pull (benchmarks/bench_pull_mapping.py).
 """
 
 
-def force_to_nullspace_input(
-    chain: SerialChain,
-    joint_position: Float[np.ndarray, " joints"],
-    joint: int,
-    pull: Float[np.ndarray, "3"],
-    mapping: ForceMapping = DEFAULT_MAPPING,
-    point: Float[np.ndarray, "3"] | None = None,
-) -> Float[np.ndarray, " joints"]:
-    """Null-space input d from a pull at a joint, or at the link that it moves.
-
-    With "transpose", d = J_joint^T f: the torques of a force, which never move the joint
-    against the pull, not even after the projection into the null space of the task. The
-    paper's "pinv", d = J_joint^+ v, can (its section VII).
-
-    Args:
-        chain: The arm.
-        joint_position: Joint positions [rad].
-        joint: Index of the pulled joint, from 1.
-        pull: Force [N] or velocity [m/s], in the base frame.
-        mapping: Mapping of the force to the joints.
-        point: Point at which the link is pulled, in the base frame [m]; the joint's origin if
-            None.
+def check_positive(settings: object) -> None:
+    """Check that all numbers among the fields of a configuration are positive.
 
     Raises:
-        ValueError: If the arm has no such joint.
+        ValueError: A number is not positive.
     """
-    q = torch.as_tensor(joint_position, dtype=torch.float64)
-    linear, angular = chain.joint_jacobian(q, joint).split(3)
-    J = linear
-    if point is not None:
-        lever = torch.as_tensor(point) - chain.link_poses(q).position[joint - 1]
-        J = linear + torch.linalg.cross(angular, lever[:, None], dim=0)
-    f = torch.as_tensor(pull, dtype=torch.float64)
-    if mapping == "transpose":
-        return (J.mT @ f).numpy()
-    # The first joints of an arm cannot move their own origin in all directions.
-    return (torch.linalg.pinv(J, rtol=1e-6) @ f).numpy()
+    for name, value in vars(settings).items():
+        if isinstance(value, float | int) and not value > 0:
+            raise ValueError(f"{name} must be positive, but is {value}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +68,7 @@ class InteractionForceConfig:
     turn_speed: float = 0.8
     """Largest angular speed of the end effector [rad/s]."""
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, float | int) and not value > 0:
-                raise ValueError(f"{name} must be positive, but is {value}.")
+    __post_init__ = check_positive
 
     def velocity(self, force: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """Velocity that a gizmo asks for where it would be a spring of this force [m/s].
@@ -124,6 +93,48 @@ def bounded(vector: Float[np.ndarray, " n"], most: float) -> Float[np.ndarray, "
     return vector * min(1.0, most / max(float(np.abs(vector).max()), TINY))
 
 
+def force_to_nullspace_input(
+    chain: SerialChain,
+    joint_position: Float[np.ndarray, " joints"],
+    joint: int,
+    force: Float[np.ndarray, "3"],
+    config: InteractionForceConfig | None = None,
+    point: Float[np.ndarray, "3"] | None = None,
+) -> Float[np.ndarray, " joints"]:
+    """Null-space input d from a force at a joint, or at the link that it moves.
+
+        d = J^T f         ("transpose")
+        d = c_d J^+ v(f)  ("pinv", the paper's section VII)
+
+    The torques of a force never move the joint against the pull, not even after the projection
+    into the null space of the task; the paper's mapping can.
+
+    Args:
+        chain: The arm.
+        joint_position: Joint positions [rad].
+        joint: Index of the pulled joint, from 1.
+        force: Force in the base frame [N]; with "pinv" it stands for the velocity that a gizmo
+            displaced as far asks for.
+        config: Mapping of the force to the joints; None: the defaults.
+        point: Point at which the link is pulled, in the base frame [m]; the joint's origin if
+            None.
+
+    Raises:
+        ValueError: If the arm has no such joint.
+    """
+    config = config or InteractionForceConfig()
+    q = torch.as_tensor(joint_position, dtype=torch.float64)
+    J, angular = chain.joint_jacobian(q, joint).split(3)
+    if point is not None:
+        lever = torch.as_tensor(point) - chain.link_poses(q).position[joint - 1]
+        J = J + torch.linalg.cross(angular, lever[:, None], dim=0)
+    if config.mapping == "transpose":
+        return (J.mT @ torch.as_tensor(force, dtype=torch.float64)).numpy()
+    # The first joints of an arm cannot move their own origin in all directions.
+    inverse = torch.linalg.pinv(J, rtol=1e-6).numpy()
+    return config.damping * inverse @ config.velocity(force)
+
+
 def gizmo_nullspace_input(
     chain: SerialChain,
     joint_position: Float[np.ndarray, " joints"],
@@ -132,13 +143,10 @@ def gizmo_nullspace_input(
     displacement: Float[np.ndarray, "3"],
     config: InteractionForceConfig,
 ) -> Float[np.ndarray, " joints"]:
-    """Null-space input d from a gizmo on the arm.
+    """Null-space input d from a gizmo on the arm, bounded with its direction kept.
 
         d = J^T f,      f = stiffness * displacement ("transpose")
         d = c_d J^+ v,  v = rate * displacement      ("pinv", the paper's)
-
-    J is that of the point by which the link is held. v, f and d are bounded with their
-    direction kept.
 
     Args:
         chain: The arm.
@@ -151,85 +159,50 @@ def gizmo_nullspace_input(
     Raises:
         ValueError: If the arm has no such joint.
     """
-    if config.mapping == "pinv":
-        pull = config.damping * capped(config.rate * displacement, config.speed)
-    else:
-        pull = capped(config.stiffness * displacement, config.max_force)
-    d = force_to_nullspace_input(chain, joint_position, joint, pull, config.mapping, point)
+    force = config.stiffness * displacement
+    if config.mapping == "transpose":
+        force = capped(force, config.max_force)
+    d = force_to_nullspace_input(chain, joint_position, joint, force, config, point)
     return bounded(d, config.max_nullspace_input)
-
-
-def pull_to_nullspace_input(
-    chain: SerialChain,
-    joint_position: Float[np.ndarray, " joints"],
-    joint: int,
-    force: Float[np.ndarray, "3"],
-    config: InteractionForceConfig,
-) -> Float[np.ndarray, " joints"]:
-    """Null-space input d from a force at a joint, by either mapping.
-
-    Args:
-        chain: The arm.
-        joint_position: Joint positions [rad].
-        joint: Index of the pulled joint, from 1.
-        force: Force in the base frame [N]; with "pinv" it stands for the velocity that a gizmo
-            displaced as far asks for.
-        config: The mapping.
-
-    Raises:
-        ValueError: If the arm has no such joint.
-    """
-    pull = force if config.mapping == "transpose" else config.damping * config.velocity(force)
-    return force_to_nullspace_input(chain, joint_position, joint, pull, config.mapping)
 
 
 def guiding_twist(
     pose: Pose,
     velocity: Float[np.ndarray, "3"],
-    orientation: Float[torch.Tensor, "4"] | None,
     config: InteractionForceConfig,
+    turn: Float[torch.Tensor, "4"] | None = None,
 ) -> Float[np.ndarray, "6"]:
-    """Twist of a hand-guided end effector with a velocity, turned towards an orientation.
+    """Twist of a hand-guided end effector, which turns by the coarse orientation rule.
 
     Args:
         pose: Pose of the end effector.
         velocity: Asked for [m/s]; capped with its direction kept.
-        orientation: Target orientation (wxyz), such as the coarse rule's; None: no turn.
         config: Speeds.
+        turn: Rotation added to the rule's orientation (wxyz); None: none.
     """
-    angular = np.zeros(3)
-    if orientation is not None:
-        turn = quaternion.multiply(orientation, quaternion.conjugate(pose.orientation))
-        angular = capped(config.turn_rate * quaternion.log(turn).numpy(), config.turn_speed)
+    orientation = coarse_orientation(pose.position)
+    if turn is not None:
+        orientation = quaternion.multiply(turn, orientation)
+    error = quaternion.multiply(orientation, quaternion.conjugate(pose.orientation))
+    angular = capped(config.turn_rate * quaternion.log(error).numpy(), config.turn_speed)
     return np.concatenate([capped(velocity, config.speed), angular])
 
 
 def steering_twist(
-    chain: SerialChain,
-    joint_position: Float[np.ndarray, " joints"],
-    direction: Float[np.ndarray, "3"],
-    config: InteractionForceConfig,
-    *,
-    coarse: bool = True,
-    turn: Float[torch.Tensor, "4"] | None = None,
+    chain: SerialChain, state: ArmState, direction: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "6"]:
     """Twist that steers the end effector in a direction; zero if the direction is zero.
 
     Args:
         chain: The arm.
-        joint_position: Joint positions [rad].
+        state: State of the arm.
         direction: Direction of motion in the base frame, as a fraction of the largest speed.
-        config: Speeds.
-        coarse: Turn the end effector by the coarse orientation rule.
-        turn: Rotation added to that rule (wxyz); None: none.
     """
     if not direction.any():
         return np.zeros(6)
-    tool = chain.forward(torch.from_numpy(joint_position))
-    orientation = coarse_orientation(tool.position) if coarse else None
-    if orientation is not None and turn is not None:
-        orientation = quaternion.multiply(turn, orientation)
-    return guiding_twist(tool, config.speed * direction, orientation, config)
+    config = InteractionForceConfig()
+    tool = chain.forward(torch.from_numpy(state.joint_position))
+    return guiding_twist(tool, config.speed * direction, config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,10 +216,7 @@ class HandGuidingConfig:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Settings of the safety filter, which knows the limits of the arm's driver."""
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, float | int) and not value > 0:
-                raise ValueError(f"{name} must be positive, but is {value}.")
+    __post_init__ = check_positive
 
 
 ATTRACTION = 0.12
@@ -425,16 +395,18 @@ class CombinedInput(Human):
         """Combined input of all sources."""
         inputs = [source.read(state) for source in self._sources]
         joints = len(state.joint_position)
+
+        def first(name: str) -> Any:
+            found = (getattr(one, name) for one in inputs)
+            return next((value for value in found if value is not None), None)
+
         return HumanInput(
-            nullspace_input=np.sum([i.effort(joints) for i in inputs], axis=0),
-            twist=np.sum([i.twist for i in inputs], axis=0),
-            gripper=next((i.gripper for i in inputs if i.gripper is not None), None),
-            region=next((i.region for i in inputs if i.region is not None), None),
-            target=next((i.target for i in inputs if i.target is not None), None),
-            turn=next((i.turn for i in inputs if i.turn is not None), None),
-            requests=tuple(request for i in inputs for request in i.requests),
-            pause=any(i.pause for i in inputs),
-            stop=next((i.stop for i in inputs if i.stop), ""),
+            nullspace_input=np.sum([one.effort(joints) for one in inputs], axis=0),
+            twist=np.sum([one.twist for one in inputs], axis=0),
+            requests=tuple(request for one in inputs for request in one.requests),
+            pause=any(one.pause for one in inputs),
+            stop=next((one.stop for one in inputs if one.stop), ""),
+            **{name: first(name) for name in ("gripper", "region", "target", "turn")},
         )
 
     def tell(self, feedback: Feedback) -> None:
@@ -454,11 +426,7 @@ class LinkGuide(Human):
     the link. The end effector is left alone.
     """
 
-    def __init__(
-        self,
-        human: Human,
-        chain: SerialChain,
-    ):
+    def __init__(self, human: Human, chain: SerialChain):
         """Take a device.
 
         Args:
@@ -472,7 +440,7 @@ class LinkGuide(Human):
         asked, config = self._human.read(state), self._config
         # As a gizmo's displacement, whose largest force and speed are those of the device.
         force = capped(config.max_force / config.speed * asked.twist[:3], config.max_force)
-        d = pull_to_nullspace_input(self._chain, state.joint_position, _ELBOW, force, config)
+        d = force_to_nullspace_input(self._chain, state.joint_position, _ELBOW, force, config)
         return replace(
             asked,
             nullspace_input=bounded(asked.effort(len(d)) + d, config.max_nullspace_input),
@@ -493,10 +461,7 @@ class InputFilterConfig:
     angular: float = 5.0
     """[rad/s^2]"""
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, but is {value}.")
+    __post_init__ = check_positive
 
 
 class InputFilter(Human):

@@ -7,11 +7,11 @@ import contextlib
 import io
 import logging
 import time
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import Any
 
 import msgspec
@@ -33,13 +33,11 @@ from hrc_learn.teleoperation.gate.messages import (
     Point,
     TrackedHand,
 )
-from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, steering_twist
+from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.headset import headset_contents, headset_data, scene_state
 from hrc_learn.teleoperation.page_operator import (
-    AddedTurn,
     GizmoCommand,
     HeadsetHands,
-    HeldGizmo,
     HeldGizmos,
     gizmo_command,
 )
@@ -82,9 +80,8 @@ class PageConfig(AddressConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("silence", "timeout", "refresh"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        if not self.refresh > 0:
+            raise ValueError(f"refresh must be positive, but is {self.refresh}.")
         level = np.array(self.touch_points).reshape(-1, 3)[:, :2]
         if len(level) < 3 or np.ptp(level, axis=0).max() < _APART:
             raise ValueError(
@@ -157,13 +154,16 @@ class Page:
         if not config.meshes:
             bodies = [replace(body, meshes=()) for body in bodies]
         self._chain = chain
-        self.control = control = Control(config.silence, config.timeout)
+        self.control = control = Control(config.silence, config.timeout, self._let_go)
         self.human = PageHuman(len(chain.joint_names), present=lambda: control.present)
         draws = guides if draws is None else draws
         headset = headset_contents()
         features = {"guides": guides, "draws": draws, "task": task, "opening": OPEN}
         features["touch_points"] = config.touch_points
         self._data = headset_data(bodies, boxes, **features) if headset else {}
+        self._wake = Event()
+        self._held_gizmos = held = HeldGizmos(self._wake.set, self._links)
+        self._hands = HeadsetHands(held, guides=guides)
         self._server, secret = guarded_viser()
         self._sockets = PageSockets(
             control, self._heard, self._fits, self._told, self._server.get_port(), secret
@@ -178,21 +178,15 @@ class Page:
         self.address = self._gate.address
         self.url, self.watch_url = self.address.link(), self.address.link(watch=True)
         self.headset_url = self.address.link("/xr") if headset else ""
-        self._wake = Event()
-        self._held_gizmos = held = HeldGizmos(self._wake.set, self._links)
-        self._turn = turn = AddedTurn()
-        self._hands = HeadsetHands(held, turn, guides=guides)
-        self._scene = PageScene(
-            self._server, bodies, boxes, held, turn, guides=guides, turns=draws
-        )
+        self._scene = PageScene(self._server, bodies, boxes, held, guides=guides, turns=draws)
         self._panel = Panel(
             self._server,
             boxes,
             config.forces,
             self.human.request,
             self._scene,
+            held,
             task,
-            turn,
             guides=guides,
             draws=draws,
         )
@@ -201,11 +195,9 @@ class Page:
             np.stack([body.orientation[0] for body in bodies]),
         )
         self._status = PageStatus()
-        self._placed, self._counted = 0, (0, time.monotonic())
         self._closing = Event()
         self._error: BaseException | None = None
         self.farewell = "The session has ended."
-        self._last_turn, self._last_turn_lock = self.control.turn, Lock()
         self._asked = 0.0
         self._drawing: Future[None] | None = None
         self._thread = Thread(target=self._guarded, name="page refresh", daemon=True)
@@ -256,7 +248,6 @@ class Page:
     ) -> None:
         """Tell after each step where the bodies are: positions [m], unit quaternions (wxyz)."""
         self._poses = (positions, orientations)
-        self._placed += 1
 
     def show(self, status: PageStatus) -> None:
         """Tell how the session stands."""
@@ -298,13 +289,15 @@ class Page:
         if state is None:
             return None
         command = self._command(state)
+        editor = self._panel.editor
         scene = scene_state(
             *self._poses,
             self._chain.link_poses(_joints(state)),
             command.arrows,
             followed_colour(self.human.feedback.followed),
             self._status.region,
-            *self._panel.drawn,
+            None if editor is None else editor.drawn,
+            editor is not None and editor.region is not None,
             self._status.plan,
         )
         self._sockets.scene = msgspec.Raw(msgspec.json.encode(scene))
@@ -330,73 +323,55 @@ class Page:
             self._scene.point(command.arrows, colour, command.held)
             self._scene.show_region(self._status.region)
             if panel:
-                people = self.control.people
-                self._panel.refresh(self._status, command.nullspace_input, self._rate(), people)
-                self._panel.tell(feedback)
+                people, d = self.control.people, command.nullspace_input
+                self._panel.refresh(self._status, feedback, d, people)
 
         loop = self._server.get_event_loop()
         self._drawing = asyncio.run_coroutine_threadsafe(draw(), loop)
 
-    def _rate(self) -> float:
-        """Steps that the loop has taken since the last time this was asked [1/s]."""
-        placed, began = self._counted
-        self._counted = self._placed, time.monotonic()
-        return (self._counted[0] - placed) / max(self._counted[1] - began, 1e-9)
-
     def _command(self, state: ArmState) -> GizmoCommand:
-        panel, forces = self._panel, self._panel.forces
-        gizmos, turn = self._held().values(), self._turn.rotation
-        command = gizmo_command(
-            self._chain, state.joint_position, gizmos, forces, coarse=panel.coarse, turn=turn
-        )
-        twist = command.twist
-        if not twist.any() and self.control.present:
-            direction, joints = panel.direction(), state.joint_position
-            twist = steering_twist(
-                self._chain, joints, direction, forces, coarse=panel.coarse, turn=turn
-            )
-        self.human.post(
-            HumanInput(
-                nullspace_input=command.nullspace_input,
-                twist=twist,
-                gripper=panel.gripper,
-                region=panel.region,
-                target=panel.target,
-                turn=self._turn.vector,
-            )
-        )
-        return command
-
-    def _held(self) -> dict[tuple[Hashable, str], HeldGizmo]:
-        """Gizmos held by the controlling client, as long as it is alive.
+        """Renew what is asked of the arm.
 
         The server notices a dropped connection, such as an unplugged cable, much later, and a
         pointer at rest sends nothing. Signs of life are therefore checked separately.
         """
-        control = self.control
-        self._new_leader()
+        control, panel, held = self.control, self._panel, self._held_gizmos
         if control.gone:
-            self._held_gizmos.clear()
-            self._turn.drop()
-        held = self._held_gizmos.held() if control.present else {}
-        if held:
+            held.clear()
+        present = control.present
+        gizmos = held.held().values() if present else ()
+        if gizmos:
             control.keep()
-        return held
+        command = gizmo_command(
+            self._chain,
+            state.joint_position,
+            gizmos,
+            panel.forces,
+            direction=panel.direction() if present else None,
+            turn=held.turn,
+        )
+        editor = panel.editor
+        self.human.post(
+            HumanInput(
+                nullspace_input=command.nullspace_input,
+                twist=command.twist,
+                gripper=panel.gripper,
+                region=None if editor is None else editor.region,
+                target=None if editor is None else editor.target,
+                turn=held.turn_vector,
+            )
+        )
+        return command
 
-    def _new_leader(self) -> None:
-        """Release what was held before control last changed."""
-        with self._last_turn_lock:
-            if (turn := self.control.turn) != self._last_turn:
-                self._last_turn = turn
-                self._held_gizmos.clear()
-                self._turn.drop()
-                self._hands.forget()
+    def _let_go(self) -> None:
+        """Release what was held before control changed."""
+        self._held_gizmos.clear()
+        self._hands.forget()
 
     def _heard(self, message: Message) -> None:
         """Handle a message from the controlling client."""
         match message:
             case Hands():
-                self._new_leader()
                 self._hands.hear(message)
                 self._asked = message.sent
                 self._wake.set()

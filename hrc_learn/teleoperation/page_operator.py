@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import SerialChain, coarse_orientation
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput, Request
 from hrc_learn.teleoperation.gate.messages import Grip, Hands, MessageError, TrackedHand
 from hrc_learn.teleoperation.hand_guiding import (
@@ -37,14 +37,18 @@ class HeldGizmo:
     less the tool centre point, in the base frame [m]."""
     pointer: Float[np.ndarray, "3"]
     """Position to which the gizmo has been dragged, in the base frame [m]."""
-    orientation: Float[np.ndarray, "4"] | None = None
-    """Orientation the end effector's gizmo has been turned to (wxyz)."""
+
+
+Key = tuple[Hashable, str]
+"""Holder, which tells two clients apart, and name of the gizmo held."""
 
 
 class HeldGizmos:
-    """All held gizmos, each until it is released or its holder leaves.
+    """All held gizmos, each until it is released or its holder leaves, and the rotation that
+    people add to the end effector's orientation with its rings.
 
-    Safe to use from several threads. A holder is whatever tells two browsers apart.
+    That rotation stays after release, and the next drag adds to it. Safe to use from several
+    threads.
     """
 
     def __init__(
@@ -60,22 +64,40 @@ class HeldGizmos:
                 is known.
         """
         self._changed, self.links = changed, links
-        self._held: dict[tuple[Hashable, str], HeldGizmo] = {}
+        self._held: dict[Key, HeldGizmo] = {}
+        self._turning: Key | None = None
+        self._turn = self._turn_before = self._turned_from = _NO_TURN
         self._lock = Lock()
 
-    def take(self, holder: Hashable, handle: str, held: HeldGizmo) -> None:
-        """Begin to hold a gizmo."""
+    def take(
+        self,
+        key: Key,
+        held: HeldGizmo | None,
+        turned_from: Float[np.ndarray, "4"] | None = None,
+    ) -> None:
+        """Begin to hold a gizmo.
+
+        Args:
+            key: Holder and gizmo.
+            held: Place at which it is held; None: it is only turned.
+            turned_from: Present orientation of its rings, whose rotation is added (wxyz); None:
+                it has none.
+        """
         with self._lock:
-            self._held[holder, handle] = held
+            if held is not None:
+                self._held[key] = held
+            if turned_from is not None:
+                self._turning, self._turn_before = key, self._turn
+                self._turned_from = torch.from_numpy(turned_from)
         self._changed()
 
     def grab(
         self,
-        holder: Hashable,
-        handle: str,
+        key: Key,
         joint: int | None,
         start: Float[np.ndarray, "3"],
         pointer: Float[np.ndarray, "3"],
+        turned_from: Float[np.ndarray, "4"] | None = None,
     ) -> None:
         """Begin to hold a link, or the end effector, at a point of the base frame [m]."""
         links = self.links()
@@ -85,110 +107,79 @@ class HeldGizmos:
             held_at = start - links[-1].position.numpy()
         else:
             held_at = links[joint - 1].inverse().apply(torch.from_numpy(start)).numpy()
-        self.take(holder, handle, HeldGizmo(joint=joint, held_at=held_at, pointer=pointer))
+        held = HeldGizmo(joint=joint, held_at=held_at, pointer=pointer)
+        self.take(key, held, turned_from)
 
     def move(
         self,
-        holder: Hashable,
-        handle: str,
+        key: Key,
         pointer: Float[np.ndarray, "3"],
         orientation: Float[np.ndarray, "4"] | None = None,
     ) -> None:
-        """Drag a gizmo on; one that is not held (any more) stays where it is."""
+        """Drag and turn a gizmo on; one that is not held (any more) stays where it is."""
         with self._lock:
-            held = self._held.get((holder, handle))
-            if held is not None:
-                self._held[holder, handle] = replace(
-                    held, pointer=pointer, orientation=orientation
+            if (held := self._held.get(key)) is not None:
+                self._held[key] = replace(held, pointer=pointer)
+            if self._turning == key and orientation is not None:
+                now = quaternion.multiply(
+                    torch.from_numpy(orientation), quaternion.conjugate(self._turned_from)
                 )
+                self._turn = quaternion.normalize(quaternion.multiply(now, self._turn_before))
         self._changed()
 
-    def release(self, holder: Hashable, handle: str) -> None:
+    def release(self, key: Key) -> None:
         """Let go of a gizmo."""
-        with self._lock:
-            self._held.pop((holder, handle), None)
-        self._changed()
+        self._release(lambda held: held == key)
 
     def release_all(self, holder: Hashable) -> None:
         """Forget a client that has left."""
-        with self._lock:
-            for key in [key for key in self._held if key[0] == holder]:
-                del self._held[key]
+        self._release(lambda held: held[0] == holder)
 
     def clear(self) -> None:
         """Let go of everything: a connection that comes back has to take its gizmo anew."""
-        with self._lock:
-            self._held.clear()
+        self._release(lambda _: True)
 
-    def held(self) -> dict[tuple[Hashable, str], HeldGizmo]:
-        """All of them, by holder and name."""
+    def _release(self, chosen: Callable[[Key], bool]) -> None:
+        with self._lock:
+            kept = {key: held for key, held in self._held.items() if not chosen(key)}
+            fewer = len(kept) < len(self._held)
+            self._held = kept
+            if self._turning is not None and chosen(self._turning):
+                self._turning = None
+        if fewer:
+            self._changed()
+
+    def held(self) -> dict[Key, HeldGizmo]:
+        """All of them."""
         with self._lock:
             return dict(self._held)
 
+    @property
+    def turning(self) -> bool:
+        """True while somebody holds the rings."""
+        return self._turning is not None
 
-class AddedTurn:
-    """Rotation that people add to the end effector's orientation with the rings of its gizmo.
-
-    It stays after release, and the next drag adds to it. Safe to use from several threads.
-
-    Attributes:
-        holder: Client that holds the rings; None: they are free.
-    """
-
-    def __init__(self) -> None:
-        self._turn = self._before = self._taken = _NO_TURN
-        self._lock = Lock()
-        self.holder: Hashable | None = None
-
-    def take(self, holder: Hashable, orientation: Float[np.ndarray, "4"]) -> None:
-        """Begin to turn a gizmo whose orientation is this (wxyz)."""
+    def clear_turn(self) -> None:
+        """Take the rotation back."""
         with self._lock:
-            self._taken, self._before = torch.from_numpy(orientation), self._turn
-            self.holder = holder
-
-    def release(self, holder: Hashable) -> None:
-        """Let go of it."""
-        with self._lock:
-            if self.holder == holder:
-                self.holder = None
-
-    def drop(self) -> None:
-        """Release it, for any holder."""
-        with self._lock:
-            self.holder = None
-
-    def move(self, holder: Hashable, orientation: Float[np.ndarray, "4"]) -> None:
-        """Rotate further, if this client holds the rings."""
-        with self._lock:
-            if self.holder != holder:
-                return
-            now = quaternion.multiply(
-                torch.from_numpy(orientation), quaternion.conjugate(self._taken)
-            )
-            self._turn = quaternion.normalize(quaternion.multiply(now, self._before))
-
-    def clear(self) -> None:
-        """Take it back."""
-        with self._lock:
-            self._turn = self._before = _NO_TURN
+            self._turn = self._turn_before = _NO_TURN
 
     @property
-    def rotation(self) -> Float[torch.Tensor, "4"]:
-        """Unit quaternion of the rotation (wxyz)."""
+    def turn(self) -> Float[torch.Tensor, "4"]:
+        """Unit quaternion of the rotation added (wxyz)."""
         with self._lock:
             return self._turn
 
     @property
-    def vector(self) -> tuple[float, float, float] | None:
+    def turn_vector(self) -> tuple[float, float, float] | None:
         """Rotation vector in the base frame [rad]; None: nothing was added."""
-        turn = self.rotation
+        turn = self.turn
         if float(quaternion.angle(turn, _NO_TURN)) == 0.0:
             return None
         x, y, z = quaternion.log(turn).tolist()
         return x, y, z
 
 
-_HOLDER = "headset"
 _AT_REST = np.array([1.0, 0.0, 0.0, 0.0])  # unit quaternion (wxyz)
 
 
@@ -196,31 +187,22 @@ class HeadsetHands:
     """Turns what two hands hold into held gizmos, by the rules of the mouse.
 
     A message names all that is held; what an earlier one named and this one does not is let go.
+
+    Attributes:
+        tracked: Tracked hands that are visible now, by name.
     """
 
-    def __init__(
-        self,
-        held: HeldGizmos,
-        turn: AddedTurn,
-        *,
-        guides: bool,
-    ):
+    def __init__(self, held: HeldGizmos, *, guides: bool):
         """Start with empty hands.
 
         Args:
             held: Record of held gizmos.
-            turn: Rotation that a hand adds to the end effector's orientation.
             guides: True if the end effector can be held.
         """
-        self._held, self._turn, self._guides = held, turn, guides
+        self._held, self._guides = held, guides
         self._grips: dict[str, Grip] = {}
-        self._tracked: Mapping[str, TrackedHand] = {}
+        self.tracked: Mapping[str, TrackedHand] = {}
         self._noted = False
-
-    @property
-    def tracked(self) -> Mapping[str, TrackedHand]:
-        """Tracked hands that are visible now, by name."""
-        return self._tracked
 
     def hear(self, hands: Hands) -> None:
         """Take a message over.
@@ -228,7 +210,7 @@ class HeadsetHands:
         Raises:
             MessageError: It holds a joint that the arm does not have.
         """
-        self._tracked = {seen.hand: seen for seen in hands.tracked}
+        self.tracked = {seen.hand: seen for seen in hands.tracked}
         links = self._held.links()
         if links is None:
             return
@@ -238,31 +220,24 @@ class HeadsetHands:
         if not self._noted:
             self._grips, self._noted = now, True
         for hand in self._grips.keys() - now.keys():
-            self._held.release(_HOLDER, hand)
-            self._turn.release((_HOLDER, hand))
+            self._held.release(("headset", hand))
         for hand, grip in now.items():
+            key, pointer = ("headset", hand), np.array(grip.pointer)
+            turned = grip.orientation if grip.joint is None else None
             before = self._grips.get(hand)
             if before is None or (before.joint, before.start) != (grip.joint, grip.start):
-                self._take(grip, len(links.position))
-            else:
-                self._held.move(_HOLDER, hand, np.array(grip.pointer))
-            if grip.joint is None and grip.orientation is not None:
-                self._turn.move((_HOLDER, hand), np.array(grip.orientation))
+                if grip.joint is not None and grip.joint >= len(links.position):
+                    raise MessageError(f"the arm has no joint {grip.joint}")
+                start, turned_from = np.array(grip.start), None if turned is None else _AT_REST
+                self._held.grab(key, grip.joint, start, pointer, turned_from)
+            self._held.move(key, pointer, None if turned is None else np.array(turned))
         self._grips = now
 
     def forget(self) -> None:
         """Forget the hands when control changes; held gizmos move nothing until they are taken
         again.
         """
-        self._noted, self._tracked = False, {}
-
-    def _take(self, grip: Grip, joints: int) -> None:
-        if grip.joint is not None and grip.joint >= joints:
-            raise MessageError(f"the arm has no joint {grip.joint}")
-        if grip.joint is None and grip.orientation is not None:
-            self._turn.take((_HOLDER, grip.hand), _AT_REST)
-        start, pointer = np.array(grip.start), np.array(grip.pointer)
-        self._held.grab(_HOLDER, grip.hand, grip.joint, start, pointer)
+        self._noted, self.tracked = False, {}
 
 
 class PageHuman(Human):
@@ -271,6 +246,10 @@ class PageHuman(Human):
     `read` costs the loop about a microsecond: references are exchanged, nothing is computed.
     What has been posted holds for a moment only (the dead man's switch): where the page falls
     silent, the person asks for no motion.
+
+    Attributes:
+        state: The newest reading of the arm; None before the first.
+        feedback: Latest feedback of the arm.
     """
 
     def __init__(
@@ -288,29 +267,14 @@ class PageHuman(Human):
             holds_for: Time for which a posted input stays valid [s].
             clock: Monotonic clock [s].
             present: True while the person gives signs of life; called at each reading.
-
-        Raises:
-            ValueError: `holds_for` is not positive.
         """
-        if not holds_for > 0:
-            raise ValueError(f"holds_for must be positive, but is {holds_for}.")
         self._holds_for, self._clock, self._present = holds_for, clock, present
         self._idle = _locked(HumanInput(nullspace_input=np.zeros(joints)))
         # While it holds, afterwards, and until when: changed together, as one reference.
         self._posted = (self._idle, self._idle, float("-inf"))
         self._requests: deque[Request] = deque()
-        self._state: ArmState | None = None
-        self._feedback = Feedback()
-
-    @property
-    def feedback(self) -> Feedback:
-        """Latest feedback of the arm."""
-        return self._feedback
-
-    @property
-    def state(self) -> ArmState | None:
-        """The newest reading of the arm; None before the first."""
-        return self._state
+        self.state: ArmState | None = None
+        self.feedback = Feedback()
 
     def post(self, asked: HumanInput) -> None:
         """Renew what the person asks for; its requests are left to `request`."""
@@ -324,7 +288,7 @@ class PageHuman(Human):
 
     def read(self, state: ArmState) -> HumanInput:
         """Current input of the person. Its arrays must not be written to."""
-        self._state = state
+        self.state = state
         asked, still, deadline = self._posted
         if self._clock() > deadline or not self._present():
             asked = still
@@ -335,7 +299,7 @@ class PageHuman(Human):
 
     def tell(self, feedback: Feedback) -> None:
         """Hand over what the arm tells, for the page's thread to show."""
-        self._feedback = feedback
+        self.feedback = feedback
 
 
 def _locked(asked: HumanInput) -> HumanInput:
@@ -365,24 +329,25 @@ def gizmo_command(
     gizmos: Collection[HeldGizmo],
     config: InteractionForceConfig,
     *,
-    coarse: bool = True,
+    direction: Float[np.ndarray, "3"] | None = None,
     turn: Float[torch.Tensor, "4"] | None = None,
 ) -> GizmoCommand:
-    """Command of several held gizmos. Their inputs add up, with the bounds of a single one.
+    """Command of held gizmos and keys. Their inputs add up, with the bounds of a single one.
 
     Args:
         chain: Kinematics of the arm.
         joint_position: Joint positions [rad].
         gizmos: Held gizmos.
         config: Gains and bounds of gizmos.
-        coarse: Turn a hand-guided end effector by the coarse orientation rule; otherwise it
-            turns with its gizmo.
-        turn: Rotation added to that rule (wxyz); None: none.
+        direction: Direction in which keys move the end effector, as a fraction of the largest
+            speed; None: no key is pressed.
+        turn: Rotation added to the coarse orientation rule (wxyz); None: none.
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
-    tool = links[-1]
     d, velocity = np.zeros(len(chain.joint_names)), np.zeros(3)
-    orientation, guided = None, False
+    guided = direction is not None and bool(direction.any())
+    if direction is not None:
+        velocity += config.speed * direction
     arrows = np.empty((len(gizmos), 2, 3))
     for k, gizmo in enumerate(gizmos):
         point = _point_held(links, gizmo)
@@ -395,15 +360,9 @@ def gizmo_command(
             continue
         guided = True
         velocity += config.rate * displacement
-        if gizmo.orientation is not None:
-            orientation = torch.as_tensor(gizmo.orientation, dtype=torch.float64)
-    if coarse:
-        orientation = coarse_orientation(tool.position)
-        if turn is not None:
-            orientation = quaternion.multiply(turn, orientation)
     return GizmoCommand(
         nullspace_input=bounded(d, config.max_nullspace_input),
-        twist=guiding_twist(tool, velocity, orientation, config) if guided else np.zeros(6),
+        twist=guiding_twist(links[-1], velocity, config, turn) if guided else np.zeros(6),
         arrows=arrows,
         held=tuple(gizmo.joint for gizmo in gizmos),
     )

@@ -20,7 +20,7 @@ from hrc_learn.teleoperation.headset import (
     body_shape,
     held_joint,
 )
-from hrc_learn.teleoperation.page_operator import AddedTurn, HeldGizmo, HeldGizmos
+from hrc_learn.teleoperation.page_operator import HeldGizmo, HeldGizmos
 from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
 # viser is imported when a page is opened, and not before.
@@ -41,12 +41,14 @@ def in_loop[Event](callback: Callable[[Event], object]) -> Callable[[Event], Any
     return called
 
 
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+# An edge goes up along one axis, from -1 to 1.
+_EDGES = np.array([(a, b) for a in _CORNERS for b in _CORNERS if sorted(b - a) == [0, 0, 2]])
+
+
 def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 3"]:
     """Both ends of each edge of a box about the origin [m]."""
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    # An edge goes up along one axis, from -1 to 1.
-    pairs = [(a, b) for a in corners for b in corners if sorted(b - a) == [0, 0, 2]]
-    return np.array(pairs) * np.array(half_size)
+    return _EDGES * np.array(half_size)
 
 
 _KNOBS = (2, 4, 6)
@@ -69,7 +71,7 @@ class PageScene:
     """Bodies where they are, once as the arm and once as its twin, and the mouse on them.
 
     Callbacks are coroutines: the browser's messages then come in their order, and in viser's
-    event loop.
+    event loop. Handles of viser send a property only if it has changed.
     """
 
     def __init__(
@@ -78,7 +80,6 @@ class PageScene:
         bodies: Sequence[Body],
         boxes: Sequence[Box],
         held: HeldGizmos,
-        turn: AddedTurn,
         *,
         guides: bool,
         turns: bool,
@@ -90,12 +91,10 @@ class PageScene:
             bodies: Moving bodies with their shapes.
             boxes: Fixed boxes.
             held: Record of held gizmos.
-            turn: Rotation added by the rings of the end effector's gizmo.
             guides: True if the end effector can be held and has a gizmo.
             turns: True if its gizmo has rings even where it cannot be held.
         """
-        self._scene, self._held, self._turn, self._guides = server.scene, held, turn, guides
-        self._absolute = False
+        self._scene, self._held, self._guides = server.scene, held, guides
         self._twin = self._scene.add_frame("/twin", position=_TWIN_AT, show_axes=False)
         # Objects that are carried have no twin: what matters is what can be held.
         self._frames = [
@@ -108,9 +107,15 @@ class PageScene:
         for box in (*boxes, PEDESTAL):
             self._draw_box(box)
         self._surroundings(server)
-        self._arrows = None
-        self._knob_colours = dict.fromkeys(_KNOBS, PERSON)
-        self._region_shown: DrawnRegion | None = None
+        self._arrows = self._scene.add_arrows(
+            "/pull",
+            np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]]]),
+            rgba(PERSON)[:3],
+            shaft_radius=0.008,
+            head_radius=0.022,
+            head_length=0.05,
+            visible=False,
+        )
         self._region = self._scene.add_line_segments(
             "/active_region",
             np.zeros((12, 2, 3)),
@@ -143,13 +148,10 @@ class PageScene:
             for knob in knobs:
                 knob.position = links.position[joint - 1].numpy()
         gizmo = self._gizmo
-        if gizmo is None or self._turn.holder is not None:
+        if gizmo is None or self._held.turning:
             return
         if all(name != gizmo.name for _, name in self._held.held()):
-            gizmo.position = links.position[-1].numpy()
-            # Without rotation it moves along the axes of the base.
-            turned = links.orientation[-1].numpy() if self._absolute else _BASE_AXES
-            gizmo.wxyz = turned
+            gizmo.position, gizmo.wxyz = links.position[-1].numpy(), _BASE_AXES
 
     def show_twin(self, visible: bool) -> None:
         """Show or hide the twin."""
@@ -157,22 +159,12 @@ class PageScene:
 
     def show_region(self, region: DrawnRegion | None) -> None:
         """Show the region to which a controller takes the end effector; None: there is none."""
-        if region == self._region_shown:
-            return
-        self._region_shown = region
         self._region.visible = region is not None
         if region is not None:
             self._region.points = box_edges(region.half_size) + np.array(region.centre)
 
-    def let_turn(self, rings: bool, absolute: bool) -> None:
-        """Set the rings of the end effector's gizmo.
-
-        Args:
-            rings: True if it has rings to turn it by.
-            absolute: True if the end effector takes its gizmo's orientation; otherwise what the
-                rings are turned by is added to its orientation.
-        """
-        self._absolute = absolute
+    def let_turn(self, rings: bool) -> None:
+        """Show or hide the rings of the end effector's gizmo."""
         if self._gizmo is not None:
             self._gizmo.disable_rotations = not rings
 
@@ -189,27 +181,13 @@ class PageScene:
             colour: Colour of the arrows and of the knobs held.
             held: Joints that are held, counted from 1; None: the end effector.
         """
-        for joint, before in self._knob_colours.items():
-            now = colour if joint in held else PERSON
-            if now != before:
-                self._knob_colours[joint] = now
-                for knob in self._knobs[joint]:
-                    knob.color = rgba(now)[:3]
-        if self._arrows is not None and not len(arrows):
-            self._arrows.remove()
-            self._arrows = None
-        elif self._arrows is not None:  # to draw them anew would cost the browser more
+        for joint, knobs in self._knobs.items():
+            for knob in knobs:
+                knob.color = rgba(colour if joint in held else PERSON)[:3]
+        self._arrows.visible = bool(len(arrows))
+        if len(arrows):
             self._arrows.points = arrows.astype(np.float32)
             self._arrows.colors = np.array(rgba(colour)[:3], np.uint8)
-        elif len(arrows):
-            self._arrows = self._scene.add_arrows(
-                "/pull",
-                arrows,
-                rgba(colour)[:3],
-                shaft_radius=0.008,
-                head_radius=0.022,
-                head_length=0.05,
-            )
 
     def _draw(self, parent: str, body: Body) -> Any:
         path, joint = f"{parent}/arm/{body.name}", held_joint(body)
@@ -253,13 +231,12 @@ class PageScene:
             disable_rotations=guides,
             depth_test=False,
         )
-        gizmo.on_update(self._gizmo_dragged if guides else self._gizmo_turned)
+        gizmo.on_update(self._gizmo_dragged)
         return gizmo
 
     async def _release(self, client: Any) -> None:
         """Forget a client that has left."""
         self._held.release_all(client.client_id)
-        self._turn.release(client.client_id)
 
     def _connect(self, node: Any, joint: int | None, parent: str) -> None:
         if joint is None and not self._guides:
@@ -268,14 +245,15 @@ class PageScene:
 
         @node.on_drag
         async def dragged(event: Any) -> None:
+            key = event.client_id, node.name
             pointer = np.array(event.end_position) - offset
             if event.phase == "start":
                 start = np.array(event.start_position) - offset
-                self._held.grab(event.client_id, node.name, joint, start, pointer)
+                self._held.grab(key, joint, start, pointer)
             elif event.phase == "update":
-                self._held.move(event.client_id, node.name, pointer)
+                self._held.move(key, pointer)
             else:
-                self._held.release(event.client_id, node.name)
+                self._held.release(key)
 
     def _draw_box(self, box: Box) -> None:
         r, g, b, opacity = box.colour
@@ -308,28 +286,17 @@ class PageScene:
         server.on_client_connect(_step_back)
 
     async def _gizmo_dragged(self, event: Any) -> None:
-        name, pointer = event.target.name, event.target.position.copy()
         if event.client_id is None:
             return
+        key, gizmo = (event.client_id, event.target.name), event.target
+        pointer, orientation = gizmo.position.copy(), gizmo.wxyz.copy()
         if event.phase == "start":
             held = HeldGizmo(joint=None, held_at=np.zeros(3), pointer=pointer)
-            self._held.take(event.client_id, name, held)
+            self._held.take(key, held if self._guides else None, orientation)
         elif event.phase == "update":
-            self._held.move(event.client_id, name, pointer, event.target.wxyz.copy())
+            self._held.move(key, pointer, orientation)
         else:
-            self._held.release(event.client_id, name)
-        if not self._absolute:
-            await self._gizmo_turned(event)
-
-    async def _gizmo_turned(self, event: Any) -> None:
-        if event.client_id is None:
-            return
-        if event.phase == "start":
-            self._turn.take(event.client_id, event.target.wxyz.copy())
-        elif event.phase == "update":
-            self._turn.move(event.client_id, event.target.wxyz.copy())
-        else:
-            self._turn.release(event.client_id)
+            self._held.release(key)
 
 
 _CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)

@@ -185,7 +185,7 @@ class PageSession:
         with torch.inference_mode():
             step = self.arm.step()
         if self._ticks % self._config.record_every == 0:
-            frame = {**recorded(step), **hand_columns(self._page.hands)}
+            frame = recorded_frame(step, self._page.hands)
             self._recorder.add(frame, self._met(step))
         width = step.human_input.gripper
         if width is not None and width != self._width:
@@ -272,30 +272,26 @@ class PageSession:
         )
 
 
-def recorded(step: GuidedStep) -> Frame:
-    """Columns of a step, with all that the person asked for."""
-    human_input, box = step.human_input, np.zeros(6)
-    if human_input.region is not None:
-        box = np.array([*human_input.region.centre, *human_input.region.half_size])
-    return {
-        **step.frame(),
-        "observation.human_twist": human_input.twist,
-        "observation.region": box,
-    }
-
-
-def hand_columns(hands: Mapping[str, TrackedHand]) -> Frame:
-    """Columns of the person's hands.
+def recorded_frame(step: GuidedStep, hands: Mapping[str, TrackedHand]) -> Frame:
+    """Columns of a step, with all that the person asked for.
 
     Args:
+        step: Step of the guided arm.
         hands: Tracked hands, by "left" and "right".
     """
-    columns: Frame = {}
+    asked, box = step.human_input, np.zeros(6)
+    if asked.region is not None:
+        box = np.array([*asked.region.centre, *asked.region.half_size])
+    frame = {
+        **step.frame(),
+        "observation.human_twist": asked.twist,
+        "observation.region": box,
+    }
     for name in ("left", "right"):
         seen = hands.get(name)
         pose = np.zeros(7) if seen is None else np.array([*seen.position, *seen.orientation])
-        columns[f"observation.{name}_hand"] = pose
-    return columns
+        frame[f"observation.{name}_hand"] = pose
+    return frame
 
 
 class TaskPage:

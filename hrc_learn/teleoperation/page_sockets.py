@@ -67,15 +67,30 @@ class ControlView:
     """False for a client that may only watch."""
 
 
+_MOST_IDLE = 10.0
+"""Idle time after which a waiting client gets control [s]."""
 _REMEMBERED = 3.0
 """Time for which the cause of a slow browser is shown [s], enough to read a sentence."""
+
+
+@dataclass
+class _Client:
+    may_lead: bool
+    heard: float
+    """Time of its last sign of life [s]."""
+    lag: float = 0.0
+    """Time since its page last responded [s]."""
+    asked: float = math.inf
+    """Time at which it requested control [s]; infinite: it has not."""
+    slowed: tuple[float, float, float] = (-math.inf, 0.0, 0.0)
+    """Time at which it was last slow, its silence and its lag then [s]."""
 
 
 class Control:
     """Gives control to one of several clients; the others watch and may request control.
 
     The first client to join has control and keeps it until it hands over or leaves. A client
-    that requests control also gets it when the controlling client has been idle for `max_idle`.
+    that requests control also gets it when the controlling client has been idle for 10 s.
     Control is never taken away during a drag. Safe to use from several threads.
     """
 
@@ -83,8 +98,7 @@ class Control:
         self,
         silence: float,
         timeout: float,
-        *,
-        max_idle: float = 10.0,
+        changed: Callable[[], object] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ):
         """Start without clients.
@@ -94,7 +108,7 @@ class Control:
                 motion [s].
             timeout: Time without a sign of life after which the client releases what it holds,
                 and an unresponsive page counts as gone [s].
-            max_idle: Idle time after which a waiting client gets control [s].
+            changed: Callback for each change of the leader.
             clock: Monotonic clock [s].
 
         Raises:
@@ -105,38 +119,29 @@ class Control:
                 "silence must be positive and no longer than timeout, but they are "
                 f"{silence} and {timeout} s."
             )
-        self._silence, self._timeout, self._max_idle = silence, timeout, max_idle
-        self._clock = clock
-        self._heard: dict[str, float] = {}
-        self._lag: dict[str, float] = {}
-        self._slow: dict[str, tuple[float, float, float]] = {}
-        self._asking: dict[str, float] = {}
-        self._able: set[str] = set()
+        self._silence, self._timeout = silence, timeout
+        self._changed, self._clock = changed, clock
+        self._clients: dict[str, _Client] = {}
         self._leader: str | None = None
-        self._acted = float("-inf")
-        self._turn = 0
+        self._acted = -math.inf
         self._lock = RLock()
 
     def join(self, client: str, *, may_lead: bool = True) -> None:
         """Add a client. It gets control if no other client has it and it may lead."""
         with self._lock:
-            self._heard[client] = self._clock()
-            if may_lead:
-                self._able.add(client)
-                if self._leader is None:
-                    self._give(client)
+            self._clients[client] = _Client(may_lead, self._clock())
+            if may_lead and self._leader is None:
+                self._give(client)
 
     def leave(self, client: str) -> None:
         """Remove a client."""
         with self._lock:
-            for table in (self._heard, self._lag, self._slow, self._asking):
-                table.pop(client, None)
-            self._able.discard(client)
+            self._clients.pop(client, None)
             if client == self._leader:
                 # The only client left leads, as the first to come does: a page that is loaded
                 # anew may come before the old one has left.
-                alone = next(iter(self._able)) if len(self._able) == 1 else None
-                self._give(min(self._asking, key=self._asking.__getitem__, default=alone))
+                able = [name for name, one in self._clients.items() if one.may_lead]
+                self._give(self._waiting() or (able[0] if len(able) == 1 else None))
 
     def hear(self, client: str, lag: float = 0.0) -> None:
         """Note a sign of life.
@@ -147,13 +152,13 @@ class Control:
                 hangs.
         """
         with self._lock:
-            if client not in self._heard:
+            if (one := self._clients.get(client)) is None:
                 return
             now = self._clock()
-            silence = now - self._heard[client]
-            self._heard[client], self._lag[client] = now, lag
+            silence = now - one.heard
+            one.heard, one.lag = now, lag
             if silence > self._silence or lag > self._timeout / 2:
-                self._slow[client] = now, silence, lag
+                one.slowed = now, silence, lag
 
     def act(self, client: str, *, idle: bool = False) -> bool:
         """True if a client may act now.
@@ -181,25 +186,19 @@ class Control:
         over.
         """
         with self._lock:
-            if client not in self._able or client == self._leader:
+            one = self._clients.get(client)
+            if one is None or not one.may_lead or client == self._leader:
                 return
             if self._leader is None:
                 self._give(client)
             else:
-                self._asking.setdefault(client, self._clock())
+                one.asked = min(one.asked, self._clock())
 
     def hand_over(self, client: str) -> None:
         """Hand control over to the first client that requested it, or release control."""
         with self._lock:
             if client == self._leader:
-                self._give(min(self._asking, key=self._asking.__getitem__, default=None))
-
-    @property
-    def turn(self) -> int:
-        """Rises with each change of leader: what was held before then is held no more."""
-        with self._lock:
-            self._pass_on()
-            return self._turn
+                self._give(self._waiting())
 
     @property
     def present(self) -> bool:
@@ -212,58 +211,62 @@ class Control:
         return not self._within(self._timeout)
 
     @property
-    def lag(self) -> float:
-        """Time since the page of the controlling client last responded [s]."""
-        with self._lock:
-            return 0.0 if self._leader is None else self._lag.get(self._leader, 0.0)
-
-    @property
     def slow(self) -> tuple[float, float]:
         """Silence and lag of the controlling client that slowed it down lately [s]; zero if
         nothing did.
         """
         with self._lock:
-            time, silence, lag = self._slow.get(self._leader or "", (-math.inf, 0.0, 0.0))
+            if (leader := self._leading()) is None:
+                return 0.0, 0.0
+            time, silence, lag = leader.slowed
             return (silence, lag) if self._clock() - time <= _REMEMBERED else (0.0, 0.0)
 
     @property
     def people(self) -> int:
         """Number of connected clients."""
-        with self._lock:
-            return len(self._heard)
+        return len(self._clients)
 
     def view(self, client: str) -> ControlView:
         """Control state for a client."""
         with self._lock:
             self._pass_on()
-            leads = client == self._leader
+            leads, one = client == self._leader, self._clients.get(client)
+            asked = self._waiting() is not None if leads else one and one.asked < math.inf
             return ControlView(
                 role="leads" if leads else "watches",
                 taken=self._leader is not None,
-                asked=bool(self._asking) if leads else client in self._asking,
-                may_lead=client in self._able,
+                asked=bool(asked),
+                may_lead=one is not None and one.may_lead,
             )
+
+    def _leading(self) -> _Client | None:
+        return self._clients.get(self._leader or "")
+
+    def _waiting(self) -> str | None:
+        """Client that has waited for control for the longest time, if any."""
+        asking = [name for name, one in self._clients.items() if one.asked < math.inf]
+        return min(asking, key=lambda name: self._clients[name].asked, default=None)
 
     def _within(self, limit: float) -> bool:
         with self._lock:
-            heard = self._heard.get(self._leader or "")
-            if heard is None:
+            if (leader := self._leading()) is None:
                 return False
-            return self._clock() - heard <= limit and self.lag <= self._timeout
+            return self._clock() - leader.heard <= limit and leader.lag <= self._timeout
 
     def _give(self, client: str | None) -> None:
         self._leader, self._acted = client, self._clock()
-        self._asking.pop(client or "", None)
-        self._turn += 1
+        if (leader := self._leading()) is not None:
+            leader.asked = math.inf
+        self._changed()
 
     def _pass_on(self) -> None:
         """Pass control on to a waiting client if the controlling client is idle or
         unresponsive.
         """
-        if self._leader is None or not self._asking:
+        first = self._waiting()
+        if self._leader is None or first is None:
             return
-        first = min(self._asking, key=self._asking.__getitem__)
-        if self._clock() - max(self._acted, self._asking[first]) >= self._max_idle:
+        if self._clock() - max(self._acted, self._clients[first].asked) >= _MOST_IDLE:
             self._give(first)
 
 

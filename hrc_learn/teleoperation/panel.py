@@ -16,7 +16,7 @@ from hrc_learn.protocols import DrawnRegion, Feedback, Request
 from hrc_learn.teleoperation.devices import DIRECTIONS, OPEN, KeyboardState
 from hrc_learn.teleoperation.gate.messages import Gripper, Message, Region, Target, Task
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
-from hrc_learn.teleoperation.page_operator import AddedTurn
+from hrc_learn.teleoperation.page_operator import HeldGizmos
 from hrc_learn.teleoperation.page_scene import PageScene, ViserServer, in_loop
 from hrc_learn.teleoperation.region_editor import RegionEditor
 from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed_colour
@@ -66,12 +66,11 @@ def can_do(status: PageStatus, task: str) -> str:
     )
 
 
-def state_html(status: PageStatus, rate: float, people: int, task: str = "") -> str:
+def state_html(status: PageStatus, people: int, task: str = "") -> str:
     """Name of the arm, its activity, and the number of viewers, as HTML.
 
     Args:
         status: Status of the session.
-        rate: Control rate [Hz].
         people: Number of browsers that show the page.
         task: Description of the task.
     """
@@ -90,8 +89,7 @@ def state_html(status: PageStatus, rate: float, people: int, task: str = "") -> 
         f"{doing}"
         f"<div>{can_do(status, task)}</div>"
         f'<div style="opacity:.75;font-size:.85em">{html.escape(status.note) or "&nbsp;"}</div>'
-        f'<div style="opacity:.75;font-size:.85em">{rate:.0f} steps a second, '
-        f"{people} connected</div></div>"
+        f'<div style="opacity:.75;font-size:.85em">{people} connected</div></div>'
     )
 
 
@@ -179,27 +177,25 @@ def interventions_html(status: PageStatus, latest: str) -> str:
         status: Status of the session.
         latest: Kind of the latest intervention, shown in red; empty if there was none.
     """
-    rows = [
-        f'<tr style="{f"color:{VERMILION};font-weight:600" if name == latest else ""}">'
-        f"<td>{html.escape(name.replace('_', ' '))}</td>"
-        f'<td style="text-align:right">{count}</td></tr>'
+    red = f"color:{VERMILION};font-weight:600"
+    rows: list[tuple[str, int | str, str]] = [
+        (name.replace("_", " "), count, red if name == latest else "")
         for name, count in status.interventions.items()
         if count
     ]
-    nothing = f'<tr><td style="color:{GREEN}">the filter has not had to act</td></tr>'
-    contacts = (
-        f'<tr style="color:{VERMILION}"><td>touches of the surroundings</td>'
-        f'<td style="text-align:right">{status.contacts}</td></tr>'
+    rows = rows or [("the filter has not had to act", "", f"color:{GREEN}")]
+    if status.contacts:
+        rows.append(("touches of the surroundings", status.contacts, f"color:{VERMILION}"))
+    table = "".join(
+        f'<tr style="{style}"><td>{name}</td><td style="text-align:right">{count}</td></tr>'
+        for name, count, style in rows
     )
-    table = "".join(rows) or nothing
-    table += contacts if status.contacts else ""
     return _block(
         "Safety filter, steps", f'<table style="width:100%;border-spacing:0">{table}</table>'
     )
 
 
 def _block(title: str, content: str) -> str:
-    title = html.escape(title.replace("_", " "))
     return (
         '<div style="padding:.2em .9em .4em;font-size:.85em">'
         f'<div style="opacity:.75;margin-bottom:.2em">{title}</div>'
@@ -227,6 +223,7 @@ class Panel:
 
     Attributes:
         gripper: Opening the person wants [m]; None until asked for.
+        editor: Region and target that people draw; None: they cannot.
     """
 
     def __init__(
@@ -236,11 +233,11 @@ class Panel:
         forces: InteractionForceConfig,
         request: Callable[[Request], None],
         scene: PageScene,
+        held: HeldGizmos,
         task: str,
-        turn: AddedTurn,
         *,
-        guides: bool = True,
-        draws: bool = True,
+        guides: bool,
+        draws: bool,
     ):
         """Build the panel.
 
@@ -250,12 +247,12 @@ class Panel:
             forces: Initial gains of gizmos.
             request: Receives what buttons ask for.
             scene: Scene, whose twin and gizmo the panel sets.
+            held: Gizmos, and the rotation added by the rings of the end effector's.
             task: Description of the task.
-            turn: Rotation added by the rings of the end effector's gizmo.
             guides: True if the person guides the end effector and records.
             draws: True if people draw regions, mark targets and turn the end effector.
         """
-        self._gui, self._initial_forces = server.gui, forces
+        self._gui, self._initial_forces, self._held = server.gui, forces, held
         gui = server.gui
         gui.configure_theme(
             control_width="medium",
@@ -264,8 +261,7 @@ class Panel:
             brand_color=(0, 114, 178),
         )
         gui.main_panel.dock_right()
-        self._task = self._switch = self._coarse = self._region = None
-        self._turn, self._keep = turn, None
+        self._task = self._switch = self._keep = None
         self._next: Request = "start"
         self._keys = KeyboardState()
         self.gripper: float | None = None
@@ -274,19 +270,19 @@ class Panel:
             with gui.add_folder("Demonstration"):
                 self._add_recording(request, task)
         with gui.add_folder("Null-space input and safety"):
-            self._bars = gui.add_html("")
-            self._safety = gui.add_html("")
+            self._bars, self._safety = gui.add_html(""), gui.add_html("")
         with gui.add_folder("Arm"):
             if guides:
                 self._add_end_effector(scene)
             twin = gui.add_checkbox("Virtual twin", True, hint="Hold it instead of the arm.")
             twin.on_update(in_loop(lambda _: scene.show_twin(twin.value)))
             self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
+        self.editor: RegionEditor | None = None
         if draws:
             with gui.add_folder("Region, target and turn"):
-                self._region = RegionEditor(server, boxes)
+                self.editor = RegionEditor(server, boxes)
                 clear = gui.add_button("Clear the turn", color="gray")
-                clear.on_click(in_loop(lambda _: turn.clear()))
+                clear.on_click(in_loop(lambda _: held.clear_turn()))
                 self._turn_text = gui.add_markdown(_turn_words(None))
         self._seen: Mapping[str, int] = {}
         self._latest = ""
@@ -307,21 +303,13 @@ class Panel:
 
     def _add_end_effector(self, scene: PageScene) -> None:
         """Move the end effector by keys, turn it, open and close it."""
-        coarse = self._coarse = self._gui.add_checkbox(
-            "Coarse orientation rule",
-            True,
-            hint="Down in front of the robot, level at the end of its reach.",
-        )
         fine = self._gui.add_checkbox(
-            "Fine turn", False, hint="Rings turn the end effector on top of that rule."
+            "Fine turn",
+            False,
+            hint="Rings turn the end effector on top of the rule: down in front of the robot, "
+            "level at the end of its reach.",
         )
-
-        async def chosen(_: object) -> None:
-            fine.disabled = not coarse.value
-            scene.let_turn(fine.value or not coarse.value, not coarse.value)
-
-        coarse.on_update(chosen)
-        fine.on_update(chosen)
+        fine.on_update(in_loop(lambda _: scene.let_turn(fine.value)))
         gripper = self._gui.add_button_group("Gripper", ("open", "close"))
         gripper.on_click(in_loop(lambda _: self._move_gripper(gripper.value)))
         for key in DIRECTIONS:
@@ -329,16 +317,10 @@ class Panel:
                 f"Move the end effector {_KEYS[key]}",
                 hotkey=key.upper(),  # type: ignore
             )
-            command.on_trigger(self._presses(key))
+            command.on_trigger(in_loop(lambda _, key=key: self._keys.press(key)))
         self._gui.add_markdown(
             "Keys **I K J L U O** move the end effector away, back, left, right, up, down."
         )
-
-    def _presses(self, key: str) -> Callable[[Any], Any]:
-        async def pressed(_event: Any) -> None:
-            self._keys.press(key)
-
-        return pressed
 
     def _move_gripper(self, word: str) -> None:
         self.gripper = OPEN if word == "open" else 0.0
@@ -348,28 +330,6 @@ class Panel:
         """Description of the task."""
         return "" if self._task is None else self._task.value
 
-    @property
-    def coarse(self) -> bool:
-        """True if the end effector turns by the coarse orientation rule."""
-        return self._coarse is None or self._coarse.value
-
-    @property
-    def region(self) -> DrawnRegion | None:
-        """The region active."""
-        return None if self._region is None else self._region.region
-
-    @property
-    def target(self) -> tuple[float, float, float] | None:
-        """The point marked [m]."""
-        return None if self._region is None else self._region.target
-
-    @property
-    def drawn(self) -> tuple[DrawnRegion | None, bool]:
-        """Drawn region and its state, true if active; None if regions cannot be drawn."""
-        if self._region is None:
-            return None, False
-        return self._region.drawn, self._region.region is not None
-
     def hear(self, message: Message) -> None:
         """Do what a headset asks, as the panel's own controls would."""
         match message:
@@ -377,10 +337,10 @@ class Panel:
                 self.gripper = width
             case Task(task=task) if self._task is not None:
                 self._task.value = task
-            case Region(centre=centre, half_size=half_size, active=active) if self._region:
-                self._region.draw(DrawnRegion(centre=centre, half_size=half_size), active)
-            case Target(point=point) if self._region is not None:
-                self._region.mark(None if point is None else np.array(point))
+            case Region(centre=centre, half_size=half_size, active=active) if self.editor:
+                self.editor.draw(DrawnRegion(centre=centre, half_size=half_size), active)
+            case Target(point=point) if self.editor:
+                self.editor.mark(None if point is None else np.array(point))
             case _:
                 pass  # what this page does not offer
 
@@ -413,27 +373,22 @@ class Panel:
         """Direction of motion requested by keys: a unit vector, or zero."""
         return self._keys.direction()
 
-    def tell(self, feedback: Feedback) -> None:
-        """Show what the arm tells, where that has changed."""
-        words = feedback_html(feedback)
-        if words != self._told.content:
-            self._told.content = words
-
     def refresh(
         self,
         status: PageStatus,
+        feedback: Feedback,
         nullspace_input: Float[np.ndarray, " joints"],
-        rate: float,
         people: int,
     ) -> None:
         """Show status.
 
         Args:
             status: Status of the session.
+            feedback: Feedback of the arm.
             nullspace_input: d that is asked for now [N m].
-            rate: Steps that the loop takes [1/s].
             people: Browsers that show the page.
         """
+        self._told.content = feedback_html(feedback)
         if self._switch is not None:
             self._next = "stop" if status.recording == "recording" else "start"
             self._switch.label = self._next.capitalize()
@@ -443,10 +398,10 @@ class Panel:
             if self._keep is not None:
                 self._keep.visible = status.recording == "stopped"
         largest = self._initial_forces.max_nullspace_input
-        self._state.content = state_html(status, rate, people, self.task)
+        self._state.content = state_html(status, people, self.task)
         self._bars.content = nullspace_input_html(nullspace_input, largest)
-        if self._region is not None:
-            self._turn_text.content = _turn_words(self._turn.vector)
+        if self.editor is not None:
+            self._turn_text.content = _turn_words(self._held.turn_vector)
         counts, seen = status.interventions, self._seen
         more = [name for name, count in counts.items() if count > seen.get(name, 0)]
         self._seen, self._latest = dict(counts), more[-1] if more else self._latest

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Box, quaternion
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.page_scene import (
-    ViserServer,
-    box_edges,
-    in_loop,
-)
+from hrc_learn.teleoperation.page_scene import ViserServer, box_edges, in_loop
 from hrc_learn.viz.palette import GREEN, VERMILION, rgba
 
 
@@ -98,10 +95,14 @@ def region_over(
         smallest: Half size that no edge falls below [m].
     """
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    x, y = ((low + high) / 2).tolist()
-    a, b = np.maximum((high - low) / 2, smallest).tolist()
-    c = max(height / 2, smallest)
-    return DrawnRegion(centre=(x, y, bottom + c), half_size=(a, b, c))
+    half_size = np.maximum(np.append(high - low, height) / 2, smallest)
+    centre = np.append((low + high) / 2, bottom + half_size[2])
+    return DrawnRegion(centre=_triple(centre), half_size=_triple(half_size))
+
+
+def _triple(vector: Sequence[float] | Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = map(float, vector)
+    return x, y, z
 
 
 FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.10))
@@ -117,7 +118,12 @@ _LIFTED = 0.08
 
 
 class RegionEditor:
-    """The box in the scene, its controls in the panel, and the target's mark."""
+    """The box in the scene, its controls in the panel, and the target's mark.
+
+    Attributes:
+        drawn: The region, active or not.
+        target: The point marked, where there is one [m].
+    """
 
     def __init__(self, server: ViserServer, boxes: Sequence[Box]):
         """Draw the first region, not active.
@@ -127,8 +133,8 @@ class RegionEditor:
             boxes: Furniture that targets may be marked on.
         """
         self._server, self._scene, self._boxes = server, server.scene, tuple(boxes)
-        self._region = FIRST_REGION
-        self._target: tuple[float, float, float] | None = None
+        self.drawn = FIRST_REGION
+        self.target: tuple[float, float, float] | None = None
         self._add_controls()
         self._add_nodes()
         self._update()
@@ -136,41 +142,32 @@ class RegionEditor:
     @property
     def region(self) -> DrawnRegion | None:
         """The region, where it is active."""
-        return self._region if self._in_force.value else None
+        return self.drawn if self._in_force.value else None
 
-    @property
-    def drawn(self) -> DrawnRegion:
-        """The region, active or not."""
-        return self._region
+    def draw(self, region: DrawnRegion, active: bool | None = None) -> None:
+        """Take another region, and let scene and panel follow.
 
-    def draw(self, region: DrawnRegion, active: bool) -> None:
-        """Take a region that was drawn elsewhere, and whether it is active."""
-        self._in_force.value = active
-        self.reshape(region)
-
-    @property
-    def target(self) -> tuple[float, float, float] | None:
-        """The point marked, where there is one [m]."""
-        return self._target
-
-    def reshape(self, region: DrawnRegion) -> None:
-        """Take another region, and let scene and panel follow."""
-        self._region = region
+        Args:
+            region: The region.
+            active: True if it attracts the end effector; None: as before.
+        """
+        if active is not None:
+            self._in_force.value = active
+        self.drawn = region
         self._update()
 
     def mark(self, point: Float[np.ndarray, "3"] | None) -> None:
         """Mark the target somewhere [m], or nowhere."""
         self._mark.visible = point is not None
-        self._target = None
+        self.target = None if point is None else _triple(point)
         if point is not None:
-            x, y, z = point.tolist()
-            self._target = (x, y, z)
             self._mark.position = point
 
     def _add_controls(self) -> None:
         gui = self._server.gui
-        self._draw = gui.add_button("Draw on the table", icon=_DRAW)
-        self._draw.on_click(in_loop(lambda _: self._draw_next()))
+        draw = gui.add_button("Draw on the table", icon=_DRAW)
+        select = self._scene.on_rect_select, self._scene.remove_rect_select_callback
+        draw.on_click(in_loop(lambda _: _once(draw, *select, self._draw_over)))
         self._in_force = gui.add_checkbox(
             "Active", False, hint="The end effector is attracted into the region."
         )
@@ -181,13 +178,14 @@ class RegionEditor:
         ]
         for slider in self._sizes:
             slider.on_update(in_loop(self._resized))
-        self._mark_next_button = gui.add_button("Mark the target", icon=_MARK)
-        self._mark_next_button.on_click(in_loop(lambda _: self._mark_next()))
+        mark = gui.add_button("Mark the target", icon=_MARK)
+        click = self._scene.on_click, self._scene.remove_click_callback
+        mark.on_click(in_loop(lambda _: _once(mark, *click, self._mark_above)))
         clear = gui.add_button("Clear the target", color="gray")
         clear.on_click(in_loop(lambda _: self.mark(None)))
 
     def _add_nodes(self) -> None:
-        scene, region = self._scene, self._region
+        scene, region = self._scene, self.drawn
         self._gizmo = scene.add_transform_controls(
             "/region", scale=0.16, disable_rotations=True, position=region.centre
         )
@@ -214,33 +212,29 @@ class RegionEditor:
         self._mark.on_drag(self._mark_dragged)
 
     async def _moved(self, event: Any) -> None:
-        x, y, z = event.target.position.tolist()
-        self._region = DrawnRegion(centre=(x, y, z), half_size=self._region.half_size)
+        self.drawn = replace(self.drawn, centre=_triple(event.target.position))
 
     async def _corner_dragged(self, event: Any) -> None:
         # Two sizes follow the pointer; the third, along the view, could only be guessed.
-        corner = np.array(self._region.centre) + self._region.half_size
-        eye = event.client.camera.position
+        centre = np.array(self.drawn.centre)
+        corner, eye = centre + self.drawn.half_size, event.client.camera.position
         view = np.array(event.end_position) - eye
         axis = int(np.abs(view).argmax())
         place = meet_plane(eye, view / np.linalg.norm(view), axis, corner[axis])
-        if place is None:
-            return
-        half_size = np.clip(place - self._region.centre, _SMALLEST, _LARGEST)
-        a, b, c = half_size.tolist()
-        self.reshape(DrawnRegion(centre=self._region.centre, half_size=(a, b, c)))
+        if place is not None:
+            half_size = np.clip(place - centre, _SMALLEST, _LARGEST)
+            self.draw(replace(self.drawn, half_size=_triple(half_size)))
 
     async def _mark_dragged(self, event: Any) -> None:
         self.mark(np.array(event.end_position))
 
     def _resized(self, event: Any) -> None:
-        if event.client is None:  # we have moved the slider ourselves
-            return
-        a, b, c = (slider.value / 2 for slider in self._sizes)
-        self.reshape(DrawnRegion(centre=self._region.centre, half_size=(a, b, c)))
+        if event.client is not None:  # otherwise we have moved the slider ourselves
+            sizes = [slider.value / 2 for slider in self._sizes]
+            self.draw(replace(self.drawn, half_size=_triple(sizes)))
 
     def _update(self) -> None:
-        region = self._region
+        region = self.drawn
         self._gizmo.position = region.centre
         self._box.dimensions = _doubled(region.half_size)
         self._box.opacity = 0.3 if self._in_force.value else 0.12
@@ -249,22 +243,8 @@ class RegionEditor:
         for slider, half in zip(self._sizes, region.half_size, strict=True):
             slider.value = round(2 * half, 3)
 
-    def _draw_next(self) -> None:
-        """Make the next rectangle drawn on the screen the region's footprint."""
-        self._draw.disabled = True
-
-        @self._scene.on_rect_select()  # pyright: ignore[reportArgumentType]
-        async def drawn(event: Any) -> None:
-            self._scene.remove_rect_select_callback(drawn)
-            self._draw.disabled = False
-            footprint = self._footprint(event)
-            if footprint is not None:
-                bottom = self._region.centre[2] - self._region.half_size[2]
-                height = 2 * self._region.half_size[2]
-                self.reshape(region_over(footprint, bottom, height))
-
-    def _footprint(self, event: Any) -> Float[np.ndarray, "4 3"] | None:
-        """Projections of the midpoints of a rectangle's edges on the table."""
+    def _draw_over(self, event: Any) -> None:
+        """Make a rectangle drawn on the screen the region's footprint on the table."""
         (left, top), (right, bottom) = event.screen_min, event.screen_max
         x, y = (left + right) / 2, (top + bottom) / 2
         camera = event.client.camera
@@ -272,19 +252,15 @@ class RegionEditor:
         for screen in ((left, y), (right, y), (x, top), (x, bottom)):
             ray = view_ray(screen, camera.wxyz, camera.fov, camera.aspect)
             points.append(meet_plane(camera.position, ray, 2, 0.0))
-        return None if any(p is None for p in points) else np.array(points)
+        if all(point is not None for point in points):
+            half = self.drawn.half_size[2]
+            self.draw(region_over(np.array(points), self.drawn.centre[2] - half, 2 * half))
 
-    def _mark_next(self) -> None:
-        """Mark the target above the next point clicked."""
-        self._mark_next_button.disabled = True
-
-        @self._scene.on_click()  # pyright: ignore[reportArgumentType]
-        async def clicked(event: Any) -> None:
-            self._scene.remove_click_callback(clicked)
-            self._mark_next_button.disabled = False
-            point = self._surface(np.array(event.ray_origin), np.array(event.ray_direction))
-            if point is not None:
-                self.mark(point + np.array([0.0, 0.0, _LIFTED]))
+    def _mark_above(self, event: Any) -> None:
+        """Mark the target above a point clicked."""
+        point = self._surface(np.array(event.ray_origin), np.array(event.ray_direction))
+        if point is not None:
+            self.mark(point + np.array([0.0, 0.0, _LIFTED]))
 
     def _surface(
         self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
@@ -298,6 +274,20 @@ class RegionEditor:
         if np.isfinite(nearest):
             return origin + nearest * direction
         return meet_plane(origin, direction, 2, 0.0)
+
+
+def _once(
+    button: Any, listen: Any, remove: Callable[[Any], None], act: Callable[[Any], None]
+) -> None:
+    """Act on the next event of the pointer only; the button is disabled until then."""
+    button.disabled = True
+
+    async def heard(event: Any) -> None:
+        remove(heard)
+        button.disabled = False
+        act(event)
+
+    listen()(heard)
 
 
 def _doubled(half_size: tuple[float, float, float]) -> tuple[float, float, float]:

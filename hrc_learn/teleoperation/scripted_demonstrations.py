@@ -36,28 +36,23 @@ from hrc_learn.vision import angle, centre
 class DemonstrationConfig:
     """Settings of hand guiding and recording."""
 
+    duration: float
+    """Duration of the motion [s]."""
     tremor: float = 4e-4
     """Amplitude of the tremor of the person's hand [m]."""
     settle: float = 1.0
     """Rest at the end of a demonstration [s]."""
-    dt: float = 0.01
-    """Control step [s]."""
     record_every: int = 2
     """Control steps from one recorded frame to the next."""
-    damping: float = 3.0
-    """c_d [N m s/rad]."""
 
     def __post_init__(self) -> None:
-        if not (self.dt > 0 and self.record_every >= 1 and self.damping > 0):
-            raise ValueError(
-                "dt and damping must be positive and record_every at least 1, but are "
-                f"{self.dt}, {self.damping} and {self.record_every}."
-            )
+        if self.record_every < 1:
+            raise ValueError(f"record_every must be at least 1, but is {self.record_every}.")
 
     @property
     def fps(self) -> float:
         """Recorded frames per second."""
-        return 1.0 / (self.dt * self.record_every)
+        return 1.0 / (HandGuidingConfig.dt * self.record_every)
 
 
 type OpenArm = Callable[[World], AbstractContextManager[OpenedArm]]
@@ -72,7 +67,6 @@ def guided_frames(
     chain: SerialChain,
     opened: OpenedArm,
     human: Human,
-    duration: float,
     config: DemonstrationConfig,
     observe: Callable[[], Frame] = dict,
 ) -> Iterator[Frame]:
@@ -82,20 +76,19 @@ def guided_frames(
         chain: The arm's kinematics.
         opened: The arm, where the demonstration starts.
         human: Gives end-effector motion and null-space input.
-        duration: Duration of the demonstration [s].
-        config: Settings of hand guiding.
+        config: Duration and rate.
         observe: Further columns of a frame, called when it is recorded.
 
     Yields:
         A frame every `record_every` control steps.
     """
-    guiding = HandGuidingConfig(dt=config.dt, damping=config.damping)
-    arm = HandGuidedArm(chain, opened.arm, human, guiding)
-    for k in range(round(duration / config.dt)):
+    arm = HandGuidedArm(chain, opened.arm, human)
+    dt = arm.config.dt
+    for k in range(round((config.duration + config.settle) / dt)):
         step = arm.step()
         if k % config.record_every == 0:
             yield {**step.frame(), **observe()}
-        opened.advance(config.dt)
+        opened.advance(dt)
 
 
 def write_demonstrations(
@@ -255,11 +248,8 @@ def demonstrate_servoing(
             ANGLE_FEATURE: np.array([angle(last), angle(target)]),
         }
 
-    duration = config.duration + config.settle
     with open_arm(world) as opened:
-        return list(
-            guided_frames(world.arm.robot.chain, opened, expert, duration, config, observe)
-        )
+        return list(guided_frames(world.arm.robot.chain, opened, expert, config, observe))
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
@@ -356,8 +346,7 @@ def demonstrate_placing(
     offset = torch.from_numpy(expert.path.position(0.0)) - workplace.home().position
     world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
     with open_arm(world) as opened:
-        duration = config.duration + config.settle
-        frames = list(guided_frames(world.arm.robot.chain, opened, expert, duration, config))
+        frames = list(guided_frames(world.arm.robot.chain, opened, expert, config))
     return frames, world.cabinet_contacts.touches + world.object_contacts.touches
 
 

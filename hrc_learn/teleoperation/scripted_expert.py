@@ -5,6 +5,7 @@ guides the end effector along way points.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.teleoperation.hand_guiding import (
     TINY,
     InteractionForceConfig,
-    pull_to_nullspace_input,
+    force_to_nullspace_input,
 )
 
 
@@ -128,18 +129,15 @@ class ScriptedPerturbation(Human):
         """The null-space input of all forces that act now."""
         d = np.zeros(len(self._chain.joint_names))
         if self._begin is None:
-            return HumanInput(nullspace_input=d, twist=np.zeros(6))
-        time = state.time - self._begin
-        active = [force for force in self.forces if force.start < time < force.end]
-        if active:
-            q = torch.from_numpy(state.joint_position)
-            for scripted in active:
-                origin = self._chain.joint_origin(q, scripted.joint)
-                force = scripted.force(time, origin.numpy())
-                d += pull_to_nullspace_input(
-                    self._chain, state.joint_position, scripted.joint, force, self._config
+            return HumanInput(nullspace_input=d)
+        q, time = state.joint_position, state.time - self._begin
+        for scripted in self.forces:
+            if scripted.start < time < scripted.end:
+                origin = self._chain.joint_origin(torch.from_numpy(q), scripted.joint).numpy()
+                d += force_to_nullspace_input(
+                    self._chain, q, scripted.joint, scripted.force(time, origin), self._config
                 )
-        return HumanInput(nullspace_input=d, twist=np.zeros(6))
+        return HumanInput(nullspace_input=d)
 
 
 class GuidedPath:
@@ -293,22 +291,21 @@ class DrawnInterval:
 class ScriptedDrawing(Human):
     """Person that only draws, by a script; can be combined with others."""
 
-    def __init__(self, script: Sequence[DrawnInterval], joints: int = 7):
+    def __init__(self, script: Sequence[DrawnInterval]):
         """Prepare.
 
         Args:
             script: Intervals with their drawn regions. If intervals overlap, the first that has
                 a region, a target or a turn decides about that.
-            joints: Number of joints of the arm.
         """
-        self._script, self._still = tuple(script), np.zeros(joints)
+        self._script = tuple(script)
 
     def read(self, state: ArmState) -> HumanInput:
         """Region drawn at the state's time."""
         now = [i for i in self._script if i.start <= state.time < i.start + i.duration]
-        return HumanInput(
-            nullspace_input=self._still,
-            region=next((i.region for i in now if i.region is not None), None),
-            target=next((i.target for i in now if i.target is not None), None),
-            turn=next((i.turn for i in now if i.turn is not None), None),
-        )
+
+        def first(name: str) -> Any:
+            found = (getattr(one, name) for one in now)
+            return next((value for value in found if value is not None), None)
+
+        return HumanInput(**{name: first(name) for name in ("region", "target", "turn")})

@@ -176,7 +176,7 @@ def test_curves_of_long_episodes_lose_no_spike():
     frames, points = _points(values, np.linspace(0, 100_000, 1001).astype(int))
     assert len(points) <= 2000
     assert max(points) == 7.0
-    assert frames[points.index(7.0)] == 54_321
+    assert frames[points.argmax()] == 54_321
 
 
 def test_decisions_are_kept_at_once_and_taken_back(page, client):

@@ -10,7 +10,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.teleoperation.demonstration_recorder import (
     UNNAMED,
     DemonstrationRecorder,
-    without_rest,
+    moving_part,
 )
 
 FPS = 5.0  # few frames make a demonstration of half a second
@@ -183,6 +183,12 @@ def resting_frames(moves):
     ]
 
 
+def without_rest(frames):
+    state = [np.append(f["joint_position"], f["gripper"]) for f in frames]
+    part = moving_part(np.array([f["time"] for f in frames]), np.stack(state))
+    return None if part is None else frames[part]
+
+
 @pytest.mark.parametrize(
     "moves",
     [
@@ -200,10 +206,10 @@ def test_rest_before_and_after_the_motion_is_left_out(moves):
     assert kept[-1]["time"] >= 13.0
 
 
-def test_an_arm_that_never_moves_keeps_what_was_recorded():
+def test_an_arm_that_never_moves_has_no_moving_part():
     frames = resting_frames(lambda share: {})
-    assert without_rest(frames) == frames
-    assert without_rest(frames[:1]) == frames[:1]
+    assert without_rest(frames) is None
+    assert without_rest(frames[:1]) is None
 
 
 def test_a_motion_that_is_cut_off_is_kept_to_its_end():

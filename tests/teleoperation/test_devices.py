@@ -72,8 +72,8 @@ def test_the_numbers_are_those_of_the_library():
 
 def test_a_gamepad_that_is_not_there_is_named():
     pytest.importorskip("pygame", reason="the extra `gamepad` is not installed")
-    with pytest.raises(ValueError, match="no gamepad 63"):
-        Gamepad.open(panda, index=63)
+    with pytest.raises(ValueError, match="SDL finds no gamepad"):
+        Gamepad.open(panda)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_gamepad_that_is_not_there_is_named():
 def test_sticks_lead_where_they_point(axes, way):
     asked = Gamepad(panda, Pad(axes)).read(STATE)
     np.testing.assert_allclose(asked.twist[:3], SPEED * np.array(way), atol=1e-12)
-    assert not asked.nullspace_input.any()
+    assert asked.nullspace_input is None
 
 
 def test_a_stick_near_its_middle_rests():
@@ -163,8 +163,8 @@ def test_the_device_is_read_before_it_is_asked():
 def test_keys_count_for_a_moment_and_together():
     clock = Clock()
     keys = KeyboardState(holds_for=0.2, clock=clock)
-    assert keys.press("i")
-    assert not keys.press("x")
+    keys.press("i")
+    keys.press("x")
     assert keys.direction().tolist() == [1.0, 0.0, 0.0]
     clock.time = 0.15
     keys.press("u")
@@ -351,8 +351,8 @@ def test_the_motors_of_a_gamepad_of_the_librarys_own_turn(monkeypatch):
     """SDL itself makes the gamepad, and tells what its motors were asked for."""
     pytest.importorskip("pygame", reason="the extra `gamepad` is not installed")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    with pytest.raises(ValueError, match="no gamepad 63"):  # which starts the library
-        Gamepad.open(panda, index=63)
+    with pytest.raises(ValueError, match="no gamepad"):  # which starts the library
+        Gamepad.open(panda)
     maps = Path("/proc/self/maps")
     lines = maps.read_text().splitlines() if maps.exists() else []
     loaded = [line.split()[-1] for line in lines if "libSDL2-2" in line]
@@ -367,7 +367,7 @@ def test_the_motors_of_a_gamepad_of_the_librarys_own_turn(monkeypatch):
     index = sdl.SDL_JoystickAttachVirtualEx(ctypes.byref(pad))
     assert index >= 0
     try:
-        gamepad = Gamepad.open(panda, index)
+        gamepad = Gamepad.open(panda)
         assert not gamepad.read(STATE).twist.any()
         gamepad.tell(feedback(followed=0.5, force=60.0))
         assert asked == [(65535, 32767)]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation import (
@@ -291,9 +291,10 @@ def test_a_pull_at_the_joint_itself_needs_no_point():
     origin = point_on_link(q, 4, torch.zeros(3, dtype=torch.float64))
     pull = np.array([1.0, -2.0, 0.5])
     for mapping in ("pinv", "transpose"):
-        at_point = force_to_nullspace_input(panda, q, 4, pull, mapping, origin)
+        config = InteractionForceConfig(mapping=mapping)
+        at_point = force_to_nullspace_input(panda, q, 4, pull, config, origin)
         np.testing.assert_allclose(
-            at_point, force_to_nullspace_input(panda, q, 4, pull, mapping), atol=1e-12
+            at_point, force_to_nullspace_input(panda, q, 4, pull, config), atol=1e-12
         )
 
 
@@ -332,25 +333,29 @@ def test_caps_shorten_and_never_lengthen():
     assert bounded(np.zeros(2), 1.0).tolist() == [0.0, 0.0]
 
 
+def guided(position, error, velocity, config):
+    """Twist of an end effector that has to turn by `error` (a rotation vector) to its rule."""
+    position = torch.tensor(position, dtype=torch.float64)
+    turn = quaternion.exp(torch.tensor([0.4, -0.1, 0.3], dtype=torch.float64))
+    goal = quaternion.multiply(turn, coarse_orientation(position))
+    error = quaternion.exp(torch.tensor(error, dtype=torch.float64))
+    start = quaternion.multiply(quaternion.conjugate(error), goal)
+    return [
+        guiding_twist(Pose(position, sign * start), np.array(velocity), config, turn)
+        for sign in (1.0, -1.0)
+    ]
+
+
 def test_a_hand_follows_and_turns_the_shorter_way():
     config = InteractionForceConfig(turn_rate=1.0, turn_speed=10.0)
-    turn = torch.tensor([0.3, -0.5, 0.2], dtype=torch.float64)
-    start = quaternion.normalize(torch.tensor([0.2, 0.9, -0.3, 0.1], dtype=torch.float64))
-    goal = quaternion.multiply(quaternion.exp(turn), start)
-    hand = Pose(torch.zeros(3, dtype=torch.float64), start)
-    for sign in (1.0, -1.0):
-        twist = guiding_twist(hand, np.array([0.1, 0.0, 0.0]), sign * goal, config)
-        np.testing.assert_allclose(twist, [0.1, 0.0, 0.0, *turn.tolist()], atol=1e-12)
+    for twist in guided([0.4, 0.2, 0.3], [0.3, -0.5, 0.2], [0.1, 0.0, 0.0], config):
+        np.testing.assert_allclose(twist, [0.1, 0.0, 0.0, 0.3, -0.5, 0.2], atol=1e-12)
 
 
 def test_a_hand_is_led_no_faster_than_allowed():
     config = InteractionForceConfig(speed=0.2, turn_speed=0.3)
-    start = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    goal = quaternion.exp(torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64))
-    hand = Pose(torch.zeros(3, dtype=torch.float64), start)
-    twist = guiding_twist(hand, np.array([0.0, 3.0, 4.0]), goal, config)
-    np.testing.assert_allclose(twist, [0.0, 0.12, 0.16, 0.0, 0.3, 0.0], atol=1e-12)
-    assert not guiding_twist(hand, np.zeros(3), None, config).any()
+    for twist in guided([0.4, 0.2, 0.3], [0.0, 2.0, 0.0], [0.0, 3.0, 4.0], config):
+        np.testing.assert_allclose(twist, [0.0, 0.12, 0.16, 0.0, 0.3, 0.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["rate", "speed", "stiffness", "damping", "turn_speed"])

@@ -177,7 +177,7 @@ def test_the_region_is_moved_and_sized(still, worn):
     page, _ = still
     arm = json.loads(worn.tab.evaluate("localStorage['hrc-placing']"))["arm"]
     yaw, stands = arm["yaw"], np.array(arm["position"])
-    before = page._panel._region.drawn
+    before = page._panel.editor.drawn
     closed = _closing(worn, "right")
     worn.press("Draw region")
 
@@ -191,15 +191,15 @@ def test_the_region_is_moved_and_sized(still, worn):
         return last - first
 
     moved = pull(before.centre, [0.05, 0.1, 0.02])
-    settled(lambda: page._panel._region.drawn != before, "another place")
-    after = page._panel._region.drawn
+    settled(lambda: page._panel.editor.drawn != before, "another place")
+    after = page._panel.editor.drawn
     np.testing.assert_allclose(np.subtract(after.centre, before.centre), moved, atol=2e-6)
     assert after.half_size == before.half_size
 
     corner = np.add(after.centre, np.multiply(after.half_size, (1, -1, 1)))
     moved = pull(corner, [0.04, 0.03, 0.05])
-    settled(lambda: page._panel._region.drawn != after, "another size")
-    sized = page._panel._region.drawn
+    settled(lambda: page._panel.editor.drawn != after, "another size")
+    sized = page._panel.editor.drawn
     still_there = np.subtract(after.centre, np.multiply(after.half_size, (1, -1, 1)))
     opposite = np.subtract(sized.centre, np.multiply(sized.half_size, (1, -1, 1)))
     np.testing.assert_allclose(opposite, still_there, atol=2e-6)
@@ -221,8 +221,8 @@ def test_the_hand_turns_the_end_effector_by_its_own_turn(still, worn):
 
     def take_back():
         # What the hand said before it opened may come late, and turns on.
-        wait_until(lambda: page._turn.holder is None, "the hand has let go")
-        page._turn.clear()
+        wait_until(lambda: not page._held_gizmos.turning, "the hand has let go")
+        page._held_gizmos.clear_turn()
         wait_until(lambda: page.human.read(state).turn is None, "no turn is asked for")
 
     def turn_heard():

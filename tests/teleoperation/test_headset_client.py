@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from hrc_learn.geometry import Body, Box, Capsule
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.teleoperation import headset
 from hrc_learn.teleoperation.gate.messages import Hands, MessageError, session_message
+from hrc_learn.teleoperation.hand_guiding import GuidedStep
 from hrc_learn.teleoperation.headset import headset_contents, headset_data, scene_glb
 from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.teleoperation.page_session import hand_columns
+from hrc_learn.teleoperation.page_session import recorded_frame
 
 AT_REST = {"position": np.zeros((1, 3)), "orientation": np.array([[1.0, 0.0, 0.0, 0.0]])}
 LINK = Body(
@@ -111,7 +114,14 @@ def hands(**seen) -> str:
 def test_hands_become_columns():
     message = session_message(hands(position=[0.1, 0.2, 0.3], orientation=[0.6, 0.0, 0.8, 0.0]))
     assert isinstance(message, Hands)
-    columns = hand_columns({hand.hand: hand for hand in message.tracked})
+    q = panda.ready
+    state = ArmState(
+        time=0.0, joint_position=q.numpy(), joint_velocity=np.zeros(7), gripper_width=0.08
+    )
+    step = GuidedStep(
+        state=state, human_input=HumanInput(), pose=panda.forward(q), command=np.zeros(7)
+    )
+    columns = recorded_frame(step, {hand.hand: hand for hand in message.tracked})
     left, right = (columns[f"observation.{name}_hand"] for name in ("left", "right"))
     np.testing.assert_array_equal(left, [0.1, 0.2, 0.3, 0.6, 0.0, 0.8, 0.0])
     assert not np.any(right)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from page_in_browser import PATIENCE, Browser, Session, chromium, wait_until
 
+from hrc_learn.teleoperation.page_scene import _TWIN_AT
+
 pytestmark = pytest.mark.browser
 
 
@@ -73,12 +75,12 @@ def test_drawing_by_the_processor_leaves_time_for_the_mouse(session, browser):
 
 
 def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
-    editor = session.page._panel._region
-    before = editor._region
+    editor = session.page._panel.editor
+    before = editor.drawn
     corner = np.array(before.centre) + before.half_size
     with browser.dragging(corner, by=(40, -30)):
-        wait_until(lambda: editor._region != before, "another size")
-    after = editor._region
+        wait_until(lambda: editor.drawn != before, "another size")
+    after = editor.drawn
     assert after.centre == before.centre
     # The camera looks along -x, so the pointer sizes y and z.
     assert after.half_size[0] == pytest.approx(before.half_size[0])
@@ -91,7 +93,7 @@ def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
 
 @pytest.mark.slow
 def test_the_twin_is_held_as_the_arm_is(session, browser):
-    with browser.dragging(session.frame(4) + session.page._config.twin, by=(-50, 0)):
+    with browser.dragging(session.frame(4) + np.array(_TWIN_AT), by=(-50, 0)):
         wait_until(lambda: session.asked.nullspace_input.any(), "effort")
     wait_until(lambda: still(session), "rest")
 
@@ -140,13 +142,13 @@ def test_a_click_marks_the_target_on_the_table(session, browser):
 
 @pytest.mark.slow
 def test_a_rectangle_on_the_table_becomes_the_region(session, browser):
-    editor = session.page._panel._region
-    before = editor._region
+    editor = session.page._panel.editor
+    before = editor.drawn
     browser.button("Draw on the table").click()
     with browser.dragging([0.2, 0.6, 0.0], by=(60, 40)):
         pass
-    wait_until(lambda: editor._region != before, "a region")
-    x, y, _ = editor._region.centre
+    wait_until(lambda: editor.drawn != before, "a region")
+    x, y, _ = editor.drawn.centre
     assert -0.2 < x < 0.7
     assert 0.5 < y < 1.0
 

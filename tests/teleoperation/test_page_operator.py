@@ -12,7 +12,6 @@ from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig, gizmo_nullspace_input
 from hrc_learn.teleoperation.page import PageHuman
 from hrc_learn.teleoperation.page_operator import (
-    AddedTurn,
     HeldGizmo,
     HeldGizmos,
     gizmo_command,
@@ -57,22 +56,28 @@ def rotation(x, y, z):
 
 
 def test_turns_of_the_rings_add_up_and_stay():
-    turn = AddedTurn()
-    assert turn.vector is None
+    held, here = HeldGizmos(), np.zeros(3)
+    first, second = (1, "rings"), (2, "rings")
+    assert held.turn_vector is None
     # The gizmo may stand anyhow when it is taken: what counts is how far it is turned.
     stood = rotation(0.3, 0.2, -0.9)
-    turn.take(1, stood.numpy())
-    turn.move(1, quaternion.multiply(rotation(0.2, 0.0, 0.0), stood).numpy())
-    turn.move(2, quaternion.multiply(rotation(0.9, 0.0, 0.0), stood).numpy())  # not the holder
-    turn.release(1)
-    turn.move(1, rotation(0.0, 1.0, 0.0).numpy())
-    np.testing.assert_allclose(turn.vector, [0.2, 0.0, 0.0], atol=1e-12)
-    turn.take(2, rotation(0.0, 0.0, 0.0).numpy())
-    turn.move(2, rotation(0.0, 0.3, 0.0).numpy())
+    held.take(first, None, stood.numpy())
+    assert held.turning
+    assert not held.held()
+    held.move(first, here, quaternion.multiply(rotation(0.2, 0.0, 0.0), stood).numpy())
+    held.move(second, here, quaternion.multiply(rotation(0.9, 0.0, 0.0), stood).numpy())
+    held.release(first)
+    assert not held.turning
+    held.move(first, here, rotation(0.0, 1.0, 0.0).numpy())
+    np.testing.assert_allclose(held.turn_vector, [0.2, 0.0, 0.0], atol=1e-12)
+    held.take(second, None, rotation(0.0, 0.0, 0.0).numpy())
+    held.move(second, here, rotation(0.0, 0.3, 0.0).numpy())
     expected = quaternion.multiply(rotation(0.0, 0.3, 0.0), rotation(0.2, 0.0, 0.0))
-    torch.testing.assert_close(turn.rotation, expected)
-    turn.clear()
-    assert turn.vector is None
+    torch.testing.assert_close(held.turn, expected)
+    held.release_all(2)
+    assert not held.turning
+    held.clear_turn()
+    assert held.turn_vector is None
 
 
 def test_a_turn_comes_on_top_of_the_coarse_rule():
@@ -83,8 +88,17 @@ def test_a_turn_comes_on_top_of_the_coarse_rule():
     # An angular velocity of so much for a second turns there.
     reached = quaternion.multiply(rotation(*asked.twist[3:]), pose.orientation)
     assert float(quaternion.angle(reached, wanted)) < 1e-9
-    alone = gizmo_command(panda, Q, [grip(None, np.zeros(3))], config, coarse=False, turn=turn)
-    assert not alone.twist.any()
+
+
+def test_keys_add_to_what_is_held():
+    config, way = InteractionForceConfig(speed=1.0), np.array([0.05, 0.0, 0.0])
+    asked = gizmo_command(
+        panda, Q, [grip(None, way)], config, direction=np.array([0.0, 0.5, 0.0])
+    )
+    np.testing.assert_allclose(asked.twist[:3], [config.rate * 0.05, 0.5, 0.0], atol=1e-12)
+    assert not gizmo_command(panda, Q, [], config, direction=np.zeros(3)).twist.any()
+    fast = gizmo_command(panda, Q, [], config, direction=np.array([3.0, 0.0, 4.0]))
+    np.testing.assert_allclose(fast.twist[:3], [0.6, 0.0, 0.8], atol=1e-12)
 
 
 def test_requests_come_once_each_and_in_order():
@@ -165,7 +179,7 @@ def test_a_point_held_goes_with_its_link():
     np.testing.assert_allclose(asked.arrows[0, 0], point, atol=1e-12)
 
 
-def test_a_hand_that_is_led_turns_by_the_rule_or_as_its_handle_is_turned():
+def test_a_guided_end_effector_turns_by_the_rule():
     config, way = InteractionForceConfig(turn_speed=100.0), np.array([0.05, 0.0, 0.0])
     hand = panda.forward(torch.from_numpy(Q))
     asked = gizmo_command(panda, Q, [grip(None, way)], config)
@@ -175,8 +189,6 @@ def test_a_hand_that_is_led_turns_by_the_rule_or_as_its_handle_is_turned():
     R = panda.forward(torch.from_numpy(Q)).matrix()[:3, :3]
     goal = coarse_orientation(hand.position)
     torch.testing.assert_close(turned @ R, quaternion.to_matrix(goal), atol=1e-9, rtol=0)
-    free = gizmo_command(panda, Q, [grip(None, way)], config, coarse=False)
-    assert not free.twist[3:].any()
 
 
 def test_nobody_asks_for_nothing():
@@ -228,26 +240,26 @@ def elbow(x=0.0):
 
 
 def test_a_handle_is_held_until_it_is_let_go(grips):
-    grips.take(1, "elbow", elbow())
-    grips.move(1, "elbow", np.array([0.3, 0.0, 0.0]))
+    grips.take((1, "elbow"), elbow())
+    grips.move((1, "elbow"), np.array([0.3, 0.0, 0.0]))
     (grip,) = grips.held().values()
     assert grip.pointer.tolist() == [0.3, 0.0, 0.0]
-    grips.release(1, "elbow")
+    grips.release((1, "elbow"))
     assert not grips.held()
 
 
 def test_what_was_dropped_moves_nothing_before_it_is_taken_anew(grips):
-    grips.take(1, "elbow", elbow())
+    grips.take((1, "elbow"), elbow())
     grips.clear()
-    grips.move(1, "elbow", np.array([0.5, 0.0, 0.0]))
+    grips.move((1, "elbow"), np.array([0.5, 0.0, 0.0]))
     assert not grips.held()
-    grips.take(1, "elbow", elbow())
+    grips.take((1, "elbow"), elbow())
     assert grips.held()
 
 
 def test_people_hold_independently_of_each_other(grips):
-    grips.take(1, "elbow", elbow(0.1))
-    grips.take(2, "elbow", elbow(0.2))
+    grips.take((1, "elbow"), elbow(0.1))
+    grips.take((2, "elbow"), elbow(0.2))
     assert len(grips.held()) == 2
     grips.release_all(1)
     assert [holder for holder, _ in grips.held()] == [2]

@@ -48,12 +48,12 @@ def test_a_filter_that_has_not_acted_is_said_to():
 
 
 def test_what_others_have_written_is_not_taken_for_the_pages_own():
-    html = state_html(PageStatus(title="<script>", note="<b>"), rate=100.0, people=2)
+    html = state_html(PageStatus(title="<script>", note="<b>"), people=2)
     assert "<script>" not in html
     assert "<b>" not in html
     assert "2 connected" in html
     assert "recording 1.5 s" in state_html(
-        PageStatus(recording="recording", seconds=1.5), rate=0.0, people=0
+        PageStatus(recording="recording", seconds=1.5), people=0
     )
 
 
@@ -68,11 +68,11 @@ def test_what_can_be_done_now_is_said():
     assert said["stopped", "show it"] == "Save it or discard it."
     assert "Task" in said["stopped", ""]
     assert can_do(PageStatus(doing="servo"), "") == ""
-    assert "Press Start" in state_html(PageStatus(), rate=0.0, people=0)
+    assert "Press Start" in state_html(PageStatus(), people=0)
 
 
 def test_an_arm_that_works_by_itself_says_what_it_does_and_records_nothing():
-    html = state_html(PageStatus(doing="aim & wait", seconds=12.34), rate=0.0, people=0)
+    html = state_html(PageStatus(doing="aim & wait", seconds=12.34), people=0)
     assert "aim &amp; wait" in html
     assert "12.3 s" in html
     assert "saved" not in html

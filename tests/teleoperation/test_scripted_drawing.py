@@ -33,7 +33,7 @@ def test_everything_is_drawn_in_its_interval():
     assert [a.target is not None for a in asked] == [False, False, True, True, False, False]
     first, second = (0.1, 0.0, 0.0), (0.0, 0.2, 0.0)
     assert [a.turn for a in asked] == [None, None, first, first, second, None]
-    assert not any(a.twist.any() or a.nullspace_input.any() for a in asked)
+    assert not any(a.twist.any() or a.effort(7).any() for a in asked)
 
 
 def test_one_draws_while_another_pulls():

@@ -11,6 +11,7 @@ from hrc_learn.kinematics import coarse_orientation, gripper_down, null_space_pr
 from hrc_learn.protocols import ArmState
 from hrc_learn.teleoperation import (
     GuidedPath,
+    InteractionForceConfig,
     ScriptedExpert,
     ScriptedForce,
     ScriptedPerturbation,
@@ -18,6 +19,8 @@ from hrc_learn.teleoperation import (
     force_to_nullspace_input,
 )
 
+# The force stands for the same velocity: what is tested is the mapping.
+PINV = InteractionForceConfig(mapping="pinv", rate=1.0, stiffness=1.0, speed=1e9, damping=1.0)
 WAYPOINTS = np.array([[0.4, 0.0, 0.5], [0.42, -0.2, 0.45], [0.4, -0.35, 0.4], [0.4, -0.6, 0.4]])
 
 
@@ -106,7 +109,7 @@ def test_a_pull_never_moves_the_joint_against_it(joint):
 def test_the_papers_mapping_asks_for_the_velocity_pulled():
     for q in random_configurations(20):
         velocity = np.array([0.05, -0.02, 0.03])
-        d = torch.from_numpy(force_to_nullspace_input(panda, q, 4, velocity, mapping="pinv"))
+        d = torch.from_numpy(force_to_nullspace_input(panda, q, 4, velocity, PINV))
         J = panda.joint_jacobian(torch.from_numpy(q), 4)[:3]
         # Joint 4 cannot leave the sphere around the shoulder: only the part along it is met.
         reachable = (J @ torch.linalg.pinv(J, rtol=1e-6)).numpy() @ velocity
@@ -118,7 +121,7 @@ def test_the_papers_mapping_can_move_the_elbow_against_the_pull():
     worst = 0.0
     for q in random_configurations(300, seed=2):
         pull = rng.normal(size=3)
-        d = torch.from_numpy(force_to_nullspace_input(panda, q, 4, pull, mapping="pinv"))
+        d = torch.from_numpy(force_to_nullspace_input(panda, q, 4, pull, PINV))
         q_t = torch.from_numpy(q)
         motion = null_space_projector(panda.jacobian(q_t)) @ d
         along = float(panda.joint_jacobian(q_t, 4)[:3] @ motion @ torch.from_numpy(pull))
