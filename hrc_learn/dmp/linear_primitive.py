@@ -253,11 +253,11 @@ class LinearPrimitive(nn.Module):
 
     def with_tensors[S: "LinearPrimitive"](self: S, tensors: Mapping[str, Tensor]) -> S:
         """Primitive with other tensors, named as in `tensors`, and the same parts and names."""
-        return type(self)(**self.arguments() | _tensor_arguments(tensors))
+        return type(self)(**self.arguments(tensors))
 
-    def arguments(self) -> dict[str, Any]:
-        """Arguments that make this primitive again."""
-        return _tensor_arguments(self.tensors()) | {
+    def arguments(self, tensors: Mapping[str, Tensor] | None = None) -> dict[str, Any]:
+        """Arguments that make this primitive again, or one with other tensors."""
+        return _tensor_arguments(self.tensors() if tensors is None else tensors) | {
             "basis": self.basis,
             "spring": self.spring,
             "scaling": self.forcing_scale,
