@@ -24,7 +24,7 @@ from timing import time_calls
 from hrc_learn import cli
 from hrc_learn.log import CameraRecording, RunRecording, StepLog
 from hrc_learn.vision import CameraModel, Marker, MarkerDetector, SyntheticCamera
-from hrc_learn.viz.run_dashboard import LiveSender, LogStream, record_run
+from hrc_learn.viz.run_dashboard import LogStream, live_sender, record_run
 
 STEPS = 200  # timed together, since one takes less than the clock resolves
 TARGETS = {"log_step_us": 5.0, "log_live_us": 5.0, "camera_ms": 4.0, "detect_ms": 4.0}
@@ -84,7 +84,7 @@ def measure_live(repeats: int) -> dict[str, float]:
     stream = rr.RecordingStream("benchmark")
     with tempfile.TemporaryDirectory() as folder:
         stream.save(Path(folder) / "live.rrd")
-        with LiveSender(LogStream(log, stream, columns).send, period=0.05):
+        with live_sender(LogStream(log, stream, columns).send, period=0.05):
             for k in range(repeats):
                 began = time.thread_time()
                 for step in range(STEPS):

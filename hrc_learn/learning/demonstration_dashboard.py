@@ -19,7 +19,6 @@ from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Curves, Plot, Tab, limit_curves, several, single, slug
 from hrc_learn.viz.rerun_stream import (
     POSE_RATE,
-    StaticShapes,
     dashboard,
     frame_view,
     markdown_table,
@@ -93,9 +92,8 @@ def record_demonstrations(
                 name, colour = str(demo.episode), _colour(k)
                 send_strips(stream, f"world/paths/{name}", [demo.position], colour, 0.003)
                 send_dot(stream, name, demo.time, demo.position, colour)
-        still = StaticShapes(stream)
         for body in arm:
-            send_shapes(still, body)
+            send_shapes(stream, body)
             send_poses(stream, first.time, body, samples(first.time, POSE_RATE))
         for demo in alone:
             _send_images(stream, demo, images.get(demo.episode, {}))

@@ -1,7 +1,7 @@
 """Sending to Rerun: complete .rrd files, columns instead of single values, and layouts."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -57,9 +57,6 @@ def begin(stream: rr.RecordingStream, title: str) -> None:
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
 
-Logged = rr.AsComponents | tuple[rr.AsComponents, ...]
-
-
 class StaticShapes:
     """Sends static data once, and again only if they changed."""
 
@@ -67,19 +64,11 @@ class StaticShapes:
         self._stream = stream
         self._sent: dict[str, object] = {}
 
-    def send(self, path: str, value: object, make: Callable[[], Logged]) -> None:
-        """Send data to an entity if they changed.
-
-        Args:
-            path: Path of the entity.
-            value: Value that identifies the data.
-            make: Makes the data to send.
-        """
-        if path in self._sent and self._sent[path] == value:
-            return
-        self._sent[path] = value
-        made = make()
-        self._stream.log(path, *(made if isinstance(made, tuple) else (made,)), static=True)
+    def send(self, path: str, *shapes: rr.AsComponents, key: object = None) -> None:
+        """Send data to an entity if their key is new or has changed."""
+        if path not in self._sent or self._sent[path] != key:
+            self._sent[path] = key
+            self._stream.log(path, *shapes, static=True)
 
 
 def seconds(time: Float[np.ndarray, " time"]) -> list[rr.TimeColumn]:
@@ -127,19 +116,18 @@ def body_path(body: Body) -> str:
     return f"world/bodies/{body.name}"
 
 
-def send_shapes(still: StaticShapes, body: Body) -> None:
-    """Send the shapes of a body."""
+def send_shapes(stream: rr.RecordingStream, body: Body) -> None:
+    """Send the shapes of a body: its meshes, or else its capsules, and its boxes."""
     path, plain = body_path(body), body.boxes
     for k, mesh in enumerate(body.meshes):
         for j, part in enumerate(read_mesh(mesh.path)):
-            name = f"{path}/mesh{k}_{j}"
-            still.send(name, (mesh, j), lambda mesh=mesh, part=part: _drawn(mesh, part))
+            stream.log(f"{path}/mesh{k}_{j}", _drawn(mesh, part), static=True)
     if body.meshes:
         plain = tuple(box for box in body.boxes if box.name)
     elif body.capsules:
-        still.send(f"{path}/capsules", body.capsules, lambda: capsules(body.capsules))
+        stream.log(f"{path}/capsules", capsules(body.capsules), static=True)
     if plain:
-        still.send(f"{path}/boxes", plain, lambda: boxes(plain))
+        stream.log(f"{path}/boxes", boxes(plain), static=True)
 
 
 def _drawn(mesh: MeshFile, part: MeshPart) -> rr.Mesh3D:
@@ -363,11 +351,8 @@ class CameraStream:
             image_plane_distance=0.25,
             color=palette.rgba(palette.SKY),
         )
-        self._still.send(
-            "world/camera",
-            (model.pose.tobytes(), model.matrix.tobytes()),
-            lambda: (place, pinhole),
-        )
+        key = (model.pose.tobytes(), model.matrix.tobytes())
+        self._still.send("world/camera", place, pinhole, key=key)
         new = camera.images[self._images :]
         if new:
             self._stream.send_columns(
@@ -399,15 +384,10 @@ class CameraStream:
         seen = np.asarray(np.isfinite(camera.feature).all(axis=-1))
         trails = [[thin(camera.feature[: end + 1][seen[: end + 1]])] for end in ends]
         self._send_lines(f"{_ROOT}/path", time[ends], trails, palette.SKY)
-        self._still.send(
-            f"{_ROOT}/feature",
-            None,
-            lambda: rr.Points2D.from_fields(
-                radii=[-5.0],  # negative: in points of the screen, whatever the zoom
-                colors=[palette.rgba(palette.ORANGE)],
-                draw_order=30.0,
-            ),
-        )
+        orange = [palette.rgba(palette.ORANGE)]
+        # A negative radius is in points of the screen, whatever the zoom.
+        dot = rr.Points2D.from_fields(radii=[-5.0], colors=orange, draw_order=30.0)
+        self._still.send(f"{_ROOT}/feature", dot)
         # A sample without points removes the mark while the feature is not seen.
         columns = rr.Points2D.columns(positions=camera.feature[at][seen[at]])
         self._stream.send_columns(
@@ -422,13 +402,9 @@ class CameraStream:
         colour: str,
     ) -> None:
         """Lines over the image, any number of them at each sample."""
-        self._still.send(
-            path,
-            None,
-            lambda: rr.LineStrips2D.from_fields(
-                radii=[-2.0], colors=[palette.rgba(colour)], draw_order=20.0
-            ),
-        )
+        colours = [palette.rgba(colour)]
+        look = rr.LineStrips2D.from_fields(radii=[-2.0], colors=colours, draw_order=20.0)
+        self._still.send(path, look)
         columns = rr.LineStrips2D.columns(strips=[strip for here in strips for strip in here])
         counts = [len(here) for here in strips]
         self._stream.send_columns(path, seconds(time), columns.partition(counts))

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -38,12 +37,6 @@ from hrc_learn.viz.rerun_stream import (
     tab_view,
     thin,
 )
-
-
-def run_outline(run: RunRecording) -> tuple:
-    """Key of the layout: runs with equal keys have the same layout."""
-    plots = [(tab.title, [plot.title for plot in tab.plots]) for tab in run_tabs(run)]
-    return plots, run.camera is not None, bool(run.phases)
 
 
 def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
@@ -104,6 +97,7 @@ class RunStream:
         self._camera = CameraStream(stream, self._still)
         self._rows = self._phases = self._remarks = 0
         self._outline: tuple | None = None
+        self._drawn: set[str] = set()
 
     def send(self, run: RunRecording) -> None:
         """Send the data of a run that were not sent before.
@@ -111,7 +105,10 @@ class RunStream:
         Args:
             run: The same run as before, as long or longer.
         """
-        outline = run_outline(run)
+        plots = [(tab.title, [plot.title for plot in tab.plots]) for tab in run_tabs(run)]
+        outline = (plots, run.camera is not None, bool(run.phases))
+        if self._outline is None:
+            begin(self._stream, run.title)
         if outline != self._outline:
             self._stream.send_blueprint(run_layout(run, self._finished))
             self._outline = outline
@@ -125,7 +122,7 @@ class RunStream:
 
     def _send_scene(self, run: RunRecording) -> None:
         if run.boxes:
-            self._still.send("world/scene", run.boxes, lambda: boxes(run.boxes))
+            self._still.send("world/scene", boxes(run.boxes), key=run.boxes)
         if run.region is not None:
             region = rr.Boxes3D(
                 centers=[run.region.centre],
@@ -135,18 +132,19 @@ class RunStream:
                 labels=[run.region.name or "region"],
                 show_labels=False,
             )
-            self._still.send("world/region", run.region, lambda: region)
+            self._still.send("world/region", region, key=run.region)
         for name, line, colour, radius in (
             ("demonstration", run.demo_path, palette.DEMO, 0.006),
             ("plan", run.plan_path, palette.ORANGE, 0.005),
         ):
             if line is not None:
-                strip = rr.LineStrips3D(
-                    [thin(line)], radii=[radius], colors=[palette.rgba(colour)]
-                )
-                self._still.send(f"world/paths/{name}", line.tobytes(), lambda s=strip: s)
+                colours = [palette.rgba(colour)]
+                strip = rr.LineStrips3D([thin(line)], radii=[radius], colors=colours)
+                self._still.send(f"world/paths/{name}", strip, key=line.tobytes())
         for body in run.bodies:
-            send_shapes(self._still, body)
+            if body.name not in self._drawn:
+                self._drawn.add(body.name)
+                send_shapes(self._stream, body)
 
     def _send_rows(self, run: RunRecording, first: int) -> None:
         time = run.time
@@ -170,15 +168,13 @@ class RunStream:
         for tab in run_tabs(run):
             for plot in tab.plots:
                 for curves in plot.curves:
-                    self._still.send(curves.path, curves.names, lambda c=curves: style(c))
+                    self._still.send(curves.path, style(curves), key=curves.names)
                     new = replace(curves, values=curves.values[first:])
                     send_rows(self._stream, seconds(time[first:]), new)
 
     def _send_path(self, run: RunRecording, ends: Int[np.ndarray, " ends"]) -> None:
         path, colours = "world/paths/run", [palette.rgba(palette.RUN_ON_DARK)]
-        self._still.send(
-            path, None, lambda: rr.LineStrips3D.from_fields(radii=[0.003], colors=colours)
-        )
+        self._still.send(path, rr.LineStrips3D.from_fields(radii=[0.003], colors=colours))
         strips = [thin(run.position[: end + 1]) for end in ends]
         columns = rr.LineStrips3D.columns(strips=strips)
         self._stream.send_columns(path, seconds(run.time[ends]), columns)
@@ -195,7 +191,7 @@ class RunStream:
         if not len(at):
             return
         path, known = "world/active_region", np.isfinite(region[at]).all(axis=1)
-        self._still.send(path, None, lambda: rr.Boxes3D.from_fields(radii=[0.002]))
+        self._still.send(path, rr.Boxes3D.from_fields(radii=[0.002]))
         shown = at[known]
         colours = [palette.rgba(palette.PERSON if d else palette.TARGET) for d in drawn[shown]]
         columns = rr.Boxes3D.columns(
@@ -214,7 +210,7 @@ class RunStream:
         at: Int[np.ndarray, " chosen"],
     ) -> None:
         """Send lines or arrows between pairs of points, where these are known."""
-        self._still.send(path, None, lambda: look)
+        self._still.send(path, look)
         known = np.isfinite(pairs[at]).all(axis=(1, 2))
         start, end = pairs[at][known].swapaxes(0, 1)
         columns = rr.Arrows3D.columns(origins=start, vectors=end - start)
@@ -273,7 +269,7 @@ class LogStream:
                 for name in self._columns:
                     values = rows[name].reshape(len(rows), -1)
                     for curves in _plot(name, values).curves:
-                        self._still.send(curves.path, None, lambda c=curves: style(c))
+                        self._still.send(curves.path, style(curves))
                         send_rows(self._stream, seconds(rows["time"]), curves)
                 self._rows += len(rows)
 
@@ -288,49 +284,43 @@ def _plot(name: str, values: Shaped[np.ndarray, "rows curves"]) -> Plot:
 _DUTY_CYCLE = 0.2  # largest fraction of the time of a thread spent on sending
 
 
-class LiveSender:
-    """Calls a function a few times a second, and once more when it is closed.
+@contextmanager
+def live_sender(send: Callable[[], object], *, period: float = 0.25) -> Iterator[None]:
+    """Call a function a few times a second in a thread, and once more at the end.
 
     An error of the function ends the thread and is raised where the `with` block is left.
 
         log = StepLog()
-        with LiveSender(LogStream(log, stream, ["joint_position", "feature"]).send):
+        with live_sender(LogStream(log, stream, ["joint_position", "feature"]).send):
             ...  # the loop, which appends to `log`
+
+    Args:
+        send: Sends the new data.
+        period: Time between two calls [s]; longer if sending would take more than a fifth of
+            the time.
     """
+    closing, errors = threading.Event(), []
 
-    def __init__(self, send: Callable[[], object], *, period: float = 0.25):
-        """Prepare the thread; it starts with the `with` block.
-
-        Args:
-            send: Sends the new data.
-            period: Time between two calls [s]; longer if sending would take more than a fifth
-                of the time.
-        """
-        self._send, self._period = send, period
-        self._closing = threading.Event()
-        self._error: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="LiveSender", daemon=True)
-
-    def __enter__(self) -> "LiveSender":
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        self._closing.set()
-        self._thread.join()
-        if self._error is not None and error is None:
-            raise self._error
-
-    def _run(self) -> None:
-        pause = self._period
+    def run() -> None:
+        pause = period
         try:
-            while not self._closing.wait(pause):
+            while not closing.wait(pause):
                 began = time.monotonic()
-                self._send()
-                pause = max(self._period, (time.monotonic() - began) * (1 / _DUTY_CYCLE - 1))
-            self._send()
-        except Exception as error:  # handed over to the thread that closes
-            self._error = error
+                send()
+                pause = max(period, (time.monotonic() - began) * (1 / _DUTY_CYCLE - 1))
+            send()
+        except Exception as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run, name="live_sender", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        closing.set()
+        thread.join()
+    if errors:
+        raise errors[0]
 
 
 @contextmanager
@@ -349,17 +339,11 @@ def live_dashboard(
         period: Time between two updates [s].
     """
     sender = RunStream(stream)
-    begun = False
 
     def send() -> None:
-        nonlocal begun
-        run = snapshot()
-        if run is not None:
-            if not begun:
-                begin(stream, run.title)
-                begun = True
+        if (run := snapshot()) is not None:
             sender.send(run)
 
-    with LiveSender(send, period=period):
+    with live_sender(send, period=period):
         yield
     stream.flush()

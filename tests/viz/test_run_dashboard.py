@@ -17,9 +17,9 @@ from hrc_learn.log import Event, RunRecording, StepLog
 from hrc_learn.viz.panels import run_tabs
 from hrc_learn.viz.rerun_stream import capsules, samples, thin
 from hrc_learn.viz.run_dashboard import (
-    LiveSender,
     LogStream,
     live_dashboard,
+    live_sender,
     record_run,
     run_layout,
 )
@@ -247,7 +247,7 @@ def test_every_step_arrives_once_and_in_order(tmp_path):
     log = StepLog(block=64)
     stream = rr.RecordingStream("test")
     stream.save(tmp_path / "live.rrd")
-    with LiveSender(LogStream(log, stream, ["joint", "error"]).send, period=0.002):
+    with live_sender(LogStream(log, stream, ["joint", "error"]).send, period=0.002):
         for k in range(1000):
             log.append(time=k / 1000, joint=np.full(7, k), error=-k, unsent=0.0)
             if k % 50 == 0:
@@ -265,7 +265,7 @@ def test_every_step_arrives_once_and_in_order(tmp_path):
 def test_an_error_of_the_thread_is_raised_where_it_is_closed():
     log = StepLog()
     log.append(time=0.0)
-    sender = LiveSender(LogStream(log, rr.RecordingStream("test"), ["speed"]).send)
+    sender = live_sender(LogStream(log, rr.RecordingStream("test"), ["speed"]).send)
     with pytest.raises(ValueError, match="speed"), sender:
         pass
 
@@ -274,9 +274,9 @@ def test_an_error_of_the_loop_comes_first():
     def fail() -> None:
         raise ValueError
 
-    with pytest.raises(ZeroDivisionError), LiveSender(fail):
+    with pytest.raises(ZeroDivisionError), live_sender(fail):
         raise ZeroDivisionError
-    assert "LiveSender" not in {thread.name for thread in threading.enumerate()}
+    assert "live_sender" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_rows_are_read_whole_while_another_thread_appends():
