@@ -23,28 +23,20 @@ from typing import Any, NoReturn
 
 from hrc_learn.store import DISK_ERRORS, json_text, parse_json, write_json
 
-EXTRAS = {
-    "tyro": "programs",
-    "rich": "programs",
-    "mujoco": "sim",
-    "cv2": "sim",
-    "pyarrow": "demos",
-    "av": "demos",
-    "scipy": "demos",
-    "rerun": "viz",
-    "matplotlib": "viz",
-    "viser": "ui",
-    "pygame": "gamepad",
-    "forcedimension_core": "haptic",
-    "lerobot": "lerobot",
-    "gymnasium": "lerobot",
-    "franky": "hardware",
-    "pylibfranka": "hardware",
-    "franky_sim": "hardware",
-    "example_robot_data": "meshes",
-    "huggingface_hub": "hub",
-    "httpx": "hub",
+_LIBRARIES = {
+    "programs": ("tyro", "rich"),
+    "sim": ("mujoco", "cv2"),
+    "demos": ("pyarrow", "av", "scipy"),
+    "viz": ("rerun", "matplotlib"),
+    "ui": ("viser",),
+    "gamepad": ("pygame",),
+    "haptic": ("forcedimension_core",),
+    "lerobot": ("lerobot", "gymnasium"),
+    "hardware": ("franky", "pylibfranka", "franky_sim"),
+    "meshes": ("example_robot_data",),
+    "hub": ("huggingface_hub", "httpx"),
 }
+EXTRAS = {library: extra for extra, names in _LIBRARIES.items() for library in names}
 """Extra of the package that installs a library."""
 
 

@@ -5,10 +5,10 @@ here imports a library, so that a mistyped option is found before any work; test
 choices with the definitions they repeat.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 Channel = Literal["joint", "position", "orientation", "pose"]
 """Keys of `hrc_learn.learning.primitive_fitting.CHANNELS`."""
@@ -20,6 +20,25 @@ def sibling(dataset: Path, suffix: str) -> Path:
     """Folder DATASET_suffix next to a dataset, which may be given as "." or ".."."""
     named = dataset if dataset.name not in ("", "..") else dataset.resolve()
     return named.with_name(f"{named.name}_{suffix}")
+
+
+def refuse_given(args: Any, names: Iterable[str], reason: str) -> None:
+    """Refuse options that differ from their defaults.
+
+    Args:
+        args: Arguments of a command.
+        names: Fields that must have their defaults.
+        reason: End of the message, after the name of the option.
+
+    Raises:
+        ValueError: An option was given.
+    """
+    for field_ in fields(args):
+        default = field_.default
+        if field_.default_factory is not MISSING:
+            default = field_.default_factory()
+        if field_.name in names and getattr(args, field_.name) != default:
+            raise ValueError(f"--{field_.name.replace('_', '-')} {reason}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -442,10 +461,7 @@ class WithDriver(WithRobot):
                 f"--arm {self.arm} needs --ip with the address of the arm's control box; "
                 "--ip sim serves the simulated arm there."
             )
-        defaults = {field.name: field.default for field in fields(self)}
-        if given := [name for name in simulated_only if getattr(self, name) != defaults[name]]:
-            option = given[0].replace("_", "-")
-            raise ValueError(f"--{option} is for simulated arms, not for a real one (--ip).")
+        refuse_given(self, simulated_only, "is for simulated arms, not for a real one (--ip)")
         return True
 
 

@@ -2,8 +2,8 @@
 
 import sys
 import webbrowser
+from collections import Counter
 from collections.abc import Mapping
-from itertools import combinations
 from pathlib import Path
 
 from rich.console import Console
@@ -162,7 +162,11 @@ def curate(args: Curate) -> None:
         FileNotFoundError: There is no dataset.
         ValueError: An episode is named twice or does not exist, or a cut leaves nothing.
     """
-    _refuse_contradictions(args)
+    named = Counter([*args.accept, *args.cut, *args.reject])
+    if twice := [episode for episode, count in named.items() if count > 1]:
+        raise ValueError(
+            f"--accept, --cut and --reject name episode {min(twice)} twice: decide on one"
+        )
     _require_dataset(args.dataset)
     ranking = rank_episodes(
         args.dataset,
@@ -199,15 +203,6 @@ def curate(args: Curate) -> None:
             f"--write makes the cleaned dataset"
         )
     write_values(args.json, values)
-
-
-def _refuse_contradictions(args: Curate) -> None:
-    options = {"accept": {*args.accept}, "cut": {*args.cut}, "reject": {*args.reject}}
-    for (one, first), (other, second) in combinations(options.items(), 2):
-        if first & second:
-            raise ValueError(
-                f"--{one} and --{other} both name episode {min(first & second)}: decide on one"
-            )
 
 
 def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:

@@ -6,7 +6,7 @@ An experiment that is given no model uses the demo's, which is learned first if 
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -22,6 +22,7 @@ from hrc_learn.cli.arguments import (
     Run,
     WithImperfections,
     WithRobot,
+    refuse_given,
 )
 from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment, Pulls
 from hrc_learn.experiments.collaboration_trial import Disturbances
@@ -80,7 +81,9 @@ class _Settings:
 def run(args: Run) -> int:
     """Run an experiment, in simulation or on a real arm."""
     args = replace(args, out=args.out or Path("outputs") / args.experiment)
-    _refuse_inapplicable(args)
+    for name, experiments in _APPLIES.items():
+        if args.experiment not in experiments:
+            refuse_given(args, [name], f"is an option of hrc run {' and '.join(experiments)}")
     refuse_existing(_folder(args), args.overwrite)
     is_real = args.drives_real_arm(_SIMULATED_ONLY)
     experiment = _experiment(_with_models(args))
@@ -104,16 +107,6 @@ def run(args: Run) -> int:
 def _folder(args: Run) -> Path:
     assert args.out is not None
     return args.out
-
-
-def _refuse_inapplicable(args: Run) -> None:
-    defaults = {field.name: field.default for field in fields(args)}
-    for name, experiments in _APPLIES.items():
-        if args.experiment not in experiments and getattr(args, name) != defaults[name]:
-            raise ValueError(
-                f"--{name.replace('_', '-')} is an option of hrc run "
-                f"{' and '.join(experiments)}, not of {args.experiment}"
-            )
 
 
 def _experiment(args: Run) -> Experiment[Any]:
@@ -297,14 +290,13 @@ def learn(
     made_of = [software_versions(), code, robot.robot, robot.tip]
     for number, step in enumerate(_learning_steps(out, robot), start=1):
         title, work, folders = step
-        digest = [*made_of, *map(_digest, folders)]
-        if not again and done.get(folders[-1].name) == digest:
-            title = f"{title}: up to date in {folders[-1]}"
-            _announce(console, number, steps, title)
+        name, digest = folders[-1].name, [*made_of, *map(_digest, folders)]
+        if not again and done.get(name) == digest:
+            _announce(console, number, steps, f"{title}: up to date in {folders[-1]}")
             continue
         _announce(console, number, steps, title)
         work()
-        done[folders[-1].name] = [*made_of, *map(_digest, folders)]
+        done[name] = [*made_of, *map(_digest, folders)]
         write_json(ledger, done)
 
 
@@ -320,42 +312,26 @@ def _digest(folder: Path, pattern: str = "*") -> str:
 
 def _learning_steps(
     out: Path, robot: WithRobot
-) -> Iterator[tuple[str, Callable[[], None], list[Path]]]:
+) -> Iterator[tuple[str, Callable[[], object], list[Path]]]:
     """Title and work of each step, and the folders that it reads, its result last."""
     from hrc_learn.cli.fit_command import fit_primitives
     from hrc_learn.cli.image_jacobian_commands import fit_image_jacobian
     from hrc_learn.cli.record_command import record
 
     def demonstrate(scenario: Any, folder: Path) -> None:
-        arguments = Record(
-            scenario=scenario, out=folder, robot=robot.robot, tip=robot.tip, overwrite=True
-        )
-        if record(arguments):
+        chosen = {"robot": robot.robot, "tip": robot.tip, "overwrite": True}
+        if record(Record(scenario=scenario, out=folder, **chosen)):
             raise RuntimeError(f"the scripted expert failed to demonstrate {scenario}")
 
-    placing, aiming = out / "placing_demos", out / "aiming_demos"
-    yield (
-        "Demonstrations of placing",
-        lambda: demonstrate("placing", placing),
-        [placing],
-    )
-    yield (
-        "Demonstrations of servoing with an uncalibrated camera",
-        lambda: demonstrate("servoing", aiming),
-        [aiming],
-    )
-    primitives = FitPrimitives(dataset=placing, out=out / "placing", overwrite=True)
-    yield (
-        "Movement primitives of placing",
-        lambda: fit_primitives(primitives),
-        [placing, out / "placing"],
-    )
-    jacobian = FitImageJacobian(dataset=aiming, out=out / "aiming", overwrite=True)
-    yield (
-        "Image Jacobian of servoing",
-        lambda: fit_image_jacobian(jacobian),
-        [aiming, out / "aiming"],
-    )
+    shown, watched = out / "placing_demos", out / "aiming_demos"
+    placing, aiming = out / "placing", out / "aiming"
+    primitives = FitPrimitives(dataset=shown, out=placing, overwrite=True)
+    jacobian = FitImageJacobian(dataset=watched, out=aiming, overwrite=True)
+    title = "Demonstrations of servoing with an uncalibrated camera"
+    yield "Demonstrations of placing", lambda: demonstrate("placing", shown), [shown]
+    yield title, lambda: demonstrate("servoing", watched), [watched]
+    yield "Movement primitives of placing", lambda: fit_primitives(primitives), [shown, placing]
+    yield "Image Jacobian of servoing", lambda: fit_image_jacobian(jacobian), [watched, aiming]
 
 
 def _announce(console: Console, step: int, steps: int, title: str) -> None:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from hrc_learn import distributed
 from hrc_learn.cli._run import command_line, configuration, refuse_repeats, write_values
-from hrc_learn.cli.arguments import FitPrimitives
+from hrc_learn.cli.arguments import FitPrimitives, refuse_given
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.learning.fit_dashboards import fit_report, record_fit, shown_fit
@@ -38,19 +38,17 @@ def fit_primitives(args: FitPrimitives) -> None:
     torch.manual_seed(0)
     console = Console()
     refuse_repeats(args.episodes)
+    _refuse_contradictions(args)
     if args.as_lerobot_policy:
         _fit_policy(args, console)
         return
     if args.several == "streamed":
-        _fit_streamed(args, console)
+        _fit_streamed(args)
         return
-    _refuse_unused_context(args)
     source = open_demos(args.dataset, **_wanted(args), keep_contract=args.keep_contract)
     demos = sampled(source)
-    for note in demos.notes:
-        console.print(f"note: {note}", soft_wrap=True)
-    if _is_sample(demos, source):
-        console.print(f"note: {_SAMPLE_NOTE}", soft_wrap=True)
+    notes = [*demos.notes, _SAMPLE_NOTE] if _is_sample(demos, source) else demos.notes
+    print(*(f"note: {note}\n" for note in notes), sep="", end="")
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(source)} demonstrations"):
             fitted, metrics = _learn(args, source, demos, folder)
@@ -83,13 +81,7 @@ def _learn(
     """
     # Only some channels take a scaling.
     scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
-    fitted = fit(
-        demos,
-        args.n_basis,
-        args.method,
-        channels=args.channels,
-        **scaled,
-    )
+    fitted = fit(demos, args.n_basis, args.method, channels=args.channels, **scaled)
     if _is_sample(demos, source):
         fitted = fit_all(fitted, source)
     metrics = fitted.metrics()
@@ -106,20 +98,22 @@ def _is_sample(demos: DemonstrationSet, source: DemonstrationSource) -> bool:
     return len(demos) < len(source) or demos.frames < source.frames
 
 
-def _refuse_unused_context(args: FitPrimitives) -> None:
-    """Refuse --context with models that are no function of it."""
-    if not args.context:
+def _refuse_contradictions(args: FitPrimitives) -> None:
+    """Refuse options that the chosen model would ignore."""
+    if args.as_lerobot_policy:
+        model, others = "--as-lerobot-policy", ["channels", "joint_names", "units", "mapping"]
+        others += ["context", "several", "method", "scaling"]
+    elif args.several == "streamed":
+        model, others = "--several streamed", ["context", "method", "scaling"]
+    elif args.several not in ("best", "contextual"):
+        model, others = f"--several {args.several}", ["context"]
+    elif args.several == "best" and args.scaling != "none":
+        model, others = f"--scaling {args.scaling}", ["context"]
+    else:
         return
-    if args.several not in ("best", "contextual"):
-        raise ValueError(
-            f"--several {args.several} does not use --context: leave it out, or learn a "
-            f"function of it with --several contextual"
-        )
-    if args.several == "best" and args.scaling != "none":
-        raise ValueError(
-            f"--scaling {args.scaling} does not use --context: leave one of them out, or give "
-            f"--several contextual"
-        )
+    refuse_given(args, others, f"is not used by {model}: leave one of them out")
+    if args.n_basis is None and (args.as_lerobot_policy or args.several == "streamed"):
+        raise ValueError(f"{model} needs a number of basis functions: --n-basis 60")
 
 
 _SAMPLE_NOTE = (
@@ -138,18 +132,12 @@ def _wanted(args: FitPrimitives) -> dict[str, Any]:
     }
 
 
-def _fit_streamed(args: FitPrimitives, console: Console) -> None:
-    if args.context or (args.method, args.scaling) != ("trajectory", "none"):
-        raise ValueError(
-            "--several streamed is an unscaled least-squares fit: it takes neither --method "
-            "nor --scaling nor --context"
-        )
-    if args.n_basis is None:
-        raise ValueError("--several streamed needs a number of basis functions: --n-basis 60")
+def _fit_streamed(args: FitPrimitives) -> None:
+    assert args.n_basis is not None
     with distributed.processes() as rank:
         demos = open_demos(args.dataset, **_wanted(args))
         for note in () if rank else demos.notes:
-            console.print(f"note: {note}")
+            print(f"note: {note}")
         fits, metrics = fit_streamed(demos, args.n_basis, channels=args.channels)
         if rank:
             return
@@ -163,24 +151,13 @@ def _fit_policy(args: FitPrimitives, console: Console) -> None:
     # LeRobot takes ten seconds to import.
     from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
-    given = (args.channels, args.context, args.joint_names, args.units, args.mapping)
-    if any(given) or (args.several, args.method, args.scaling) != (
-        "best",
-        "trajectory",
-        "none",
-    ):
-        raise ValueError(
-            "--as-lerobot-policy learns the dataset's actions from its observations: it takes "
-            "--n-basis and --episodes only"
-        )
-    if args.n_basis is None:
-        raise ValueError("--as-lerobot-policy needs a number of basis functions: --n-basis 50")
+    assert args.n_basis is not None
     if (args.dataset / "meta/info.json").is_file():
         dataset, kept = open_dataset(args.dataset), ""
         if args.keep_contract:
             dataset, kept = dataset.keep_first_contract()
         for note in filter(None, (kept, dataset.contract_note)):
-            console.print(f"note: {note}", soft_wrap=True)
+            print(f"note: {note}")
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status("Fitting a policy"):
             metrics = write_closed_form_policy(
@@ -194,10 +171,7 @@ def _made_by(args: FitPrimitives) -> dict:
 
 
 def _draw(
-    fitted: FittedPrimitives,
-    args: FitPrimitives,
-    metrics: dict[str, float],
-    folder: Path,
+    fitted: FittedPrimitives, args: FitPrimitives, metrics: dict[str, float], folder: Path
 ) -> None:
     """Write report and recording of the fit, unless only orientations were learned."""
     if set(fitted.each) == {"orientation"}:

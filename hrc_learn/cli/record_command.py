@@ -1,8 +1,8 @@
 """`hrc record`: demonstrations by a scripted expert, in simulation."""
 
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from rich.progress import Progress, track
@@ -36,15 +36,10 @@ _DEFAULTS = {"placing": (3, 0), "servoing": (8, 1), "expert": (10, 0)}
 
 
 @dataclass(frozen=True, kw_only=True)
-class _PlacingSettings:
-    demonstration: PlacingDemonstrationConfig = field(
-        default_factory=PlacingDemonstrationConfig
-    )
+class _Settings[Config]:
+    """Settings of the demonstrations."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class _ServoingSettings:
-    demonstration: ServoDemonstrationConfig = field(default_factory=ServoDemonstrationConfig)
+    demonstration: Config
 
 
 def record(args: Record) -> int:
@@ -70,62 +65,42 @@ def record(args: Record) -> int:
 
 def _record_placing(args: Record, episodes: int, seed: int) -> None:
     """Placing on a shelf: end effector and null-space posture at once."""
-    config = with_settings(args.config, _PlacingSettings()).demonstration
+    settings = _Settings(demonstration=PlacingDemonstrationConfig())
+    config = with_settings(args.config, settings).demonstration
     workplace, world, rng = _work_cell(args, seed)
     goal = workplace.shelf(args.shelf).position.numpy()
-    discarded, errors = [], []
+    discarded, errors = 0, []
 
-    def demonstrations() -> Iterator[list[Frame]]:
-        for _ in track(range(episodes), description="Placing demonstrations"):
-            frames, contacts = demonstrate_placing_without_contact(
-                world, workplace, args.shelf, config, rng, SIMULATED.open
-            )
-            discarded.append(contacts)
-            errors.append(float(np.linalg.norm(frames[-1]["position"] - goal)))
-            yield frames
+    def demonstrate() -> list[Frame]:
+        nonlocal discarded
+        frames, contacts = demonstrate_placing_without_contact(
+            world, workplace, args.shelf, config, rng, SIMULATED.open
+        )
+        discarded += contacts
+        errors.append(1e3 * float(np.linalg.norm(frames[-1]["position"] - goal)))
+        return frames
 
-    write_demonstrations(
-        args.out,
-        demonstrations(),
-        f"place the box on the {args.shelf} shelf",
-        config.fps,
-        robot=workplace.robot,
-        details={"shelf": args.shelf, **_details(args)},
-        overwrite=args.overwrite,
-    )
-    print(f"{episodes} demonstrations in {args.out} ({sum(discarded)} discarded)")
-    values = {
-        "episodes": episodes,
-        "discarded": sum(discarded),
-        "final_error_mm_max": 1e3 * max(errors),
-    }
+    _write(args, workplace, demonstrate, f"place the box on the {args.shelf} shelf", config.fps)
+    print(f"{episodes} demonstrations in {args.out} ({discarded} discarded)")
+    values = {"episodes": episodes, "discarded": discarded, "final_error_mm_max": max(errors)}
     write_values(args.json, values)
 
 
 def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     """Visual servoing to an object with an uncalibrated camera."""
-    config = with_settings(args.config, _ServoingSettings()).demonstration
+    settings = _Settings(demonstration=ServoDemonstrationConfig())
+    config = with_settings(args.config, settings).demonstration
     workplace, world, rng = _work_cell(args, seed)
     sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
     visible = []
 
-    def demonstrations() -> Iterator[list[Frame]]:
-        for _ in track(range(episodes), description="Servoing demonstrations"):
-            frames = demonstrate_servoing(world, workplace, sensor, config, rng, SIMULATED.open)
-            visible.append(float(np.mean([bool(f["feature_visible"]) for f in frames])))
-            yield frames
+    def demonstrate() -> list[Frame]:
+        frames = demonstrate_servoing(world, workplace, sensor, config, rng, SIMULATED.open)
+        visible.append(float(np.mean([bool(f["feature_visible"]) for f in frames])))
+        return frames
 
     features = {OBJECT_FEATURE: OBJECT_FEATURE_NAMES, ANGLE_FEATURE: ANGLE_FEATURE_NAMES}
-    write_demonstrations(
-        args.out,
-        demonstrations(),
-        "servo to the box",
-        config.fps,
-        robot=workplace.robot,
-        features=features,
-        details=_details(args),
-        overwrite=args.overwrite,
-    )
+    _write(args, workplace, demonstrate, "servo to the box", config.fps, features)
     seen = 100 * min(visible)
     print(f"{episodes} demonstrations in {args.out}, marker visible in {seen:.0f} %")
     write_values(args.json, {"episodes": episodes, "marker_seen_min": min(visible)})
@@ -136,8 +111,27 @@ def _work_cell(args: Record, seed: int) -> tuple[Workplace, World, np.random.Gen
     return workplace, World(workplace.scene), np.random.default_rng(seed)
 
 
-def _details(args: Record) -> dict[str, object]:
-    return {"scene": "hrc_learn workplace", "recorded with": configuration(args)}
+def _write(
+    args: Record,
+    workplace: Workplace,
+    demonstrate: Callable[[], list[Frame]],
+    task: str,
+    fps: float,
+    features: Mapping[str, Sequence[str]] | None = None,
+) -> None:
+    """Record the demonstrations into the dataset, one after another."""
+    assert args.episodes is not None
+    title = f"Demonstrations of {args.scenario}"
+    write_demonstrations(
+        args.out,
+        (demonstrate() for _ in track(range(args.episodes), description=title)),
+        task,
+        fps,
+        robot=workplace.robot,
+        features=features,
+        details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
+        overwrite=args.overwrite,
+    )
 
 
 def _record_expert(args: Record, episodes: int, seed: int) -> None:

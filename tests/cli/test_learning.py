@@ -98,13 +98,13 @@ def test_an_error_that_is_no_number_meets_no_limit(poses, tmp_path, monkeypatch)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--several", "streamed", "--method", "ridge"), "neither --method nor"),
-        (("--several", "streamed", "--scaling", "amplitude"), "neither --method nor"),
-        (("--several", "streamed", "--context", "size"), "neither --method nor"),
+        (("--several", "streamed", "--method", "ridge"), "--method is not used by"),
+        (("--several", "streamed", "--scaling", "amplitude"), "--scaling is not used by"),
+        (("--several", "streamed", "--context", "size"), "--context is not used by"),
         (("--several", "streamed", "--n-basis", "None"), "--n-basis 60"),
         (("--several", "streamed", "--n-basis", 0), "at least 2 functions, got 0"),
-        (("--several", "mean", "--context", "size"), "does not use --context"),
-        (("--scaling", "amplitude", "--context", "size"), "does not use --context"),
+        (("--several", "mean", "--context", "size"), "--context is not used by"),
+        (("--scaling", "amplitude", "--context", "size"), "--context is not used by"),
         (("--episodes", 0, 1, 0), "--episodes names 0 more than once"),
     ],
 )

@@ -217,7 +217,7 @@ def test_an_episode_is_not_decided_on_twice(odd, one, other):
         name: (f"--{name}", 3, *(("5:20",) if name == "cut" else ())) for name in (one, other)
     }
     error = done("curate", odd, *words[one], *words[other], status=2).error
-    assert f"--{one} and --{other} both name episode 3" in error
+    assert "--accept, --cut and --reject name episode 3 twice" in error
     assert not decisions_path(odd).exists()
 
 
