@@ -73,20 +73,16 @@ class Found:
 
 
 def points_of(robot: Arm, q: Float[Tensor, "batch n"]) -> Float[Tensor, "batch 3 3 n"]:
-    """Linear Jacobians of the tool, the end of a load, and the elbow (the middle joint)."""
-    pose, J = robot.forward_and_jacobian(q)
-    w = pose.orientation
-    axis = torch.stack(
-        [
-            2 * (w[:, 1] * w[:, 3] + w[:, 0] * w[:, 2]),
-            2 * (w[:, 2] * w[:, 3] - w[:, 0] * w[:, 1]),
-            1 - 2 * (w[:, 1] ** 2 + w[:, 2] ** 2),
-        ],
-        dim=-1,
-    )
-    load = J[:, :3] + torch.linalg.cross(J[:, 3:], _LOAD * axis[..., None], dim=1)
-    elbow = robot.joint_jacobian(q, q.shape[-1] // 2 + 1)[:, :3]
-    return torch.stack([J[:, :3], load, elbow], dim=1)
+    """Linear Jacobians of the tool, the end of a load, and the elbow."""
+    J, load = robot.jacobian(q), load_of(robot, q)
+    end = J[:, :3] + torch.linalg.cross(J[:, 3:], load[..., None], dim=1)
+    elbow = robot.joint_jacobian(q, robot.elbow)[:, :3]
+    return torch.stack([J[:, :3], end, elbow], dim=1)
+
+
+def load_of(robot: Arm, q: Float[Tensor, "batch n"]) -> Float[Tensor, "batch 3"]:
+    """Vector from the tool to the far end of the load [m]."""
+    return _LOAD * robot.forward(q).matrix()[..., :3, 2]
 
 
 @torch.inference_mode()
@@ -152,7 +148,7 @@ def _run(
             u.to(dtype),
             dt,
             jacobian=robot.jacobian(q).to(dtype),
-            points=points[:, 1:].to(dtype),
+            load=load_of(robot, q).to(dtype),
         )
         v = velocity.double()
         q = q + dt * v

@@ -102,15 +102,15 @@ def hostile_streams(config: StreamConfig, safety: SafetyFilter | None = None) ->
             reading, u = given[:, :7], given[:, 7:14]
             J = given[:, 14:].view_as(J)
             poisonings += int(hit.sum())
+        stale = uniform(rng, count, 1) < config.event
         v, state, _ = safety.step(
             state,
-            reading,
+            reading.masked_fill(stale, torch.nan),
             u,
             step,
             jacobian=J,
             human_distance=_where(rng, count, config.event, 0.3, 3.0),
             stop=uniform(rng, count) < config.event,
-            stale=uniform(rng, count) < config.event,
         )
         q = q + dt * v
         positions.append(q)

@@ -292,7 +292,8 @@ def _run_serve(
     took, late = np.empty(steps), np.empty(steps)
     observation["joint_position"][:] = arm.read().joint_position
     runner.step()  # the first step is slower than all others
-    runner.start(arm.read().joint_position)
+    reading = arm.read()
+    runner.start(reading.joint_position, reading.joint_velocity)
     rate = Rate(dt)
     with ending_at_rest(lambda: arm.command(np.zeros(len(chain.joint_names)))):
         for k in range(steps):

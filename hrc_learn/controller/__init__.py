@@ -23,12 +23,12 @@ from hrc_learn.controller.interface import Observation as Observation
 from hrc_learn.controller.resolved_rate import BlendingConfig as BlendingConfig
 from hrc_learn.controller.resolved_rate import VisionBlending as VisionBlending
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
-from hrc_learn.controller.safety_filter import VelocityStep as VelocityStep
-from hrc_learn.controller.safety_filter import WantedVelocity as WantedVelocity
 from hrc_learn.controller.safety_state import INTERVENTIONS as INTERVENTIONS
 from hrc_learn.controller.safety_state import SafetyConfig as SafetyConfig
 from hrc_learn.controller.safety_state import SafetyReport as SafetyReport
 from hrc_learn.controller.safety_state import SafetyState as SafetyState
 from hrc_learn.controller.task_pace import WayMakingConfig as WayMakingConfig
+from hrc_learn.controller.velocity_step import VelocityStep as VelocityStep
+from hrc_learn.controller.velocity_step import WantedVelocity as WantedVelocity
 from hrc_learn.watchdog import Watchdog as Watchdog
 from hrc_learn.watchdog import WatchdogError as WatchdogError

@@ -39,7 +39,7 @@ from hrc_learn.controller.resolved_rate import (
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.controller.task_pace import WayMakingConfig, way_making_velocity
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import ArrayLike, is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain, TaskSpace, task_basis, task_rank
@@ -148,8 +148,6 @@ class _Motion(NamedTuple):
     """Twist of the task alone."""
     xi_q: Tensor
     """Joint-space feedback."""
-    bounds: tuple[Tensor, Tensor]
-    """Lowest and highest velocities allowed by position and velocity limits."""
     pose_drift: PoseDrift | None
     """Measured drift; None: not compensated."""
     jacobian: Tensor
@@ -206,7 +204,7 @@ class AdaptiveController(nn.Module):
         limits = arm.limits
         self.joint_region = joint_region or JointRegion.from_limits(limits.lower, limits.upper)
         self.blending = VisionBlending(config.blending)
-        self.safety = SafetyFilter(limits, config.safety)
+        self.safety = SafetyFilter(arm, config.safety)
         caps = [
             [config.linear_speed, config.angular_speed],
             [config.approach_linear_speed, config.approach_angular_speed],
@@ -319,7 +317,7 @@ class AdaptiveController(nn.Module):
         motion = self._motion(state, observation, goals, q, pose, J, task_level, feedback.s)
         sound = timed & _all_finite(motion.joint_velocity, feedback.xi_x, feedback.xi_r)
         v, safety, report = self._filtered(
-            state.safety, observation, q, motion, J, stop, stale | ~sound
+            state.safety, observation, q, motion, pose, J, stop, stale | ~sound
         )
         pose_drift = self._next_drift(state.pose_drift, motion, v, dt, sound, safety)
         command = Command(
@@ -360,27 +358,28 @@ class AdaptiveController(nn.Module):
         observation: Observation,
         q: Tensor,
         motion: _Motion,
+        pose: Pose,
         J: Tensor,
         stop: Tensor | None,
-        stale: Tensor,
+        unknown: Tensor,
     ) -> tuple[Tensor, SafetyState, SafetyReport]:
-        """Step of the safety filter."""
+        """Step of the safety filter, which brakes where something is unknown."""
         if observation.stop is not None:
             stop = observation.stop if stop is None else stop | observation.stop
         distances = observation.distances
         if self.config.safety.constraints is None and self.config.way_making is not None:
             distances = None  # used for way-making alone, not kept
+        load = observation.load
         return self.safety.step(
             state,
             q,
-            motion.joint_velocity,
+            motion.joint_velocity.masked_fill(unknown.unsqueeze(-1), math.nan),
             observation.dt,
             jacobian=J,
+            load=None if load is None else quaternion.rotate(pose.orientation, load),
             joint_velocity=observation.joint_velocity,
             human_distance=observation.human_distance,
             stop=stop,
-            stale=stale,
-            bounds=motion.bounds,
             distances=distances,
         )
 
@@ -433,9 +432,7 @@ class AdaptiveController(nn.Module):
             basis = self._basis(goals, pose, J)
         bounds = self.safety.velocity_bounds(q)
         task, null = self._resolved(goals, q, J, basis, twist, null, task_level, bounds)
-        return _Motion(
-            task + null, null, twist, task_twist, xi_q, bounds, pose_drift, controlled
-        )
+        return _Motion(task + null, null, twist, task_twist, xi_q, pose_drift, controlled)
 
     def _resolved(
         self,

@@ -52,8 +52,9 @@ from hrc_learn.controller.task_pace import (
     people_bind,
     way_making_velocity,
 )
+from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.numerics import null_projection
-from hrc_learn.kinematics import JointLimits, SerialChain
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
 # Null-space input below which one that has ended is over [N m].
@@ -69,20 +70,18 @@ class ArmLoop:
         chain: SerialChain,
         config: ArmLoopConfig | None = None,
         clearance: Clearance | None = None,
-        limits: JointLimits | None = None,
     ):
         """Put the parts together.
 
         Args:
-            chain: Kinematics of the arm.
+            chain: Kinematics and limits of the arm.
             config: Settings of the loop.
             clearance: Distance of the arm from itself and its surroundings; None: a push can
                 move it anywhere within its limits.
-            limits: Limits of the joints; None: those of the chain.
         """
         self.chain, self.clearance = chain, clearance
         self.config = config = config or ArmLoopConfig()
-        self._tracking = PoseTracking(chain, config, clearance, limits or chain.limits)
+        self._tracking = PoseTracking(chain, config, clearance)
         self._paths = PathLaw(self._tracking)
         self.safety = self._tracking.safety
 
@@ -91,6 +90,7 @@ class ArmLoop:
         joint_position: Float[Tensor, "*batch n"],
         time: float = 0.0,
         joint_velocity: Float[Tensor, "*batch n"] | None = None,
+        joint_acceleration: Float[Tensor, "*batch n"] | None = None,
     ) -> ArmLoopState:
         """State of arms that follow no path.
 
@@ -98,12 +98,15 @@ class ArmLoop:
             joint_position: Joint positions [rad].
             time: Reading of the clock [s].
             joint_velocity: Measured joint velocities [rad/s]; None: at rest.
+            joint_acceleration: Joint accelerations [rad/s^2]; None: zero.
         """
         still = torch.zeros_like(joint_position)
         clock = still[..., 0] + time
         never = torch.zeros_like(clock, dtype=torch.bool)
         return ArmLoopState(
-            safety=self.safety.initial_state(joint_position, joint_velocity),
+            safety=self.safety.initial_state(
+                joint_position, joint_velocity, joint_acceleration
+            ),
             pace=TaskPace.begin(clock, self.config.speed),
             null_velocity=still,
             return_velocity=still,
@@ -252,13 +255,14 @@ class ArmLoop:
     ) -> tuple[Tensor, ArmLoopState, ArmReport]:
         """Send a joint velocity through the safety filter."""
         velocity = wanted.joint_velocity
-        J, scale = reading.jacobian, reading.person_speed_scale
+        J, load = reading.jacobian, reading.load
         sent, safety, filtered = self.safety.step(
             state.safety,
             reading.joint_position,
-            _scaled(velocity, scale),
+            _scaled(velocity, reading.person_speed_scale),
             self.config.dt,
             jacobian=J,
+            load=None if load is None else quaternion.rotate(reading.pose.orientation, load),
             distances=reading.distances,
             stop=reading.stop,
         )

@@ -70,6 +70,9 @@ class ArmReading:
     """Push of a person on the null space [N m]."""
     pause: Bool[Tensor, "*batch"]
     """True while a person pauses the task."""
+    load: Float[Tensor, "*batch 3"] | None = None
+    """Far end of a load in the frame of the end effector, whose speed is capped as well [m];
+    None: no load."""
     distances: Distances | None = None
     """Distances from people, which the safety filter keeps; None: people are not tracked."""
     person_speed_scale: Float[Tensor, "*batch"] | None = None

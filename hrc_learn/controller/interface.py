@@ -199,6 +199,9 @@ class Observation:
     human_distance: Float[Tensor, "*batch"] | None = None
     """Distance of the nearest person from the tool [m], which slows and stops the tool; NaN
     (unknown): stop. None: no person is monitored."""
+    load: Float[Tensor, "*batch 3"] | None = None
+    """Far end of a load in the frame of the tool centre point, whose speed is capped as well
+    [m]; None: no load."""
     distances: Distances | None = None
     """Distances of the arm from itself, the scene and people, kept by
     `SafetyConfig.constraints`; None: none."""

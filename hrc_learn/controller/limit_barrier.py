@@ -294,6 +294,10 @@ class SpeedBarrier(nn.Module):
     *Joint limits.* Near its position limits a joint follows its own barrier, whose velocity
     decays at most at the rate A/c. Braking faster than y v, it leaves y v by at most
     (1 - (1 + log rho)/rho) v with rho = T A/c > 1.
+
+    *Delay and jitter.* Positions that are read a time D before the motion have changed since by
+    at most D (x + A D), which turns the links further, and from one reading to the next by
+    dt (x + A D). A step lasts up to (1 + jitter) dt.
     """
 
     deceleration: Tensor
@@ -306,15 +310,22 @@ class SpeedBarrier(nn.Module):
     """Largest A/c of the joints [1/s]."""
     distal: Tensor
     """1 at (i, j) for j not before i (n, n)."""
+    slowing: Tensor
+    """A D, by which a joint may have been faster when its position was read [rad/s]."""
 
-    def __init__(self, joints: LimitBarrier, cap: float):
+    def __init__(
+        self, joints: LimitBarrier, cap: float, *, delay: float = 0.0, jitter: float = 0.0
+    ):
         """Compute the constants of the barrier.
 
         Args:
             joints: Barrier of the joint limits.
             cap: The usual cap [m/s]; the barrier holds for any other as well.
+            delay: D, time from a reading to the motion that results from it [s].
+            jitter: Largest relative excess of a step over its dt.
         """
         super().__init__()
+        self.delay, self.stretch = delay, 1 + jitter
         A, j = joints.acceleration, joints.jerk
         gentle = min(cap, 1.0) * (2 * _RAMP * j * joints.velocity).sqrt()
         # A joint that may not move has a velocity limit of zero.
@@ -325,6 +336,7 @@ class SpeedBarrier(nn.Module):
             "fade": (deceleration / j).amax() / 2,
             "decay": (joints.twice_acceleration / (2 * joints.knee)).amax(),
             "distal": torch.ones(len(A), len(A)).triu().to(A),
+            "slowing": A * delay,
         }
         for name, value in constants.items():
             self.register_buffer(name, value)
@@ -343,7 +355,7 @@ class SpeedBarrier(nn.Module):
         """Bound on the speed of all points during a step and the braking after it [m/s].
 
         Args:
-            points: Linear Jacobians of the points at the start of the step.
+            points: Linear Jacobians of the points at the positions read last.
             velocity: Joint velocity of the step [rad/s].
             acceleration: Acceleration with which it was reached [rad/s^2].
             dt: The step [s].
@@ -360,17 +372,23 @@ class SpeedBarrier(nn.Module):
         excess = excess + (1 - (1 + rho.log()) / rho) * x
         fastest = x + excess
 
-        growth = (fastest * (T / 2 + dt)).sum(-1, keepdim=True).exp()
+        late, before = self.stretch * dt + self.delay, fastest + self.slowing
+        growth = (fastest * T / 2 + before * late).sum(-1, keepdim=True).exp()
         columns = torch.linalg.vector_norm(points, dim=-2) * growth.unsqueeze(-1)
         R = (columns.unsqueeze(-2) * self.distal).amax(-1)
-        # sum_ij R_max(i,j) x_i x_j, by sums of x up to each joint.
-        sums = (fastest.unsqueeze(-2) * self.distal.mT).sum(-1)
-        pairs = (fastest * (2 * sums - fastest)).unsqueeze(-2)
-        B = torch.linalg.vecdot(R, pairs)
+        B = turned = self._turning(R, fastest, fastest)
+        if self.delay > 0:
+            turned = self._turning(R, fastest, before)
         moved = torch.linalg.vecdot(points, velocity.unsqueeze(-2).unsqueeze(-2))
-        M = torch.linalg.vector_norm(moved, dim=-1) + dt * B
+        M = torch.linalg.vector_norm(moved, dim=-1) + late * turned
         aside = torch.linalg.vecdot(R, excess.unsqueeze(-2))
         return (_peak(M, B * (T + self.fade) / 2) + aside).amax(-1, keepdim=True)
+
+    def _turning(self, R: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """sum_ij R_max(i,j) x_i y_j, by sums up to each joint."""
+        up_to_x, up_to_y = ((v.unsqueeze(-2) * self.distal.mT).sum(-1) for v in (x, y))
+        pairs = x * up_to_y + y * up_to_x - x * y
+        return torch.linalg.vecdot(R, pairs.unsqueeze(-2))
 
 
 def _peak(M: Tensor, gamma: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from hrc_learn.controller.null_space_motion import (
 from hrc_learn.controller.resolved_rate import resolved_rate, scale_null_space
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import JointLimits, SerialChain
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import apply_where
 
 
@@ -65,20 +65,18 @@ class PoseTracking:
         chain: SerialChain,
         config: ArmLoopConfig,
         clearance: Clearance | None,
-        limits: JointLimits,
     ):
         """Put the parts together.
 
         Args:
-            chain: Kinematics of the arm.
+            chain: Kinematics and limits of the arm.
             config: Settings of the loop.
             clearance: Distance of the arm from obstacles; None: there are none.
-            limits: Limits of the joints.
         """
         self.chain, self.config, self.clearance = chain, config, clearance
-        self.safety = SafetyFilter(limits, config.safety)
+        self.safety = SafetyFilter(chain, config.safety)
         margin = config.safety.margin + config.limit_margin
-        self.task_margin = SafetyFilter(limits, replace(config.safety, margin=margin))
+        self.task_margin = SafetyFilter(chain, replace(config.safety, margin=margin))
 
     def track(
         self,

@@ -7,7 +7,7 @@ playback of a learned motion, a joystick.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple, final
 
 import torch
@@ -23,9 +23,8 @@ from hrc_learn.controller.safety_state import (
     SafetyReport,
     SafetyState,
 )
-from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number
+from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number, may_branch
 from hrc_learn.kinematics import MotionLimits, SerialChain
-from hrc_learn.pytree import pytree
 
 # Smallest relative excess, or change of a joint velocity [rad/s], reported as an intervention.
 # Smaller ones are rounding, also in float32: a command along a limit would be flagged at
@@ -54,13 +53,12 @@ class _Inputs(NamedTuple):
     """Wanted joint velocity [rad/s], zero where the arm has to brake."""
     jacobian: Tensor | None
     points: Tensor | None
-    """Linear Jacobians of the capped points, that of the tool first (points, 3, n)."""
+    """Linear Jacobians of the capped points (points, 3, n); None: no cap acts."""
     bounds: tuple[Tensor, Tensor]
     """Lowest and highest velocity allowed by position and velocity limits [rad/s]."""
     dt: float | Tensor
     invalid: Tensor
     stopped: Tensor
-    wrong_start: Tensor
 
 
 @final
@@ -77,10 +75,10 @@ class SafetyFilter(nn.Module):
     limits, or within their margin, does not move further out. It may rest there, and returns
     when the command asks for it: a stop never causes a motion.
 
-    The cap on the speed of the tool, and of other points, holds by a barrier as well
-    (`SpeedBarrier`). Where no admissible motion keeps it, because the cap has fallen faster
-    than the arm can brake, or a start was faster, the arm brakes as hard as it can, and the
-    report says by how much and for how long the cap is exceeded.
+    The cap on the speed of tool, elbow and load holds by a barrier as well (`SpeedBarrier`).
+    Where no admissible motion keeps it, because the cap has fallen faster than the arm can
+    brake, or a start was faster, the arm brakes as hard as it can, and the report says by how
+    much and for how long the cap is exceeded.
 
     Any NaN or infinity, in an argument or in the state, brakes the arm to rest and is
     forgotten: neither a command nor a state is ever NaN or infinite.
@@ -94,12 +92,14 @@ class SafetyFilter(nn.Module):
         """Prepare the filter.
 
         Args:
-            limits: Joint limits, or the arm or chain that has them.
+            limits: The arm or chain, whose elbow is capped like its tool; or joint limits
+                alone.
             config: Margins and caps; default: the recommended ones.
         """
         super().__init__()
+        self._arm = None
         if not isinstance(limits, MotionLimits):
-            limits = limits.limits
+            self._arm, limits = limits, limits.limits
         self.config = config = config or SafetyConfig()
         # A step shorter than dt needs a larger acceleration for the same change of velocity.
         usable = (1 - _ROUNDING) * config.braking * (1 - config.jitter)
@@ -115,7 +115,9 @@ class SafetyFilter(nn.Module):
             jitter=config.jitter,
             rests_outside=True,
         )
-        self.speed_barrier = SpeedBarrier(self.barrier, config.tcp_speed)
+        self.speed_barrier = SpeedBarrier(
+            self.barrier, config.tcp_speed, delay=config.delay, jitter=config.jitter
+        )
 
     def joint_vector(self, values: ArrayLike, name: str) -> Float[Tensor, "*batch n"]:
         """Joint values as a tensor (*batch, n); tensors are returned as they are.
@@ -200,12 +202,10 @@ class SafetyFilter(nn.Module):
         dt: float | Float[Tensor, ""],
         *,
         jacobian: Float[Tensor, "*batch rows n"] | None = None,
-        points: Float[Tensor, "*batch points 3 n"] | None = None,
+        load: Float[Tensor, "*batch 3"] | None = None,
         joint_velocity: Float[Tensor, "*batch n"] | None = None,
         human_distance: Float[Tensor, "*batch"] | None = None,
         stop: Bool[Tensor, "*batch"] | None = None,
-        stale: Bool[Tensor, "*batch"] | None = None,
-        bounds: tuple[Tensor, Tensor] | None = None,
         distances: Distances | None = None,
     ) -> tuple[Float[Tensor, "*batch n"], SafetyState, SafetyReport]:
         """Velocity to send for the next `dt` seconds.
@@ -219,17 +219,14 @@ class SafetyFilter(nn.Module):
             dt: Time until the next step [s], or since the last where steps are irregular. A
                 tensor outside (0, longest_step]: brake to rest, with the last valid step.
             jacobian: Jacobian of the tool centre point, linear rows first; enables the cap on
-                its speed. Not finite: brake to rest.
-            points: Linear Jacobians of further points under the same cap, such as the elbow and
-                the far end of a load. Not finite: brake to rest.
+                the speed of tool, elbow and load. Not finite: brake to rest.
+            load: Vector from the tool centre point to the far end of a load, in the base frame
+                [m]; needs all six rows of the Jacobian. Not finite: brake to rest.
             joint_velocity: Measured joint velocities [rad/s]. Where they differ from those of a
                 start, in the first step after it, the filter goes on from them.
             human_distance: Distance of the tool from the nearest person [m], which slows and
                 stops it; NaN (unknown): stop. None: no person is monitored.
             stop: True where the arm has to brake to rest for another reason.
-            stale: True where the joint position is too old to be used: brake to rest.
-            bounds: `velocity_bounds` of a trusted joint position, if already computed. Not
-                finite: brake to rest, as hard as the arm can.
             distances: Distances to keep, by `SafetyConfig.constraints`. Not finite: brake to
                 rest.
 
@@ -244,9 +241,10 @@ class SafetyFilter(nn.Module):
         self._check_arguments(jacobian, human_distance, distances)
         q = self.joint_vector(joint_position, "joint_position")
         u = self.joint_vector(joint_velocity_command, "joint_velocity_command")
-        given = self._validated(
-            state, q, u, dt, jacobian, points, bounds, distances, stop, stale, joint_velocity
-        )
+        given = self._validated(state, q, u, dt, jacobian, distances, stop)
+        given, wrong_start = self._from_measured_start(given, joint_velocity)
+        if human_distance is not None or self.config.tcp_speed < math.inf:
+            given = self._with_capped_points(given, load)
         target, fast, cut = self._limit_velocity(given)
         target, cap, speeding, near = self._cap_speed(given, target, human_distance)
         # Constraints keep the bounds on the velocity themselves.
@@ -255,14 +253,13 @@ class SafetyFilter(nn.Module):
         report, excess = None, torch.zeros_like(given.state.dt)
         if self.config.constraints is not None:
             v, report = self._keep_constraints(given, v, distances)
-        if given.points is not None and (human_distance is not None or cap < math.inf):
+        if given.points is not None:
             v, braked = self._keep_speed(given, v, cap)
             speeding = speeding | braked
-            speed = _speed(given.points, v)
-            excess = (speed - cap).clamp(min=0).squeeze(-1)
+            excess = (_speed(given.points, v) - cap).clamp(min=0).squeeze(-1)
         # In the order of INTERVENTIONS.
         flags = (fast, cut, hard, jerky, speeding, near)
-        flags = torch.cat((*flags, given.invalid, given.stopped, given.wrong_start), dim=-1)
+        flags = torch.cat((*flags, given.invalid, given.stopped, wrong_start), dim=-1)
         return v, *self._results(given, v, flags, excess, report)
 
     def _check_arguments(
@@ -286,22 +283,6 @@ class SafetyFilter(nn.Module):
                 "jacobian as well"
             )
 
-    def _measured_start(
-        self, state: SafetyState, measured: Tensor | None
-    ) -> tuple[SafetyState, Tensor]:
-        """The state after a start that agrees with the measured velocity, and the flag."""
-        if measured is None:
-            return state, torch.zeros_like(state.fresh).unsqueeze(-1)
-        most = self.barrier.velocity
-        error = (measured - state.velocity).abs() > _START_ERROR * most
-        known = is_number(measured).all(-1, keepdim=True)
-        wrong = state.fresh.unsqueeze(-1) & known & error.any(-1, keepdim=True)
-        return replace(
-            state,
-            velocity=torch.where(wrong, measured, state.velocity),
-            acceleration=state.acceleration.masked_fill(wrong, 0),
-        ), wrong
-
     def _validated(
         self,
         state: SafetyState,
@@ -309,49 +290,29 @@ class SafetyFilter(nn.Module):
         u: Tensor,
         dt: float | Tensor,
         jacobian: Tensor | None,
-        points: Tensor | None,
-        bounds: tuple[Tensor, Tensor] | None,
         distances: Distances | None,
         stop: Tensor | None,
-        stale: Tensor | None,
-        joint_velocity: Tensor | None,
     ) -> _Inputs:
         """Arguments of a step, with invalid values replaced and flagged."""
         state, dt, invalid = self._validated_state(state, dt)
-        state, wrong_start = self._measured_start(state, joint_velocity)
-        numbers = [q, u]
-        if jacobian is not None:
-            numbers.append(jacobian.flatten(-2))
-            tool = jacobian[..., None, :3, :]
-            points = tool if points is None else torch.cat([tool, points], dim=-3)
-        if points is not None:
-            numbers.append(points.flatten(-3))
+        numbers = [q, u] if jacobian is None else [q, u, jacobian.flatten(-2)]
         invalid = invalid | ~is_number(torch.cat(numbers, dim=-1)).all(-1, keepdim=True)
         if distances is not None:
             invalid = invalid | ~distances.known().unsqueeze(-1)
-        if bounds is not None:
-            unknown = ~is_number(torch.cat(bounds, dim=-1)).all(-1, keepdim=True)
-            invalid = invalid | unknown
-            bounds = bounds[0].masked_fill(unknown, 0), bounds[1].masked_fill(unknown, 0)
-        if stale is not None:
-            invalid = invalid | stale.unsqueeze(-1)
         stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
         q = torch.where(invalid, state.position, q)
         if jacobian is not None:
             jacobian = jacobian.masked_fill(invalid.unsqueeze(-1), 0)
-        if points is not None:
-            points = points.masked_fill(invalid.unsqueeze(-1).unsqueeze(-1), 0)
         return _Inputs(
             state=state,
             joint_position=q,
             command=u.masked_fill(invalid | stopped, 0),
             jacobian=jacobian,
-            points=points,
-            bounds=bounds or self.velocity_bounds(q),
+            points=None,
+            bounds=self.velocity_bounds(q),
             dt=dt,
             invalid=invalid,
             stopped=stopped,
-            wrong_start=wrong_start,
         )
 
     def _validated_state(
@@ -371,6 +332,41 @@ class SafetyFilter(nn.Module):
                 f"guarantee the limits, but got {dt:g} s; step faster or lower its rate"
             )
         return replace(state, dt=torch.full_like(state.dt, dt)), dt, invalid
+
+    def _from_measured_start(
+        self, given: _Inputs, measured: Tensor | None
+    ) -> tuple[_Inputs, Tensor]:
+        """The arguments with a start that agrees with the measured velocity, and the flag."""
+        state = given.state
+        if measured is None:
+            return given, torch.zeros_like(given.invalid)
+        error = (measured - state.velocity).abs() > _START_ERROR * self.barrier.velocity
+        known = is_number(measured).all(-1, keepdim=True)
+        wrong = state.fresh.unsqueeze(-1) & known & error.any(-1, keepdim=True)
+        velocity = torch.where(wrong, measured, state.velocity)
+        acceleration = state.acceleration.masked_fill(wrong, 0)
+        state = replace(state, velocity=velocity, acceleration=acceleration)
+        return given._replace(state=state), wrong
+
+    def _with_capped_points(self, given: _Inputs, load: Tensor | None) -> _Inputs:
+        """The arguments with the Jacobians of tool, elbow and far end of a load."""
+        J, invalid = given.jacobian, given.invalid
+        if J is None:
+            return given
+        points = [J[..., :3, :]]
+        if self._arm is not None:
+            q, elbow = given.joint_position, self._arm.elbow
+            points.append(self._arm.joint_jacobian(q, elbow)[..., :3, :])
+        if load is not None:
+            unknown = ~is_number(load).all(-1, keepdim=True)
+            invalid, end = invalid | unknown, load.masked_fill(unknown, 0).unsqueeze(-1)
+            turning = J[..., 3:, :]
+            points.append(J[..., :3, :] + torch.linalg.cross(turning, end, dim=-2))
+        return given._replace(
+            points=torch.stack(points, dim=-3),
+            command=given.command.masked_fill(invalid, 0),
+            invalid=invalid,
+        )
 
     def _limit_velocity(self, given: _Inputs) -> tuple[Tensor, Tensor, Tensor]:
         """Limits of velocity and position.
@@ -460,12 +456,6 @@ class SafetyFilter(nn.Module):
         )
         return v + acceleration * dt
 
-    @property
-    def _exits_early(self) -> bool:
-        """True if steps skip work by branches on the data, where they run one by one."""
-        constraints = self.config.constraints
-        return constraints is not None and constraints.early_exit
-
     def _keep_constraints(
         self, given: _Inputs, v: Tensor, distances: Distances | None
     ) -> tuple[Tensor, ConstraintReport]:
@@ -492,7 +482,7 @@ class SafetyFilter(nn.Module):
         v = kept.joint_velocity
         v = torch.where(v.abs() < _REST, 0, v)
         braking = given.invalid | given.stopped
-        if not self._exits_early or bool(braking.any()):
+        if not may_branch(v) or bool(braking.any()):
             v = torch.where(braking, self._stopping(given), v)
         idle = braking.squeeze(-1)
         report = ConstraintReport(
@@ -512,10 +502,10 @@ class SafetyFilter(nn.Module):
         and the one that brakes as hard as the arm can. A stop brakes hard in any case.
         """
         cap = cap * (1 - 8 * torch.finfo(v.dtype).eps)
-        braking = given.invalid | given.stopped
         speed = self._highest_speed(given, v)
-        if self._exits_early and not bool((speed > cap).any()):
-            return v, torch.zeros_like(braking)
+        passes = (speed <= cap) | given.invalid | given.stopped
+        if may_branch(v) and bool(passes.all()):
+            return v, ~passes
         stopping, easing = self._stopping(given), self._easing(given)
         hard, gentle = self._highest_speed(given, stopping), self._highest_speed(given, easing)
         eases = gentle <= cap
@@ -525,8 +515,8 @@ class SafetyFilter(nn.Module):
         # The bound is almost straight on so short a line; where it bulges, once more.
         at = self._highest_speed(given, torch.lerp(low, high, fraction))
         fraction = fraction * _secant(at_low, at, cap)
-        kept = torch.where(braking, v, torch.lerp(low, high, fraction))
-        return kept, ~braking & ~(eases & (fraction > 1 - _REPORTED))
+        kept = torch.where(passes, v, torch.lerp(low, high, fraction))
+        return kept, ~passes & ~(eases & (fraction > 1 - _REPORTED))
 
     def _highest_speed(self, given: _Inputs, v: Tensor) -> Tensor:
         """Bound on the speed of the points at a velocity and on the way to rest [m/s]."""
@@ -583,91 +573,3 @@ def _excess(vector: Tensor, limit: Tensor) -> Tensor:
 def _acts(excess: Tensor) -> Bool[Tensor, "..."]:
     """True where scaling by an excess above 1 changes a vector by more than rounding."""
     return excess > 1 + _REPORTED
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class WantedVelocity:
-    """Observation of a velocity step."""
-
-    joint_position: Float[Tensor, "*batch n"]
-    """Measured joint positions [rad]."""
-    joint_velocity: Float[Tensor, "*batch n"]
-    """Wanted joint velocities [rad/s]."""
-    stop: Bool[Tensor, "*batch"]
-    """True to brake to rest, whatever is wanted."""
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class FilteredVelocity:
-    """Command of a velocity step."""
-
-    joint_velocity: Float[Tensor, "*batch n"]
-    """Joint velocities to send [rad/s]."""
-    safety: SafetyReport
-    """Interventions of the safety filter."""
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
-class VelocityStepState:
-    """State of a velocity step."""
-
-    safety: SafetyState
-    """State of the safety filter."""
-
-
-@final
-class VelocityStep(nn.Module):
-    """Joint velocities within the limits of an arm and a cap on its tool speed.
-
-    Attributes:
-        chain: Kinematics and limits of the arm.
-    """
-
-    def __init__(self, chain: SerialChain, *, dt: float, config: SafetyConfig | None = None):
-        """Prepare the filter.
-
-        Args:
-            chain: Kinematics and limits of the arm.
-            dt: Time between two steps [s].
-            config: Settings of the filter.
-
-        Raises:
-            ValueError: The filter cannot guarantee the limits at this step.
-        """
-        super().__init__()
-        self.chain, self.dt = chain, dt
-        self.safety = SafetyFilter(chain.limits, config)
-        if not 0 < dt <= self.safety.config.longest_step:
-            raise ValueError(
-                f"dt must be in (0, {self.safety.config.longest_step:g}] s, but is {dt:g}"
-            )
-
-    def initial_state(
-        self,
-        joint_position: Float[Tensor, "*batch n"],
-        joint_velocity: Float[Tensor, "*batch n"] | None = None,
-        joint_acceleration: Float[Tensor, "*batch n"] | None = None,
-    ) -> VelocityStepState:
-        """State of an arm at rest, or in motion, see `SafetyFilter.initial_state`."""
-        return VelocityStepState(
-            safety=self.safety.initial_state(joint_position, joint_velocity, joint_acceleration)
-        )
-
-    def step(
-        self, state: VelocityStepState, observation: WantedVelocity
-    ) -> tuple[FilteredVelocity, VelocityStepState]:
-        """Take one step."""
-        _, jacobian = self.chain.transform_and_jacobian(observation.joint_position)
-        velocity, safety, report = self.safety.step(
-            state.safety,
-            observation.joint_position,
-            observation.joint_velocity,
-            self.dt,
-            jacobian=jacobian,
-            stop=observation.stop,
-        )
-        command = FilteredVelocity(joint_velocity=velocity, safety=report)
-        return command, VelocityStepState(safety=safety)

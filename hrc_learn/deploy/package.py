@@ -36,8 +36,14 @@ class Steppable(Protocol):
 
     chain: SerialChain
 
-    def initial_state(self, joint_position: Float[Tensor, "*batch n"], /) -> Any:
-        """State of an arm at rest at joint positions [rad], a pytree."""
+    def initial_state(
+        self,
+        joint_position: Float[Tensor, "*batch n"],
+        joint_velocity: Float[Tensor, "*batch n"] | None = None,
+        joint_acceleration: Float[Tensor, "*batch n"] | None = None,
+        /,
+    ) -> Any:
+        """State of an arm at rest, or in motion, a pytree."""
         ...
 
     def step(self, state: Any, observation: Any, /) -> tuple[Any, Any]:

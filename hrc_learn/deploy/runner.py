@@ -25,8 +25,7 @@ from hrc_learn.deploy.package import (
     tensors_of,
 )
 
-_POSITIONS = {"safety.position", "pose_drift.joint_position"}
-"""State fields with joint positions of an earlier step."""
+type _Joints = Float[np.ndarray, "*batch n"]
 
 
 class StepRunner(ABC):
@@ -49,8 +48,19 @@ class StepRunner(ABC):
         self.joint_velocity: Float[np.ndarray, "*batch n"] = self._command["joint_velocity"]
 
     @abstractmethod
-    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
-        """Reset the state to an arm at rest at joint positions [rad]."""
+    def start(
+        self,
+        joint_position: _Joints,
+        joint_velocity: _Joints | None = None,
+        joint_acceleration: _Joints | None = None,
+    ) -> None:
+        """Reset the state to an arm at rest, or in motion: pass what is measured.
+
+        Args:
+            joint_position: Joint positions [rad].
+            joint_velocity: Joint velocities [rad/s]; None: at rest.
+            joint_acceleration: Joint accelerations [rad/s^2]; None: zero.
+        """
 
     @abstractmethod
     def step(self) -> Float[np.ndarray, "*batch n"]:
@@ -121,11 +131,23 @@ class PackageRunner(StepRunner):
         self._first_state = loaded.first_state
         self._vectors.state.copy_(loaded.first_state)
 
-    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
+    def start(
+        self,
+        joint_position: _Joints,
+        joint_velocity: _Joints | None = None,
+        joint_acceleration: _Joints | None = None,
+    ) -> None:
         self._vectors.state.copy_(self._first_state)
         state = self._layouts.state.arrays(self._vectors.state)
-        for field in _POSITIONS & state.keys():
-            state[field][...] = joint_position
+        known = {
+            "safety.position": joint_position,
+            "pose_drift.joint_position": joint_position,
+            "safety.velocity": joint_velocity,
+            "safety.acceleration": joint_acceleration,
+        }
+        for field, value in known.items():
+            if value is not None and field in state:
+                state[field][...] = value
 
     def step(self) -> Float[np.ndarray, "*batch n"]:
         self._run(self._arguments)
@@ -156,10 +178,16 @@ class EagerRunner(StepRunner):
         self.observe(observation)
         self.start(self.observation["joint_position"])
 
-    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
+    def start(
+        self,
+        joint_position: _Joints,
+        joint_velocity: _Joints | None = None,
+        joint_acceleration: _Joints | None = None,
+    ) -> None:
         dtype = self._layouts.observation.fields[0].dtype
-        q = torch.tensor(joint_position, dtype=dtype)
-        self._state = self._controller.initial_state(q)
+        known = (joint_position, joint_velocity, joint_acceleration)
+        q, *motion = (None if x is None else torch.tensor(x, dtype=dtype) for x in known)
+        self._state = self._controller.initial_state(q, *motion)
 
     @torch.inference_mode()
     def step(self) -> Float[np.ndarray, "*batch n"]:

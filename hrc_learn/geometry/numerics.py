@@ -100,6 +100,16 @@ def is_number(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
     return x.abs() < _LARGEST_VALID  # NaN compares false
 
 
+def may_branch(x: Tensor) -> bool:
+    """True where a step may skip work by a branch on its data.
+
+    A tracer or `vmap` cannot follow the branch, and an accelerator would have to wait for it.
+    """
+    if torch.compiler.is_compiling() or x.device.type != "cpu":
+        return False
+    return torch._C._functorch.maybe_current_level() is None  # pyright: ignore
+
+
 def polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     """Value of a polynomial, the constant term first, by Horner's rule."""
     *rest, last_but_one, last = coefficients

@@ -419,19 +419,12 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
         acceleration=config.acceleration * chain.limits.acceleration,
         jerk=config.jerk * chain.limits.jerk,
     )
-    limited = SerialChain(
-        joint_names=chain.joint_names,
-        mounts=chain.mounts,
-        flange=chain.flange,
-        tcp=chain.tcp,
-        limits=limits,
-        ready=chain.ready,
-    )
-    step = VelocityStep(limited, dt=CYCLE, config=config.safety)
+    step = VelocityStep(chain.with_limits(limits), config.safety)
     example = WantedVelocity(
         joint_position=chain.ready,
         joint_velocity=torch.zeros_like(chain.ready),
         stop=torch.tensor(False),
+        dt=CYCLE,
     )
     if config.compiled:
         try:

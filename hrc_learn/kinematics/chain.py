@@ -9,6 +9,7 @@ fuses everything into one loop over the batch.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Literal
 
 import torch
@@ -23,6 +24,8 @@ type JointKind = Literal["revolute", "continuous", "prismatic"]
 """Kind of a joint; a continuous one rotates without limits."""
 
 type _Row = list[Tensor]
+
+_NO_TOOL = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
 
 
 def transform_and_jacobian(
@@ -199,6 +202,17 @@ class SerialChain:
             kinds=self.kinds,
         )
 
+    def with_limits(self, limits: JointLimits) -> SerialChain:
+        """The same arm with other joint limits."""
+        limited = copy(self)
+        limited.limits = limits
+        return limited
+
+    @property
+    def elbow(self) -> int:
+        """Number of the joint at the elbow, from 1: the middle one, of two the nearer one."""
+        return (len(self.joint_names) + 1) // 2
+
     def joint_positions(self, q: ArrayLike) -> Float[Tensor, "*batch joints"]:
         """Joint positions as a tensor, their number checked.
 
@@ -324,6 +338,10 @@ class SerialChain:
         count = len(self.joint_names)
         if not 1 <= joint <= count:
             raise ValueError(f"joint must be 1 to {count}, counted from the base, not {joint}.")
+        if torch.compiler.is_compiling():
+            q, mounts = self.joint_positions(q)[..., :joint], self._mount_entries[:joint]
+            _, J = transform_and_jacobian(q, mounts, _NO_TOOL, self._slides[:joint])
+            return torch.nn.functional.pad(J, (0, count - joint))
         frames = torch.stack(self._joint_frames(self.joint_positions(q), joint), dim=-3)
         origin = frames[..., -1:, :, 3]
         J = self._screw_jacobian(frames[..., 2], frames[..., 3], origin)

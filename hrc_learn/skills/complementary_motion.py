@@ -101,7 +101,7 @@ class ComplementaryMotion:
                 margin=0.0, velocity_margin=0.0, braking=_EFFORT, tcp_speed=math.inf
             ),
         )
-        self._loop = ArmLoop(chain, loop_config, clearance, limits)
+        self._loop = ArmLoop(chain.with_limits(limits), loop_config, clearance)
         self.restart()
 
     def restart(self) -> None:
@@ -152,8 +152,12 @@ class ComplementaryMotion:
         self._take(torch.from_numpy(np.array(wish, dtype=float)), width)
         if self.posture is None or self.joints is None:
             self.posture = self.joints = self._wished()[0]
-            self._state = self._loop.initial_state(self.joints)
-        before, offset = self.posture, self.joints - self.posture
+            moving = torch.from_numpy(np.array(state.joint_velocity, dtype=float))
+            self._state = self._following(moving)
+            before = self.posture - self._dt * moving
+        else:
+            before = self.posture
+        offset = self.joints - self.posture
         off = bool(offset.abs().max() > _SAME)
         if pushed or bool(self._state.pushed) or off or self.waits:
             self._yield(push)
@@ -170,9 +174,7 @@ class ComplementaryMotion:
     def _following(self, velocity: Float[Tensor, " joints"]) -> ArmLoopState:
         """State of a loop on the policy's posture, which moves at a velocity [rad/s]."""
         assert self.joints is not None  # set by the first step
-        state = self._loop.initial_state(self.joints)
-        safety = self._loop.safety.initial_state(self.joints, velocity)
-        return replace(state, safety=safety)
+        return self._loop.initial_state(self.joints, joint_velocity=velocity)
 
     def _take(self, wish: Float[Tensor, " joints"], width: float) -> None:
         """Add a posture of the policy."""

@@ -19,7 +19,7 @@ _NAN = math.nan
 # close.
 _COMING_TO_REST = 0.15
 
-NEAR_PEOPLE = ConstraintConfig(early_exit=True, distance_weight=0.1)
+NEAR_PEOPLE = ConstraintConfig(distance_weight=0.1)
 """Constraint layer of an arm near people. An arm may always come to rest before them, so it
 need not leave its path: the path comes before the distance, and the arm brakes on it within the
 reaction time that the protective distance allows for. The end effector then leaves its path by

@@ -30,7 +30,7 @@ def clearance(q):
 
 
 def loop(**options):
-    constraints = ConstraintConfig(early_exit=True, distance_weight=0.1)
+    constraints = ConstraintConfig(distance_weight=0.1)
     config = ArmLoopConfig(safety=SafetyConfig(constraints=constraints), **options)
     return ArmLoop(panda, config, clearance)
 

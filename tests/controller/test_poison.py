@@ -217,7 +217,7 @@ FILTER_ARGUMENTS = {
     "jacobian": panda.jacobian,
     "human_distance": lambda q: torch.tensor(3.0, dtype=DOUBLE),
     "dt": lambda q: torch.tensor(DT, dtype=DOUBLE),
-    "bounds": SafetyFilter(LIMITS).velocity_bounds,
+    "load": lambda q: torch.tensor([0.0, 0.0, 0.1], dtype=DOUBLE),
 }
 
 
@@ -226,7 +226,7 @@ FILTER_ARGUMENTS = {
     "name", [*FILTER_ARGUMENTS, "state.velocity", "state.acceleration", "state.position"]
 )
 def test_the_filter_alone_brakes_for_one_tick_and_forgets(name, value):
-    safety, q = SafetyFilter(LIMITS), panda.ready
+    safety, q = SafetyFilter(panda), panda.ready
     state = safety.initial_state(q)
     speeds = []
     for k in range(60):

@@ -162,7 +162,6 @@ HALTS: dict[str, dict[str, Any]] = {
     "a lost joint position": {
         "joint_position": torch.full((7,), torch.nan, dtype=torch.float64)
     },
-    "an old joint state": {"stale": torch.tensor(True)},
     "a person too near": {"human_distance": torch.tensor(0.05, dtype=torch.float64)},
     "a person lost": {"human_distance": torch.tensor(torch.nan, dtype=torch.float64)},
 }
@@ -239,7 +238,6 @@ def test_the_tool_is_capped_where_a_jacobian_is_given():
     [
         {"q": torch.full((7,), torch.nan, dtype=torch.float64)},
         {"u": torch.full((7,), torch.inf, dtype=torch.float64)},
-        {"stale": torch.tensor(True)},
         {"stop": torch.tensor(True)},
     ],
 )
@@ -247,7 +245,7 @@ def test_a_fault_brakes_to_rest_along_a_straight_line_and_resumes_smoothly(fault
     safety = SafetyFilter(LIMITS)
     u = torch.tensor([0.5, -0.4, 0.3, 0.2, -0.1, 0.6, -0.7], dtype=torch.float64)
     state, q, dt = safety.initial_state(READY, u), READY, 0.004
-    options = {k: w for k, w in fault.items() if k in ("stale", "stop")}
+    options = {k: w for k, w in fault.items() if k == "stop"}
     for _ in range(60):
         before = state.velocity
         v, state, report = safety.step(

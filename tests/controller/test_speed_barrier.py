@@ -115,12 +115,13 @@ def test_a_start_from_the_measured_motion_continues_it():
 
 def test_more_points_than_the_tool_are_capped():
     safety = SafetyFilter(panda, SafetyConfig(tcp_speed=0.2))
-    u = torch.tensor([1.5, 0.5, 0, 0, 0, 0, 0], dtype=torch.float64)
-    J = torch.zeros(6, 7, dtype=torch.float64)
-    elbow = panda.joint_jacobian(READY, 5)[:3]
-    state = safety.initial_state(READY)
-    for _ in range(200):
-        v, state, _ = safety.step(
-            state, READY, u, 0.004, jacobian=J, points=elbow.unsqueeze(-3)
-        )
-    assert 0.17 < (elbow @ v).norm() <= 0.2
+    u = torch.tensor([0.0, 1.5, 0, -1.5, 0, 0, 0], dtype=torch.float64)
+    elbow = panda.joint_jacobian(READY, panda.elbow)[:3]
+    J = panda.jacobian(READY)
+    end = torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64)
+    load = J[:3] + torch.linalg.cross(J[3:], end[:, None], dim=0)
+    for given, point in (({"jacobian": 0 * J}, elbow), ({"jacobian": J, "load": end}, load)):
+        state = safety.initial_state(READY)
+        for _ in range(200):
+            v, state, _ = safety.step(state, READY, u, 0.004, **given)
+        assert 0.17 < (point @ v).norm() <= 0.2

@@ -12,11 +12,12 @@ from hrc_learn.deploy import EagerRunner, PackageRunner, export_step
 from hrc_learn.kinematics import panda
 
 DT = 1e-3
-STEP = VelocityStep(panda, dt=DT)
+STEP = VelocityStep(panda)
 EXAMPLE = WantedVelocity(
     joint_position=panda.ready,
     joint_velocity=torch.zeros(7, dtype=torch.float64),
     stop=torch.tensor(False),
+    dt=DT,
 )
 READY = panda.ready.numpy()
 
