@@ -43,7 +43,7 @@ def test_poison_that_is_remembered_is_noticed(monkeypatch):
     assert result.stuck.any()
 
 
-@pytest.mark.parametrize(("worse", "kept"), [(1.0, True), (6.0, False)])
+@pytest.mark.parametrize(("worse", "kept"), [(1.0, True), (10.0, False)])
 def test_plants_as_declared_keep_their_limits_and_move_again(worse, kept):
     with shapes_unchecked():  # for speed
         result = run_plant_trials(PlantConfig(count=40, duration=2.0, worse=worse))
