@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -60,31 +59,35 @@ _AGREEMENT = 10.0
 _PLANE_STEPS = 20
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CameraMotion:
     """Motion of a camera since the demonstrations."""
 
-    rotation: tuple[float, float, float]
-    """Rotation vector about the camera's axes (x right, y down, z along the view) [rad]."""
-    translation: tuple[float, float, float]
-    """Translation along the same axes [m]."""
+    twist: Float[np.ndarray, "6"]
+    """Rotation vector about the camera's axes (x right, y down, z along the view) [rad], and
+    translation along them [m], as for `MarkerCamera.moved`."""
     displacement: float
     """Explained displacement in the image, root mean square over the frames [px]."""
+
+    @staticmethod
+    def of(
+        twist: Float[np.ndarray, "6"],
+        points: Float[np.ndarray, "frames 3"],
+        camera: MarkerCamera,
+    ) -> CameraMotion:
+        """Motion by a twist, with the displacement of points of the camera frame [m]."""
+        displacement = _root_mean_square(camera.motion_jacobian(points) @ twist)
+        return CameraMotion(twist=twist, displacement=displacement)
 
     @property
     def angle(self) -> float:
         """Angle of the rotation [rad]."""
-        return float(np.linalg.norm(self.rotation))
+        return float(np.linalg.norm(self.twist[:3]))
 
     @property
     def distance(self) -> float:
         """Length of the translation [m]."""
-        return float(np.linalg.norm(self.translation))
-
-    @property
-    def twist(self) -> Float[np.ndarray, "6"]:
-        """Rotation vector and translation, as for `MarkerCamera.moved` [rad, m]."""
-        return np.array([*self.rotation, *self.translation])
+        return float(np.linalg.norm(self.twist[3:]))
 
     def __str__(self) -> str:
         return (
@@ -134,14 +137,15 @@ class CameraReference:
             )
         if not fps > 0:
             raise ValueError(f"fps must be positive, got {fps}.")
-        largest = 0.0
-        folds = min(FOLDS, len(demonstrations))
+        largest, folds = 0.0, min(FOLDS, len(demonstrations))
         for fold in range(folds):
             others = [d for i, d in enumerate(demonstrations) if i % folds != fold]
-            camera = _camera_of(others, image_size)
-            watch = CameraWatch(_reference(camera, others, np.inf))
+            watch = CameraWatch(_reference(_camera_of(others, image_size), others, np.inf))
             for demo in demonstrations[fold::folds]:
-                largest = max(largest, _largest_displacement(watch, demo, fps))
+                watch.clear()
+                for k in demo.visible.nonzero()[:, 0].tolist():
+                    watch.update(k / fps, demo.pose[k], demo.feature[k].double().numpy())
+                    largest = max(largest, watch.displacement)
         if not largest:
             raise ValueError(
                 f"no demonstration shows the marker {FEWEST_FRAMES} times within {_WINDOW} s: "
@@ -154,19 +158,11 @@ class CameraReference:
 def _reference(
     camera: MarkerCamera, demonstrations: Sequence[ImageDemonstration], threshold: float
 ) -> CameraReference:
-    points = np.concatenate([camera.points(_seen(demo)[0]) for demo in demonstrations])
+    points = np.concatenate([camera.points(demo.seen()[0]) for demo in demonstrations])
     lower, upper = (tuple(corner.tolist()) for corner in (points.min(0), points.max(0)))
     return CameraReference(
         camera=camera, threshold=threshold, window=_WINDOW, lower=lower, upper=upper
     )
-
-
-class _Frame(NamedTuple):
-    time: float
-    point: Float[np.ndarray, "3"]
-    pixel: Float[np.ndarray, "2"]
-    error: Float[np.ndarray, "2"]
-    jacobian: Float[np.ndarray, "2 6"]
 
 
 class CameraWatch:
@@ -188,7 +184,7 @@ class CameraWatch:
         self.reference = reference
         self.displacement = 0.0
         self._fewest = fewest
-        self._frames: deque[_Frame] = deque()
+        self._frames: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
 
     def clear(self) -> None:
         """Forget all frames: before another episode, or after a pause."""
@@ -219,28 +215,26 @@ class CameraWatch:
                 "without the marker."
             )
         frames = self._frames
-        if frames and not time > frames[-1].time:
+        if frames and not time > frames[-1][0]:
             raise ValueError(
-                f"time must increase, but {time} follows {frames[-1].time}: call clear() "
+                f"time must increase, but {time} follows {frames[-1][0]}: call clear() "
                 "between episodes."
             )
         camera = self.reference.camera
-        point = camera.points(_double(pose))
+        point = camera.points(pose)
         if self.reference.covers(point):
-            error, L = pixel - camera.project(point), camera.motion_jacobian(point)
-            frames.append(_Frame(time, point, pixel, error, L))
-        while frames and frames[0].time < time - self.reference.window:
+            frames.append((time, point, pixel))
+        while frames and frames[0][0] < time - self.reference.window:
             frames.popleft()
+        self.displacement = 0.0
         if len(frames) < self._fewest:
-            self.displacement = 0.0
             return None
-        errors = np.array([frame.error for frame in frames])
-        jacobians = np.array([frame.jacobian for frame in frames])
+        points, pixels = (np.array([frame[i] for frame in frames]) for i in (1, 2))
+        errors, jacobians = pixels - camera.project(points), camera.motion_jacobian(points)
         twist, self.displacement = _explained(errors, jacobians)
         if self.displacement <= self.reference.threshold * max(1, FEWEST_FRAMES / len(frames)):
             return None
-        points, pixels = (np.array([f[i] for f in frames]) for i in (1, 2))
-        return motion_of(refined_twist(camera, points, pixels, twist), points, camera)
+        return CameraMotion.of(refined_twist(camera, points, pixels, twist), points, camera)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,17 +269,17 @@ def camera_placements(
     seen = {
         index: frames
         for index, demo in enumerate(demonstrations)
-        if len(frames := _seen(demo)[1]) >= FEWEST_FRAMES
+        if len(frames := demo.seen()[1]) >= FEWEST_FRAMES
     }
     if len(seen) < 2:
         return []
     chosen = [demonstrations[index] for index in seen]
     camera, twists = _camera_of_episodes(chosen, image_size)
-    jacobians = [camera.motion_jacobian(camera.points(_seen(demo)[0])) for demo in chosen]
+    points = [camera.points(demo.seen()[0]) for demo in chosen]
 
     def apart(first: int, second: int) -> float:
         return max(
-            _root_mean_square(jacobians[i] @ (twists[first] - twists[second]))
+            CameraMotion.of(twists[first] - twists[second], points[i], camera).displacement
             for i in (first, second)
         )
 
@@ -302,9 +296,9 @@ def camera_placements(
     return [
         CameraPlacement(
             episodes=tuple(index[i] for i in group),
-            motion=motion_of(
+            motion=CameraMotion.of(
                 np.median(twists[group], axis=0) - first,
-                np.concatenate([camera.points(_seen(chosen[i])[0]) for i in group]),
+                np.concatenate([points[i] for i in group]),
                 camera,
             ),
         )
@@ -316,16 +310,20 @@ def _camera_of_episodes(
     demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
 ) -> tuple[MarkerCamera, Float[np.ndarray, "episodes 6"]]:
     """Camera of the median episode, and its motion from there in each episode."""
-    unmoved, twists = demonstrations, np.zeros((len(demonstrations), 6))
-    camera = _camera_of(demonstrations, image_size)
+    camera, twists = _camera_of(demonstrations, image_size), np.zeros(0)
     for _ in range(_REFINEMENTS):
-        views = [(camera.points(pose), pixel) for pose, pixel in map(_seen, demonstrations)]
-        twists = np.array([refined_twist(camera, *view, np.zeros(6)) for view in views])
+        seen = [demo.seen() for demo in demonstrations]
+        twists = np.array(
+            [
+                refined_twist(camera, camera.points(pose), pixel.numpy(), np.zeros(6))
+                for pose, pixel in seen
+            ]
+        )
         twists -= np.median(twists, axis=0)
-        unmoved = [
-            _as_unmoved(demo, camera, twist)
-            for demo, twist in zip(demonstrations, twists, strict=True)
-        ]
+        unmoved = []
+        for demo, twist in zip(demonstrations, twists, strict=True):
+            shift = torch.from_numpy(_displacement(camera, demo.pose, twist))
+            unmoved.append(replace(demo, feature=demo.feature.double() - shift))
         camera = _camera_of(unmoved, image_size)
     return camera, twists
 
@@ -336,26 +334,6 @@ def _camera_of(
     neurons = RBFCenters.around(demonstrations)
     network = RBFImageJacobian.fit(demonstrations, neurons)
     return MarkerCamera.fit(demonstrations, network.double(), image_size)
-
-
-def _largest_displacement(watch: CameraWatch, demo: ImageDemonstration, fps: float) -> float:
-    """Largest displacement that a camera watch sees in a demonstration [px]."""
-    watch.clear()
-    largest = 0.0
-    for frame in demo.visible.nonzero()[:, 0].tolist():
-        watch.update(frame / fps, demo.pose[frame], demo.feature[frame].double().numpy())
-        largest = max(largest, watch.displacement)
-    return largest
-
-
-def _seen(demo: ImageDemonstration) -> tuple[Pose, Float[np.ndarray, "_frames 2"]]:
-    """Poses and pixels of the frames with a visible marker."""
-    pose = Pose(demo.pose.position[demo.visible], demo.pose.orientation[demo.visible])
-    return _double(pose), demo.feature[demo.visible].double().numpy()
-
-
-def _double(pose: Pose) -> Pose:
-    return Pose(pose.position.double(), pose.orientation.double())
 
 
 def _explained(
@@ -410,25 +388,12 @@ def from_moved(
     return (points - twist[3:]) @ quaternion.to_matrix(turn).numpy()
 
 
-def _as_unmoved(
-    demo: ImageDemonstration, camera: MarkerCamera, twist: Float[np.ndarray, "6"]
-) -> ImageDemonstration:
-    """The demonstration as seen by the camera before its motion."""
-    points = camera.points(_double(demo.pose))
-    change = camera.project(from_moved(points, twist)) - camera.project(points)
-    return replace(demo, feature=demo.feature.double() - torch.from_numpy(change))
-
-
-def motion_of(
-    twist: Float[np.ndarray, "6"], points: Float[np.ndarray, "frames 3"], camera: MarkerCamera
-) -> CameraMotion:
-    """Camera motion of a twist, with its displacement of points in the image."""
-    turn, shift = twist[:3].tolist(), twist[3:].tolist()
-    return CameraMotion(
-        rotation=(turn[0], turn[1], turn[2]),
-        translation=(shift[0], shift[1], shift[2]),
-        displacement=_root_mean_square(camera.motion_jacobian(points) @ twist),
-    )
+def _displacement(
+    camera: MarkerCamera, pose: Pose, twist: Float[np.ndarray, "6"]
+) -> Float[np.ndarray, "*batch 2"]:
+    """Change of the marker's pixel at poses of the tool by a motion of the camera [px]."""
+    points = camera.points(pose)
+    return camera.project(from_moved(points, twist)) - camera.project(points)
 
 
 def _root_mean_square(pixels: Float[np.ndarray, "frames 2"]) -> float:
@@ -519,17 +484,17 @@ class CameraCorrection:
             further one.
         """
         camera = self._reference.camera
-        point = camera.points(Pose(pose.position.double(), pose.orientation.double()))
+        point = camera.points(pose)
         corrected = self.marker(pose, pixel)
         noticed = self._watch.update(time, pose, corrected)
         if not self._reference.covers(point):
             return None
         self._frames.append((time, point, pixel))
-        if self.motion is None and noticed is None:
-            self._forget(time)
-            return None
         if noticed is None:
-            self._find(steps=1)  # starts from the estimate of the last frame
+            if self.motion is None:
+                self._forget(time)
+            else:
+                self._find(steps=1)  # starts from the estimate of the last frame
             return None
         self._watch.clear()
         if self.motion is not None and len(self._frames) < FEWEST_FRAMES:
@@ -551,10 +516,7 @@ class CameraCorrection:
         """Pixel of the tool's marker corrected for the camera motion [px]."""
         if self.motion is None:
             return pixel
-        camera = self._reference.camera
-        point = camera.points(Pose(pose.position.double(), pose.orientation.double()))
-        change = camera.project(from_moved(point, self._twist)) - camera.project(point)
-        return pixel - change
+        return pixel - _displacement(self._reference.camera, pose, self._twist)
 
     def object(
         self, plane: ObjectPlane, pixel: Float[np.ndarray, "2"]
@@ -576,7 +538,7 @@ class CameraCorrection:
         camera = self._reference.camera
         points, pixels = (np.array([f[i] for f in self._frames]) for i in (1, 2))
         self._twist = refined_twist(camera, points, pixels, self._twist, steps)
-        self.motion = motion_of(self._twist, points, camera)
+        self.motion = CameraMotion.of(self._twist, points, camera)
         now = self._frames[-1][0] - self._reference.window
         recent = np.array([f[0] >= now for f in self._frames])
         left = pixels - camera.project(from_moved(points, self._twist))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -65,12 +65,12 @@ class ImageJacobianEstimator(nn.Module, ABC):
         super().__init__()
         self.network = network
 
-    @abstractmethod
     def initial_state(self, *batch: int) -> Any:
-        """State before the first step, for a batch of robots.
+        """State before the first step, for a batch of robots: the network's weights.
 
         Its tensors have the dtype and device of the network.
         """
+        return WeightState(weight=self.initial_weight(*batch))
 
     @abstractmethod
     def update(self, state: Any, measurement: Measurement) -> Any:
@@ -140,10 +140,6 @@ def evaluate(
 
 class FixedEstimator(ImageJacobianEstimator):
     """Keeps the network's weights: the baseline for all other estimators."""
-
-    def initial_state(self, *batch: int) -> WeightState:
-        """The network's weights."""
-        return WeightState(weight=self.initial_weight(*batch))
 
     def update(self, state: WeightState, measurement: Measurement) -> WeightState:
         """The same state."""
@@ -221,6 +217,9 @@ class MotionSample:
 class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
     """Base of estimators that learn from pairs of key frames."""
 
+    constant_law: ClassVar[str] = ""
+    """Beginning of the message that only normalised neurons serve; empty: others do too."""
+
     config: Config
 
     scale: Tensor
@@ -235,8 +234,17 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         Args:
             network: Neurons and initial weights.
             config: Choice of key frames, and settings of the estimator.
+
+        Raises:
+            ValueError: The estimator needs normalised neurons, but the network's are not.
         """
         super().__init__(network)
+        # Equal weights of all normalised neurons give a constant Jacobian.
+        if self.constant_law and not network.normalized:
+            raise ValueError(
+                f"{self.constant_law} a constant Jacobian, which only normalised neurons can "
+                "represent: build the network with normalized=True."
+            )
         self.config = config
         scale = component_scale(network.centers, config.rotation_scale)
         bound = config.weight_bound * scale.repeat(network.rows).unsqueeze(-1)
@@ -248,14 +256,36 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         weight, key = self.initial_weight(*batch), KeyFrame.absent(self.network, *batch)
         return KeyFrameState(weight=weight, key=key)
 
-    def projected(
-        self, weight: Float[Tensor, "*batch entries K"]
-    ) -> Float[Tensor, "*batch entries K"]:
-        """Weights clamped to their bound.
+    @abstractmethod
+    def learned(self, state: Any, now: Measurement, theta: Tensor, pair: MotionSample) -> Any:
+        """State with weights that have learned from a pair, if there is one.
 
-        The projection on a convex set never moves an estimate away from a truth inside it.
+        Args:
+            state: State before.
+            now: Measurement of this step.
+            theta: Neurons at its pose, (*batch, K).
+            pair: Motion from the key frame.
         """
-        return weight.clamp(-self.bound, self.bound)
+
+    def update(self, state: Any, measurement: Measurement) -> Any:
+        """State after one control step, with its weights clamped to their bound."""
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta)
+        learned = self.learned(state, measurement, theta, pair)
+        # The projection on a convex set never moves an estimate away from a truth inside it.
+        return replace(learned, weight=learned.weight.clamp(-self.bound, self.bound), key=key)
+
+    def along(
+        self, step: Float[Tensor, "*batch rows"], pair: MotionSample
+    ) -> Float[Tensor, "*batch entries 1"]:
+        """Change of the weights of a neuron by a step along the motion of a pair.
+
+        Args:
+            step: Change of the motion of the feature, over the square of the motion [px/m^2].
+            pair: Motion from the key frame.
+        """
+        entries = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
+        return entries.flatten(-2).unsqueeze(-1)
 
     def restored(self, state: Any) -> Any:
         """The state with weights and key frame reset where they are not finite."""
@@ -350,10 +380,6 @@ class PaperEstimator(ImageJacobianEstimator):
         super().__init__(network)
         self.gain = gain
 
-    def initial_state(self, *batch: int) -> WeightState:
-        """The network's weights."""
-        return WeightState(weight=self.initial_weight(*batch))
-
     def update(self, state: WeightState, measurement: Measurement) -> WeightState:
         """Take one explicit Euler step of dt."""
         theta = self.network.basis(measurement.pose)
@@ -408,14 +434,13 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
     def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
         super().__init__(network, config or CompositeConfig())
 
-    def update(self, state: KeyFrameState, measurement: Measurement) -> KeyFrameState:
+    def learned(
+        self, state: KeyFrameState, now: Measurement, theta: Tensor, pair: MotionSample
+    ) -> KeyFrameState:
         """One step of dt of the paper's term, and the correction by a new pair."""
-        theta = self.network.basis(measurement.pose)
-        key, pair = self.advance(state.key, measurement, theta)
-        rate = paper_rate(state.weight, theta, measurement, self.config.task_gain)
-        change = measurement.dt * rate + self._correction(state.weight, pair)
-        weight = state.weight + change
-        return KeyFrameState(weight=self.projected(weight), key=key)
+        rate = paper_rate(state.weight, theta, now, self.config.task_gain)
+        change = now.dt * rate + self._correction(state.weight, pair)
+        return replace(state, weight=state.weight + change)
 
     def _correction(self, weight: Tensor, pair: MotionSample) -> Tensor:
         """Normalised gradient step on the prediction error; zero without a new pair."""
@@ -427,8 +452,7 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
         activity = pair.theta.square().sum(-1).clamp_min(least)
         size = (motion * activity).clamp_min(torch.finfo(motion.dtype).tiny)
         step = config.prediction_gain * pair.error(weight) / size.unsqueeze(-1)
-        entries = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
-        return entries.flatten(-2).unsqueeze(-1) * pair.theta.unsqueeze(-2)
+        return self.along(step, pair) * pair.theta.unsqueeze(-2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -441,40 +465,25 @@ class BroydenConfig(LearningConfig):
     """Fraction of the prediction error removed by one pair, in (0, 1]."""
 
 
-def check_normalised(network: RBFImageJacobian, law: str) -> None:
-    """Raise ValueError unless equal weights of all neurons give a constant Jacobian."""
-    if not network.normalized:
-        raise ValueError(
-            f"{law} a constant Jacobian, which only normalised neurons can represent: build "
-            "the network with normalized=True."
-        )
-
-
 class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     """Broyden's update,  J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997).
 
     It applies everywhere at once: equal changes of all normalised neurons add a constant.
     """
 
+    constant_law = "Broyden's update adds"
+
     def __init__(self, network: RBFImageJacobian, config: BroydenConfig | None = None):
-        """Prepare the update.
-
-        Raises:
-            ValueError: The network's neurons are not normalised.
-        """
         super().__init__(network, config or BroydenConfig())
-        check_normalised(network, "Broyden's update adds")
 
-    def update(self, state: KeyFrameState, measurement: Measurement) -> KeyFrameState:
+    def learned(
+        self, state: KeyFrameState, now: Measurement, theta: Tensor, pair: MotionSample
+    ) -> KeyFrameState:
         """Update with a new pair, if there is one."""
-        theta = self.network.basis(measurement.pose)
-        key, pair = self.advance(state.key, measurement, theta)
         # dr is zero without a pair; the floor avoids 0 / 0.
         size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
         step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
-        change = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
-        weight = state.weight + change.flatten(-2).unsqueeze(-1)
-        return KeyFrameState(weight=self.projected(weight), key=key)
+        return replace(state, weight=state.weight + self.along(step, pair))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -533,6 +542,8 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
     its own, only its covariance. Both image rows have the same regressors and one covariance.
     """
 
+    constant_law = "the filter's drift is"
+
     first_covariance: Tensor
     """Initial covariance, (P, P)."""
     walk: Tensor
@@ -545,12 +556,8 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
             network: Neurons and initial weights. The covariance of an offline fit is the
                 initial one of the filter.
             config: Prior, noise and drift.
-
-        Raises:
-            ValueError: The network's neurons are not normalised.
         """
         super().__init__(network, config or KalmanConfig())
-        check_normalised(network, "the filter's drift is")
         # The posterior of an offline fit, or the prior.
         covariance = network.covariance
         if covariance is None:
@@ -586,44 +593,27 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
         state = super().resumed(state, pause)
         return replace(state, covariance=state.covariance + pause * self.walk)
 
-    def update(self, state: KalmanState, measurement: Measurement) -> KalmanState:
-        """Drift for dt, then one pair if there is a new one."""
-        theta = self.network.basis(measurement.pose)
-        key, pair = self.advance(state.key, measurement, theta)
-        weight, covariance = condition(
-            state.weight,
-            state.covariance + measurement.dt * self.watched * self.walk,
-            pair,
-            self.scale,
-            self.config.pair_noise(state.weight, pair.theta),
+    def learned(
+        self, state: KalmanState, now: Measurement, theta: Tensor, pair: MotionSample
+    ) -> KalmanState:
+        """Drift for dt, then mean and covariance conditioned on a new pair, if there is one.
+
+        With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
+        """
+        weight = state.weight
+        covariance = state.covariance + now.dt * self.watched * self.walk
+        phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
+        P_phi = matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
+        noise = self.config.pair_noise(weight, pair.theta)
+        spread = (P_phi * phi).sum(-1, keepdim=True) + noise
+        change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
+        change = change.unflatten(-1, (6, -1)) * self.scale.unsqueeze(-1)  # (*batch, 2, 6, K)
+        # The outer product of a vector with itself is exactly symmetric. That of the gain and
+        # P_phi is not, and forgetting amplifies the difference until the covariance is
+        # indefinite.
+        root = P_phi / spread.sqrt()
+        return replace(
+            state,
+            weight=weight + change.flatten(-3, -2),
+            covariance=covariance - root.mT * root,
         )
-        return KalmanState(weight=self.projected(weight), covariance=covariance, key=key)
-
-
-def condition(
-    weight: Float[Tensor, "*batch entries K"],
-    covariance: Float[Tensor, "*batch P P"],
-    pair: MotionSample,
-    scale: Float[Tensor, "6"],
-    noise: float | Float[Tensor, "*batch 1 1"],
-) -> tuple[Float[Tensor, "*batch entries K"], Float[Tensor, "*batch P P"]]:
-    """Mean and covariance conditioned on one more pair; unchanged without one.
-
-    With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
-
-    Args:
-        weight: Mean before.
-        covariance: Covariance before.
-        pair: Observed motion.
-        scale: Metres per unit of each component of a twist.
-        noise: Variance of each coordinate of dx - J_s_hat dr [px^2].
-    """
-    phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
-    P_phi = matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
-    spread = (P_phi * phi).sum(-1, keepdim=True) + noise
-    change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
-    change = change.unflatten(-1, (6, -1)) * scale.unsqueeze(-1)  # (*batch, 2, 6, K)
-    # The outer product of a vector with itself is exactly symmetric. That of the gain and P_phi
-    # is not, and forgetting amplifies the difference until the covariance is indefinite.
-    root = P_phi / spread.sqrt()
-    return weight + change.flatten(-3, -2), covariance - root.mT * root

@@ -11,7 +11,7 @@ summed statistics.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
@@ -209,10 +209,20 @@ class ImageDemonstration:
     visible: Bool[Tensor, " time"]
     """True where the feature was found."""
 
+    def double(self) -> ImageDemonstration:
+        """The demonstration in float64."""
+        pose = Pose(self.pose.position.double(), self.pose.orientation.double())
+        return replace(self, pose=pose, feature=self.feature.double())
+
+    def seen(self) -> tuple[Pose, Float[Tensor, "_frames 2"]]:
+        """Poses and image features where the feature was found, in float64."""
+        known = self.double()
+        return known.pose[self.visible], known.feature[self.visible]
+
     def motion(self, config: KeyFrameConfig) -> MotionSamples:
         """Motion between its key frames, in float64."""
-        pose = Pose(self.pose.position.double(), self.pose.orientation.double())
-        return MotionSamples.of(pose, self.feature.double(), self.visible, config)
+        known = self.double()
+        return MotionSamples.of(known.pose, known.feature, self.visible, config)
 
 
 def statistics_by_fold(
@@ -373,9 +383,7 @@ def _range(
     low = torch.full((6,), torch.inf, dtype=torch.float64)
     high = -low
     for _, demonstration in distributed.local_items(demonstrations):
-        pose = demonstration.pose
-        pose = Pose(pose.position.double(), pose.orientation.double())
-        inputs = pose_inputs(pose, reference)
+        inputs = pose_inputs(demonstration.double().pose, reference)
         low = torch.minimum(low, inputs.amin(dim=0))
         high = torch.maximum(high, inputs.amax(dim=0))
     lows, highs = (torch.stack(distributed.gather(end)) for end in (low, high))

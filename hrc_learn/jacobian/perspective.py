@@ -167,7 +167,8 @@ class MarkerCamera:
 
     def points(self, pose: Pose) -> Float[np.ndarray, "*batch 3"]:
         """The marker in the camera frame [m] at poses of the tool, in float64."""
-        return self.from_base(pose.apply(pose.position.new_tensor(self.marker)).numpy())
+        pose = Pose(pose.position.double(), pose.orientation.double())
+        return self.from_base(pose.apply(self.marker).numpy())
 
     def from_base(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Points of the base frame in the camera frame [m]."""
@@ -287,9 +288,9 @@ def _sampled(
     each = -(-_FRAMES // len(demonstrations))
     positions, orientations, pixels = [], [], []
     for demo in islice(demonstrations, 0, None, every):
-        seen = demo.visible.nonzero()[:, 0]
-        seen = seen[:: max(1, len(seen) // each)]
-        positions.append(demo.pose.position[seen].double())
-        orientations.append(demo.pose.orientation[seen].double())
-        pixels.append(demo.feature[seen].double())
+        pose, feature = demo.seen()
+        some = slice(None, None, max(1, len(feature) // each))
+        positions.append(pose.position[some])
+        orientations.append(pose.orientation[some])
+        pixels.append(feature[some])
     return Pose(torch.cat(positions), torch.cat(orientations)), torch.cat(pixels)
