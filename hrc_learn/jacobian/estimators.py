@@ -44,6 +44,24 @@ class Measurement:
     xi_r: Float[Tensor, "*batch 6"]
     """Cartesian feedback of the controller."""
 
+    @staticmethod
+    def seen(pose: Pose, feature: Float[Tensor, " rows"], dt: float = 0.0) -> Measurement:
+        """Measurement of a visible feature, without feedback of a controller.
+
+        Args:
+            pose: Pose of the tool when the image was taken.
+            feature: Image feature [px].
+            dt: Time since the last step [s].
+        """
+        return Measurement(
+            pose=pose,
+            feature=feature,
+            valid=torch.tensor(True),
+            dt=dt,
+            xi_x=torch.zeros_like(feature),
+            xi_r=feature.new_zeros(6),
+        )
+
 
 @pytree
 @dataclass(frozen=True, kw_only=True)

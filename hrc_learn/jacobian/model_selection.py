@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -273,24 +274,18 @@ class HeldOutSamples:
             cells: Number of cells along x and along y, equally wide over the range of the
                 pairs.
         """
-        place = self.position[:, :2]
-        low, high = place.amin(dim=0), place.amax(dim=0)
-        edges = torch.stack([torch.linspace(0, 1, cells + 1).double()] * 2, dim=1)
-        edges = low + (high - low) * edges
-        # Points on the upper edge, and all points of an axis without motion, stay inside.
-        cell = ((place - low) / (high - low).clamp_min(1e-9) * cells).long().clamp(0, cells - 1)
-        flat = cell[:, 0] * cells + cell[:, 1]
+        x, y = self.position[:, :2].mT.numpy()
+        pairs, *edges = np.histogram2d(x, y, cells)
 
         def total(values: Tensor) -> Tensor:
-            return torch.zeros(cells**2, dtype=values.dtype).index_add(0, flat, values)
+            return torch.from_numpy(np.histogram2d(x, y, edges, weights=values.numpy())[0])
 
         error, motion = total(self.error.square().sum(-1)), total(self.motion.square().sum(-1))
-        pairs = total(torch.ones_like(flat))
         return CellErrors(
-            edges=edges,
-            pairs=pairs.view(cells, cells),
-            relative=(error / motion).sqrt().view(cells, cells),
-            uncertainty=(total(self.uncertainty) / pairs).view(cells, cells),
+            edges=torch.from_numpy(np.stack(edges, axis=-1)),
+            pairs=torch.from_numpy(pairs).long(),
+            relative=(error / motion).sqrt(),
+            uncertainty=total(self.uncertainty) / torch.from_numpy(pairs),
         )
 
 

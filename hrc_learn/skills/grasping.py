@@ -314,9 +314,8 @@ class Grasping:
 
     def _at_height(self, height: float) -> Pose:
         """Pose of the end effector at a height [m], from here along its own axis."""
-        position, orientation = self._cell.pose.position, self.servo.orientation
-        if orientation is None:
-            orientation = self._workplace.hover().orientation
+        position = self._cell.pose.position
+        orientation = self.servo.orientation(self._workplace.hover().orientation)
         direction = quaternion.to_matrix(orientation)[:, 2]
         distance = (height - position[2]) / direction[2]
         return Pose(position + distance * direction, orientation)

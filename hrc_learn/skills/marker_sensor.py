@@ -481,12 +481,4 @@ def _updated(
         # The estimator learns from differences to the key frame, each less than half a turn.
         before = state.key.feature[0]
         angle = before + torch.remainder(angle - before + math.pi, 2 * math.pi) - math.pi
-    measured = Measurement(
-        pose=pose,
-        feature=angle.reshape(1),
-        valid=torch.tensor(True),
-        dt=dt,
-        xi_x=torch.zeros(1, dtype=torch.float64),
-        xi_r=torch.zeros(6, dtype=torch.float64),
-    )
-    return estimator.update(state, measured)
+    return estimator.update(state, Measurement.seen(pose, angle.reshape(1), dt))

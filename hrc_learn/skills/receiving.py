@@ -75,20 +75,10 @@ class Receipt:
     """Time of the recognition [s]."""
     seen: float = np.nan
     """Time of the newest image at the recognition [s]."""
-    phase: float = np.nan
-    """Estimated phase of the movement in that image, 0 to 1."""
-    duration: float = np.nan
-    """Estimated duration of the movement [s]."""
-    probability: float = np.nan
-    """Probability of a hand-over at the recognition."""
     predicted: Float[np.ndarray, "3"] | None = None
     """Position of the end effector at the meeting, predicted at the recognition [m]."""
-    refined: Float[np.ndarray, "3"] | None = None
-    """Prediction at the end of the movement [m]."""
     taken: float = np.nan
     """Time at which the fingers held the object [s]."""
-    place: Float[np.ndarray, "3"] | None = None
-    """Position of the end effector at that time [m]."""
     attempts: int = 0
     """Number of times that the fingers closed."""
     passed_over: int = 0
@@ -191,7 +181,6 @@ class Receiving:
             move_fingers(self._cell, CLOSED, CLOSING_TIME)
             if holds(self._cell, item):
                 self.receipt.taken = self._cell.time
-                self.receipt.place = self._cell.pose.position.numpy().copy()
                 self._cell.load = as_load(item)
                 return self.receipt
             move_fingers(self._cell, OPEN, CLOSING_TIME)
@@ -216,16 +205,11 @@ class Receiving:
             certain = certain + 1 if estimate.probability[k] > self._config.certainty else 0
             other = certain == 0
             if certain == 2:
-                self._note(estimate, float(estimate.probability[k]))
+                receipt, times = self.receipt, self._watch.times
+                receipt.recognised, receipt.set_off = self._cell.time, times[0]
+                receipt.seen, receipt.predicted = times[-1], _end(estimate)[0].numpy().copy()
                 return estimate
         raise MissedGraspError("receive: no hand-over was recognised.")
-
-    def _note(self, estimate: InteractionEstimate, probability: float) -> None:
-        receipt, seen = self.receipt, self._watch.times[-1]
-        receipt.recognised, receipt.set_off = self._cell.time, self._watch.times[0]
-        receipt.seen, receipt.probability = seen, probability
-        receipt.phase, receipt.duration = estimate.phase, estimate.duration
-        receipt.predicted = receipt.refined = _end(estimate)[0].numpy().copy()
 
     def _meet(self, estimate: InteractionEstimate, deadline: float) -> Float[np.ndarray, "3"]:
         """Go to the predicted meeting point; returns the demonstrated offset of the hand
@@ -240,7 +224,6 @@ class Receiving:
             if self._look() and moving:
                 if self._watch.times and self._watch.times[0] == receipt.set_off:
                     estimate = self._estimate()
-                    receipt.refined = _end(estimate)[0].numpy().copy()
                 else:
                     moving = False  # the hand has come to rest
             goal, deviation = _end(estimate)

@@ -44,7 +44,6 @@ from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 # Fractions of the probe's height, tried until its upper end is well within the image.
 _PROBE_FRACTIONS = np.array([1.0, 0.75, 0.5])
-_NO_TURN = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 _NOT_SEEN = np.full(2, np.nan)
 
 
@@ -98,8 +97,6 @@ class ServoState:
     """Orientation that the newest image asks for; None: that of the target."""
     goal_orientation: Float[Tensor, "4"] | None = None
     """Present goal, on the way to the wanted orientation; None: that of the target."""
-    nominal_orientation: Float[Tensor, "4"] = _NO_TURN
-    """Orientation of the last target before it is turned for the object."""
     last_image: float = -np.inf
     """Time of the last image used [s]."""
     last_detection: float = -np.inf
@@ -262,12 +259,7 @@ class ServoStep:
         drawn = self._drawn.turned(
             state.drawn, reading.human.turn, self.config.turn_rate * reading.dt
         )
-        state = replace(
-            state,
-            drawn=drawn,
-            nominal_orientation=target.above.orientation,
-            last_image=image.time,
-        )
+        state = replace(state, drawn=drawn, last_image=image.time)
         if visible:
             state = replace(state, last_detection=image.time, detected=True, last_pixel=feature)
         goals, state, remark = self._goals(state, reading, target)
@@ -323,15 +315,6 @@ class ServoStep:
         inside &= state.last_pixel < np.array(IMAGE_SIZE) - border
         missing = time - state.last_detection
         return missing > self.config.lost_after and not inside.all()
-
-    def orientation(self, state: ServoState) -> Float[Tensor, "4"] | None:
-        """Orientation for the object, with the turn of the person; None: not turned."""
-        turn, wanted = state.drawn.turn, state.wanted_orientation
-        if wanted is None and float(quaternion.angle(turn, _NO_TURN)) == 0:
-            return None
-        return quaternion.multiply(
-            turn, state.nominal_orientation if wanted is None else wanted
-        )
 
     def feature(self, reading: ServoReading) -> Float[np.ndarray, "2"]:
         """Pixel of the end effector's marker; NaN if it is not detected [px]."""
@@ -505,10 +488,16 @@ class VisualServo:
         """Distance of the feature from its target [px]; NaN if it is not detected."""
         return self._law.pixel_error(self.state, self._read(), target)
 
-    @property
-    def orientation(self) -> Float[Tensor, "4"] | None:
-        """Orientation of the end effector for the object; None: not turned."""
-        return self._law.orientation(self.state)
+    def orientation(self, unturned: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
+        """Orientation of the end effector for the object, with the turn of the person.
+
+        Args:
+            unturned: Orientation of an end effector that is not turned for an object.
+        """
+        wanted = self.state.wanted_orientation
+        return quaternion.multiply(
+            self.state.drawn.turn, unturned if wanted is None else wanted
+        )
 
     def _converge(
         self, target: ServoTarget, tolerance: float, start: float
@@ -607,12 +596,4 @@ def _mean(seen: Sequence[tuple[Pose, Float[Tensor, "2"]]]) -> Measurement | None
     poses, features = zip(*known, strict=True)
     # At rest the orientations differ only by noise, too small to matter.
     pose = Pose(torch.stack([p.position for p in poses]).mean(0), poses[-1].orientation)
-    none = torch.zeros(6, dtype=pose.position.dtype)
-    return Measurement(
-        pose=pose,
-        feature=torch.stack(features).mean(0),
-        valid=torch.tensor(True),
-        dt=0.0,
-        xi_x=none[:2],
-        xi_r=none,
-    )
+    return Measurement.seen(pose, torch.stack(features).mean(0))
