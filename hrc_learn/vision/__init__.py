@@ -3,7 +3,6 @@
 from hrc_learn.vision.camera_model import CameraModel as CameraModel
 from hrc_learn.vision.imaging import ImageNoise as ImageNoise
 from hrc_learn.vision.imaging import Lens as Lens
-from hrc_learn.vision.imaging import OccludingBoard as OccludingBoard
 from hrc_learn.vision.imaging import SyntheticCamera as SyntheticCamera
 from hrc_learn.vision.markers import Marker as Marker
 from hrc_learn.vision.markers import MarkerDetector as MarkerDetector

@@ -5,7 +5,7 @@ It renders what matters to visual servoing, in a fraction of a renderer's time: 
 machines without OpenGL use it in place of the simulator's camera.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,16 +124,6 @@ MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 """Returns the pose of each marker now, by its id: p_base = pose @ p_marker."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class OccludingBoard:
-    """A flat board in one colour, in front of everything else."""
-
-    corners: Float[np.ndarray, "corners 3"]
-    """Corners of a convex outline, in the base frame [m]."""
-    colour: tuple[float, float, float]
-    """Red, green, blue, 0 to 1."""
-
-
 # Texture resolutions, one octave apart: bilinear sampling aliases beyond a factor of two.
 _MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)
 # Grey levels of a lit print: white is not 255, black not 0.
@@ -158,8 +148,6 @@ class SyntheticCamera:
         rng: np.random.Generator,
         noise: ImageNoise | None = None,
         hidden: Callable[[], Set[int]] = frozenset,
-        occluders: Callable[[], Sequence[OccludingBoard]] = tuple,
-        background: UInt8[np.ndarray, "h w 3"] | None = None,
     ):
         """Draw everything that stays the same from frame to frame.
 
@@ -170,22 +158,15 @@ class SyntheticCamera:
             rng: Source of the noise.
             noise: Blur and noise of the sensor; the defaults of `ImageNoise` when None.
             hidden: Called at each frame; ids that are occluded now.
-            occluders: Called at each frame; boards held in front of the camera now.
-            background: Image outside the markers; a plain table top when None.
 
         Raises:
-            ValueError: Two markers have the same id, or the background has another size.
+            ValueError: Two markers have the same id.
         """
         self.model = model
         self.markers = _by_id(markers)
-        self._poses, self._hidden, self._occluders = poses, hidden, occluders
+        self._poses, self._hidden = poses, hidden
         self._rng, self._noise = rng, noise or ImageNoise()
-        self._clean = table_top(model.width, model.height) if background is None else background
-        if self._clean.shape[:2] != (model.height, model.width):
-            raise ValueError(
-                f"background must be {model.width}x{model.height} as the camera, but is "
-                f"{self._clean.shape[1]}x{self._clean.shape[0]}."
-            )
+        self._clean = table_top(model.width, model.height)
         self._background = self._noise.degrade(self._clean, rng)
         self._canvas = self._clean.copy()  # equals `_clean` between frames
         self._rays = pixel_rays(model)
@@ -196,7 +177,6 @@ class SyntheticCamera:
     def read(self) -> UInt8[np.ndarray, "h w 3"]:
         """The image now, RGB."""
         drawn = [self._draw(marker, pose) for marker, pose in self._visible()]
-        drawn += [self._draw_board(board) for board in self._occluders()]
         image = self._background.copy()
         for roi in drawn:
             image[roi] = self._noise.degrade(self._canvas[roi], self._rng)
@@ -236,16 +216,6 @@ class SyntheticCamera:
         # Grey is already weighted by opacity, so this is exact at the soft edges too.
         self._canvas[roi] = np.rint(grey + (1.0 - alpha) * self._canvas[roi])
         return roi
-
-    def _draw_board(self, board: OccludingBoard) -> tuple[slice, slice]:
-        """Paint a board over what has been drawn and return the region it touched."""
-        import cv2
-
-        pixels = self.model.project(board.corners)
-        colour = tuple(255.0 * c for c in board.colour)
-        outline = np.rint(pixels).astype(np.int32)
-        cv2.fillConvexPoly(self._canvas, outline, colour, cv2.LINE_AA)
-        return self._around(pixels)
 
     def _around(self, pixels: Float[np.ndarray, "corners 2"]) -> tuple[slice, slice]:
         """Part of the image about some pixels, with room for the blur."""
