@@ -89,37 +89,21 @@ def test_what_nobody_pushes_is_handed_on_as_it_is():
     assert openings == widths.tolist()
 
 
-def test_the_elbow_goes_aside_and_back_while_the_hand_goes_on():
-    wishes = line(still=6.0)
-    postures, joints, _ = followed(wishes, Pusher(-2.0 * SIDEWAYS, 0.6, 1.9))
+def test_elbow_goes_aside_and_back_while_the_hand_goes_on():
+    wishes = line(seconds=3.0, still=5.5)
+    postures, joints, _ = followed(wishes, Pusher(-2.0 * SIDEWAYS, 0.5, 1.3))
     np.testing.assert_array_equal(postures.numpy(), wishes)  # without a pause
     aside = (elbow(joints) - elbow(postures)).norm(dim=-1)
-    assert aside.max() > 0.15
+    assert aside.max() > 0.1
     off, turn = hand_off(postures, joints)
     assert off < 1e-6
     assert turn < 1e-6
-    assert aside[-1] < 1e-3
+    # Joints that are back are the policy's own to the last digit.
+    assert torch.equal(joints[-1], postures[-1])
     step = joints.diff(dim=0).abs().amax(dim=0) / DT
     assert (step <= panda.limits.velocity).all()
     # Smoothly: each joint's speed changes by no more than its limit.
     assert (joints.diff(n=2, dim=0).abs() / DT**2 <= panda.limits.acceleration).all()
-
-
-def test_joints_that_are_back_are_the_policys_own_to_the_last_digit():
-    postures, joints, _ = followed(
-        line(seconds=1.5, still=6.5), Pusher(0.7 * SIDEWAYS, 0.2, 0.8)
-    )
-    assert torch.equal(joints[-1], postures[-1])
-    assert not torch.equal(joints[30], postures[30])
-
-
-def test_joints_stay_aside_if_wanted():
-    config = YieldingConfig(after_push="stay")
-    wishes = line(seconds=3.0, still=1.0)
-    postures, joints, _ = followed(wishes, Pusher(SIDEWAYS, 0.6, 2.0), config=config)
-    aside = (elbow(joints) - elbow(postures)).norm(dim=-1)
-    assert aside[-1] > 0.1
-    assert hand_off(postures, joints)[0] < 1e-6
 
 
 @pytest.mark.parametrize("strength", [0.3, 3.0])
@@ -137,8 +121,8 @@ def test_the_share_followed_is_the_null_velocity_reached_over_the_one_asked(stre
 
 def test_a_push_ends_where_limits_and_singularities_begin():
     """However long and hard: the hand stays, no joint passes its limit, and they come back."""
-    wishes = np.repeat(panda.ready.numpy()[None], round(12.0 / DT), axis=0)
-    postures, joints, _ = followed(wishes, Pusher(-4 * SIDEWAYS, 0.2, 3.0))
+    wishes = np.repeat(panda.ready.numpy()[None], round(10.0 / DT), axis=0)
+    postures, joints, _ = followed(wishes, Pusher(-4 * SIDEWAYS, 0.2, 2.2))
     assert ((joints > panda.limits.lower) & (joints < panda.limits.upper)).all()
     assert torch.linalg.svdvals(panda.jacobian(joints))[:, -1].min() > 0.05
     assert (joints - postures).abs().max() > 1.0
@@ -162,8 +146,8 @@ def test_the_null_space_stops_before_a_limit_that_would_move_the_hand():
 
 def test_nobody_pushes_the_arm_into_what_is_around_it():
     """A wall across the way of the elbow: it slides along, and the hand goes on."""
-    wishes = line(still=0.5)
-    human = Pusher(1.2 * SIDEWAYS, 0.6, 3.0)
+    wishes = line(seconds=3.5, still=0.0)
+    human = Pusher(1.2 * SIDEWAYS, 0.5, 2.6)
     postures, free, _ = followed(wishes, human)
     way = elbow(free) - elbow(postures)
     farthest = int(way.norm(dim=-1).argmax())
@@ -187,7 +171,7 @@ def test_nobody_pushes_the_arm_into_what_is_around_it():
 
 
 def test_where_an_arm_aside_cannot_go_on_it_waits_and_then_does_everything_that_was_asked():
-    wishes, blocked = line(seconds=3.0), {}
+    wishes, blocked = line(seconds=3.0, still=4.5), {}
     widths = np.arange(len(wishes), dtype=float)
 
     def before(k, motion):
@@ -236,7 +220,7 @@ def test_paths_beside_the_policys_own_keep_the_limits():
     goal = panda.ready + torch.from_numpy(rng.uniform(-0.9, 0.9, 7))
     goal = goal.clamp(panda.limits.lower + 0.25, panda.limits.upper - 0.25)
     path = joint_line(panda.ready, goal, speed=0.6, dt=DT).numpy()
-    wishes = np.concatenate([path, np.repeat(path[-1:], 60, axis=0)])
+    wishes = np.concatenate([path, np.repeat(path[-1:], 30, axis=0)])
     push = rng.choice([-1, 1]) * rng.uniform(1, 2) * SIDEWAYS
     postures, joints, _ = followed(wishes, Pusher(push, 0.3, rng.uniform(1.5, 3.5)))
     assert (elbow(joints) - elbow(postures)).norm(dim=-1).max() > 0.05
@@ -248,10 +232,10 @@ def test_paths_beside_the_policys_own_keep_the_limits():
 
 def test_joints_far_aside_hold_the_policy_until_they_are_nearer():
     """Where the end effector rests the null space leads back as it led aside."""
-    wishes = line(still=6.0)
-    postures, joints, _ = followed(wishes, Pusher(SIDEWAYS, 0.6, 3.0))
+    wishes = line(seconds=3.0, still=5.5)
+    postures, joints, _ = followed(wishes, Pusher(SIDEWAYS, 0.4, 2.6))
     far = (joints - postures).norm(dim=-1) > FAR_ASIDE
-    assert far.sum() > 20
+    assert far.sum() > 15
     # It needs 0.2 s to stop.
     moves = postures.diff(dim=0).abs().amax(dim=-1) > 0
     assert not moves[4:][far.unfold(0, 6, 1).all(dim=-1)].any()
@@ -261,7 +245,7 @@ def test_joints_far_aside_hold_the_policy_until_they_are_nearer():
 def test_a_push_far_aside_is_balanced_by_the_return_and_its_fraction_reported():
     posture = np.array([0.59, -0.25, -0.05, -2.05, 0.0, 1.61, 1.13])
     human = Pusher(2 * SIDEWAYS, 0.2, 1e9)
-    postures, joints, _ = followed(np.repeat(posture[None], 150, axis=0), human)
+    postures, joints, _ = followed(np.repeat(posture[None], 100, axis=0), human)
     far = (postures[-1] - joints[-1]).norm()
     assert FAR_ASIDE < far < FAR_ASIDE + 0.4
     assert (joints[-1] - joints[-10]).abs().max() < 0.02
@@ -272,9 +256,11 @@ def test_a_push_far_aside_is_balanced_by_the_return_and_its_fraction_reported():
 
 def test_joints_that_stay_aside_are_not_led_back_however_far_they_are():
     config = YieldingConfig(after_push="stay")
-    wishes = line(seconds=3.0, still=2.0)
-    postures, joints, _ = followed(wishes, Pusher(SIDEWAYS, 0.6, 3.0), config=config)
+    wishes = line(seconds=3.0, still=0.5)
+    postures, joints, _ = followed(wishes, Pusher(SIDEWAYS, 0.3, 2.7), config=config)
     np.testing.assert_array_equal(postures.numpy(), wishes)  # without a pause
     off = (joints - postures).norm(dim=-1)
     assert off.max() > FAR_ASIDE
     assert off[-1] > off.max() - 0.1
+    assert (elbow(joints) - elbow(postures)).norm(dim=-1)[-1] > 0.1
+    assert hand_off(postures, joints)[0] < 1e-6
