@@ -140,7 +140,6 @@ def test_the_recording_tells_how_the_estimate_came_to_the_truth(grasp):
     )
     assert wrong[known[-1]] < 0.15 * wrong[known[0]]
     assert np.isfinite(run.potential_rate[known]).all()
-    assert "fraction of vision" in run.potentials
 
 
 def test_a_scene_is_remote_unhurt_and_seen():
