@@ -20,6 +20,7 @@ from closed_loop import (
 from grasp_trials import MARKER
 from jaxtyping import Bool, Float, Int
 from limit_monitor import LimitMonitor
+from pinhole_camera import PinholeCamera
 from torch import Tensor
 from torch.utils import _pytree
 
@@ -33,7 +34,6 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.cameras import PinholeCamera
 
 ELBOW = 4
 """Joint that is pushed."""

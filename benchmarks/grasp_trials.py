@@ -14,6 +14,7 @@ from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from jaxtyping import Bool, Float, Int
 from limit_monitor import LimitMonitor
 from paper_law import paper_goals, paper_joint_region
+from pinhole_camera import PinholeCamera
 from torch import Tensor
 
 from hrc_learn.controller import (
@@ -41,7 +42,6 @@ from hrc_learn.kinematics import (
 )
 from hrc_learn.kinematics.inverse import best_postures, solutions_from
 from hrc_learn.regions import JointRegion
-from hrc_learn.sim.cameras import PinholeCamera
 
 TABLE = ((0.26, 0.54, -0.02), (0.42, 0.34, 0.02))
 """Centre and half edges of the table [m], as simulated."""

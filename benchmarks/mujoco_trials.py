@@ -20,13 +20,13 @@ from grasp_trials import (
     grasp_controller,
 )
 from jaxtyping import Bool, Float
+from pinhole_camera import PinholeCamera
 from torch import Tensor
 
 from hrc_learn.controller import GRIPPER_DOWN
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian
 from hrc_learn.sim import SceneConfig, World, open_camera
-from hrc_learn.sim.cameras import PinholeCamera
 from hrc_learn.sim.scene import HAND_MARKER, CabinetConfig
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.vision import CameraModel

@@ -1,13 +1,13 @@
 """An arm that servoes on a marker over a box: camera, controller, starts and observations."""
 
 import torch
+from pinhole_camera import PinholeCamera
 from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals, Observation
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.cameras import PinholeCamera
 
 DOUBLE = torch.float64
 LIMITS = panda.limits

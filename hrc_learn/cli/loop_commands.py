@@ -39,7 +39,6 @@ from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import MovingBodies, SceneConfig, World
-from hrc_learn.sim.cameras import PinholeCamera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import Gamepad, HapticDevice, TerminalKeyboard
@@ -53,9 +52,12 @@ from hrc_learn.teleoperation.page_session import (
     counted,
     place_targets,
 )
+from hrc_learn.vision import CameraModel
 
 SWITCH_INTERVAL = 0.0005
 """Longest time for which a thread of the page holds the interpreter [s]."""
+MARKER = (0.05, 0.0, -0.08)
+"""Marker of the gripper in the frame of the tool, as `hrc serve` simulates it [m]."""
 FRAME_TIME = 0.032
 """Time between images of `hrc serve` [s]."""
 CENTRE = (0.35, 0.35, 0.35)
@@ -236,25 +238,27 @@ def serve(args: Serve) -> None:
     write_values(args.json, figures)
 
 
-def _camera() -> PinholeCamera:
-    centre = torch.tensor(CENTRE, dtype=torch.float64)
-    return PinholeCamera.above(
-        centre,
-        height=centre.new_tensor(1.1),
-        roll=centre.new_tensor(0.5),
-        tilt=centre.new_tensor(0.2),
-        bearing=centre.new_tensor(1.0),
-        marker=centre.new_tensor((0.05, 0.0, -0.08)),
-    )
+def _camera() -> CameraModel:
+    """Camera 1.1 m above the box, leaning by 0.2 rad and turned about its axis."""
+    lean, turn = ([0.2 * -np.sin(1.0), 0.2 * np.cos(1.0), 0.0], [0.0, 0.0, 0.5])
+    # The paper's camera looks down, image right is -x and image down is +y.
+    overhead = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
+    turned = quaternion.multiply(overhead, quaternion.exp(torch.tensor(turn).double()))
+    orientation = quaternion.multiply(quaternion.exp(torch.tensor(lean).double()), turned)
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion.to_matrix(orientation).numpy()
+    pose[:3, 3] = CENTRE - 1.1 * pose[:3, 2]
+    return CameraModel(focal=(1600.0, 1600.0), pose=pose)
 
 
 def _controller(
-    chain: SerialChain, camera: PinholeCamera, dt: float, safety: SafetyConfig
+    chain: SerialChain, camera: CameraModel, dt: float, safety: SafetyConfig
 ) -> tuple[AdaptiveController, Observation]:
     """The controller, and an observation with every field that the loop sets."""
     centre = torch.tensor(CENTRE, dtype=torch.float64)
     down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
-    target, _ = camera.project(Pose(centre + centre.new_tensor((0.03, -0.02, 0.0)), down))
+    tool = Pose(centre + centre.new_tensor((0.03, -0.02, 0.0)), down)
+    target = torch.from_numpy(camera.project(tool.apply(MARKER).numpy()))
     J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
     network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
     controller = AdaptiveController(
@@ -281,7 +285,7 @@ def _run_serve(
     runner: StepRunner,
     opened: OpenedArm,
     chain: SerialChain,
-    camera: PinholeCamera,
+    camera: CameraModel,
     dt: float,
     steps: int,
 ) -> dict[str, float | int]:
@@ -305,9 +309,9 @@ def _run_serve(
             observation["feature_new"][...] = k % frame_steps == 0
             if k % frame_steps == 0:
                 q = arm.read().joint_position
-                feature, visible = camera.project(chain.forward(torch.from_numpy(q)))
-                observation["feature"][:] = feature.numpy()
-                observation["feature_visible"][...] = bool(visible)
+                marker = chain.forward(q).apply(MARKER).numpy()
+                observation["feature"][:] = camera.project(marker)
+                observation["feature_visible"][...] = bool(camera.in_view(marker))
                 observation["image_joint_position"][:] = q
             late[k] = rate.wait()
     figures: dict[str, float | int] = {

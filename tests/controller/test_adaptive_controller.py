@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import sampling
 import torch
+from pinhole_camera import PinholeCamera
 from servoing import (
     CENTRE,
     DOUBLE,
@@ -30,7 +31,6 @@ from hrc_learn.jacobian import (
     PaperEstimator,
 )
 from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
-from hrc_learn.sim.cameras import PinholeCamera
 
 
 class TestTheLaw:

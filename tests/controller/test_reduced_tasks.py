@@ -5,6 +5,7 @@ import pytest
 import sampling
 import torch
 from closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
+from pinhole_camera import PinholeCamera
 from servoing import CENTRE, DOUBLE, DOWN, grasping, near_starts, network, observe
 from unchecked import shapes_unchecked
 
@@ -13,7 +14,6 @@ from hrc_learn.controller.resolved_rate import task_descent
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
 from hrc_learn.kinematics import Arm, arm, panda, solve_inverse, task_basis, task_rank
-from hrc_learn.sim.cameras import PinholeCamera
 from hrc_learn.skills.placing import follow_pose
 
 pytestmark = pytest.mark.simulation

@@ -7,6 +7,7 @@ import sampling
 import torch
 from closed_loop import Imperfections
 from grasp_trials import CORNERS, TrialConfig, run_trials
+from pinhole_camera import PinholeCamera
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import VisionBlending
@@ -21,7 +22,6 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.cameras import PinholeCamera
 
 DOUBLE = torch.float64
 J0 = torch.tensor([[-1500.0, 0, 0, 0, -200, 60], [0, 2400, 170, -200, 0, 180]], dtype=DOUBLE)
