@@ -276,13 +276,6 @@ def drift_free_slope(
     return curvature - h_rate * cross - h * bend + turning + k * torch.linalg.cross(rate, cross)
 
 
-def left_jacobian(
-    phi: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
-) -> Float[Tensor, "*batch 3"]:
-    """J_l(phi) rate: angular velocity in the base frame of a moving rotation vector."""
-    return drift_free_rate(-phi, rate)
-
-
 def left_jacobian_transposed(
     phi: Float[Tensor, "*batch 3"], slope: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:

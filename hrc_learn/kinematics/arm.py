@@ -271,7 +271,8 @@ class Arm(SerialChain):
                 f"{self.name} has no closed-form inverse, so q7 does not apply: pass near= to "
                 "choose among its solutions."
             )
-        batch = _batch_of(pose, q7)
+        shapes = [pose.position.shape[:-1], pose.orientation.shape[:-1]]
+        batch = np.broadcast_shapes(*shapes, () if q7 is None else as_tensor(q7).shape)
         if near is None and batch:
             q, missing = self._path(pose, q7, batch, task, samples)
         else:
@@ -351,24 +352,21 @@ class Arm(SerialChain):
         angles = None if q7 is None else as_tensor(q7, pose.position).expand(batch)
         before, path, missing = self.ready.to(pose.position), [], []
         for k in range(batch[-1]):
-            angle = None if angles is None else angles[..., k]
-            q, lost = self._next(pose[..., k], angle, before, task, samples)
+            here, angle = pose[..., k], None if angles is None else angles[..., k]
+            q, lost = (
+                before.new_full((1,), torch.nan),
+                torch.zeros(batch[:-1], dtype=torch.bool),
+            )
+            if self._closed_form is None:
+                start = before.double().unsqueeze(-2)
+                q = solutions_from(self, here, start, task=task).squeeze(-2).to(before)
+            # A comparison with NaN is false, so poses that were not reached are searched, too.
+            if not bool(((q - before).abs().amax(-1) < _LARGEST_STEP).all()):
+                q, lost = self._nearest(here, angle, before, task, samples)
             path.append(q)
             missing.append(lost)
             before = torch.where(q.isnan(), before, q)
         return torch.stack(path, dim=-2), torch.stack(missing, dim=-1)
-
-    def _next(
-        self, pose: Pose, q7: Tensor | None, before: Tensor, task: TaskSpace, samples: int
-    ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
-        """Solution for the next pose of a path, close to the one before."""
-        if self._closed_form is None:
-            start = before.double().unsqueeze(-2)
-            q = solutions_from(self, pose, start, task=task).squeeze(-2).to(before)
-            # A comparison with NaN is false, so poses that were not reached are searched, too.
-            if bool(((q - before).abs().amax(-1) < _LARGEST_STEP).all()):
-                return q, torch.zeros_like(q[..., 0], dtype=torch.bool)
-        return self._nearest(pose, q7, before, task, samples)
 
     def _nearest(
         self, pose: Pose, q7: ArrayLike | None, near: Tensor, task: TaskSpace, samples: int
@@ -456,13 +454,6 @@ def comfortable_posture(arm: Arm, pose: Pose) -> Float[Tensor, " joints"]:
         UnreachableError: No joint positions within the limits reach the pose.
     """
     return arm.postures(pose)[0]
-
-
-def _batch_of(pose: Pose, q7: ArrayLike | None) -> tuple[int, ...]:
-    shapes = [pose.position.shape[:-1], pose.orientation.shape[:-1]]
-    if q7 is not None:
-        shapes.append(as_tensor(q7).shape)
-    return tuple(np.broadcast_shapes(*shapes))
 
 
 def _repeated(pose: Pose, shape: Sequence[int]) -> Pose:

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hrc_learn.geometry import Capsule
 from hrc_learn.geometry.numerics import Constant, safe_norm
 from hrc_learn.kinematics.chain import SerialChain
 
@@ -35,17 +36,11 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class LinkCapsule:
-    """All points within a radius of a segment."""
+class LinkCapsule(Capsule):
+    """A capsule in the frame of a link."""
 
     link: int
     """Number of the link it belongs to; 0 is the base."""
-    start: tuple[float, float, float]
-    """One end of the segment, in the frame of the link [m]."""
-    end: tuple[float, float, float]
-    """The other end [m]."""
-    radius: float
-    """[m]"""
 
 
 @final

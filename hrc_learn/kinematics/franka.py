@@ -18,7 +18,6 @@ Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at mo
 
 from __future__ import annotations
 
-from collections import defaultdict
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, distribution
 from math import cos, pi, sin
@@ -30,7 +29,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry import Body, Capsule, MeshFile, Pose
+from hrc_learn.geometry import Body, MeshFile, Pose
 from hrc_learn.kinematics.arm import TCP_OFFSET, Arm, ArmShape, hand_capsules
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import LinkCapsule
@@ -281,27 +280,19 @@ def panda_bodies(joint_position: Float[np.ndarray, "time 7"]) -> tuple[Body, ...
     Args:
         joint_position: [rad].
     """
-    poses = panda.link_poses(torch.from_numpy(joint_position))
-    position, orientation = poses.position.numpy(), poses.orientation.numpy()
-    # The base, which moves with no joint, comes first.
-    position = np.concatenate([np.zeros_like(position[:, :1]), position], axis=1)
-    upright = np.zeros_like(orientation[:, :1])
-    upright[..., 0] = 1.0
-    orientation = np.concatenate([upright, orientation], axis=1)
-    shapes = defaultdict(list)
-    for capsule in panda.whole.capsules:
-        shapes[capsule.link].append(
-            Capsule(start=capsule.start, end=capsule.end, radius=capsule.radius)
+    moving = panda.link_poses(joint_position)
+    upright = moving.orientation.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(joint_position), 4)
+    bodies = []
+    for link in dict.fromkeys(panda.whole.links):
+        # The base moves with no joint.
+        pose = moving[:, link - 1] if link else Pose(torch.zeros_like(upright[:, :3]), upright)
+        name = "tool" if link == TOOL_LINK else f"link{link}"
+        body = Body(
+            name=name,
+            position=pose.position.numpy(),
+            orientation=pose.orientation.numpy(),
+            capsules=tuple(c for c in panda.whole.capsules if c.link == link),
+            meshes=panda_meshes(name),
         )
-    last = position.shape[1] - 1
-    names = {link: "tool" if link == last else f"link{link}" for link in shapes}
-    return tuple(
-        Body(
-            name=names[link],
-            position=position[:, link],
-            orientation=orientation[:, link],
-            capsules=tuple(capsules),
-            meshes=panda_meshes(names[link]),
-        )
-        for link, capsules in shapes.items()
-    )
+        bodies.append(body)
+    return tuple(bodies)

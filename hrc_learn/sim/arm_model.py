@@ -100,7 +100,7 @@ def add_box(body, name: str, half_size, colour, **more):
     )
 
 
-def add_capsule(body, name: str, capsule: LinkCapsule | Capsule, colour):
+def add_capsule(body, name: str, capsule: Capsule, colour):
     """Add a capsule to a body, a ball if it has no length, as MuJoCo takes no such capsule."""
     is_ball = math.dist(capsule.start, capsule.end) < _SHORTEST
     along = {"pos": capsule.start} if is_ball else {"fromto": (*capsule.start, *capsule.end)}
@@ -385,11 +385,11 @@ class MujocoArm:
         """
         data = self._data
         torque = data.qfrc_constraint + data.qfrc_applied
-        wrench = data.xfrc_applied.copy()
-        wrench[:, :3] += self._unknown[:, None] * self._model.opt.gravity
-        for body in np.flatnonzero(wrench.any(axis=1)):
-            force, moment = np.split(wrench[body], 2)
-            mujoco.mj_applyFT(self._model, data, force, moment, data.xipos[body], body, torque)
+        force = data.xfrc_applied[:, :3] + self._unknown[:, None] * self._model.opt.gravity
+        moment = data.xfrc_applied[:, 3:]
+        for body in np.flatnonzero(force.any(axis=1) | moment.any(axis=1)):
+            at = data.xipos[body]
+            mujoco.mj_applyFT(self._model, data, force[body], moment[body], at, body, torque)
         return torque[self._velocities]
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
