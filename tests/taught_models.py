@@ -17,10 +17,10 @@ def teach(folder: Path) -> tuple[VisualServoSkill, PlacingSkill]:
     placing, servoing = folder / "placing_demos", folder / "servoing_demos"
     done("record", "placing", "--out", placing, "--episodes", 1)
     done(
-        *("record", "servoing", "--out", servoing, "--episodes", 4),
-        *("--config", "demonstration.duration=5", "--json", folder / "servoing.json"),
+        *("record", "servoing", "--out", servoing, "--episodes", 3),
+        *("--config", "demonstration.duration=4", "--json", folder / "servoing.json"),
     )
-    assert json.loads((folder / "servoing.json").read_text())["episodes"] == 4
+    assert json.loads((folder / "servoing.json").read_text())["episodes"] == 3
     done("fit", "--dataset", placing, "--out", folder / "placing")
     done("fit", "image-jacobian", "--dataset", servoing, "--out", folder / "aiming")
     aiming = VisualServoSkill.load(folder / "aiming")

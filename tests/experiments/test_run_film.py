@@ -50,12 +50,12 @@ def test_the_caption_is_of_the_phase_that_was_entered_last():
 
 def test_a_pull_is_an_arrow_above_the_forearm_while_it_lasts():
     run, pulled, free = pushed(slice(80, 120)), 100, 20
-    arrow, forearm = film._pull(run, pulled)
-    assert arrow.head
+    lines, _ = film._drawn_in(run, pulled)
+    (arrow,) = (line for line in lines if line.head)
+    (forearm,) = (line for line in lines if line.colour == palette.PERSON)
     np.testing.assert_allclose(np.subtract(arrow.end, arrow.start), [0, 0.45, 0], atol=1e-9)
     np.testing.assert_allclose(forearm.start, [0.1, 0.0, 0.5])
     assert arrow.start[2] > forearm.start[2]
-    assert film._pull(run, free) == []
     assert "a person pulls the elbow" in labels(run, pulled)
     assert "a person pulls the elbow" not in labels(run, free)
 

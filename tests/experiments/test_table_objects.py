@@ -1,16 +1,18 @@
 import numpy as np
 import pytest
 
+from hrc_learn.experiments import surroundings
 from hrc_learn.experiments.surroundings import (
     OBJECTS_REACH,
     THREE_OBJECTS,
-    random_object_poses,
+    draw_object_poses,
     with_objects,
 )
 from hrc_learn.sim import FINGER_STROKE, World
 from hrc_learn.sim.workplace import Workplace
 
 WORKPLACE = with_objects(Workplace(), THREE_OBJECTS)
+WORLD = World(WORKPLACE.scene)
 
 
 # Points of the open fingers beside an object, in its frame: along its x axis 4 to 6 cm to
@@ -26,8 +28,7 @@ OPEN_FINGERS = np.array(
 
 
 def scattered(seed):
-    rng = np.random.default_rng(seed)
-    return random_object_poses(THREE_OBJECTS, WORKPLACE.table_centre, OBJECTS_REACH, rng)
+    return draw_object_poses(WORKPLACE, WORLD, np.pi, np.random.default_rng(seed))
 
 
 def test_objects_lie_on_the_table_in_reach_and_in_view_with_room_for_the_fingers():
@@ -60,7 +61,7 @@ def test_the_gripper_takes_every_object_and_its_palm_clears_them_all():
 
 
 def test_scattered_objects_rest_where_they_were_put():
-    world, poses = World(WORKPLACE.scene), scattered(3)
+    world, poses = WORLD, scattered(3)
     world.reset(WORKPLACE.home_joints().numpy(), poses)
     world.advance(0.5)
     for item in THREE_OBJECTS:
@@ -68,8 +69,8 @@ def test_scattered_objects_rest_where_they_were_put():
         assert world.rests_on(item.name, "table")
 
 
-def test_more_objects_than_fit_are_refused():
+def test_more_objects_than_fit_are_refused(monkeypatch):
+    monkeypatch.setattr(surroundings, "OBJECTS_REACH", (0.01, 0.01))
+    monkeypatch.setattr(surroundings, "_ARRANGEMENTS", 20)
     with pytest.raises(ValueError, match="do not fit"):
-        random_object_poses(
-            THREE_OBJECTS, (0.2, 0.5), (0.01, 0.01), np.random.default_rng(0), attempts=20
-        )
+        scattered(0)

@@ -122,6 +122,8 @@ def test_a_world_without_a_worker_keeps_no_distances():
 
 def test_beside_the_elbow_nobody_leans_into_the_arm_that_waits():
     visit = draw_visit(WORKPLACE, np.random.default_rng(0))
+    other = draw_visit(WORKPLACE, np.random.default_rng(1))
+    assert other.worker.config != visit.worker.config
     waiting, world = WORKPLACE.hover_joints().numpy(), World(SCENE)
     world.reset(waiting)
     distance = WorkerDistance(world)

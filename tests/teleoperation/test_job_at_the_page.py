@@ -12,7 +12,7 @@ from hrc_learn.experiments.collaboration_trial import (
     CollaborationScenario,
     simulate_collaboration,
 )
-from hrc_learn.experiments.run_measures import ELBOW, Deviation, link_poses, span
+from hrc_learn.experiments.run_measures import ELBOW, Deviation, span
 from hrc_learn.experiments.simulated_cell import Observer
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
@@ -59,7 +59,8 @@ class Job:
         return events[-1].text if events else ""
 
     def link(self, index: int) -> np.ndarray:
-        return link_poses(self.cell.log.snapshot(), panda).position[-1, index].numpy()
+        joints = self.cell.log.snapshot()["joint_position"][-1]
+        return panda.joint_origins(joints)[index].numpy()
 
     def __enter__(self):
         self._thread.start()
@@ -99,6 +100,6 @@ def test_the_elbow_yields_to_the_mouse_while_the_end_effector_servoes(tmp_path, 
     assert np.nan_to_num(deviation.elbow).max() > 0.05
     assert np.nan_to_num(deviation.position).max() < 1e-3
     # To the right of the screen is +y.
-    moved = link_poses(log, panda).position.numpy()[:, ELBOW] - elbow
+    moved = panda.joint_origins(log["joint_position"]).numpy()[:, ELBOW] - elbow
     assert moved[effort > 0][-1, 1] > 0
     assert result.world.rests_on("box", "board_middle")
