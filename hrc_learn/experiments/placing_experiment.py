@@ -9,11 +9,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import matplotlib
 import numpy as np
 import torch
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from torch import Tensor
 
 from hrc_learn.demos import Demonstration, load_demos
 from hrc_learn.experiments.experiment import Study
@@ -34,7 +32,8 @@ from hrc_learn.experiments.placing_trial import (
     random_start,
     taught_correction,
 )
-from hrc_learn.experiments.run_recorder import joint_ranges, record
+from hrc_learn.experiments.run_recorder import record
+from hrc_learn.experiments.run_report import placing_joints_figure, placing_paths_figure
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.log import LoggedSteps, RunRecording
@@ -42,22 +41,7 @@ from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, PlanningSpace
 from hrc_learn.store import read_made_by
-from hrc_learn.viz import palette
-from hrc_learn.viz.figures import (
-    STYLE,
-    WIDTH,
-    JointCurves,
-    demonstrated_joints,
-    draw_box,
-    frame_space,
-    joint_grid_figure,
-    near,
-    space,
-)
 from hrc_learn.viz.report import Picture, Section
-
-_COLOURS = (palette.ORANGE, palette.BLUE, palette.PURPLE, palette.GREEN)
-"""Colours of the shelves, from bottom to top."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,21 +103,13 @@ class PlacingExperiment:
             for shelf in scene.workplace.shelf_names():
                 observer.tell(f"Placing on the {shelf} shelf, planned in {label}")
                 viewed = (planned, shelf) == ("joint", scene.demonstrated_shelf)
-                placed = place(
-                    scene.skill,
-                    scene.workplace,
+                placings[planned, shelf], outcomes[planned][shelf] = scene.place(
                     shelf,
                     torch.from_numpy(joints[0]),
                     space=planned,
                     speed=self.speed,
-                    world=scene.world,
-                    correction=scene.correction,
                     access=access_by(self.arm, scene.skill.robot),
                     observer=observer if viewed else UNOBSERVED,
-                )
-                placings[planned, shelf] = placed
-                outcomes[planned][shelf] = PlacingOutcome.of(
-                    placed, scene.workplace, scene.demonstration
                 )
         return PlacingRun(
             workplace=scene.workplace,
@@ -200,13 +176,13 @@ class PlacingExperiment:
         """Report section: paths and joints on the way to all shelves."""
         paths = Picture(
             "paths",
-            paths_figure(run),
+            placing_paths_figure(run, self._shelves),
             "Paths of the end effector. A shifted goal bends the joint-space motion; in task "
             "space the approach keeps its shape.",
         )
         joints = Picture(
             "joints",
-            joints_figure(run),
+            placing_joints_figure(run, self._shelves),
             "Joints, planned in task space: the demonstration, and the faster motions to three "
             "goals.",
         )
@@ -242,6 +218,21 @@ class PlacingScene:
     demonstrated_shelf: str
     correction: PlaceCorrection | None
 
+    def place(
+        self, shelf: str, start: Tensor, **options: Any
+    ) -> tuple[SimulatedPlacing, PlacingOutcome]:
+        """Place on a shelf from joint positions [rad] with options of `placing_trial.place`."""
+        placed = place(
+            self.skill,
+            self.workplace,
+            shelf,
+            start,
+            world=self.world,
+            correction=self.correction,
+            **options,
+        )
+        return placed, PlacingOutcome.of(placed, self.workplace, self.demonstration)
+
 
 @dataclass(frozen=True)
 class RandomStart:
@@ -251,21 +242,14 @@ class RandomStart:
 
     def __call__(self, seed: int) -> Mapping[str, Any]:
         """Metrics of placings in task space."""
-        rng = np.random.default_rng(seed)
+        rng, noise = np.random.default_rng(seed), self.experiment.noise
         scene = self.experiment.open_scene(rng)
         outcomes = {}
         for shelf in scene.workplace.shelf_names():
-            placed = place(
-                scene.skill,
-                scene.workplace,
-                shelf,
-                random_start(scene.world, scene.workplace, self.experiment.noise, rng),
-                space="pose",
-                speed=self.experiment.speed,
-                world=scene.world,
-                correction=scene.correction,
+            start = random_start(scene.world, scene.workplace, noise, rng)
+            _, outcomes[shelf] = scene.place(
+                shelf, start, space="pose", speed=self.experiment.speed
             )
-            outcomes[shelf] = PlacingOutcome.of(placed, scene.workplace, scene.demonstration)
         evaluation = evaluate(placing_metrics(scene.workplace.shelf_names()), outcomes)
         return {**evaluation.values, "failure": evaluation.failure}
 
@@ -283,46 +267,3 @@ def dataset_of(placing: Path) -> Path:
             "--demonstrations."
         )
     return path
-
-
-def paths_figure(run: PlacingRun) -> Figure:
-    """Paths of the end effector, one panel for each planning space."""
-    shown = demonstrated_path(run.demonstration, run.workplace.robot.chain)
-    paths = {key: placed.path for key, placed in run.placings.items()}
-    points = np.concatenate([shown, *paths.values()])
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 4.5))
-        for i, (planned, label) in enumerate(SPACES.items()):
-            axes = space(figure, position=(1, len(SPACES), 1 + i))
-            for box in near(tuple(run.workplace.scene.cabinet.boxes()), points):
-                draw_box(axes, box, "#8D8F94", alpha=0.08)
-            axes.plot(*shown.T, color=palette.DEMO, lw=5, label="demonstration")
-            for shelf, colour in zip(run.workplace.shelf_names(), _COLOURS, strict=False):
-                path = paths[planned, shelf]
-                axes.plot(*path.T, color=colour, lw=1.8, label=f"{shelf} shelf")
-                axes.plot(*path[-1], "s", color=colour, ms=4)
-            axes.set_title(label.capitalize(), loc="left")
-            frame_space(axes, points, zoom=1.0)
-            axes.xaxis.set_major_locator(MaxNLocator(3))
-            axes.view_init(elev=16, azim=62)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
-    return figure
-
-
-def joints_figure(run: PlacingRun) -> Figure:
-    """Joint positions over time: the demonstration, and the motion to each shelf."""
-    shown, chain = run.demonstration, run.workplace.robot.chain
-    assert shown.joint_position is not None
-    curves = [demonstrated_joints(shown.time - shown.time[0], shown.joint_position)]
-    for shelf, colour in zip(run.workplace.shelf_names(), _COLOURS, strict=False):
-        placed = run.placings["pose", shelf]
-        curves.append(
-            JointCurves(
-                label=f"{shelf} shelf",
-                time=placed.time,
-                position=placed.joint_position,
-                colour=colour,
-            )
-        )
-    return joint_grid_figure(chain.joint_names, curves, joint_ranges(chain))

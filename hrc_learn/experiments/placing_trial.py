@@ -46,10 +46,8 @@ _DRAWS = 100
 class SimulatedPlacing:
     """One placing, from the start of the transfer to the end of the retreat."""
 
-    shelf: str
     goal: Pose
     """True pose at which the end effector should release the object."""
-    space: PlanningSpace
     plan: Plan
     """Plan to the measured pose at the goal."""
     world: World
@@ -131,9 +129,7 @@ def place(
         release_time = place_along(cell, plan, measured_goal, lowering)
     contacts = unwanted_contacts(world, cell.log, {item.name: release_time})
     return SimulatedPlacing(
-        shelf=shelf,
         goal=goal,
-        space=space,
         plan=plan,
         world=world,
         cell=cell,

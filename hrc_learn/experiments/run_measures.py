@@ -22,8 +22,8 @@ from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.vision import CameraModel
 
-ELBOW, TOOL = 3, -1
-"""Indices of the elbow and the tool among the frames of the links."""
+ELBOW = 3
+"""Index of the elbow among the frames of the links."""
 
 # Time after its end during which a pull still counts, while the arm moves back [s].
 _AFTER = 1.0
@@ -66,12 +66,12 @@ def true_image_jacobian(
     """
     used = np.isfinite(log["image_jacobian"]).all(axis=(1, 2))
     jacobian = np.full_like(log["image_jacobian"], np.nan)
-    poses = link_poses(log, world.arm.robot.chain)
+    tools = world.arm.robot.forward(log["joint_position"])
     offset = torch.from_numpy(world.hand_marker_offset())
     ends = [*(start for start, _ in cameras[1:]), math.inf]
     for (start, camera), end in zip(cameras, ends, strict=True):
         rows = used & (log["time"] >= start) & (log["time"] < end)
-        tool = poses[torch.from_numpy(rows), TOOL]
+        tool = tools[torch.from_numpy(rows)]
         marker = tool.apply(offset).numpy()
         jacobian[rows] = camera.image_jacobian(marker, tool.position.numpy())
     return jacobian
@@ -88,11 +88,6 @@ def body_poses(motion: MotionLog, name: str, steps: int) -> Pose:
     """True poses of a link or an object in the first steps of a run, (time,)."""
     (body,) = (body for body in motion.bodies(steps) if body.name == name)
     return Pose(torch.from_numpy(body.position), torch.from_numpy(body.orientation))
-
-
-def link_poses(log: LoggedSteps, chain: SerialChain) -> Pose:
-    """Measured poses of the joint frames, the flange and the tool, (time, links)."""
-    return chain.link_poses(torch.from_numpy(log["joint_position"]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -235,16 +230,10 @@ def place_angle(pose: Float[np.ndarray, "4 4"], goal: Float[Tensor, "4"]) -> flo
         goal: Orientation of the hand at the goal.
     """
     q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
-    return float(box_angle(q, quaternion.multiply(goal, _IN_HAND)))
-
-
-def box_angle(
-    q: Float[Tensor, "*batch 4"], goal: Float[Tensor, "4"]
-) -> Float[Tensor, "*batch"]:
-    """Angle between orientations of a box, equal under half a turn about its z axis [rad]."""
-    half_turn = q.new_tensor([0.0, 0.0, 0.0, 1.0])
-    other = quaternion.multiply(q, half_turn)
-    return torch.minimum(quaternion.angle(q, goal), quaternion.angle(other, goal))
+    wanted = quaternion.multiply(goal, _IN_HAND)
+    # A box looks the same after half a turn about its z axis.
+    turned = quaternion.multiply(q, q.new_tensor([0.0, 0.0, 0.0, 1.0]))
+    return min(float(quaternion.angle(either, wanted)) for either in (q, turned))
 
 
 class PullEffect(NamedTuple):

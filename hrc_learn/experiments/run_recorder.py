@@ -7,7 +7,7 @@ bounded, and so is its cost.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from itertools import pairwise
+from itertools import combinations, pairwise, product
 from typing import Any
 
 import numpy as np
@@ -329,74 +329,47 @@ def _arrow(line: Line) -> Arrow:
 
 def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str, str]]]:
     """Lines in the picture of a step, and the legend of their colours."""
-    lines: list[Line] = []
-    labels: list[tuple[str, str]] = []
+    drawn: list[tuple[str, str, list[Line]]] = []
     phase = next((e.text for e in reversed(run.phases) if e.time <= run.time[step]), "")
     if run.plan_path is not None and phase in _CARRYING:
-        lines += _polyline(run.plan_path, palette.GREEN)
-        labels.append(("learned motion, planned", palette.GREEN))
+        path = _polyline(run.plan_path, palette.GREEN)
+        drawn.append(("learned motion, planned", palette.GREEN, path))
     elif run.region is not None:
-        lines += _edges(run.region, palette.YELLOW)
-        labels.append(("region of visual servoing", palette.YELLOW))
+        edges = _edges(run.region, palette.YELLOW)
+        drawn.append(("region of visual servoing", palette.YELLOW, edges))
     first = int(np.searchsorted(run.time, run.time[step] - _TRAIL))
-    lines += _polyline(run.position[first : step + 1], palette.BLUE)
-    labels.append(("path of the gripper", palette.BLUE))
-    if pull := _pull(run, step):
-        lines += pull
-        labels.append(("a person pulls the elbow", palette.PERSON))
+    trail = _polyline(run.position[first : step + 1], palette.BLUE)
+    drawn.append(("path of the gripper", palette.BLUE, trail))
+    if run.push is not None and np.isfinite(run.push[step]).all():
+        # The forearm that pulls, and an arrow above it.
+        at, tip = run.push[step]
+        above = np.array([0.0, 0.0, _ABOVE])
+        arrow = _line(at + above, tip + above, palette.VERMILION, width=0.02, head=True)
+        forearm = _line(at, tip, palette.PERSON, width=_HAND)
+        drawn.append(("a person pulls the elbow", palette.PERSON, [arrow, forearm]))
     if run.worker_nearest is not None and np.isfinite(run.worker_nearest[step]).all():
         near, far = run.worker_nearest[step]
         distance = float(np.linalg.norm(far - near))
         if distance < _NEAR:
-            lines.append(
-                Line(start=_point(near), end=_point(far), colour=palette.PURPLE, width=0.01)
-            )
-            labels.append((f"distance to the worker: {distance:.2f} m", palette.PURPLE))
-    return lines, labels
-
-
-def _pull(run: RunRecording, step: int) -> list[Line]:
-    """Lines for the forearm that pulls the elbow, and for an arrow above it."""
-    if run.push is None or not np.isfinite(run.push[step]).all():
-        return []
-    at, tip = run.push[step]
-    above = np.array([0.0, 0.0, _ABOVE])
-    return [
-        Line(
-            start=_point(at + above),
-            end=_point(tip + above),
-            colour=palette.VERMILION,
-            width=0.02,
-            head=True,
-        ),
-        Line(start=_point(at), end=_point(tip), colour=palette.PERSON, width=_HAND),
-    ]
+            gap = _line(near, far, palette.PURPLE, width=0.01)
+            words = f"distance to the worker: {distance:.2f} m"
+            drawn.append((words, palette.PURPLE, [gap]))
+    lines = [line for *_, some in drawn for line in some]
+    return lines, [(words, colour) for words, colour, _ in drawn]
 
 
 def _polyline(points: Float[np.ndarray, "points 3"], colour: str) -> list[Line]:
     kept = points[np.unique(np.linspace(0, len(points) - 1, _POINTS).round().astype(int))]
-    return [
-        Line(start=_point(a), end=_point(b), colour=colour)
-        for a, b in pairwise(kept)
-        if np.isfinite([a, b]).all()
-    ]
+    return [_line(a, b, colour) for a, b in pairwise(kept) if np.isfinite([a, b]).all()]
 
 
 def _edges(box: Box, colour: str) -> list[Line]:
-    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    lines = []
-    for a in corners:
-        for axis in range(3):
-            if a[axis] < 0:
-                b = a.copy()
-                b[axis] = 1
-                start, end = (np.array(box.centre) + c * box.half_size for c in (a, b))
-                lines.append(
-                    Line(start=_point(start), end=_point(end), colour=colour, width=0.004)
-                )
-    return lines
+    corners = np.array(list(product((-1, 1), repeat=3)))
+    ends = [(a, b) for a, b in combinations(corners, 2) if (a != b).sum() == 1]
+    centre, half = np.array(box.centre), np.array(box.half_size)
+    return [_line(centre + a * half, centre + b * half, colour, width=0.004) for a, b in ends]
 
 
-def _point(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
+def _line(start: np.ndarray, end: np.ndarray, colour: str, **more: Any) -> Line:
+    (a, b, c), (x, y, z) = start.tolist(), end.tolist()
+    return Line(start=(a, b, c), end=(x, y, z), colour=colour, **more)

@@ -9,17 +9,24 @@ import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
+from hrc_learn.experiments.placing_metrics import PlacingRun
+from hrc_learn.experiments.placing_trial import SPACES, demonstrated_path
+from hrc_learn.experiments.run_recorder import joint_ranges
 from hrc_learn.log import Event, RunRecording
 from hrc_learn.viz import palette
 from hrc_learn.viz.figures import (
     STYLE,
     WIDTH,
+    JointCurves,
     active_intervals,
+    demonstrated_joints,
     draw_box,
     finite_span,
     frame_space,
     image_jacobian_figure,
+    joint_grid_figure,
     joints_figure,
     near,
     needed,
@@ -35,6 +42,8 @@ CARRYING = ("transfer", "release")
 """Phases in which the end effector moves an object into the cabinet."""
 
 _HIDDEN = "#8D8F94"
+_SHELVES = (palette.ORANGE, palette.BLUE, palette.PURPLE, palette.GREEN)
+"""Colours of the shelves, from bottom to top."""
 
 
 def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -> list[Section]:
@@ -254,3 +263,46 @@ def _out_of_sight(run: RunRecording) -> Bool[np.ndarray, " time"]:
         return np.zeros(len(run.time), dtype=bool)
     targeted = np.isfinite(run.camera.target).all(axis=1)
     return np.asarray(targeted & ~np.isfinite(run.camera.feature).all(axis=1))
+
+
+def placing_paths_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
+    """Paths of the end effector to shelves, one panel for each planning space."""
+    shown = demonstrated_path(run.demonstration, run.workplace.robot.chain)
+    paths = {key: placed.path for key, placed in run.placings.items()}
+    points = np.concatenate([shown, *paths.values()])
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 4.5))
+        for i, (planned, label) in enumerate(SPACES.items()):
+            axes = space(figure, position=(1, len(SPACES), 1 + i))
+            for box in near(tuple(run.workplace.scene.cabinet.boxes()), points):
+                draw_box(axes, box, "#8D8F94", alpha=0.08)
+            axes.plot(*shown.T, color=palette.DEMO, lw=5, label="demonstration")
+            for shelf, colour in zip(shelves, _SHELVES, strict=False):
+                path = paths[planned, shelf]
+                axes.plot(*path.T, color=colour, lw=1.8, label=f"{shelf} shelf")
+                axes.plot(*path[-1], "s", color=colour, ms=4)
+            axes.set_title(label.capitalize(), loc="left")
+            frame_space(axes, points, zoom=1.0)
+            axes.xaxis.set_major_locator(MaxNLocator(3))
+            axes.view_init(elev=16, azim=62)
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    return figure
+
+
+def placing_joints_figure(run: PlacingRun, shelves: Sequence[str]) -> Figure:
+    """Joint positions over time: the demonstration, and the motion to each shelf."""
+    shown, chain = run.demonstration, run.workplace.robot.chain
+    assert shown.joint_position is not None
+    curves = [demonstrated_joints(shown.time - shown.time[0], shown.joint_position)]
+    for shelf, colour in zip(shelves, _SHELVES, strict=False):
+        placed = run.placings["pose", shelf]
+        curves.append(
+            JointCurves(
+                label=f"{shelf} shelf",
+                time=placed.time,
+                position=placed.joint_position,
+                colour=colour,
+            )
+        )
+    return joint_grid_figure(chain.joint_names, curves, joint_ranges(chain))

@@ -30,7 +30,7 @@ from hrc_learn.sim import (
 from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over
 from hrc_learn.sim.worker import IMAGE_RATE, PARTS
 from hrc_learn.sim.worker_visit import turned_about_base
-from hrc_learn.sim.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace, pose_on_table
 from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig
 from hrc_learn.vision import Marker
 
@@ -61,6 +61,8 @@ OBJECTS_REACH = (0.12, 0.10)
 # Distance at which the open fingers around one object clear the next one, in any orientation
 # [m]: 0.06 m to the outside of a finger, 0.046 m to the corner of the largest object.
 _APART = 0.118
+# Arrangements of the objects that are tried.
+_ARRANGEMENTS = 10_000
 
 # Arrival at the elbow [s] and number of reaches: a robot waits above its first object 11 s
 # after the start, and the worker is to reach under it then.
@@ -132,72 +134,33 @@ def check_shelves(workplace: Workplace, shelves: Sequence[str]) -> None:
 def draw_object_poses(
     workplace: Workplace, world: World, yaw: float, rng: np.random.Generator
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Random poses of all objects on the table, with its true height and the true object sizes.
+    """Random poses of all objects on the table, clear of each other.
 
     Args:
         workplace: Workplace of the world.
-        world: World with the objects.
+        world: World with the true height of the table and the true object sizes.
         yaw: Largest rotation about the vertical, either way [rad].
         rng: Source of positions and rotations.
+
+    Raises:
+        ValueError: If the objects do not fit.
     """
     items = world.config.objects
     reach = OBJECT_REACH[:2] if len(items) == 1 else OBJECTS_REACH
-    return random_object_poses(
-        items, workplace.table_centre, reach, rng, yaw=yaw, table_top=world.table_top
-    )
-
-
-def random_object_poses(
-    items: Sequence[ObjectConfig],
-    middle: tuple[float, float],
-    reach: tuple[float, float],
-    rng: np.random.Generator,
-    *,
-    yaw: float = np.pi,
-    table_top: float = 0.0,
-    attempts: int = 10_000,
-) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Random poses of objects on the table, clear of each other.
-
-    Args:
-        items: The objects.
-        middle: Middle of the region in which they lie [m].
-        reach: Largest distance from the middle along x and y [m].
-        rng: Source of positions and rotations.
-        yaw: Largest rotation about the vertical, either way [rad].
-        table_top: Height of the table [m].
-        attempts: Largest number of arrangements tried.
-
-    Raises:
-        ValueError: If they do not fit.
-    """
-    for _ in range(attempts):
-        positions = np.array(middle) + rng.uniform(-1, 1, (len(items), 2)) * reach
-        if _are_clear(positions):
+    for _ in range(_ARRANGEMENTS):
+        positions = workplace.table_centre + rng.uniform(-1, 1, (len(items), 2)) * reach
+        gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
+        if (gaps + np.eye(len(items)) >= _APART).all():
             return {
-                item.name: _pose_on_table(item, position, rng.uniform(-yaw, yaw), table_top)
+                item.name: pose_on_table(
+                    position, rng.uniform(-yaw, yaw), world.table_top + item.half_size[2]
+                )
                 for item, position in zip(items, positions, strict=True)
             }
     raise ValueError(
         f"{len(items)} objects do not fit within {reach[0]:g} and {reach[1]:g} m of the "
-        "middle with clearance for the fingers: use fewer objects or a larger reach."
+        "middle with clearance for the fingers: use fewer objects."
     )
-
-
-def _are_clear(positions: Float[np.ndarray, "objects 2"]) -> bool:
-    first, second = np.triu_indices(len(positions), k=1)
-    gaps = np.linalg.norm(positions[first] - positions[second], axis=1)
-    return bool((gaps >= _APART).all())
-
-
-def _pose_on_table(
-    item: ObjectConfig, position: Float[np.ndarray, "2"], yaw: float, table_top: float
-) -> Float[np.ndarray, "4 4"]:
-    c, s = np.cos(yaw), np.sin(yaw)
-    pose = np.eye(4)
-    pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:3, 3] = (*position, table_top + item.half_size[2])
-    return pose
 
 
 def points_to_see(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:

@@ -228,12 +228,8 @@ class Workplace:
                 the table's edges.
         """
         turn = rng.uniform(-yaw, yaw)
-        c, s = np.cos(turn), np.sin(turn)
-        pose = np.eye(4)
-        pose[:2, :2] = [[c, -s], [s, c]]
-        pose[:2, 3] = np.array(self.table_centre) + rng.uniform(-1, 1, 2) * reach[:2]
-        pose[2, 3] = self.scene.objects[0].half_size[2]
-        return pose
+        position = np.array(self.table_centre) + rng.uniform(-1, 1, 2) * reach[:2]
+        return pose_on_table(position, turn, self.scene.objects[0].half_size[2])
 
     def shelf_names(self) -> tuple[str, ...]:
         """Names of the shelves, from bottom to top."""
@@ -283,6 +279,17 @@ class Workplace:
         position = self.shelf(name).position.clone()
         position[1] = self.scene.cabinet.front + self.approach
         return Pose(position, coarse_orientation(position, self.level_at))
+
+
+def pose_on_table(
+    position: Float[np.ndarray, "2"], yaw: float, height: float
+) -> Float[np.ndarray, "4 4"]:
+    """Pose at a place on the table, turned about the vertical [m, rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    pose = np.eye(4)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = (*position, height)
+    return pose
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -129,7 +129,7 @@ class World:
         mujoco.mj_resetData(self.model, self.data)
         self.arm.place(joint_position, gripper_width)
         for name, pose in (objects or {}).items():
-            _put(self.data, name, pose)
+            _put(self.model, self.data, name, pose)
         mujoco.mj_forward(self.model, self.data)
         self._watch.restart()
         for monitor in self._monitors:
@@ -209,7 +209,7 @@ class World:
         self.data.time = state.time
         mujoco.mj_kinematics(self.model, self.data)
         if carried is not None and in_hand is not None:
-            self._put(carried, self.arm.tcp_pose() @ in_hand)
+            _put(self.model, self.data, carried, self.arm.tcp_pose() @ in_hand)
 
     def put_in_hand(self, name: str) -> None:
         """Put an object between the fingers at once, as `hold` does.
@@ -218,7 +218,7 @@ class World:
             KeyError: If there is no object of that name.
         """
         self._object(name)
-        self._put(name, self.arm.tcp_pose() @ _IN_HAND)
+        _put(self.model, self.data, name, self.arm.tcp_pose() @ _IN_HAND)
 
     def carry(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
         """Place an object at rest, as a person does by hand.
@@ -228,11 +228,7 @@ class World:
         """
         self._object(name)
         self.data.joint(name).qvel[:] = 0.0
-        self._put(name, pose)
-
-    def _put(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
-        _put(self.data, name, pose)
-        mujoco.mj_kinematics(self.model, self.data)
+        _put(self.model, self.data, name, pose)
 
     def move_obstacle(
         self, name: str, centre: tuple[float, float, float] | Float[np.ndarray, "3"]
@@ -309,12 +305,8 @@ class World:
 
     def rests_on(self, name: str, board: str) -> bool:
         """True if an object touches a piece of furniture and no part of the arm."""
-        partners = self._partners(name)
+        partners = {self.model.geom(g).name for g in self._touched(name)}
         return board in partners and partners <= {box.name for box in self.config.boxes()}
-
-    def _partners(self, name: str) -> set[str]:
-        """Geoms that touch an object's."""
-        return {self.model.geom(g).name for g in self._touched(name)}
 
     def _touched(self, name: str) -> set[int]:
         """Numbers of the geoms that touch an object's."""
@@ -374,8 +366,7 @@ class World:
             data.qpos[self.arm.joints] = q
             mujoco.mj_kinematics(self.model, data)
             if carried is not None and in_hand is not None:
-                _put(data, carried, self.arm.tcp_pose(data) @ in_hand)
-                mujoco.mj_kinematics(self.model, data)
+                _put(self.model, data, carried, self.arm.tcp_pose(data) @ in_hand)
             mujoco.mj_collision(self.model, data)
             data.time = float(k)
             for monitor in monitors:
@@ -388,11 +379,14 @@ def _face(along: float) -> int:
     return 0 if abs(along) < _FLAT else int(math.copysign(1, along))
 
 
-def _put(data: mujoco.MjData, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
+def _put(
+    model: mujoco.MjModel, data: mujoco.MjData, name: str, pose: Float[np.ndarray, "4 4"]
+) -> None:
     """Move a free object to a pose."""
     joint = data.joint(name)
     joint.qpos[:3] = pose[:3, 3]
     mujoco.mju_mat2Quat(joint.qpos[3:7], np.ascontiguousarray(pose[:3, :3]).ravel())
+    mujoco.mj_kinematics(model, data)
 
 
 def _as_it_is(believed: SceneConfig, errors: DrawnImperfections) -> SceneConfig:
