@@ -35,7 +35,7 @@ def rrd_file(
     Args:
         path: The file.
         title: Title of the recording.
-        blueprint: Layout; None: the writer of the stream sends it.
+        blueprint: Layout; None: a `RunStream` sends layout and title.
     """
     stream = rr.RecordingStream("hrc_learn")
     # Not by `stream.save`: on a full disk it loses data, and its `flush` never returns.
@@ -44,7 +44,7 @@ def rrd_file(
         try:
             if blueprint is not None:
                 stream.send_blueprint(blueprint, make_active=False)
-            begin(stream, title)
+                begin(stream, title)
             yield stream
             part.write_bytes(content.read() or b"")
         finally:
