@@ -11,12 +11,7 @@ from rich.progress import track
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments import Extract, Import
 from hrc_learn.demos import DatasetWriter, Demonstration, Detector, extract_features
-from hrc_learn.demos.array_import import (
-    ArrayOptions,
-    ArraySources,
-    demonstrations_from_arrays,
-    read_arrays,
-)
+from hrc_learn.demos.array_import import ArrayOptions, demonstrations_from_arrays
 from hrc_learn.demos.recorded_episode import rotation_vectors
 from hrc_learn.vision import MarkerDetector, centre
 
@@ -110,13 +105,14 @@ def _read(args: Import, path: Path) -> list[Demonstration]:
         raise ValueError(
             f"--units {min(unknown)}: no such quantity; there are {', '.join(_IMPORTED_UNITS)}"
         )
-    sources = ArraySources(
-        joints=",".join(args.joints) or None,
-        position=",".join(args.position) or None,
-        orientation=",".join(args.orientation) or None,
-        time=args.time,
-    )
     options = ArrayOptions(
+        arrays={
+            "joints": _words(args.joints),
+            "position": _words(args.position),
+            "orientation": _words(args.orientation),
+            "time": _words([args.time or ""]),
+        },
+        columns=_words(args.columns),
         units=args.units,
         quaternion_order=args.quaternion_order,
         joint_names=_words(args.joint_names),
@@ -124,8 +120,7 @@ def _read(args: Import, path: Path) -> list[Demonstration]:
         fps=args.fps,
         task=path.stem if args.task is None else args.task,
     )
-    arrays = read_arrays(path, _words(args.columns))
-    return demonstrations_from_arrays(arrays, sources, options, path=path)
+    return demonstrations_from_arrays(path, options)
 
 
 def _words(values: Sequence[str]) -> list[str]:

@@ -5,7 +5,7 @@ import math
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -128,29 +128,25 @@ def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     delimiter = max(",;\t", key=first.count)
     if delimiter not in first:
         delimiter = " "
-    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    reader, rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True), []
     try:
-        rows = [
-            (reader.line_num, fields)
-            for row in reader
-            if (fields := [field.strip() for field in row if field.strip()])
-        ]
+        for row in reader:
+            if fields := [field.strip() for field in row if field.strip()]:
+                rows.append((reader.line_num, fields))
     except csv.Error as error:
         raise DatasetError(f"line {reader.line_num}: {error}", file=path) from error
     if not rows:
         raise DatasetError("is empty", file=path)
-    first_fields = rows[0][1]
-    header = [] if _are_numbers(first_fields) else first_fields
-    numbers, width = rows[1:] if header else rows, len(first_fields)
-    for line, row in numbers:
+    width, header = len(rows[0][1]), []
+    if not _are_numbers(rows[0][1]):
+        header = rows.pop(0)[1]
+    for line, row in rows:
         if len(row) != width or not _are_numbers(row):
-            raise DatasetError(
-                f"line {line} does not hold {width} numbers separated by {delimiter!r}",
-                file=path,
-            )
-    if not numbers:
+            text = f"line {line} does not hold {width} numbers separated by {delimiter!r}"
+            raise DatasetError(text, file=path)
+    if not rows:
         raise DatasetError("holds a header and no numbers", file=path)
-    return header, np.array([[float(field) for field in row] for _, row in numbers])
+    return header, np.array([row for _, row in rows], dtype=float)
 
 
 def _are_numbers(fields: Sequence[str]) -> bool:
@@ -162,27 +158,15 @@ def _are_numbers(fields: Sequence[str]) -> bool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArraySources:
-    """Arrays that hold each quantity: one name, or several joined by commas.
-
-    None finds the arrays by their names.
-    """
-
-    joints: str | None = None
-    """Joint positions."""
-    position: str | None = None
-    """Position of the end effector."""
-    orientation: str | None = None
-    """Orientation of the end effector: a quaternion (4 columns) or a rotation vector (3)."""
-    time: str | None = None
-    """Time stamps."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class ArrayOptions:
-    """Interpretation of arrays as demonstrations."""
+    """Interpretation of the arrays of a file as demonstrations."""
 
-    units: Mapping[str, str] | None = None
+    arrays: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Names of the arrays of "joints", "position", "orientation" (a quaternion or a rotation
+    vector) and "time", joined in this order; quantities not given are found by name."""
+    columns: Sequence[str] = ()
+    """Names for the columns of a .npy file, or of a .csv file without a header."""
+    units: Mapping[str, str] = field(default_factory=dict)
     """Units by role ("joint_position", "position", "time"); SI units if not given."""
     quaternion_order: str = "wxyz"
     """Order of quaternion components, "wxyz" or "xyzw"."""
@@ -201,39 +185,22 @@ class ArrayOptions:
                 raise ValueError(f"{name} must be positive, got {value}")
 
 
-def demonstrations_from_arrays(
-    table: ArrayTable, sources: ArraySources, options: ArrayOptions, *, path: Path
-) -> list[Demonstration]:
-    """Make demonstrations from arrays.
-
-    Args:
-        table: Arrays by name.
-        sources: Arrays that hold each quantity.
-        options: Units, names and time base.
-        path: Origin of the arrays, for errors.
+def demonstrations_from_arrays(path: Path, options: ArrayOptions) -> list[Demonstration]:
+    """Make demonstrations from the arrays of a .npz, .npy or .csv file.
 
     Raises:
-        DatasetError: An array is missing, has a wrong shape, or holds values that no
-            demonstration can have; names the array and the frame.
+        DatasetError: The file cannot be read; an array is missing, has a wrong shape, or holds
+            values that no demonstration can have.
     """
-    found = _find(table, sources, path)
-    if not {"joints", "position"} & found.keys():
-        raise DatasetError(
-            f"name the arrays of joints or poses (joints, position, orientation); it holds "
-            f"{', '.join(table)}",
-            file=path,
-        )
+    found = _find(read_arrays(path, options.columns), options, path)
     factors = {
         role.replace("joint_position", "joints"): unit_factor(role, unit)
-        for role, unit in (options.units or {}).items()
+        for role, unit in options.units.items()
     }
-    count = max(len(values) for values in found.values())
+    scaled = {name: values * factors.get(name, 1.0) for name, values in found.items()}
     demos = []
-    for index in range(count):
-        episode = {
-            name: values[index if len(values) > 1 else 0] * factors.get(name, 1.0)
-            for name, values in found.items()
-        }
+    for index in range(len(next(iter(scaled.values())))):
+        episode = {name: values[index] for name, values in scaled.items()}
         try:
             demos.append(_demonstration(episode, options))
         except ValueError as error:
@@ -241,48 +208,35 @@ def demonstrations_from_arrays(
     return demos
 
 
-def _find(table: ArrayTable, sources: ArraySources, path: Path) -> ArrayTable:
-    """Arrays of joints, position, orientation and time."""
-    chosen = {name: text.split(",") for name, text in vars(sources).items() if text}
-    by_name = {name: ns for name, ns in _by_name(table).items() if name not in chosen}
-    if chosen.keys() & {"joints", "position", "orientation"}:
-        by_name = {name: ns for name, ns in by_name.items() if name == "time"}
-    found = {}
-    for name, arrays in (by_name | chosen).items():
-        missing = [array for array in arrays if array not in table]
-        if missing:
-            raise DatasetError(
-                f"there is no array {missing[0]!r} for {name}; it holds {', '.join(table)}",
-                file=path,
-                key=name,
-            )
-        found[name] = _joined(name, arrays, table, path)
-    shapes = {name: values.shape[:2] for name, values in found.items()}
-    frames = {shape[1] for shape in shapes.values()}
-    counts = {shape[0] for shape in shapes.values()} - {1}
-    if len(frames) > 1 or len(counts) > 1:
-        raise DatasetError(
-            f"arrays differ in their numbers of demonstrations and frames: {shapes}", file=path
-        )
-    return found
+def _find(table: ArrayTable, options: ArrayOptions, path: Path) -> ArrayTable:
+    """Joints, position, orientation and time, of equally many demonstrations and frames."""
+    chosen = {name: list(arrays) for name, arrays in options.arrays.items() if arrays}
+    by_name = _by_name(table)
+    if chosen.keys() - {"time"}:
+        by_name = {name: arrays for name, arrays in by_name.items() if name == "time"}
+    names, there = by_name | chosen, ", ".join(table)
+    for name, arrays in names.items():
+        for array in arrays:
+            if array not in table:
+                text = f"there is no array {array!r} for {name}; it holds {there}"
+                raise DatasetError(text, file=path, key=name)
+    if not {"joints", "position"} & names.keys():
+        text = f"name the arrays of joints or poses (joints, position); it holds {there}"
+        raise DatasetError(text, file=path)
+    shapes = {array: table[array].shape[:2] for arrays in names.values() for array in arrays}
+    counts = {demos for demos, _ in shapes.values()} - {1}
+    if len(counts) > 1 or len({frames for _, frames in shapes.values()}) > 1:
+        text = f"arrays differ in their numbers of demonstrations and frames: {shapes}"
+        raise DatasetError(text, file=path)
+    count = max(counts, default=1)
 
+    def repeated(array: str) -> np.ndarray:
+        return np.broadcast_to(table[array], (count, *table[array].shape[1:]))
 
-def _joined(
-    name: str, arrays: Sequence[str], table: ArrayTable, path: Path
-) -> Float64[np.ndarray, "demos frames components"]:
-    """Arrays concatenated along their components."""
-    first, *others = arrays
-    for other in others:
-        for axis, counted in enumerate(("demonstrations", "frames")):
-            one, two = table[first].shape[axis], table[other].shape[axis]
-            if one != two:
-                raise DatasetError(
-                    f"{first!r} has {one} {counted}, {other!r} has {two}: bring them to the "
-                    f"same number, or name other arrays",
-                    file=path,
-                    key=name,
-                )
-    return np.concatenate([table[array] for array in arrays], axis=-1)
+    return {
+        name: np.concatenate([repeated(array) for array in arrays], axis=-1)
+        for name, arrays in names.items()
+    }
 
 
 def _by_name(table: ArrayTable) -> dict[str, list[str]]:
@@ -290,11 +244,12 @@ def _by_name(table: ArrayTable) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for name, values in table.items():
         meaning = meaning_of_component(name)
+        role = "" if meaning is None else meaning.role
         if name.lower() in _TIME_NAMES:
             found["time"] = [name]
-        elif meaning is not None and meaning.role == "position":
+        elif role == "position":
             found.setdefault("position", []).append(name)
-        elif meaning is not None and meaning.role in ("quaternion_wxyz", "rotation_vector"):
+        elif role in ("quaternion_wxyz", "rotation_vector"):
             found.setdefault("orientation", []).append(name)
         elif values.shape[-1] == 1 or name == UNNAMED:
             found.setdefault("joints", []).append(name)
@@ -306,31 +261,30 @@ def _demonstration(episode: Mapping[str, np.ndarray], options: ArrayOptions) -> 
         bad = np.argwhere(~np.isfinite(values))
         if len(bad):
             raise ValueError(f"{name} is {values[*bad[0]]} at frame {bad[0][0]}")
-    time = _stamps(episode, options)
-    joints = episode.get("joints")
+    time, joints = _stamps(episode, options), episode.get("joints")
     width = 0 if joints is None else joints.shape[1]
     names = tuple(options.joint_names) or tuple(f"joint{i + 1}" for i in range(width))
     if joints is not None and len(names) != width:
         raise ValueError(f"{len(names)} joint names for {width} columns of joints")
+    turn = episode.get("orientation")
+    if turn is not None:
+        if turn.shape[1] not in (3, 4):
+            raise ValueError(f"orientation takes 3 or 4 columns, not {turn.shape[1]}")
+        order = f"quaternion_{options.quaternion_order}"
+        turn = to_quaternion("rotation_vector" if turn.shape[1] == 3 else order, turn)
+    # LeRobot counts frames at a whole rate; true stamps are kept in their own column.
+    # `Demonstration` refuses stamps that do not increase.
+    step = float(np.median(np.diff(time)))
     return Demonstration(
         time=time - time[0],
         start_time=float(time[0]),
         joint_position=joints,
         joint_names=names if joints is not None else (),
         position=episode.get("position"),
-        orientation=_orientation(episode.get("orientation"), options.quaternion_order),
+        orientation=turn,
         task=options.task,
-        fps=options.fps or _nominal_rate(time),
+        fps=options.fps or max(1, round(1 / max(step, 1e-9))),
     )
-
-
-def _orientation(values: np.ndarray | None, quaternion_order: str) -> np.ndarray | None:
-    if values is None:
-        return None
-    if values.shape[1] not in (3, 4):
-        raise ValueError(f"orientation takes 3 or 4 columns, not {values.shape[1]}")
-    role = "rotation_vector" if values.shape[1] == 3 else f"quaternion_{quaternion_order}"
-    return to_quaternion(role, np.ascontiguousarray(values))
 
 
 def _stamps(episode: Mapping[str, np.ndarray], options: ArrayOptions) -> np.ndarray:
@@ -346,10 +300,3 @@ def _stamps(episode: Mapping[str, np.ndarray], options: ArrayOptions) -> np.ndar
     raise ValueError(
         "there are no stamps: name the array that holds them (time), or give duration or fps"
     )
-
-
-def _nominal_rate(time: np.ndarray) -> float:
-    """Whole frame rate, as LeRobot counts frames; true stamps are kept in their own column."""
-    step = float(np.median(np.diff(time)))
-    # `Demonstration` rejects stamps that do not increase.
-    return float(max(1, round(1 / step))) if step > 0 else 1.0

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
 from hrc_learn.geometry import quaternion
@@ -141,19 +141,12 @@ def butterworth(
 
 
 def _filtered(
-    demo: Demonstration,
-    fields: Sequence[str],
-    smooth: Callable[
-        [Float64[np.ndarray, "frames components"]], Float64[np.ndarray, "frames components"]
-    ],
+    demo: Demonstration, fields: Sequence[str], smooth: Callable[[np.ndarray], np.ndarray]
 ) -> Demonstration:
-    smoothed = {}
-    for name in fields:
-        if name not in demo.recorded:
-            continue
+    seen, smoothed = demo.feature_visible, {}
+    for name in (name for name in fields if name in demo.recorded):
         if name in ("time", "feature_visible"):
             raise ValueError(f"{name} cannot be smoothed")
-        seen = demo.feature_visible
         if name == "feature" and seen is not None and not seen.all():
             raise ValueError(
                 f"the feature is not visible at frame {int(np.argmin(seen))}: cut the "
@@ -184,9 +177,7 @@ def estimate_joint_velocity(
         ValueError: No joint positions are recorded, or there are too few frames.
     """
     if demo.joint_position is None:
-        raise ValueError(
-            "joint velocities are estimated from joint positions; none are recorded"
-        )
+        raise ValueError("joint velocities come from joint positions; none are recorded")
     _, velocity = local_polynomial(demo.time, demo.joint_position, window=window, degree=degree)
     return replace(demo, joint_velocity=velocity)
 
@@ -209,15 +200,13 @@ def estimate_twist(
     """
     if demo.position is None or demo.orientation is None:
         raise ValueError("a twist needs position and orientation; one is not recorded")
-    _, linear = local_polynomial(demo.time, demo.position, window=window, degree=degree)
-    q, q_dot = (
-        torch.from_numpy(array)
-        for array in local_polynomial(demo.time, demo.orientation, window=window, degree=degree)
-    )
+    pose = np.hstack([demo.position, demo.orientation])
+    smooth, rate = local_polynomial(demo.time, pose, window=window, degree=degree)
+    q, q_dot = torch.from_numpy(smooth[:, 3:]), torch.from_numpy(rate[:, 3:])
     # A fitted quaternion is not exactly of unit length; the vector part ignores its growth.
     product = quaternion.multiply(q_dot, quaternion.conjugate(q))
     angular = 2 * product[:, 1:] / q.square().sum(1, keepdim=True)
-    return np.hstack([linear, angular.numpy()])
+    return np.hstack([rate[:, :3], angular.numpy()])
 
 
 _JOINT_REST, _LINEAR_REST = (0.01, 0.04), (0.003, 0.01)
@@ -316,12 +305,9 @@ def _runs(flags: Bool[np.ndarray, " frames"]) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-def _with_margin(
-    demo: Demonstration, start: int, stop: int, keep: float | int
-) -> Demonstration:
-    time = demo.time
-    first = int(np.searchsorted(time, time[start] - keep))
-    behind = int(np.searchsorted(time, time[stop - 1] + keep, side="right"))
+def _with_margin(demo: Demonstration, start: int, stop: int, keep: float) -> Demonstration:
+    first = int(np.searchsorted(demo.time, demo.time[start] - keep))
+    behind = int(np.searchsorted(demo.time, demo.time[stop - 1] + keep, side="right"))
     return cut(demo, first, behind)
 
 
@@ -342,17 +328,23 @@ def resample(demo: Demonstration, fps: float | int) -> Demonstration:
     Raises:
         ValueError: `fps` is not positive, or the demonstration is shorter than a period.
     """
+    grid = regular_grid(demo.duration, fps)
+    return replace(at_times(demo, np.minimum(grid, demo.duration)), time=grid, fps=fps)
+
+
+def regular_grid(duration: float | int, fps: float | int) -> Float64[np.ndarray, " frames"]:
+    """Times 1/fps apart from 0 to the duration [s].
+
+    Raises:
+        ValueError: `fps` is not positive, or the duration is shorter than a period.
+    """
     if not fps > 0:
         raise ValueError(f"fps must be positive, got {fps}")
     # The tolerance of a thousandth of a period allows for rounded stamps.
-    count = int(np.floor(demo.duration * fps + 1e-3)) + 1
+    count = int(np.floor(duration * fps + 1e-3)) + 1
     if count < 2:
-        raise ValueError(
-            f"a demonstration of {demo.duration:.3g} s has no two frames at {fps} Hz"
-        )
-    grid = np.minimum(np.arange(count) / fps, demo.duration)
-    moved = at_times(demo, grid)
-    return replace(moved, time=np.arange(count) / fps, fps=fps)
+        raise ValueError(f"{duration:.3g} s hold no two frames at {fps:g} Hz")
+    return np.arange(count) / fps
 
 
 def at_times(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> Demonstration:
@@ -375,7 +367,7 @@ def at_times(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> Demon
 
 def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dict[str, Any]:
     """Fields and extra columns at other times, which may repeat."""
-    from scipy.interpolate import CubicSpline
+    from scipy.interpolate import CubicSpline, make_interp_spline
 
     if len(demo) < 2:
         raise ValueError("a demonstration of one frame cannot be interpolated")
@@ -390,7 +382,7 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
         if name in _SMOOTH:
             moved[name] = CubicSpline(demo.time, values)(time)
         else:
-            moved[name] = linear(demo.time, values.astype(float), time)
+            moved[name] = make_interp_spline(demo.time, values.astype(float), k=1)(time)
     if "orientation" in moved:
         moved["orientation"] /= np.linalg.norm(moved["orientation"], axis=1, keepdims=True)
     if "feature_visible" in moved:
@@ -400,34 +392,16 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
     nearest = nearest_frames(demo.time, time)
     for key, values in demo.extra.items():
         whole = (values == np.rint(values)).all(0)
-        between = linear(demo.time, values, time)
+        between = make_interp_spline(demo.time, values, k=1)(time)
         moved["extra"][key] = np.where(whole, values[nearest], between)
     return moved
-
-
-def linear(
-    known: Float64[np.ndarray, " frames"],
-    values: Float[np.ndarray, "frames *components"],
-    time: Float64[np.ndarray, " times"],
-) -> Float64[np.ndarray, "times *components"]:
-    """Linear interpolation between frames."""
-    index = _interval(known, time)
-    width = known[index + 1] - known[index]
-    fraction = ((time - known[index]) / width).reshape(-1, *[1] * (values.ndim - 1))
-    return (1 - fraction) * values[index] + fraction * values[index + 1]
 
 
 def nearest_frames(
     known: Float64[np.ndarray, " frames"], time: Float64[np.ndarray, " times"]
 ) -> Int64[np.ndarray, " times"]:
-    """Index of the frame nearest to each time."""
-    index = _interval(known, time)
-    return index + (time - known[index] > known[index + 1] - time)
-
-
-def _interval(known: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Index of the frame before each time; the last frame is never returned."""
-    return np.clip(np.searchsorted(known, time, side="right") - 1, 0, len(known) - 2)
+    """Index of the frame nearest to each time, the earlier one of two equally near."""
+    return np.ceil(np.interp(time, known, np.arange(len(known))) - 0.5).astype(np.int64)
 
 
 def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
@@ -470,10 +444,9 @@ def equalise_durations(
     """
     if not len(demos):
         raise ValueError("an empty set of demonstrations has no duration")
-    common = (
-        float(np.median([demo.duration for demo in demos])) if duration is None else duration
-    )
-    return demos.map(lambda demo: set_duration(demo, common))
+    if duration is None:
+        duration = float(np.median([demo.duration for demo in demos]))
+    return demos.map(lambda demo: set_duration(demo, duration))
 
 
 def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demonstration:
@@ -490,10 +463,9 @@ def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demons
         ValueError: A field is not recorded, or a delay is negative or too long.
     """
     for name, delay in delays.items():
-        if name not in demo.recorded or name == "time":
-            raise ValueError(
-                f"{name} is not recorded; there are {', '.join(demo.recorded[1:])}"
-            )
+        if name not in demo.recorded[1:]:
+            recorded = ", ".join(demo.recorded[1:])
+            raise ValueError(f"{name} is not recorded; there are {recorded}")
         if not 0 <= delay < demo.duration:
             raise ValueError(
                 f"the delay of {name} must be between 0 and {demo.duration:.4g} s, got {delay}"
@@ -574,10 +546,7 @@ def align(demos: DemonstrationSet, reference: int | None = None) -> Demonstratio
         reference = int(order[(len(demos) - 1) // 2])
     leader = demos[reference]
     common = set.intersection(*(set(demo.recorded) for demo in demos))
-    if "joint_position" in common:
-        names = ("joint_position",)
-    else:
-        names = tuple(name for name in ("position", "orientation") if name in common)
+    names = {"joint_position"} & common or {"position", "orientation"} & common
     if not names:
         raise ValueError("alignment needs joints or poses recorded in all demonstrations")
     scales = {name: _scale(name, [getattr(demo, name) for demo in demos]) for name in names}
@@ -599,26 +568,26 @@ def _follow(
     """The demonstration at the times that match the frames of the reference."""
     if demo is reference:
         return demo
+    from scipy.spatial.distance import cdist
+
     squares = np.zeros((len(reference), len(demo)))
     for name, scale in scales.items():
         a, b = getattr(reference, name), getattr(demo, name)
         if name == "orientation":
             squares += (_angles(a, b) / scale) ** 2
-            continue
-        for k in range(a.shape[1]):
-            squares += ((a[:, k, None] - b[:, k]) / scale[k]) ** 2
-    phases = (np.linspace(0, 1, len(reference))[:, None], np.linspace(0, 1, len(demo)))
+        else:
+            squares += cdist(a / scale, b / scale, "sqeuclidean")
+    lead = np.linspace(0, 1, len(reference))[:, None] - np.linspace(0, 1, len(demo))
     # One step is always allowed, or there would be no path.
     widest = max(_BAND, 1 / max(min(squares.shape) - 1, 1))
-    allowed = np.abs(phases[0] - phases[1]) <= widest + 1e-12
+    allowed = np.abs(lead) <= widest + 1e-12
     first, second = warp(np.where(allowed, np.sqrt(squares), np.inf))
     # Several pairs may share a frame of the reference: their mean time counts.
     times = np.bincount(first, weights=demo.time[second]) / np.bincount(first)
     if len(reference) > 2:
         # The path advances by whole frames; a line fitted around each frame interpolates.
-        times = local_polynomial(
-            reference.time, times[:, None], window=_VELOCITY_WINDOW, degree=1
-        )[0][:, 0]
+        column, window = times[:, None], _VELOCITY_WINDOW
+        times = local_polynomial(reference.time, column, window=window, degree=1)[0][:, 0]
     times = np.maximum.accumulate(np.clip(times, 0, demo.time[-1]))
     fields = _fields_at(demo, times)
     warped = replace(demo, time=reference.time, fps=reference.fps, **fields)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from hrc_learn.demos import DatasetError
 from hrc_learn.demos.array_import import (
     ArrayOptions,
-    ArraySources,
     demonstrations_from_arrays,
     read_arrays,
 )
@@ -23,16 +22,15 @@ POSE_COLUMNS = ("px", "py", "pz", "qw", "qx", "qy", "qz")
 
 
 def read(path, columns=(), sources=None, **options):
-    table = read_arrays(path, columns)
-    return demonstrations_from_arrays(
-        table, sources or ArraySources(), ArrayOptions(**options), path=path
-    )
+    arrays = {name: text.split(",") for name, text in (sources or {}).items()}
+    given = ArrayOptions(columns=columns, arrays=arrays, **options)
+    return demonstrations_from_arrays(path, given)
 
 
 def test_npz_by_array_names(tmp_path):
     path = tmp_path / "run.npz"
     np.savez(path, t=TIME, q=np.rad2deg(Q), pos=100 * Q, R=TURN.as_quat(), note=np.array("x"))
-    sources = ArraySources(joints="q", time="t", position="pos", orientation="R")
+    sources = dict(joints="q", time="t", position="pos", orientation="R")
     units = {"joint_position": "deg", "position": "cm"}
     (demo,) = read(path, sources=sources, quaternion_order="xyzw", units=units, task="pour")
     np.testing.assert_allclose(demo.joint_position, Q)
@@ -108,7 +106,7 @@ def test_durations_and_rates_are_positive(tmp_path, name, value):
         (
             {"a": Q[:, 0], "b": Q[:-1, 1], "t": TIME},
             {"joints": "a,b"},
-            "joints: 'a' has 40 frames, 'b' has 39",
+            "differ in their numbers.*'a': .1, 40., 'b': .1, 39.",
         ),
         ({"q": Q[:1], "t": TIME[:1]}, {"joints": "q"}, "at least two frames, got 1"),
         ({"q": Q, "t": 0 * TIME}, {"joints": "q"}, "time must increase.*frame 0"),
@@ -132,7 +130,7 @@ def test_arrays_that_are_no_demonstrations(tmp_path, arrays, sources, message):
     path = tmp_path / "run.npz"
     np.savez(path, **arrays)
     with pytest.raises(DatasetError, match=message) as raised:
-        read(path, sources=ArraySources(**sources))
+        read(path, sources=sources)
     assert raised.value.file == str(path)
 
 

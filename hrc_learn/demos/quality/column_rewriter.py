@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import Int64
 
 from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.quality.episode_edits import EpisodeEdit
@@ -16,7 +17,6 @@ from hrc_learn.demos.read.metadata import (
     NUMERIC,
     Sidecar,
     SidecarColumn,
-    Statistics,
     episode_statistics,
     image_statistics,
 )
@@ -77,16 +77,12 @@ class ColumnRewriter:
         )
 
     def _choose_cameras(self, videos: bool) -> list[str]:
-        keys = video_keys(self._folder)
-        if not videos:
-            self.notes += [f"{key}: videos left out" for key in keys]
-            return []
         there = {key for segments in self._segments.values() for key in segments}
-        self.notes += [
-            f"{key}: declared, but no video of it is here; left out"
-            for key in keys
-            if key not in there
-        ]
+        reason = (
+            "declared, but no video of it is here; left out" if videos else "videos left out"
+        )
+        keys = video_keys(self._folder)
+        self.notes += [f"{key}: {reason}" for key in keys if key not in there]
         return [key for key in keys if key in there]
 
     def _task_texts(self) -> list[str]:
@@ -142,76 +138,51 @@ class ColumnRewriter:
                 "middle or resampled: leave the videos out (videos=False), or keep the frames "
                 "(drop_repeats=False, drop_bad_frames=False, fps=None)"
             )
-        first = int(edit.kept[0])
+        if self._image_columns and edit.resampled:
+            text = "its images cannot be resampled (no fps)"
+            raise edit.fault(text, key=self._image_columns[0])
+        begin = int(edit.kept[0]) / fps
+        end = begin + len(edit) / fps
         return {
-            key: VideoSegment(
-                file=found[key].file,
-                start=found[key].start + first / fps,
-                stop=found[key].start + (first + len(edit)) / fps,
-            )
-            for key in self._cameras
+            key: replace(old, start=old.start + begin, stop=old.start + end)
+            for key, old in found.items()
+            if key in self._cameras
         }
 
-    def require_writable(self, edit: EpisodeEdit) -> None:
-        """Check that every remaining frame has its images and a listed task.
-
-        Raises:
-            DatasetError: As in `videos_of`, a task is not listed, or an episode with a column
-                of images was resampled.
-        """
-        self.videos_of(edit)
-        self._tasks(edit)
-        if self._image_columns and edit.resampled:
-            raise edit.fault(
-                "its images cannot be resampled (no fps)", key=self._image_columns[0]
-            )
-
-    def stage(self, path: Path, edit: EpisodeEdit, frames_before: int) -> None:
-        """Write one episode to a file of the new dataset's staging folder."""
-        tasks = self._tasks(edit)
-        values = (
-            edit.frames | {recorded.TIME_KEY: edit.time[:, None]}
-            if self._add_time
-            else edit.frames
+    def stage(
+        self,
+        path: Path,
+        edit: EpisodeEdit,
+        videos: Segments,
+        tasks: Int64[np.ndarray, " frames"],
+        frames_before: int,
+    ) -> None:
+        """Write one episode, with `videos_of` and `tasks_of` it, to a staged file."""
+        values = edit.frames | (
+            {recorded.TIME_KEY: edit.time[:, None]} if self._add_time else {}
         )
-        values = values | recorded.index_columns(
-            self._header.fps, recorded.episode_number(path), frames_before, tasks
-        )
-        features = self._header.features
+        number, features = recorded.episode_number(path), self._header.features
+        values |= recorded.index_columns(self._header.fps, number, frames_before, tasks)
         numeric = {key: values[key] for key in features if key in values}
         others = self._other_columns(edit)
-        statistics = self._numeric_statistics(numeric)
-        for key in (*self._cameras, *self._image_columns):
-            statistics[key] = self._image_statistics(edit, key, others.get(key))
-        recorded.write_episode(
-            path,
-            recorded.StagedEpisode(
-                header=self._header,
-                tasks=[self.tasks[i] for i in dict.fromkeys(tasks.tolist())],
-                statistics=statistics,
-                table=recorded.to_table(numeric, features, others),
-            ),
+        statistics = episode_statistics(
+            {key: v.reshape(-1, *features[key]["shape"]) for key, v in numeric.items()}
         )
-
-    def _numeric_statistics(self, numeric: Mapping[str, np.ndarray]) -> Statistics:
-        """Statistics in the shape of the features."""
-        statistics = episode_statistics(numeric)
-        for key, figures in statistics.items():
-            shape = self._header.features[key]["shape"]
-            if len(shape) > 1:
-                statistics[key] = {
-                    name: v if name == "count" else np.reshape(v, shape).tolist()
-                    for name, v in figures.items()
-                }
-        return statistics
+        for key in (*self._cameras, *self._image_columns):
+            images = others.get(key, videos.get(key))
+            statistics[key] = self._image_statistics(edit, key, images)
+        staged = recorded.StagedEpisode(
+            header=self._header,
+            tasks=[self.tasks[i] for i in dict.fromkeys(tasks.tolist())],
+            statistics=statistics,
+            table=recorded.to_table(numeric, features, others),
+        )
+        recorded.write_episode(path, staged)
 
     def _other_columns(self, edit: EpisodeEdit) -> dict[str, pa.ChunkedArray]:
         """Columns that hold no numbers, for the remaining frames."""
-        keys = [
-            key
-            for key, feature in self._header.features.items()
-            if feature["dtype"] != "video" and not feature["dtype"].startswith(NUMERIC)
-        ]
+        types = {key: feature["dtype"] for key, feature in self._header.features.items()}
+        keys = [key for key, kind in types.items() if not kind.startswith(("video", *NUMERIC))]
         if not keys:
             return {}
         entry = edit.entry
@@ -221,22 +192,26 @@ class ColumnRewriter:
         return {key: table.column(key) for key in keys}
 
     def _image_statistics(
-        self, edit: EpisodeEdit, key: str, column: pa.ChunkedArray | None
+        self, edit: EpisodeEdit, key: str, images: pa.ChunkedArray | VideoSegment | None
     ) -> dict[str, list]:
         """Recorded statistics if all frames remain, else those of some images."""
-        recorded = self._recorded.get(edit.entry.index, {}).get(key)
-        if recorded is not None and len(edit) == edit.entry.length:
-            return recorded
+        known = self._recorded.get(edit.entry.index, {}).get(key)
+        if known is not None and len(edit) == edit.entry.length:
+            return known
         chosen = np.linspace(0, len(edit) - 1, min(len(edit), _STATISTICS_IMAGES)).astype(int)
-        if column is not None:
-            images = [decode_image(column[int(i)].as_py()["bytes"]) for i in chosen]
+        if isinstance(images, VideoSegment):
+            some = [image_at(images, int(i), self._folder.fps) for i in chosen]
         else:
-            segment = self.videos_of(edit)[key]
-            images = [image_at(segment, int(i), self._folder.fps) for i in chosen]
-        return image_statistics(np.stack([subsampled(image) for image in images]))
+            assert images is not None
+            some = [decode_image(images[int(i)].as_py()["bytes"]) for i in chosen]
+        return image_statistics(np.stack([subsampled(image) for image in some]))
 
-    def _tasks(self, edit: EpisodeEdit) -> np.ndarray:
-        """Index of the task of each frame."""
+    def tasks_of(self, edit: EpisodeEdit) -> Int64[np.ndarray, " frames"]:
+        """Index of the task of each frame.
+
+        Raises:
+            DatasetError: A task is not in the list of tasks.
+        """
         texts = edit.entry.tasks or self.tasks[:1]
         if "task_index" not in edit.frames or not self._folder.tasks:
             return np.full(len(edit), self.tasks.index(texts[0]))

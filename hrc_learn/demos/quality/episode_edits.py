@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.preprocessing import linear, nearest_frames, trim_rest
+from hrc_learn.demos.preprocessing import nearest_frames, regular_grid, trim_rest
 from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
@@ -312,9 +312,7 @@ def fix_signs(edit: EpisodeEdit) -> EpisodeEdit:
     return edit
 
 
-def _continuous(
-    values: Float64[np.ndarray, "frames 4"],
-) -> Float64[np.ndarray, "frames 4"]:
+def _continuous(values: Float64[np.ndarray, "frames 4"]) -> Float64[np.ndarray, "frames 4"]:
     """Quaternions in any order of their components whose signs do not jump."""
     flips = (values[1:] * values[:-1]).sum(1) < 0
     return values * np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))[:, None]
@@ -332,30 +330,28 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
         DatasetError: The stamps do not increase, the episode is shorter than a period, or it
             holds transforms, which cannot be interpolated by their entries.
     """
-    from scipy.interpolate import CubicSpline
+    from scipy.interpolate import CubicSpline, make_interp_spline
 
     known, semantics = edit.time - edit.time[0], edit.semantics
-    # The tolerance of a thousandth of a period allows for rounded stamps.
-    count = int(np.floor(known[-1] * fps + 1e-3)) + 1
-    if count < 2 or (np.diff(known) <= 0).any():
-        raise edit.fault(f"{known[-1]:.3g} s hold no two frames at {fps:g} Hz")
+    if (np.diff(known) <= 0).any():
+        raise edit.fault("stamps must increase to be resampled")
+    try:
+        grid = regular_grid(float(known[-1]), fps)
+    except ValueError as error:
+        raise edit.fault(str(error)) from error
     if "pose_matrix" in semantics.selections:
         raise edit.fault(
             "holds poses as matrices, which are not resampled; map them away "
             "(mapping={'pose_matrix': None}) or leave the frames as they are (no fps)",
             key="pose_matrix",
         )
-    grid = np.arange(count) / fps
     time = np.minimum(grid, known[-1])
     smooth, wrapped = _unwrapped_all(edit)
-    moved = replace(
-        smooth,
-        frames={
-            key: linear(known, values.astype(float), time)
-            for key, values in smooth.frames.items()
-        },
-        time=grid + edit.time[0],
-    )
+    frames = {
+        key: make_interp_spline(known, values.astype(float), k=1)(time)
+        for key, values in smooth.frames.items()
+    }
+    moved = replace(smooth, frames=frames, time=grid + edit.time[0])
     for role, values in smooth.quantities.items():
         if role in _SMOOTH:
             moved = moved.with_quantity(role, CubicSpline(known, values)(time))
@@ -373,7 +369,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
         moved,
         kept=edit.kept[nearest],
         resampled=True,
-        changes=(*edit.changes, f"resampled {len(edit)} frames to {count} at {fps:g} Hz"),
+        changes=(*edit.changes, f"resampled {len(edit)} frames to {len(grid)} at {fps:g} Hz"),
     )
 
 

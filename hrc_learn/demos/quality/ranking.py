@@ -124,10 +124,7 @@ class Ranking:
         yield from self.notes
 
 
-def rank_episodes(
-    path: str | Path,
-    progress: Progress | None = None,
-) -> Ranking:
+def rank_episodes(path: str | Path, progress: Progress | None = None) -> Ranking:
     """Rank the episodes of a dataset by how doubtful they are.
 
     The score counts the findings of `check_dataset`, the distance of the motion from the most
@@ -187,9 +184,7 @@ def _one_of_each_kind(
 
 
 def _demonstrations(
-    root: Path,
-    qualities: Mapping[int, EpisodeQuality],
-    progress: Progress | None,
+    root: Path, qualities: Mapping[int, EpisodeQuality], progress: Progress | None
 ) -> Iterator[tuple[EpisodeQuality, Demonstration]]:
     """Readable episodes, one at a time; the error of each other one becomes its doubt."""
     entries = open_folder(root).episodes

@@ -81,23 +81,18 @@ class RepairReport:
         """Number of episodes with changes."""
         return sum(map(bool, self.changes.values()))
 
-    def lines(self) -> Iterator[str]:
-        """The report as text."""
-        yield from self.notes
+    def __str__(self) -> str:
+        lines = [*self.notes]
         for new, (old, changes) in enumerate(self.changes.items()):
             name = f"episode {old}" if new == old else f"episode {old} (now {new})"
-            yield f"{name}: {'; '.join(changes) or 'unchanged'}"
-        for old, reason in self.left_out.items():
-            yield f"episode {old}: left out: {reason}"
-        yield (
-            f"{self.path}{' (nothing written)' * self.dry_run}: "
-            f"{len(self.changes)} episodes, {self.frames} of "
-            f"{self.frames_before} frames, {self.changed} episodes changed, "
+            lines.append(f"{name}: {'; '.join(changes) or 'unchanged'}")
+        lines += [f"episode {old}: left out: {why}" for old, why in self.left_out.items()]
+        lines.append(
+            f"{self.path}{' (nothing written)' * self.dry_run}: {len(self.changes)} episodes, "
+            f"{self.frames} of {self.frames_before} frames, {self.changed} episodes changed, "
             f"{len(self.left_out)} left out"
         )
-
-    def __str__(self) -> str:
-        return "\n".join(self.lines())
+        return "\n".join(lines)
 
 
 def repair_dataset(
@@ -129,7 +124,8 @@ def repair_dataset(
         DatasetError: An episode cannot be read or repaired, and must not be left out.
         FileExistsError: `out` exists.
     """
-    repair = _Repair(Path(path), Path(out), options or RepairOptions(), mapping, units, kept)
+    dataset = OpenedDataset.of(open_folder(path), mapping)
+    repair = _Repair(dataset, Path(out), options or RepairOptions(), units or {}, kept)
     repair.run(progress)
     return repair.report
 
@@ -139,36 +135,27 @@ class _Repair:
 
     def __init__(
         self,
-        path: Path,
+        dataset: OpenedDataset,
         out: Path,
         options: RepairOptions,
-        mapping: MappingSpec | None,
-        units: Mapping[str, str] | None,
+        units: Mapping[str, str],
         kept: Mapping[int, slice] | None,
     ):
-        folder = open_folder(path)
-        if not folder.episodes:
-            raise DatasetError("the dataset holds no episodes", file=folder.root)
-        self.dataset = OpenedDataset.of(folder, mapping)
-        self.folder, self.out, self.options, self.kept = folder, out, options, kept
-        self.units = units or {}
-        columns = self.dataset.columns
+        if not dataset.folder.episodes:
+            raise DatasetError("the dataset holds no episodes", file=dataset.folder.root)
+        self.dataset, self.folder, self.units, self.kept = dataset, dataset.folder, units, kept
+        self.out, self.options, columns = out, options, dataset.columns
+        declared, fps = dataset.declared_units, dataset.folder.fps
         decisions, faults = units_from_episodes(
-            columns.selections,
-            self._readable(),
-            folder.fps,
-            self.dataset.declared_units,
-            self.units,
+            columns.selections, self._readable(), fps, declared, units
         )
         self.faults = {fault.episode: fault for fault in faults}
         """Episodes that contradict the units of the others."""
         self.semantics = edits.ColumnSemantics(
             selections=columns.selections, joint_names=columns.joint_names, units=decisions
         )
-        segments = read_segments(folder) if options.videos else None
-        self.rewriter = ColumnRewriter(
-            self.dataset, self.units, fps=options.fps, segments=segments
-        )
+        segments = read_segments(self.folder) if options.videos else None
+        self.rewriter = ColumnRewriter(dataset, units, fps=options.fps, segments=segments)
         self.report = RepairReport(path=out, notes=self.rewriter.notes, dry_run=options.dry_run)
 
     def _readable(self) -> Iterator[tuple[EpisodeEntry, Quantities]]:
@@ -194,10 +181,11 @@ class _Repair:
             staging.mkdir(parents=True)
             paths: list[Path] = []
             videos: list[Segments] = []
-            for edit in self._edits(progress):
+            for edit, shown, tasks in self._edits(progress):
                 paths.append(episode_path(staging, len(paths)))
-                self.rewriter.stage(paths[-1], edit, self.report.frames - len(edit))
-                videos.append(self.rewriter.videos_of(edit))
+                before = self.report.frames - len(edit)
+                self.rewriter.stage(paths[-1], edit, shown, tasks, before)
+                videos.append(shown)
             if not paths:
                 raise DatasetError("no episode could be repaired", file=self.folder.root)
             assemble(paths, target, videos=videos, tasks=self.rewriter.tasks, link_videos=False)
@@ -205,8 +193,13 @@ class _Repair:
             self._carry_contract(target)
             shutil.rmtree(staging)
 
-    def _edits(self, progress: Progress | None) -> Iterator[edits.EpisodeEdit]:
-        """Repaired episodes; the report counts them, and those that are left out."""
+    def _edits(
+        self, progress: Progress | None
+    ) -> Iterator[tuple[edits.EpisodeEdit, Segments, np.ndarray]]:
+        """Repaired episodes with their videos and the task of each frame.
+
+        The report counts them, and those that are left out.
+        """
         report = self.report
         entries = progress(self.folder.episodes) if progress else self.folder.episodes
         for entry, frames in zip(entries, self._read(), strict=True):
@@ -216,7 +209,7 @@ class _Repair:
                 continue
             try:
                 edit = self._repaired(entry, frames)
-                self.rewriter.require_writable(edit)
+                videos, tasks = self.rewriter.videos_of(edit), self.rewriter.tasks_of(edit)
             except DatasetError as error:
                 if not self.options.drop_bad_episodes:
                     raise
@@ -224,7 +217,7 @@ class _Repair:
                 continue
             report.changes[entry.index] = edit.changes
             report.frames += len(edit)
-            yield edit
+            yield edit, videos, tasks
 
     def _repaired(
         self, entry: EpisodeEntry, frames: RawFrames | DatasetError
@@ -239,15 +232,9 @@ class _Repair:
         if "time" not in edit.semantics.selections:
             edit = edits.renew_stamps(edit, self.folder.fps)
         edit = edits.drop_bad_frames(edit, options.drop_bad_frames)
-        for wanted, change in (
-            (options.drop_late, edits.drop_late),
-            (options.trim, edits.trim),
-            (options.drop_repeats, edits.drop_repeats),
-            (options.unwrap, edits.unwrap),
-            (options.fix_signs, edits.fix_signs),
-        ):
-            if wanted:
-                edit = change(edit)
+        for name in ("drop_late", "trim", "drop_repeats", "unwrap", "fix_signs"):
+            if getattr(options, name):
+                edit = getattr(edits, name)(edit)
         if options.fps is not None:
             edit = edits.resample_to_grid(edit, options.fps)
         stalled = np.flatnonzero(np.diff(edit.time) <= 0)
@@ -266,18 +253,15 @@ class _Repair:
         if "time" in semantics.selections:
             ((key, index),) = semantics.selections["time"].columns
             time = frames[key][:, index].astype(float) * semantics.units["time"].factor
+        unused = {*INDEX_KEYS} - {"task_index"}
         edit = edits.EpisodeEdit(
             entry=entry,
             semantics=semantics,
-            frames={
-                k: v for k, v in frames.items() if k not in INDEX_KEYS or k == "task_index"
-            },
+            frames={key: values for key, values in frames.items() if key not in unused},
             time=time,
             kept=np.arange(entry.length),
         )
-        if self.kept is None:
-            return edit
-        part = self.kept[entry.index]
+        part = slice(None) if self.kept is None else self.kept[entry.index]
         wanted = np.zeros(entry.length, dtype=bool)
         wanted[part] = True
         return edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
@@ -370,26 +354,22 @@ def read_decisions(root: Path) -> Decisions:
     Raises:
         DatasetError: The file is damaged, or belongs to another dataset.
     """
-    path = decisions_path(root)
+    path, advice = decisions_path(root), "delete it to begin anew"
     if not path.is_file():
         return {}
     lengths = {entry.index: entry.length for entry in open_folder(root).episodes}
-    advice = "delete it to begin anew"
     try:
         kept = read_json(path, _DecisionFile, advice).decisions
     except ValueError as error:
         raise DatasetError(str(error).removeprefix(f"{path}: "), file=path) from error
     decisions: Decisions = {}
     for index, known in kept.items():
-        if known.length != lengths.get(index):
-            raise DatasetError(
-                f"decides on an episode of {known.length} frames, the dataset has "
-                f"{lengths.get(index, 'no such episode')}: it belongs to another dataset; "
-                f"{advice}",
-                file=path,
-                episode=index,
-            )
         try:
+            if known.length != lengths.get(index):
+                raise ValueError(
+                    f"decides on an episode of {known.length} frames, the dataset has "
+                    f"{lengths.get(index, 'no such episode')}: it belongs to another dataset"
+                )
             decisions[index] = decide(known.verdict, known.length, known.start, known.stop)
         except ValueError as error:
             raise DatasetError(f"{error}; {advice}", file=path, episode=index) from error
@@ -433,19 +413,14 @@ def write_curated(
         DatasetError: No episode is left, or an accepted one cannot be read.
         FileExistsError: `out` exists.
     """
-    entries = {entry.index: entry for entry in open_folder(path).episodes}
-    unknown = sorted({*decisions} - {*entries})
-    if unknown:
-        raise DatasetError(
-            "there is no such episode to decide on", file=path, episode=unknown[0]
-        )
-    kept = {}
-    for index, entry in entries.items():
-        decision = decisions.get(index, Decision(verdict="accept"))
+    kept = {entry.index: slice(0, entry.length) for entry in open_folder(path).episodes}
+    for index, decision in decisions.items():
+        if index not in kept:
+            raise DatasetError("there is no such episode", file=path, episode=index)
         if decision.verdict == "cut":
             kept[index] = slice(decision.start, decision.stop)
-        elif decision.verdict == "accept":
-            kept[index] = slice(0, entry.length)
+        elif decision.verdict == "reject":
+            del kept[index]
     if not kept:
         raise DatasetError("every episode is rejected: nothing is left to write", file=path)
     options = RepairOptions(trim=False, drop_late=False, unwrap=False, fix_signs=False)

@@ -19,12 +19,7 @@ import numpy as np
 from hrc_learn.demos.issues import DatasetError, aligned, plain_text
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import DatasetFolder
-from hrc_learn.demos.read.metadata import (
-    SIDECAR_PATH,
-    Feature,
-    dump_json,
-    read_sidecar,
-)
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json, read_sidecar
 from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, is_discrete
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES, is_hand, joint_of
 from hrc_learn.demos.read.units import UnitDecision, units_of

@@ -262,15 +262,14 @@ def dump_json(path: Path, content: object) -> None:
 
 
 def episode_statistics(features: Mapping[str, Shaped[np.ndarray, "_frames ..."]]) -> Statistics:
-    """Statistics of each feature over the frames of one episode."""
+    """Statistics of each feature over the frames of one episode, in the feature's shape."""
     return {key: _column_statistics(np.asarray(v, float)) for key, v in features.items()}
 
 
 def image_statistics(images: UInt8[np.ndarray, "_count _height _width 3"]) -> dict[str, list]:
     """Statistics of each colour channel, scaled to 0..1, in the nesting LeRobot expects."""
-    flat = _column_statistics(images.reshape(-1, 3) / 255)
-    nested = {name: [[[value]] for value in values] for name, values in flat.items()}
-    return nested | {"count": [len(images)]}
+    colours = images.reshape(-1, 3, 1, 1) / 255
+    return _column_statistics(colours) | {"count": [len(images)]}
 
 
 def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Statistics:
@@ -286,7 +285,8 @@ def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Sta
 
 
 def _column_statistics(values: np.ndarray) -> dict[str, list]:
-    values = values.reshape(len(values), -1)
+    if values.ndim == 1:
+        values = values[:, None]
     quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
     return {
         "min": values.min(0).tolist(),

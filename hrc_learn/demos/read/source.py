@@ -34,12 +34,7 @@ from hrc_learn.demos.read.dataset_folder import (
     open_folder,
     select_episodes,
 )
-from hrc_learn.demos.read.frames import (
-    RawEpisode,
-    disk_runs,
-    frame_timestamps,
-    read_quantities,
-)
+from hrc_learn.demos.read.frames import RawEpisode, disk_runs, frame_timestamps, read_quantities
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar, read_sidecar
 from hrc_learn.demos.read.profiles import profile_episode
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
