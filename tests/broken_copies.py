@@ -185,7 +185,7 @@ DEFECTS = {
     ),
     "unknown version": Defect(
         damage=lambda c: c.change_info(codebase_version="v4.0"),
-        finding=r"version 'v4\.0' is unknown; versions 2\.0, 2\.1 and 3\.0 can be read",
+        finding=r"codebase_version must be 2\.0, 2\.1 or 3\.0, got 'v4\.0'",
         key="codebase_version",
     ),
     "fps of zero": Defect(

@@ -75,11 +75,8 @@ def _read_npz(path: Path) -> ArrayTable:
             try:
                 array = file[name]
             except _UNREADABLE as error:
-                raise DatasetError(
-                    f"cannot be read as an array of numbers ({error}): save it again",
-                    file=path,
-                    key=name,
-                ) from error
+                text = f"cannot be read as an array of numbers ({error}): save it again"
+                raise DatasetError(text, file=path, key=name) from error
             # numpy returns bytes for a member that is no array.
             if isinstance(array, np.ndarray) and _is_numeric(array):
                 table[name] = _three_axes(array, path, name)
@@ -92,12 +89,10 @@ def _is_numeric(array: np.ndarray) -> bool:
 
 def _three_axes(array: np.ndarray, path: Path, name: str) -> np.ndarray:
     if not _is_numeric(array) or 0 in array.shape:
-        raise DatasetError(
-            f"an array of shape {array.shape} and type {array.dtype} holds no frames of "
-            f"numbers",
-            file=path,
-            key=name,
+        text = (
+            f"an array of shape {array.shape} and type {array.dtype} holds no frames of numbers"
         )
+        raise DatasetError(text, file=path, key=name)
     array = array.astype(np.float64)
     if array.ndim == 1:
         array = array[:, None]

@@ -163,6 +163,7 @@ class _EpisodeList:
 
 
 def _table_of(rows: Sequence[dict]) -> pa.Table:
+    """Table with the columns of all rows."""
     names = dict.fromkeys(name for row in rows for name in row)
     return pa.table({name: [row.get(name) for row in rows] for name in names})
 
@@ -241,11 +242,10 @@ def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> 
         _put(file, listed.target / file.relative_to(earlier), link=True)
     tables = [read_table(open_parquet(earlier, n), n) for n in episode_lists(earlier)]
     table = _concatenated(tables).sort_by("episode_index")
-    for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
-        zeros = pa.array(np.zeros(len(table), np.int64))  # the new list is one file
-        if name in table.column_names:
-            table = table.drop_columns([name])
-        table = table.append_column(name, zeros)
+    places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
+    table = table.drop_columns([name for name in places if name in table.column_names])
+    for name in places:  # the new list is one file
+        table = table.append_column(name, pa.array(np.zeros(len(table), np.int64)))
     listed.carry(table)
     listed.tasks |= dict.fromkeys(folder.tasks[i] for i in sorted(folder.tasks))
     listed.data_files = _count_files(table, "data")
@@ -300,13 +300,14 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
             interrupted recording of it holds episodes, or a foreign folder has its name.
     """
     root, staging = store.resolved(root), staging_folder(root)
-    if staging.is_dir() and not _is_recording(staging):
-        raise FileExistsError(
-            f"{staging} is no interrupted recording and is not touched: move it away, or "
-            f"choose another name than {root.name}"
-        )
-    if staging.is_dir() and (_is_done(root, staging) or not _has_episodes(staging)):
-        discard(staging)  # it holds nothing that the dataset lacks
+    if staging.is_dir():
+        if not _is_recording(staging):
+            raise FileExistsError(
+                f"{staging} is no interrupted recording and is not touched: move it away, or "
+                f"choose another name than {root.name}"
+            )
+        if _is_done(root, staging) or not _has_episodes(staging):
+            discard(staging)  # it holds nothing that the dataset lacks
     if earlier_episodes is None and os.path.lexists(root):
         raise FileExistsError(
             f"{root} already exists: choose another folder, remove it, or append to it "

@@ -291,9 +291,8 @@ class DatasetWriter:
             ("joints", sidecar.joint_names, self.joint_names),
         ):
             if theirs != ours:
-                raise ValueError(
-                    f"cannot append to {self.root}: its {name} is {theirs!r}, not {ours!r}"
-                )
+                text = f"cannot append to {self.root}: its {name} is {theirs!r}, not {ours!r}"
+                raise ValueError(text)
         self._tasks = {text: index for index, text in folder.tasks.items()}
         self._saved_frames = sum(entry.length for entry in folder.episodes)
         self.episodes = len(folder.episodes)

@@ -178,12 +178,11 @@ def dataset_card(
 
 def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterator[str]:
     frames = sum(entry.length for entry in folder.episodes)
-    yield f"# {repo.split('/')[1]}\n"
     robot = plain_text(folder.robot_type or "unknown robot")
     yield (
-        f"{len(folder.episodes)} demonstrations by {robot}, {frames} frames at "
-        f"{folder.fps:g} Hz ({frames / folder.fps / 60:.1f} min), in the LeRobot format "
-        f"{folder.version}.\n"
+        f"# {repo.split('/')[1]}\n\n{len(folder.episodes)} demonstrations by {robot}, {frames} "
+        f"frames at {folder.fps:g} Hz ({frames / folder.fps / 60:.1f} min), in the LeRobot "
+        f"format {folder.version}.\n"
     )
     shown = Counter(task for entry in folder.episodes for task in entry.tasks)
     for task, count in shown.most_common(_MOST_TASKS):
@@ -196,21 +195,20 @@ def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterato
             yield f"- camera `{_cell(feature.key)}`: {size}, stored as {feature.dtype}"
     if report.contract is not None:
         header, *rows = report.contract.rows()
-        yield "\n## Columns\n"
         yield (
-            "LeRobot datasets declare no units. These units were declared by the author or "
-            "inferred from the values.\n"
+            "\n## Columns\n\nLeRobot datasets declare no units. These units were declared by "
+            f"the author or inferred from the values.\n\n| {' | '.join(header)} |"
         )
-        yield f"| {' | '.join(header)} |"
         yield f"|{' --- |' * len(header)}"
         yield from (f"| {' | '.join(map(_cell, row))} |" for row in rows)
-    yield "\n## Check\n"
-    yield f"`hrc check`: {len(report.errors)} errors, {len(report.warnings)} warnings.\n"
+    counts = f"{len(report.errors)} errors, {len(report.warnings)} warnings"
+    yield f"\n## Check\n\n`hrc check`: {counts}.\n"
     *findings, _ = report.lines()
     yield from (f"- {_cell(line)}" for line in findings)
-    yield "\n## Use\n"
-    yield "```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n"
-    yield f'dataset = LeRobotDataset("{repo}")\n```'
+    yield (
+        "\n## Use\n\n```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
+        f'dataset = LeRobotDataset("{repo}")\n```'
+    )
 
 
 def _cell(text: str) -> str:

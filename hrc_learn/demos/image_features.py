@@ -53,9 +53,7 @@ class FeatureCache:
     def is_current(self, episode: int, segment: VideoSegment) -> bool:
         """True if the file of an episode was made from this very video."""
         path = self.path(episode)
-        if not path.is_file():
-            return False
-        metadata = pq.read_schema(path).metadata or {}
+        metadata = (pq.read_schema(path).metadata or {}) if path.is_file() else {}
         return metadata.get(_SOURCE) == _fingerprint(segment)
 
     def write(self, episode: int, segment: VideoSegment, track: Track) -> None:
@@ -74,25 +72,18 @@ class FeatureCache:
             DatasetError: The feature was not extracted, or belongs to another recording.
         """
         path = self.path(episode)
-        if not path.is_file():
-            raise DatasetError(
-                f"{self.name} was not extracted from this episode: hrc extract continues an "
-                f"interrupted extraction",
-                file=path,
-                episode=episode,
-            )
-        table = read_table(open_parquet(self._folder, path.name, episode), str(path))
 
-        def fault(row: int, message: str) -> DatasetError:
+        def fault(row: int | None, message: str) -> DatasetError:
             return DatasetError(message, file=path, episode=episode, frame=row)
 
+        if not path.is_file():
+            text = "was not extracted from this episode: hrc extract continues an interrupted"
+            raise fault(None, f"{self.name} {text} extraction")
+        table = read_table(open_parquet(self._folder, path.name, episode), str(path))
         u, v, visible = (to_numpy(table[c], fault)[:, 0] for c in ("u", "v", "visible"))
         if len(u) != frames:
-            raise DatasetError(
-                f"{self.name} has {len(u)} frames, the episode {frames}: run hrc extract again",
-                file=path,
-                episode=episode,
-            )
+            text = f"has {len(u)} frames, the episode {frames}: run hrc extract again"
+            raise fault(None, f"{self.name} {text}")
         return np.stack([u, v], axis=1), visible.astype(bool)
 
 
@@ -103,8 +94,9 @@ def _features_folder(root: Path) -> Path:
 
 
 def _feature_names(root: Path) -> list[str]:
-    """Features that were extracted, in whole or in part; hidden folders are unfinished."""
-    return sorted(path.name for path in _features_folder(root).glob("[!.]*") if path.is_dir())
+    """Features that were extracted, in whole or in part."""
+    folders = {file.parent for file in _features_folder(root).glob("[!.]*/episode_*.parquet")}
+    return sorted(folder.name for folder in folders)
 
 
 def _fingerprint(segment: VideoSegment) -> bytes:
@@ -161,23 +153,18 @@ def extract_features(
     folder = open_folder(path)
     key = _camera_key(video_keys(folder), camera)
     cache = FeatureCache(folder.root, f"{key.rpartition('.')[2]}.{name}")
-    segments = {index: found.get(key) for index, found in read_segments(folder).items()}
-    waiting = [
-        entry
-        for entry in folder.episodes
-        if (segment := segments[entry.index]) is None
-        or not cache.is_current(entry.index, segment)
-    ]
-    done = Extraction(name=cache.name, known=len(folder.episodes) - len(waiting))
+    segments = {i: shown[key] for i, shown in read_segments(folder).items() if key in shown}
+    current = {i for i, segment in segments.items() if cache.is_current(i, segment)}
+    done = Extraction(name=cache.name, known=len(current))
+    waiting = [entry for entry in folder.episodes if entry.index not in current]
     for entry in progress(waiting) if progress else waiting:
+        segment = segments.get(entry.index)
         try:
-            segment = segments[entry.index]
             if segment is None:
-                raise DatasetError(
-                    "its video is missing; copy it, or load the dataset without image features",
-                    episode=entry.index,
-                    key=key,
+                text = (
+                    "its video is missing; copy it, or load the dataset without image features"
                 )
+                raise DatasetError(text, episode=entry.index, key=key)
             track, images = _track(segment, entry.length, folder.fps, detector())
         except DatasetError as error:
             done.left_out[entry.index] = str(error)
@@ -194,16 +181,13 @@ def _track(
     segment: VideoSegment, frames: int, fps: float, detect: Detector
 ) -> tuple[Track, int]:
     """Track of the feature along one episode, and the number of frames with an image."""
-    pixels, visible = np.zeros((frames, 2)), np.zeros(frames, dtype=bool)
-    decoded = set()
-    for frame, image in decode(segment, fps):
-        if frame >= frames:
-            break
-        decoded.add(frame)
+    pixels, visible, images = np.zeros((frames, 2)), np.zeros(frames, dtype=bool), 0
+    for frame, image in decode(segment, fps, frames=range(frames)):
+        images += 1
         pixel = detect(image)
         if pixel is not None:
             pixels[frame], visible[frame] = pixel, True
-    return (pixels, visible), len(decoded)
+    return (pixels, visible), images
 
 
 def _camera_key(keys: Sequence[str], camera: str | None) -> str:
@@ -231,11 +215,9 @@ def attach_features(demos: DemonstrationSet, name: str | None = None) -> Demonst
     known = _feature_names(root) if demos.source else []
     chosen = [feature for feature in known if name in (None, feature)]
     if len(chosen) != 1:
-        raise DatasetError(
-            f"{'name the feature' if name is None else f'there is no feature {name!r}'}; "
-            f"extracted are {', '.join(known) or 'none'}",
-            file=demos.source,
-        )
+        what = "name the feature" if name is None else f"there is no feature {name!r}"
+        text = f"{what}; extracted are {', '.join(known) or 'none'}"
+        raise DatasetError(text, file=demos.source)
     cache = FeatureCache(root, chosen[0])
     return demos.map(lambda demo: with_feature(demo, cache))
 

@@ -1,11 +1,11 @@
 """Images of a dataset, decoded into tensors, one for each frame of an episode."""
 
-import io
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -76,11 +76,8 @@ class ImageReader:
         """
         feature = self._folder.features[camera]
         if len(feature.shape) != 3:
-            raise DatasetError(
-                f"declares images of the shape {list(feature.shape)}",
-                file=INFO_PATH,
-                key=camera,
-            )
+            text = f"declares images of the shape {list(feature.shape)}"
+            raise DatasetError(text, file=INFO_PATH, key=camera)
         # Channels come first or last.
         first = feature.shape[0] in (1, 3, 4) and feature.shape[2] not in (1, 3, 4)
         height, width = feature.shape[1:] if first else feature.shape[:2]
@@ -118,15 +115,13 @@ class ImageReader:
         self, episode: int, camera: str, wanted: Sequence[int], size: tuple[int, int] | None
     ) -> UInt8[Tensor, "frames 3 height width"]:
         ordered = sorted({*wanted})
-        place = {frame: number for number, frame in enumerate(ordered)}
-        images: np.ndarray | None = None
-        for frame, image in self.stream(episode, camera, ordered, size):
-            if images is None:
+        images = np.empty(0)
+        for number, (_, image) in enumerate(self.stream(episode, camera, ordered, size)):
+            if not number:  # now the size is known
                 images = np.empty((len(ordered), *image.shape), np.uint8)
-            images[place[frame]] = image
-        assert images is not None
+            images[number] = image
         if list(wanted) != ordered:
-            images = images[[place[frame] for frame in wanted]]
+            images = images[np.searchsorted(ordered, wanted)]
         return torch.from_numpy(images).permute(0, 3, 1, 2)
 
     def stream(
@@ -146,19 +141,15 @@ class ImageReader:
         entry = self.entry(episode)
         wanted = range(entry.length) if frames is None else frames
         if camera not in self.cameras:
-            raise DatasetError(
-                f"there is no camera {camera!r}; there are {', '.join(self.cameras) or 'none'}",
-                file=self._folder.root,
-                key=camera,
-            )
+            text = f"there is no such camera; there are {', '.join(self.cameras) or 'none'}"
+            raise DatasetError(text, file=self._folder.root, key=camera)
         if len(wanted) and not (wanted[0] >= 0 and wanted[-1] < entry.length):
-            raise entry.error(
-                f"has no frames {wanted[0]} to {wanted[-1]}: it has {entry.length}"
-            )
-        if self._folder.features[camera].dtype == "image":
-            yield from self._from_column(entry, camera, wanted, size)
-        else:
-            yield from self._from_video(entry, camera, wanted, size)
+            text = f"has no frames {wanted[0]} to {wanted[-1]}: it has {entry.length}"
+            raise entry.error(text)
+        in_column = self._folder.features[camera].dtype == "image"
+        yield from (self._from_column if in_column else self._from_video)(
+            entry, camera, wanted, size
+        )
 
     def entry(self, episode: int) -> EpisodeEntry:
         """An episode of the dataset.
@@ -167,11 +158,8 @@ class ImageReader:
             DatasetError: There is no such episode.
         """
         if episode not in self._entries:
-            raise DatasetError(
-                f"there is no such episode; the dataset has {len(self._entries)}",
-                file=self._folder.root,
-                episode=episode,
-            )
+            text = f"there is no such episode; the dataset has {len(self._entries)}"
+            raise DatasetError(text, file=self._folder.root, episode=episode)
         return self._entries[episode]
 
     def _from_video(
@@ -182,26 +170,20 @@ class ImageReader:
         size: tuple[int, int] | None,
     ) -> Iterator[tuple[int, Image]]:
         segment, fps = self._segments.get(entry.index, {}).get(camera), self._folder.fps
+        place: dict[str, Any] = {"episode": entry.index, "key": camera}
         if segment is None or not segment.file.is_file():
-            raise DatasetError(
-                "its video is missing",
-                file=None if segment is None else segment.file,
-                episode=entry.index,
-                key=camera,
-            )
+            file = None if segment is None else segment.file
+            raise DatasetError("its video is missing", file=file, **place)
         missing = dict.fromkeys(wanted)
         for frame, image in decode(segment, fps, size, wanted):
             del missing[frame]
             yield frame, image
         for frame in missing:
-            raise DatasetError(
+            text = (
                 f"holds no image of frame {frame}: the recording was interrupted, or the "
-                f"video is that of another episode",
-                file=segment.file,
-                episode=entry.index,
-                frame=frame,
-                key=camera,
+                f"video is that of another episode"
             )
+            raise DatasetError(text, file=segment.file, frame=frame, **place)
 
     def _from_column(
         self,
@@ -218,9 +200,8 @@ class ImageReader:
                 content = column[frame - wanted[0]].as_py()["bytes"]
                 yield frame, decode_image(content, size)
             except (DatasetError, KeyError, TypeError) as error:
-                raise entry.error(
-                    "holds an image that cannot be decoded", frame=frame, key=camera
-                ) from error
+                text = "holds an image that cannot be decoded"
+                raise entry.error(text, frame=frame, key=camera) from error
 
 
 def load_images(
@@ -293,15 +274,10 @@ def jpeg(image: Image) -> bytes:
     """The RGB image as a JPEG file."""
     import av
 
-    height, width = image.shape[:2]
     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-    frame = frame.reformat(format="yuvj420p")
-    frame.pts = 0
-    stream = io.BytesIO()
-    with av.open(stream, "w", format="mjpeg") as container:
-        encoder = container.add_stream("mjpeg", rate=Fraction(1))
-        encoder.width, encoder.height, encoder.pix_fmt = width, height, "yuvj420p"  # type: ignore[attr-defined]
-        encoder.codec_context.qmin = encoder.codec_context.qmax = _JPEG_QUANTISER  # type: ignore[attr-defined]
-        container.mux(encoder.encode(frame))  # type: ignore[attr-defined]
-        container.mux(encoder.encode(None))  # type: ignore[attr-defined]
-    return stream.getvalue()
+    encoder: Any = av.CodecContext.create("mjpeg", "w")
+    encoder.height, encoder.width = image.shape[:2]
+    encoder.pix_fmt, encoder.time_base = "yuvj420p", Fraction(1)
+    encoder.qmin = encoder.qmax = _JPEG_QUANTISER
+    packets = [*encoder.encode(frame.reformat(format="yuvj420p")), *encoder.encode(None)]
+    return b"".join(map(bytes, packets))

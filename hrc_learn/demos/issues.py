@@ -89,18 +89,11 @@ warning = partial(Issue, level="warning")
 class DatasetError(ValueError):
     """A dataset that cannot be read; `file`, `episode`, `frame` and `key` locate the fault."""
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        file: str | Path | None = None,
-        episode: int | None = None,
-        frame: int | None = None,
-        key: str | None = None,
-    ):
+    def __init__(self, message: str, *, file: str | Path | None = None, **place: Any):
         name = None if file is None else str(file)
-        self.issue = Issue(message=message, file=name, episode=episode, frame=frame, key=key)
-        self.file, self.episode, self.frame, self.key = name, episode, frame, key
+        self.issue = Issue(message=message, file=name, **place)
+        self.file, self.episode = name, self.issue.episode
+        self.frame, self.key = self.issue.frame, self.issue.key
         super().__init__(str(self.issue))
 
 

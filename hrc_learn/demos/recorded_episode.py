@@ -83,9 +83,10 @@ def columns_for(
         features: User-defined features: key -> component names.
     """
     columns = [column.of_joints(joint_names) for column in _COLUMNS if column.given in given]
-    for key, names in features.items():
-        columns.append(RecordedColumn(given=key, role=None, key=key, names=tuple(names)))
-    return columns
+    return columns + [
+        RecordedColumn(given=key, role=None, key=key, names=tuple(names))
+        for key, names in features.items()
+    ]
 
 
 def lerobot_features(columns: Sequence[RecordedColumn]) -> dict[str, dict]:
@@ -174,9 +175,8 @@ class EpisodeBuffer:
             )
         row, width = float_array(value).copy(), self._widths[name]
         if row.size != width or row.ndim > 1:
-            raise ValueError(
-                f"frame {len(self)}: {name} needs {width} numbers, got shape {row.shape}"
-            )
+            text = f"frame {len(self)}: {name} needs {width} numbers, got shape {row.shape}"
+            raise ValueError(text)
         return row.reshape(width)
 
 
@@ -221,10 +221,8 @@ def require_valid(episode: Episode) -> None:
         # The tolerance allows for float32.
         wrong = np.abs(np.linalg.norm(episode["orientation"], axis=1) - 1) > 1e-3
         if wrong.any():
-            raise ValueError(
-                f"orientation must be a unit quaternion (w, x, y, z), but is not at frame "
-                f"{wrong.argmax()}"
-            )
+            text = "orientation must be a unit quaternion (w, x, y, z), but is not at frame"
+            raise ValueError(f"{text} {wrong.argmax()}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,13 +300,10 @@ def staged_paths(folder: Path, first: int = 0) -> list[Path]:
     if not paths:
         raise DatasetError("no episode was saved, so there is no dataset to write", file=folder)
     for index, path in enumerate(paths, start=first):
-        if path != episode_path(folder, index):
-            raise DatasetError(
-                "this episode is missing from the recording; rename the later ones to close "
-                "the gap if it is lost",
-                file=episode_path(folder, index),
-                episode=index,
-            )
+        expected = episode_path(folder, index)
+        if path != expected:
+            text = "is missing from the recording; rename the later ones if it is lost"
+            raise DatasetError(text, file=expected, episode=index)
     return paths
 
 
@@ -324,15 +319,11 @@ def to_table(
         features: Features as in `meta/info.json`, in the order of the columns.
         others: Columns that hold no numbers, such as images and texts.
     """
-    others = others or {}
-    arrays = {
-        key: others[key]
-        if key in others
-        else _to_arrow(values[key], feature["dtype"], feature["shape"])
-        for key, feature in features.items()
-        if feature["dtype"] != "video"
-    }
-    return pa.table(arrays)
+    arrays: dict[str, pa.Array | pa.ChunkedArray] = {**(others or {})}
+    for key, feature in features.items():
+        if key in values:
+            arrays[key] = _to_arrow(values[key], feature["dtype"], feature["shape"])
+    return pa.table({key: arrays[key] for key in features if key in arrays})
 
 
 def _to_arrow(values: np.ndarray, dtype: str, shape: Sequence[int]) -> pa.Array:
@@ -345,14 +336,12 @@ def _to_arrow(values: np.ndarray, dtype: str, shape: Sequence[int]) -> pa.Array:
         buffers = [None, pa.py_buffer(contiguous)]
         kind = pa.from_numpy_dtype(contiguous.dtype)
         flat = pa.Array.from_buffers(kind, contiguous.size, buffers)
-    if len(shape) > 1 and contiguous.dtype != bool:
-        # Lists of lists, as Hugging Face keeps arrays of several axes.
-        for length in reversed(shape):
-            ends = np.arange(len(flat) // length + 1, dtype=np.int32) * length
-            buffers = [None, pa.py_buffer(ends)]
-            kind = pa.list_(flat.type)
-            flat = pa.Array.from_buffers(kind, len(ends) - 1, buffers, children=[flat])
-        return flat
+        if len(shape) > 1:
+            # Lists of lists, as Hugging Face keeps arrays of several axes.
+            for length in reversed(shape):
+                ends = range(0, len(flat) + 1, length)
+                flat = pa.ListArray.from_arrays(pa.array(ends, pa.int32()), flat)
+            return flat
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
 
 

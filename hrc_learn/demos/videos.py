@@ -82,34 +82,26 @@ def read_segments(folder: DatasetFolder, missing: bool = False) -> dict[int, Seg
     }
 
 
-def _segments_v3(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
+def _segments_v3(folder: DatasetFolder, keys: list[str]) -> Mapping[int, Segments]:
     columns = [f"videos/{key}/{name}" for key in keys for name in _PLACE]
-    return {
-        row["episode_index"]: {
-            key: _segment(folder, file, key, row)
-            for key in keys
-            if row.get(f"videos/{key}/chunk_index") is not None
-        }
-        for file in episode_lists(folder.root)
-        for row in read_rows(folder.root, file, ("episode_index",), columns)
-    }
-
-
-def _segment(
-    folder: DatasetFolder, file: str, key: str, row: Mapping[str, Any]
-) -> VideoSegment:
-    values: dict[str, Any] = {name: row.get(f"videos/{key}/{name}") for name in _PLACE}
-    for name, value in values.items():
-        if not isinstance(value, int | float):
-            raise DatasetError(
-                f"must be a number, got {value!r}: copy the list of episodes again",
-                file=file,
-                episode=row["episode_index"],
-                key=f"videos/{key}/{name}",
-            )
-    chunk, number, start, stop = values.values()
-    path = _video_file(folder, key, chunk_index=chunk, file_index=number)
-    return VideoSegment(file=path, start=float(start), stop=float(stop))
+    found: dict[int, dict[str, VideoSegment]] = {}
+    for file in episode_lists(folder.root):
+        for row in read_rows(folder.root, file, ("episode_index",), columns):
+            shown = found.setdefault(row["episode_index"], {})
+            for key in keys:
+                values: dict[str, Any] = {n: row.get(f"videos/{key}/{n}") for n in _PLACE}
+                if values["chunk_index"] is None:
+                    continue
+                for name, value in values.items():
+                    if not isinstance(value, int | float):
+                        text = (
+                            f"must be a number, got {value!r}: copy the list of episodes again"
+                        )
+                        place = {"episode": row["episode_index"], "key": f"videos/{key}/{name}"}
+                        raise DatasetError(text, file=file, **place)
+                chunk, number, *times = values.values()
+                shown[key] = _segment(folder, key, times, chunk_index=chunk, file_index=number)
+    return found
 
 
 def _segments_v2(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
@@ -118,20 +110,17 @@ def _segments_v2(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
     segments = {}
     for entry in folder.episodes:
         places = {"episode_chunk": entry.index // size, "episode_index": entry.index}
-        segments[entry.index] = {
-            key: VideoSegment(
-                file=_video_file(folder, key, **places),
-                start=0.0,
-                stop=entry.length / folder.fps,
-            )
-            for key in keys
-        }
+        times = (0.0, entry.length / folder.fps)
+        segments[entry.index] = {key: _segment(folder, key, times, **places) for key in keys}
     return segments
 
 
-def _video_file(folder: DatasetFolder, key: str, **places: int) -> Path:
+def _segment(
+    folder: DatasetFolder, key: str, times: Sequence[float], **places: int
+) -> VideoSegment:
     template = folder.info.get("video_path")
-    return folder.root / path_in(folder.root, template, "video_path", video_key=key, **places)
+    file = path_in(folder.root, template, "video_path", video_key=key, **places)
+    return VideoSegment(file=folder.root / file, start=float(times[0]), stop=float(times[1]))
 
 
 def decode(

@@ -98,12 +98,12 @@ FATAL = {
     ),
     "version 4": (
         lambda r: change_info(r, codebase_version="v4.0"),
-        "version 'v4.0' is unknown",
+        "must be 2.0, 2.1 or 3.0, got 'v4.0'",
         "info.json",
     ),
     "version 1": (
         lambda r: change_info(r, codebase_version="v1.6"),
-        "version 'v1.6' is unknown",
+        "must be 2.0, 2.1 or 3.0, got 'v1.6'",
         "info.json",
     ),
     "fps 0": (lambda r: change_info(r, fps=0), "fps must be positive", "info.json"),
@@ -260,7 +260,7 @@ def test_joint_sets_that_cannot_be_matched(tmp_path):
     names = {STATE: NAMES, "action": ["x1.pos", "x2.pos"]}
     root = write_folder(tmp_path / "set", [{STATE: q, "action": q[:, :2]}], names)
     report = check_dataset(root)
-    assert find(report.warnings, "cannot be matched").key == "command_position"
+    assert find(report.warnings, "Name them alike").key == "command_position"
     assert load_demos(root)[0].command_position is None
 
 
@@ -405,7 +405,7 @@ def test_leader_and_follower(tmp_path):
     names = {STATE: NAMES, "action": ["l1.pos", "l2.pos", "l3.pos"]}
     report = check_dataset(write_folder(tmp_path / "set", [{STATE: q, "action": q}], names))
     assert report.ok
-    assert find(report.warnings, "leader and follower").key == "command_position"
+    assert find(report.warnings, "Leader and follower").key == "command_position"
 
 
 def test_false_starts(tmp_path):

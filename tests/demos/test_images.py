@@ -105,7 +105,7 @@ def test_a_video_without_the_last_images_names_the_first_that_is_missing(tmp_pat
     ("episode", "cameras", "frames", "message"),
     [
         (9, None, None, "no such episode"),
-        (0, ["observation.images.left"], None, "no camera"),
+        (0, ["observation.images.left"], None, "no such camera"),
         (0, None, [-1], "no frames"),
         (0, None, [9999], "no frames"),
     ],

@@ -367,7 +367,7 @@ def test_actions_of_other_joints_are_kept_apart(tmp_path):
     demos = load_demos(write_folder(tmp_path / "set", [{STATE: q, "action": q}], names))
     assert demos[0].command_position is None
     assert demos[0].extra["action"].shape == q.shape
-    assert any("other joints" in note for note in demos.notes)
+    assert any("left among the extra columns" in note for note in demos.notes)
 
 
 def test_an_object_is_not_taken_for_the_end_effector(tmp_path):

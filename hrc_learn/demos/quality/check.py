@@ -1,6 +1,6 @@
 """Validation of a dataset before anything is learned from it."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ from hrc_learn.demos.read.units import (
     units_from_episodes,
 )
 
-METADATA_CHECKS: tuple[Callable[[DatasetFolder], Iterable[Issue]], ...] = (
+METADATA_CHECKS = (
     structure_checks.statistics_exist,
     structure_checks.task_texts,
     structure_checks.component_names,
@@ -39,23 +39,21 @@ METADATA_CHECKS: tuple[Callable[[DatasetFolder], Iterable[Issue]], ...] = (
     structure_checks.unlisted_files,
     structure_checks.unchanged_files,
 )
-RAW_EPISODE_CHECKS: tuple[
-    Callable[[DatasetFolder, EpisodeEntry, RawFrames], Iterable[Issue]], ...
-] = (
+RAW_EPISODE_CHECKS = (
     structure_checks.indices,
     episode_checks.finite_values,
     episode_checks.repetitions,
     episode_checks.episode_length,
     episode_checks.recorded_stamps,
 )
-MOTION_CHECKS: tuple[Callable[[MotionRecord], Iterable[Issue]], ...] = (
+MOTION_CHECKS = (
     episode_checks.motion_present,
     episode_checks.rest_at_ends,
     episode_checks.spikes_and_jumps,
     episode_checks.joint_speeds,
     episode_checks.copied_commands,
 )
-CONSISTENCY_CHECKS: tuple[Callable[[consistency.FeatureProfiles], Iterable[Issue]], ...] = (
+CONSISTENCY_CHECKS = (
     consistency.holds,
     consistency.noise,
     consistency.switches,
@@ -96,10 +94,8 @@ def check_dataset(
     names = () if dataset is None else dataset.columns.joint_names
     for name, limit in (speed_limits or {}).items() if dataset is not None else ():
         if name not in names:
-            raise ValueError(
-                f"speed_limits: {folder.root} has no joint {name!r}; there are "
-                f"{', '.join(names) or 'none'}"
-            )
+            there = ", ".join(names) or "none"
+            raise ValueError(f"speed_limits: there is no joint {name!r}; there are {there}")
         if not limit > 0:
             raise ValueError(f"speed_limits: that of {name} must be positive, but is {limit}")
     report.attempt(lambda: check_videos(folder, report))
@@ -148,17 +144,13 @@ def _check_content(
     profiles: dict[int, EpisodeProfile] = {}
     if dataset.contract_note is not None:
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
+    episodes = _first_pass(folder, report, columns, profiles)
     decisions, faults = units_from_episodes(
-        columns.selections,
-        _first_pass(folder, report, columns, profiles),
-        folder.fps,
-        dataset.declared_units,
-        units,
+        columns.selections, episodes, folder.fps, dataset.declared_units, units
     )
     for fault in faults:
         report.add_error(fault)
-    report.run(_guesses, columns, decisions if profiles else {})
-    report.run(_joint_sets, columns)
+    report.run(_meaning, columns, decisions if profiles else {})
     entries = {entry.index: entry for entry in folder.episodes}
     features = [*consistency.feature_profiles(folder, entries, profiles)]
     usual = _usual_motion(columns, decisions, {f.key: f for f in features})
@@ -175,17 +167,14 @@ def _check_content(
                 report.run(check, feature)
     report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
     if dataset.contract is not None:
-        overruled = replaced_roles(mapping) | {*units}
         kept = dataset.contract.selections(folder.features)
-        report.contract = report.contract.keeping(
-            dataset.contract,
-            {
-                column
-                for selections in (kept, columns.selections)
-                for role in overruled & selections.keys()
-                for column in selections[role].columns
-            },
-        )
+        overruled = {
+            column
+            for selections in (kept, columns.selections)
+            for role in (replaced_roles(mapping) | {*units}) & selections.keys()
+            for column in selections[role].columns
+        }
+        report.contract = report.contract.keeping(dataset.contract, overruled)
 
 
 def _check_motions(
@@ -259,37 +248,13 @@ def _is_sound(frames: RawFrames, mapping: ColumnMapping) -> bool:
     )
 
 
-def _guesses(mapping: ColumnMapping, decisions: Mapping[str, UnitDecision]) -> Iterator[Issue]:
-    """Guesses of columns and units; joint sets are reported in detail by their own check."""
-    unmatched = tuple(f"{role} is of other joints" for role in mapping.unmatched)
-    for note in mapping.notes:
-        if not note.startswith(unmatched):
+def _meaning(mapping: ColumnMapping, decisions: Mapping[str, UnitDecision]) -> Iterator[Issue]:
+    """Guesses of columns and units, quantities of other joints, and a lack of any."""
+    for note in (*mapping.notes, *(decision.note for decision in decisions.values())):
+        if note:
             yield warning(message=note)
-    for decision in decisions.values():
-        if decision.note:
-            yield warning(message=decision.note)
-
-
-def _joint_sets(mapping: ColumnMapping) -> Iterator[Issue]:
-    """Quantities of the same joints, and joints or poses at all."""
-    for role, others in mapping.unmatched.items():
-        message = (
-            f"{role} is of the joints {', '.join(others)}, the rest of "
-            f"{', '.join(mapping.joint_names)}"
-        )
-        if set(others) < set(mapping.joint_names):
-            advice = "it is left among the extra columns"
-        elif len(others) == len(mapping.joint_names):
-            advice = (
-                f"leader and follower? Left among the extra columns; --mapping {role} KEY "
-                f"pairs them in their order"
-            )
-        else:
-            advice = (
-                f"they cannot be matched; left among the extra columns. Name them alike, or "
-                f"map one of them (--mapping {role} KEY[0:7])"
-            )
-        yield warning(message=f"{message}: {advice}", key=role)
+    for role, note in mapping.unmatched.items():
+        yield warning(message=note, key=role)
     if not any(role in mapping.selections for role in (*JOINT_FIELDS, "position")):
         text = "no joints and no poses found among the columns: name them (mapping={...})"
         yield Issue(message=text)

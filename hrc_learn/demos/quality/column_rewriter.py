@@ -218,10 +218,9 @@ class ColumnRewriter:
         indices = edit.frames["task_index"][:, 0]
         unknown = np.flatnonzero(~np.isin(indices, list(self._task_index)))
         if len(unknown):
-            raise edit.fault(
+            text = (
                 f"task {indices[unknown[0]]:g} is not in the list of tasks: leave the episode "
-                f"out (drop_bad_episodes)",
-                frame=int(unknown[0]),
-                key="task_index",
+                f"out (drop_bad_episodes)"
             )
+            raise edit.fault(text, frame=int(unknown[0]), key="task_index")
         return np.array([self._task_index[int(i)] for i in indices])

@@ -60,17 +60,38 @@ class FeatureProfiles:
         """Usual value of one statistic of each component."""
         return np.median(self.stack(name), axis=0)
 
-    def named(self, chosen: np.ndarray) -> str:
-        """Names of components, given by a mask or their numbers."""
-        if chosen.dtype == bool and chosen.all() and len(chosen) > 1:
+    def named(self, chosen: Bool[np.ndarray, " components"]) -> str:
+        """Names of the chosen components."""
+        if chosen.all() and len(chosen) > 1:
             return "all components"
-        places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
-        return ", ".join(self.names[int(i)] for i in places[:_MOST_NAMED])
+        return _listed(self.names, np.flatnonzero(chosen))
+
+    def issue(
+        self,
+        number: int,
+        text: str,
+        components: Sequence[int],
+        severity: float = 0.0,
+        level: Literal["error", "warning"] = "warning",
+    ) -> Issue:
+        """Issue of components in one of the episodes."""
+        return self.entries[number].fault(
+            text,
+            key=self.key,
+            components=tuple(self.names[i] for i in components),
+            severity=severity,
+            level=level,
+        )
 
     @property
     def lengths(self) -> Int64[np.ndarray, " episodes"]:
         """Number of frames of each episode."""
         return np.array([entry.length for entry in self.entries])
+
+
+def _listed(names: Sequence[str], places: Sequence[int] | np.ndarray) -> str:
+    """Names of the components at some places, bounded in number."""
+    return ", ".join(names[int(place)] for place in places[:_MOST_NAMED])
 
 
 def feature_profiles(
@@ -124,12 +145,9 @@ def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
         # Grippers that are open or closed are at one end or the other.
         saturated = (at_end > _SATURATED) & ~constant & (at_low + at_high < 1)
         if saturated.any() and feature.key.startswith(("observation.state", "action", "state")):
-            yield warning(
-                message=f"sits at an end of its range for up to "
-                f"{100 * at_end[saturated].max():.0f} % of the frames: "
-                f"{feature.named(saturated)}",
-                key=feature.key,
-            )
+            share = f"{100 * at_end[saturated].max():.0f} % of the frames"
+            text = f"sits at an end of its range for up to {share}: {feature.named(saturated)}"
+            yield warning(message=text, key=feature.key)
 
 
 def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
@@ -141,15 +159,13 @@ def sizes(feature: FeatureProfiles) -> Iterator[Issue]:
     # Clocks are large by nature.
     texts = [f"{name} {feature.key}".lower() for name in feature.names]
     absurd &= np.array(["time" not in text and "stamp" not in text for text in texts])
-    for number, component in np.argwhere(absurd):
-        name, size = feature.names[component], largest[number, component]
-        yield feature.entries[number].fault(
-            f"{name} reaches {size:.3g}, usually {usual[component]:.3g}: the file was "
-            f"damaged, or memory was never written; leave the episode out",
-            key=feature.key,
-            components=(name,),
-            severity=float(np.log(size)),
+    for number, component in np.argwhere(absurd).tolist():
+        size = largest[number, component]
+        text = (
+            f"{feature.names[component]} reaches {size:.3g}, usually {usual[component]:.3g}: "
+            f"the file was damaged, or memory was never written; leave the episode out"
         )
+        yield feature.issue(number, text, [component], float(np.log(size)), "error")
 
 
 def holds(feature: FeatureProfiles) -> Iterator[Issue]:
@@ -162,16 +178,13 @@ def holds(feature: FeatureProfiles) -> Iterator[Issue]:
         (fraction > 0.1) & (fraction > 5 * usual + 0.02) & (held > max(10, 0.3 * feature.fps))
     )
     frozen &= feature.smooth & (feature.median("span") > 0)
-    for number, component in np.argwhere(frozen):
-        name = feature.names[component]
-        yield feature.entries[number].warning(
-            f"{name} stays the same for {held[number, component]:.0f} of "
-            f"{frames[number]} frames, usually for {100 * usual[component]:.0f} %: the "
-            f"encoder froze?",
-            key=feature.key,
-            components=(name,),
-            severity=float(fraction[number, component]),
+    for number, component in np.argwhere(frozen).tolist():
+        text = (
+            f"{feature.names[component]} stays the same for {held[number, component]:.0f} of "
+            f"{frames[number]} frames, usually for {100 * usual[component]:.0f} %: the encoder "
+            f"froze?"
         )
+        yield feature.issue(number, text, [component], float(fraction[number, component]))
 
 
 def noise(feature: FeatureProfiles) -> Iterator[Issue]:
@@ -186,14 +199,11 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     coarse = (levels < 0.2 * np.median(levels, axis=0)) & moving
     coarse &= feature.stack("held") / frames < 0.1  # otherwise it rests
     for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
-        for number in np.flatnonzero(odd.any(1)):
-            places = np.flatnonzero(odd[number])
-            yield feature.entries[number].warning(
-                f"is {what} than in the other episodes: {feature.named(places)}",
-                key=feature.key,
-                components=tuple(feature.names[i] for i in places),
-                severity=float(len(places)),
-            )
+        for number in np.flatnonzero(odd.any(1)).tolist():
+            places = np.flatnonzero(odd[number]).tolist()
+            names = _listed(feature.names, places)
+            text = f"is {what} than in the other episodes: {names}"
+            yield feature.issue(number, text, places, float(len(places)))
 
 
 def switches(feature: FeatureProfiles) -> Iterator[Issue]:
@@ -210,7 +220,7 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
         alike = near[:, :, component].all(1)
         if alike.sum() < max(FEWEST, len(alike) - 1):
             continue  # the other episodes differ too
-        for number in np.flatnonzero(~alike):
+        for number in np.flatnonzero(~alike).tolist():
             name = feature.names[component]
             if span[number, component] == 0:
                 text = f"{name} stays, it switches in the other episodes"
@@ -218,7 +228,7 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
                 text = f"{name} switches the other way than in the other episodes"
             else:
                 continue
-            yield feature.entries[number].warning(text, key=feature.key, components=(name,))
+            yield feature.issue(number, text, [component])
 
 
 def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
@@ -246,27 +256,22 @@ def exchanged_columns(feature: FeatureProfiles) -> Iterator[Issue]:
         off = np.abs(own - usual).mean(0) / scale
         if not (off > _FAR_OFF).any():
             continue
-        found = _permuted(own, usual, scale, off, names) or _moved(
-            own, usual, scale, off, names
-        )
+        given = (own, usual, scale, off, names)
+        found = _permuted(*given) or _moved(*given)
         if found is not None:
             level, text = found
-            yield feature.entries[number].fault(
-                text,
-                key=feature.key,
-                components=tuple(names[i] for i in np.flatnonzero(off > _FAR_OFF)),
-                severity=float(off.max()),
-                level=level,
-            )
+            far = moving[off > _FAR_OFF].tolist()
+            yield feature.issue(number, text, far, float(off.max()), level)
 
 
 _Figures = Float64[np.ndarray, "5 components"]
 _PerComponent = Float64[np.ndarray, " components"]
+_Finding = tuple[Literal["error", "warning"], str]
 
 
 def _permuted(
     own: _Figures, usual: _Figures, scale: _PerComponent, off: _PerComponent, names: list[str]
-) -> tuple | None:
+) -> _Finding | None:
     """Components that took each other's place."""
     from scipy.optimize import linear_sum_assignment
 
@@ -294,18 +299,15 @@ def _permuted(
 
 def _moved(
     own: _Figures, usual: _Figures, scale: _PerComponent, off: _PerComponent, names: list[str]
-) -> tuple | None:
+) -> _Finding | None:
     """Components with the opposite sign, a motion run backwards, or a moved zero."""
-
-    def listed(places: np.ndarray) -> str:
-        return ", ".join(names[i] for i in places[:_MOST_NAMED])
-
     # Negation exchanges the quantiles 5 and 95 %. The negated figures must be usual, and far
     # closer than the original ones.
     turned = np.abs(-own[[2, 1, 0, 3, 4]] - usual).mean(0) / scale
     negated = np.flatnonzero((off > _FAR_OFF) & (turned < 1.5) & (turned < 0.25 * off))
     if len(negated):
-        return "error", f"has the other sign than in the other episodes: {listed(negated)}"
+        text = "has the other sign than in the other episodes"
+        return "error", f"{text}: {_listed(names, negated)}"
     # All components together: single ones look alike in both directions.
     back = np.abs(own[[0, 1, 2, 4, 3]] - usual).mean(0) / scale
     if off.mean() > 2 and back.mean() < 0.4 * off.mean():
@@ -313,15 +315,15 @@ def _moved(
     moved, shift = np.flatnonzero(off > 3 * _FAR_OFF), own - usual
     # A moved zero shifts all five figures by the same amount.
     alike = np.ptp(shift, axis=0) < 0.2 * np.abs(shift.mean(0))
-    offset = [f"{names[i]} by {shift[1, i]:.3g}" for i in moved if alike[i]]
-    if offset:
-        return "warning", (
-            f"is offset from the other episodes all along: {', '.join(offset[:_MOST_NAMED])}: "
-            f"its zero was moved?"
-        )
-    return (
-        ("warning", f"is far from the other episodes: {listed(moved)}") if len(moved) else None
+    offset = ", ".join(
+        [f"{names[i]} by {shift[1, i]:.3g}" for i in moved if alike[i]][:_MOST_NAMED]
     )
+    if offset:
+        text = f"is offset from the other episodes all along: {offset}: its zero was moved?"
+        return "warning", text
+    if len(moved):
+        return "warning", f"is far from the other episodes: {_listed(names, moved)}"
+    return None
 
 
 def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
@@ -359,11 +361,11 @@ def command_tracking(
     delays = np.array([t.delay for t in trackings])
     delay = float(np.median(delays))
     if delay < -1:
-        yield warning(
-            message=f"the state moves {-delay:.0f} frames before its command in most episodes: "
-            f"actions and states are shifted against each other",
-            key=key,
+        text = (
+            f"the state moves {-delay:.0f} frames before its command in most episodes: actions "
+            f"and states are shifted against each other"
         )
+        yield warning(message=text, key=key)
     agreement = (np.abs(delays - delay) <= 2).mean()
     for profile, tracking in zip(known, trackings, strict=True):
         entry = entries[profile.index]
@@ -372,13 +374,11 @@ def command_tracking(
         better = gain_over(tracking, round(delay)) > 0.8
         # Three frames are the scatter of estimated delays.
         if abs(shift) > max(3, 0.1 * abs(delay)) and better and agreement > 0.5:
-            yield entry.fault(
+            text = (
                 f"the state comes {tracking.delay} frames after its command, in the other "
-                f"episodes {delay:.0f}: actions were shifted against states",
-                key=key,
-                components=names,
-                severity=abs(shift),
+                f"episodes {delay:.0f}: actions were shifted against states"
             )
+            yield entry.fault(text, key=key, components=names, severity=abs(shift))
         elif len(known) >= FEWEST:
             for text, level in _component_tracking(tracking, usual_slope, follow, names):
                 yield entry.fault(text, key=key, components=names, level=level)
@@ -397,10 +397,6 @@ def _component_tracking(
     names: tuple[str, ...],
 ) -> Iterator[tuple[str, Literal["error", "warning"]]]:
     """Components that follow their command in the other episodes, but not in this one."""
-
-    def listed(components: Int64[np.ndarray, " _"]) -> str:
-        return ", ".join(names[i] for i in components[:_MOST_NAMED])
-
     fit, slope, partner = tracking.fit, tracking.slope, tracking.partner
     follows = follow & (fit > _FOLLOWS)
     lost = np.flatnonzero(follow & ~(fit > _LOST) & ~np.isnan(fit))
@@ -410,25 +406,23 @@ def _component_tracking(
     swapped = [i for i in lost if tracking.similarity[i] > 0.9 and partner[i] != i]
     if len(against):
         text = "the state goes the other way than its command, in this episode alone"
-        yield f"{text}: {listed(against)}", "error"
+        yield f"{text}: {_listed(names, against)}", "error"
     elif len(swapped) > 1:
         pairs = ", ".join(f"{names[i]} as {names[partner[i]]}" for i in swapped[:4])
         yield f"columns look exchanged against the state: {pairs}", "error"
     elif len(lost):
         text = "the state does not follow its command, as it does in the other episodes"
-        yield f"{text}: {listed(lost)}", "warning"
+        yield f"{text}: {_listed(names, lost)}", "warning"
     with np.errstate(all="ignore"):
         ratio = np.abs(slope / np.where(usual_slope, usual_slope, 1))
     # A factor of exp(0.5) = 1.6: payload and contact explain less.
     size = np.flatnonzero(follows & (np.abs(np.log(ratio + 1e-9)) > 0.5))
     if len(size):
-        yield (
-            (
-                f"the state goes {slope[size[0]]:.2g} times as far as its command, in the "
-                f"other episodes {usual_slope[size[0]]:.2g}: {listed(size)}"
-            ),
-            "warning",
+        text = (
+            f"the state goes {slope[size[0]]:.2g} times as far as its command, in the other "
+            f"episodes {usual_slope[size[0]]:.2g}: {_listed(names, size)}"
         )
+        yield text, "warning"
 
 
 def _velocity_commands(

@@ -42,27 +42,24 @@ def finite_values(
         bad = np.argwhere(~np.isfinite(values.astype(float)))
         if len(bad):
             frame, component = (int(i) for i in bad[0])
-            name = folder.features[key].component(component)
-            yield entry.fault(
-                f"{name} is {values[frame, component]} ({len(bad)} values are not "
-                f"finite); hrc repair --drop bad-frames (or bad-episodes) makes a copy "
-                f"without",
-                frame=frame,
-                key=key,
+            text = (
+                f"{folder.features[key].component(component)} is {values[frame, component]} "
+                f"({len(bad)} values are not finite); hrc repair --drop bad-frames (or "
+                f"bad-episodes) makes a copy without"
             )
+            yield entry.fault(text, frame=frame, key=key)
 
 
-def repetitions(_: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> Iterator[Issue]:
+def repetitions(
+    folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
+) -> Iterator[Issue]:
     """Frames that repeat the previous one: the robot was read too fast, or stood still."""
     if entry.length < 3:
         return
     same = repeated_frames(frames)[1:]
     if same.all():
-        yield entry.warning(
-            "the state never changes: the recorder lost the robot",
-            frame=0,
-            key="observation.state",
-        )
+        text = "the state never changes: the recorder lost the robot"
+        yield entry.warning(text, frame=0, key="observation.state")
     elif same.mean() > _REPEATED:
         yield entry.warning(
             f"{100 * same.mean():.0f} % of the frames repeat the one before: the robot reports "
@@ -88,7 +85,9 @@ def is_clock(values: np.ndarray) -> bool:
     return values.shape[1] == 1 and bool((np.diff(values[:, 0]) > 0).all())
 
 
-def episode_length(folder: DatasetFolder, entry: EpisodeEntry, _: RawFrames) -> Iterator[Issue]:
+def episode_length(
+    folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames
+) -> Iterator[Issue]:
     """Episodes long enough for a demonstration."""
     seconds = entry.length / folder.fps
     if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:
@@ -115,44 +114,35 @@ def stamps(
     stalled = np.flatnonzero(steps <= 0)
     if len(stalled):
         k = int(stalled[0])
-        yield entry.fault(
+        text = (
             f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s "
-            f"({len(stalled)} times); hrc repair drops the repeated frames",
-            frame=k + 1,
-            key=key,
+            f"({len(stalled)} times); hrc repair drops the repeated frames"
         )
+        yield entry.fault(text, frame=k + 1, key=key)
         return
     usual = float(np.median(steps))
     if key == "timestamp" and abs(time[0]) > 0.5 / fps:
-        yield entry.warning(
-            f"begins at {time[0]:.6g} s, not at 0: LeRobot's stamps count from the start of "
-            f"the episode",
-            frame=0,
-            key=key,
-        )
+        text = "LeRobot's stamps count from the start of the episode"
+        yield entry.warning(f"begins at {time[0]:.6g} s, not at 0: {text}", frame=0, key=key)
     # The median step ignores gaps and repetitions.
     if abs(usual * fps - 1) > _RATE_TOLERANCE:
-        yield entry.warning(
+        text = (
             f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
-            f"{fps:g}; hrc repair --fps {round(1 / usual)} resamples to the true rate",
-            key=key,
+            f"{fps:g}; hrc repair --fps {round(1 / usual)} resamples to the true rate"
         )
+        yield entry.warning(text, key=key)
     gaps = np.flatnonzero(steps > _GAP * usual)
     if len(gaps):
         lost = int(np.rint(steps[gaps] / usual - 1).sum())
-        yield entry.warning(
+        text = (
             f"{len(gaps)} gaps, about {lost} frames lost; the first is "
-            f"{1e3 * steps[gaps[0]]:.4g} ms long; hrc repair --fps {fps:g} fills them in",
-            frame=int(gaps[0]) + 1,
-            key=key,
+            f"{1e3 * steps[gaps[0]]:.4g} ms long; hrc repair --fps {fps:g} fills them in"
         )
+        yield entry.warning(text, frame=int(gaps[0]) + 1, key=key)
     jitter = float(np.quantile(np.abs(np.delete(steps, gaps) - usual), 0.95)) / usual
     if jitter > _JITTER_TOLERANCE:
-        yield entry.warning(
-            f"steps vary by {100 * jitter:.0f} % (95th percentile); hrc repair --fps {fps:g} "
-            f"resamples",
-            key=key,
-        )
+        text = f"steps vary by {100 * jitter:.0f} % (95th percentile)"
+        yield entry.warning(f"{text}; hrc repair --fps {fps:g} resamples", key=key)
 
 
 UsualMotion = Mapping[str, tuple[np.ndarray, np.ndarray]]
@@ -200,12 +190,11 @@ def orientation_values(episode: MotionRecord) -> Iterator[Issue]:
     if role.startswith("quaternion"):
         flips = np.flatnonzero((values[1:] * values[:-1]).sum(1) < 0)
         if len(flips):
-            yield episode.entry.warning(
+            text = (
                 f"the quaternion changes its sign {len(flips)} times without turning; "
-                f"load_demos makes it continuous, hrc repair does so on disk",
-                frame=int(flips[0]) + 1,
-                key=role,
+                f"load_demos makes it continuous, hrc repair does so on disk"
             )
+            yield episode.entry.warning(text, frame=int(flips[0]) + 1, key=role)
 
 
 def motion_present(episode: MotionRecord) -> Iterator[Issue]:
@@ -234,10 +223,8 @@ def rest_at_ends(episode: MotionRecord) -> Iterator[Issue]:
         ("ends", float(time[-1] - time[arrived]), arrived),
     ):
         if seconds > _STILL_SECONDS:
-            yield episode.entry.warning(
-                f"{place} with {seconds:.1f} s of standing still: hrc repair trims it",
-                frame=frame,
-            )
+            text = f"{place} with {seconds:.1f} s of standing still: hrc repair trims it"
+            yield episode.entry.warning(text, frame=frame)
 
 
 def spikes_and_jumps(episode: MotionRecord) -> Iterator[Issue]:
@@ -259,14 +246,14 @@ def spikes_and_jumps(episode: MotionRecord) -> Iterator[Issue]:
             size = np.where(odd, np.abs(steps[: len(odd)]) / np.maximum(step, 1e-9), 0.0)
             frame, joint = divmod(int(size.argmax()), size.shape[1])
             name = episode.joint_names[joint]
-            yield episode.entry.warning(
+            text = (
                 f"{name} {what} by {steps[frame, joint]:.3g}, "
                 f"{size[frame, joint]:.0f} times its usual fast step; "
-                f"{int(odd.any(1).sum())} such frames in the episode",
-                frame=frame + 1,
-                key=f"{role} ({name})",
-                components=(name,),
-                severity=float(size.max()),
+                f"{int(odd.any(1).sum())} such frames in the episode"
+            )
+            key, worst = f"{role} ({name})", float(size.max())
+            yield episode.entry.warning(
+                text, frame=frame + 1, key=key, components=(name,), severity=worst
             )
 
 
@@ -285,22 +272,16 @@ def joint_speeds(episode: MotionRecord) -> Iterator[Issue]:
         return
     frame = int(too_fast.argmax())
     joint = int((speed[frame] / limits).argmax())
-    step = change[frame, joint]
-    # The tolerance is the usual motion within a frame.
-    wrapped = abs(abs(step) - 2 * np.pi) < 0.3
-    cause = (
-        "the encoder wrapped: hrc repair unwraps it"
-        if wrapped
-        else "a glitch, or frames were lost: look at it, or leave the episode out"
+    step, name = change[frame, joint], names[joint]
+    cause = "a glitch, or frames were lost: look at it, or leave the episode out"
+    if abs(abs(step) - 2 * np.pi) < 0.3:  # the usual motion within a frame
+        cause = "the encoder wrapped: hrc repair unwraps it"
+    text = (
+        f"{name} jumps by {step:.3g} rad in one frame ({speed[frame, joint]:.3g} rad/s, limit "
+        f"{limits[joint]:.3g}); {cause}. {int(too_fast.sum())} such frames in the episode"
     )
-    yield episode.entry.warning(
-        f"{names[joint]} jumps by {step:.3g} rad in one frame "
-        f"({speed[frame, joint]:.3g} rad/s, limit {limits[joint]:.3g}); {cause}. "
-        f"{int(too_fast.sum())} such frames in the episode",
-        frame=frame + 1,
-        key=f"joint_position ({names[joint]})",
-        components=(names[joint],),
-    )
+    key = f"joint_position ({name})"
+    yield episode.entry.warning(text, frame=frame + 1, key=key, components=(name,))
 
 
 def copied_commands(episode: MotionRecord) -> Iterator[Issue]:
@@ -308,10 +289,8 @@ def copied_commands(episode: MotionRecord) -> Iterator[Issue]:
     joints = episode.quantities.get("joint_position")
     command = episode.quantities.get("command_position")
     if joints is not None and command is not None and np.array_equal(joints, command):
-        yield episode.entry.warning(
-            ("is a copy of the state at the same frame; a policy learns to stay where it is"),
-            key="action",
-        )
+        text = "is a copy of the state at the same frame; a policy learns to stay where it is"
+        yield episode.entry.warning(text, key="action")
 
 
 def duplicates(

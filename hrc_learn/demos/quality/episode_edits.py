@@ -161,11 +161,8 @@ def drop_late(edit: EpisodeEdit) -> EpisodeEdit:
     """
     highest = np.maximum.accumulate(edit.time)
     later = np.concatenate([[True], edit.time[1:] > highest[:-1]])
-    return edit.only(
-        later,
-        f"dropped {(~later).sum()} frames whose stamp does not increase: {len(edit)} -> "
-        f"{later.sum()}",
-    )
+    dropped = f"{(~later).sum()} frames whose stamp does not increase"
+    return edit.only(later, f"dropped {dropped}: {len(edit)} -> {later.sum()}")
 
 
 def drop_repeats(edit: EpisodeEdit) -> EpisodeEdit:
@@ -184,10 +181,8 @@ def drop_repeats(edit: EpisodeEdit) -> EpisodeEdit:
     begin = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(edit))))
     end = np.append(np.flatnonzero(~repeated)[1:], len(edit))[np.cumsum(~repeated) - 1] - 1
     repeated &= edit.time[end] - edit.time[begin] <= _PAUSE
-    return edit.only(
-        ~repeated,
-        f"dropped {repeated.sum()} repeated frames: {len(edit)} -> {(~repeated).sum()}",
-    )
+    dropped = f"{repeated.sum()} repeated frames"
+    return edit.only(~repeated, f"dropped {dropped}: {len(edit)} -> {(~repeated).sum()}")
 
 
 def trim(edit: EpisodeEdit) -> EpisodeEdit:
@@ -201,27 +196,20 @@ def trim(edit: EpisodeEdit) -> EpisodeEdit:
     if role is None:
         return edit
     moving: dict[str, Any] = {role: quantities[role] * semantics.units[role].factor}
+    names = semantics.joint_names if role == "joint_position" else ()
+    time, number = edit.time - edit.time[0], edit.entry.index
     try:
-        demo = Demonstration(
-            time=edit.time - edit.time[0],
-            joint_names=semantics.joint_names if role == "joint_position" else (),
-            fps=1.0,
-            episode=edit.entry.index,
-            **moving,
+        left = trim_rest(
+            Demonstration(time=time, joint_names=names, fps=1.0, episode=number, **moving)
         )
-        left = trim_rest(demo)
     except ValueError as error:
         raise edit.fault(str(error)) from error
-    first = int(np.searchsorted(demo.time, left.start_time))
+    first = int(np.searchsorted(time, left.start_time))
     first, last = _while_all_rest(edit, first, first + len(left) - 1)
     wanted = np.zeros(len(edit), dtype=bool)
     wanted[first : last + 1] = True
-    lead, tail = demo.time[first], demo.time[-1] - demo.time[last]
-    return edit.only(
-        wanted,
-        f"trimmed {lead:.2f} s at the beginning, {tail:.2f} s at the end: {len(edit)} -> "
-        f"{wanted.sum()} frames",
-    )
+    cut = f"{time[first]:.2f} s at the beginning, {time[-1] - time[last]:.2f} s at the end"
+    return edit.only(wanted, f"trimmed {cut}: {len(edit)} -> {wanted.sum()} frames")
 
 
 def _while_all_rest(edit: EpisodeEdit, first: int, last: int) -> tuple[int, int]:
@@ -269,14 +257,9 @@ def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
         if changed.any():
             labels = semantics.selections[role].labels
             names = ", ".join(labels[int(i)] for i in np.flatnonzero(changed))
-            before, after = (
-                np.abs(np.diff(v[:, changed], axis=0)).max() for v in (values, smooth)
-            )
-            change = (
-                f"unwrapped {role} ({names}): largest step {before:.4g} -> {after:.4g} "
-                f"{semantics.units[role].unit}"
-            )
-            edit = edit.with_quantity(role, smooth, change)
+            old, new = (np.abs(np.diff(v[:, changed], axis=0)).max() for v in (values, smooth))
+            steps = f"largest step {old:.4g} -> {new:.4g} {semantics.units[role].unit}"
+            edit = edit.with_quantity(role, smooth, f"unwrapped {role} ({names}): {steps}")
     return edit
 
 
@@ -308,14 +291,9 @@ def fix_signs(edit: EpisodeEdit) -> EpisodeEdit:
             flips = int(((values[1:] * values[:-1]).sum(1) < 0).sum())
             change = f"fixed {flips} jumps of the sign of {role}: {flips} -> 0"
             if flips:
-                edit = edit.with_quantity(role, _continuous(values), change)
+                smooth = quaternion.continuous(torch.from_numpy(values)).numpy()
+                edit = edit.with_quantity(role, smooth, change)
     return edit
-
-
-def _continuous(values: Float64[np.ndarray, "frames 4"]) -> Float64[np.ndarray, "frames 4"]:
-    """Quaternions in any order of their components whose signs do not jump."""
-    flips = (values[1:] * values[:-1]).sum(1) < 0
-    return values * np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))[:, None]
 
 
 def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
@@ -356,7 +334,8 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
         if role in _SMOOTH:
             moved = moved.with_quantity(role, CubicSpline(known, values)(time))
         elif role.startswith("quaternion"):
-            q = CubicSpline(known, _continuous(values))(time)
+            signed = quaternion.continuous(torch.from_numpy(values)).numpy()
+            q = CubicSpline(known, signed)(time)
             q /= np.linalg.norm(q, axis=1, keepdims=True)
             moved = moved.with_quantity(role, q)
     for (key, index), (turn, middle) in wrapped:
@@ -376,15 +355,10 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
 def _levels(edit: EpisodeEdit) -> Iterator[tuple[str, Bool[np.ndarray, " components"]]]:
     """Components of each column without values between: integers, switches and hands."""
     semantics, profiles = edit.semantics, profile_columns(edit.frames)
-    hands = {
-        column
-        for role in ("joint_position", "gripper", "command_position")
-        if role in semantics.selections
-        for column, hand in zip(
-            semantics.selections[role].columns, semantics.hands(role), strict=True
-        )
-        if hand
-    }
+    hands: set[tuple[str, int]] = set()
+    for role in {"joint_position", "gripper", "command_position"} & semantics.selections.keys():
+        columns = semantics.selections[role].columns
+        hands |= {columns[i] for i in np.flatnonzero(semantics.hands(role))}
     for key, values in edit.frames.items():
         held = np.array([(key, index) in hands for index in range(values.shape[1])])
         if key in profiles:

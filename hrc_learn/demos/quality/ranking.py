@@ -4,7 +4,7 @@ A ranking decides nothing: it tells a person which episodes to look at first, an
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -93,34 +93,21 @@ class Ranking:
             groups.setdefault(quality.cluster, []).append(quality.episode)
         return groups
 
-    def rows(self) -> list[tuple[str, ...]]:
-        """The ranking as a table with its header."""
+    def lines(self, most: int | None = None) -> Iterator[str]:
+        """The ranking as text: the first `most` episodes as a table, then a summary."""
         rows = [("episode", "doubt", "group", "frames", *MEASURES, "why")]
-        for q in self.episodes:
+        for q in self.episodes[:most]:
             measured = (f"{q.measures[m]:.3g}" if m in q.measures else "-" for m in MEASURES)
             group = "-" if q.cluster < 0 else f"{q.cluster}"
-            why = "; ".join(q.reasons)
-            doubt = f"{q.score:.1f}"
-            rows.append((f"{q.episode}", doubt, group, f"{q.length}", *measured, why))
-        return rows
-
-    def lines(self, most: int | None = None) -> Iterator[str]:
-        """The ranking as text.
-
-        Args:
-            most: Number of episodes shown; None for all.
-        """
-        head, *rows = self.rows()
-        yield from aligned([head, *rows[:most]], ">")
-        if most is not None and len(rows) > most:
-            yield f"and {len(rows) - most} less doubtful episodes"
-        groups = {k: v for k, v in self.clusters.items() if k >= 0}
-        alone = len(self.clusters.get(-1, ()))
-        sizes = ", ".join(str(len(v)) for v in groups.values())
-        yield (
-            f"{len(groups)} groups of similar episodes ({sizes or 'none'}); "
-            f"{alone} without a group"
-        )
+            place = (f"{q.episode}", f"{q.score:.1f}", group, f"{q.length}")
+            rows.append((*place, *measured, "; ".join(q.reasons)))
+        yield from aligned(rows, ">")
+        if rest := len(self.episodes) - len(rows) + 1:
+            yield f"and {rest} less doubtful episodes"
+        groups = self.clusters
+        alone = len(groups.pop(-1, ()))
+        sizes = ", ".join(str(len(members)) for members in groups.values()) or "none"
+        yield f"{len(groups)} groups of similar episodes ({sizes}); {alone} without a group"
         yield from self.notes
 
 
@@ -154,8 +141,7 @@ def rank_episodes(path: str | Path, progress: Progress | None = None) -> Ranking
         quality.doubt(_WARNING, issue.reason)
     shapes: dict[int, Float64[np.ndarray, " numbers"]] = {}
     for quality, demo in _demonstrations(root, qualities, progress):
-        _measure(quality, demo)
-        if (motion := _motion(demo)) is not None:
+        if (motion := _measure(quality, demo)) is not None:
             shapes[quality.episode] = motion_sketch(motion, _PHASES)
     _compare(qualities, shapes)
     _mark_unusual([q for q in qualities.values() if q.measures])
@@ -193,11 +179,10 @@ def _demonstrations(
     except DatasetError as error:
         if error.episode is None:
             raise
-        sound = [e.index for e in entries if not qualities[e.index].broken]
-        if not sound:
+        entries = tuple(e for e in entries if not qualities[e.index].broken)
+        if not entries:
             return
-        source = open_demos(root, sound)
-        entries = tuple(e for e in entries if e.index in set(sound))
+        source = open_demos(root, [e.index for e in entries])
     shown = progress(entries) if progress else entries
     demos = each_or_fault(len(source), lambda first: source[first:], source.__getitem__)
     for entry, demo in zip(shown, demos, strict=True):
@@ -209,28 +194,27 @@ def _demonstrations(
             quality.doubt(_ERROR, str(demo))
 
 
-def _motion(demo: Demonstration) -> Float64[np.ndarray, "frames components"] | None:
-    """Joints or position, and the gripper."""
-    parts = [demo.joint_position if demo.joint_position is not None else demo.position]
-    parts += [None if demo.gripper is None else demo.gripper[:, None]]
-    known = [part for part in parts if part is not None]
-    return np.concatenate(known, axis=1) if known else None
+def _measure(
+    quality: EpisodeQuality, demo: Demonstration
+) -> Float64[np.ndarray, "frames components"] | None:
+    """Measure an episode.
 
-
-def _measure(quality: EpisodeQuality, demo: Demonstration) -> None:
+    Returns:
+        Its joints or position, and the gripper; None if none is recorded.
+    """
     steps = np.diff(demo.time)
     quality.measures = {
         "duration": demo.duration,
         "late": float((steps > 1.5 / demo.fps).mean()) if len(steps) else 0.0,
     }
     motion = demo.joint_position if demo.joint_position is not None else demo.position
+    gripper = None if demo.gripper is None else demo.gripper[:, None]
+    known = [part for part in (motion, gripper) if part is not None]
+    shape = np.concatenate(known, axis=1) if known else None
     if motion is None or len(demo) < 5:
-        return
+        return shape
     quality.measures["jerk"] = log_dimensionless_jerk(demo.time, motion)
-    try:
-        rest = resting(demo)
-    except ValueError:  # too few frames to estimate a speed
-        return
+    rest = resting(demo)
     quality.measures["idle"] = float(rest.mean())
     moving = np.flatnonzero(~rest)
     if len(moving):
@@ -238,6 +222,7 @@ def _measure(quality: EpisodeQuality, demo: Demonstration) -> None:
         margin = round(0.1 * demo.fps)
         quality.start = max(0, int(moving[0]) - margin)
         quality.stop = min(len(demo), int(moving[-1]) + 1 + margin)
+    return shape
 
 
 def log_dimensionless_jerk(
@@ -317,28 +302,12 @@ def _principal_components(
     return (left * sizes)[:, :_DIMENSIONS] / np.sqrt(_PHASES)
 
 
-_TESTS: dict[str, tuple[float, float, Callable[[float, float], str]]] = {
-    "distance": (
-        *(1.0, 0.25),
-        lambda own, _: f"moves unlike all others: {own:.1f} times as far from the nearest",
-    ),
-    "duration": (0.0, 0.05, lambda own, usual: f"takes {own:.1f} s, {usual:.1f} s are usual"),
-    "idle": (
-        *(0.1, 0.025),
-        lambda own, usual: (
-            f"rests for {100 * own:.0f} % of the time, {100 * usual:.0f} % are usual"
-        ),
-    ),
-    "jerk": (
-        *(1.0, 0.25),
-        lambda own, usual: f"moves jerkily: e^{own - usual:.1f} times the usual jerk",
-    ),
-    "late": (
-        *(0.02, 0.005),
-        lambda own, usual: (
-            f"{100 * own:.0f} % of its frames came late, {100 * usual:.0f} % are usual"
-        ),
-    ),
+_TESTS = {
+    "distance": (1.0, 0.25, "moves unlike all others: {own:.1f} times as far from the nearest"),
+    "duration": (0.0, 0.05, "takes {own:.1f} s, {usual:.1f} s are usual"),
+    "idle": (0.1, 0.025, "rests for {own:.0%} of the time, {usual:.0%} are usual"),
+    "jerk": (1.0, 0.25, "moves jerkily: e^{above:.1f} times the usual jerk"),
+    "late": (0.02, 0.005, "{own:.0%} of its frames came late, {usual:.0%} are usual"),
 }
 """Measure -> smallest difference from the usual value that counts, lower bound of the spread
 (for datasets of nearly equal episodes), and the reason given."""
@@ -358,5 +327,6 @@ def _mark_unusual(qualities: Sequence[EpisodeQuality]) -> None:
         spread = max(1.4826 * float(np.median(np.abs(values - usual))), least_spread)
         off = (np.abs(values - usual) if is_duration else values - usual) / spread
         for k in np.flatnonzero((off > _UNUSUAL) & (np.abs(values - usual) >= least)):
-            shown = float(np.exp(usual)) if is_duration else usual
-            known[k].doubt(min(off[k] / _UNUSUAL, 5.0), reason(known[k].measures[name], shown))
+            shown, own = float(np.exp(usual)) if is_duration else usual, known[k].measures[name]
+            text = reason.format(own=own, usual=shown, above=own - shown)
+            known[k].doubt(min(off[k] / _UNUSUAL, 5.0), text)

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -147,21 +148,14 @@ def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> It
         wrong = np.flatnonzero(frames[key][:, 0] != values) if key in frames else []
         if len(wrong):
             k = int(wrong[0])
-            yield entry.fault(
-                f"is {frames[key][k, 0]:g}, expected {values[k]:g}; frames were lost, "
-                f"repeated or moved",
-                frame=k,
-                key=key,
-            )
+            text = f"is {frames[key][k, 0]:g}, expected {values[k]:g}"
+            yield entry.fault(f"{text}; frames were lost, repeated or moved", frame=k, key=key)
     if "task_index" in frames and folder.tasks:
         known = np.isin(frames["task_index"][:, 0], list(folder.tasks))
         if not known.all():
             k = int(known.argmin())
-            yield entry.fault(
-                f"task {frames['task_index'][k, 0]:g} is not in the list of tasks",
-                frame=k,
-                key="task_index",
-            )
+            text = f"task {frames['task_index'][k, 0]:g} is not in the list of tasks"
+            yield entry.fault(text, frame=k, key="task_index")
 
 
 def statistics_exist(folder: DatasetFolder) -> Iterator[Issue]:
@@ -179,26 +173,21 @@ def statistics_fit(
     path = folder.root / _STATISTICS
     recorded = read_json(path) if path.exists() else {}
     for feature in features:
-        stated = recorded.get(feature.key)
+        stated, width = recorded.get(feature.key), len(feature.names)
         if stated is None:
             continue
+        place: dict[str, Any] = {"file": _STATISTICS, "key": feature.key}
         try:
             low, high, mean, std = (
                 np.asarray(stated[name], float).reshape(-1)
                 for name in ("min", "max", "mean", "std")
             )
         except (KeyError, TypeError, ValueError):
-            yield warning(
-                message="statistics are incomplete", file=_STATISTICS, key=feature.key
-            )
+            yield warning(message="statistics are incomplete", **place)
             continue
-        if {len(low), len(high), len(mean), len(std)} != {len(feature.names)}:
-            yield Issue(
-                message=f"statistics of {len(mean)} components for {len(feature.names)}: "
-                f"LeRobot cannot normalise",
-                file=_STATISTICS,
-                key=feature.key,
-            )
+        if {len(low), len(high), len(mean), len(std)} != {width}:
+            text = f"statistics of {len(mean)} components for {width}: LeRobot cannot normalise"
+            yield Issue(message=text, **place)
             continue
         least, most = feature.stack("low").min(0), feature.stack("high").max(0)
         span = np.maximum(most - least, 1e-6)
@@ -209,12 +198,11 @@ def statistics_fit(
         # Far wider statistics belong to other data or to another unit.
         wrong |= (high - low) > 20 * span + 1
         if wrong.any():
-            yield warning(
-                message=f"statistics do not fit the data in {wrong.sum()} components: policies "
-                f"would normalise wrongly; hrc repair computes them anew",
-                file=_STATISTICS,
-                key=feature.key,
+            text = (
+                f"statistics do not fit the data in {wrong.sum()} components: policies would "
+                f"normalise wrongly; hrc repair computes them anew"
             )
+            yield warning(message=text, **place)
 
 
 def unchanged_files(folder: DatasetFolder) -> Iterator[Issue]:
@@ -227,11 +215,11 @@ def unchanged_files(folder: DatasetFolder) -> Iterator[Issue]:
     for name in changed:
         # A missing file is reported as such by the check of its content.
         if name != SIDECAR_PATH and (folder.root / name).is_file():
-            yield Issue(
-                message=f"is not as it was written: its checksum differs. Copy it again, or "
-                f"delete {MANIFEST} if it was changed on purpose",
-                file=name,
+            text = (
+                f"is not as it was written: its checksum differs. Copy it again, or delete "
+                f"{MANIFEST} if it was changed on purpose"
             )
+            yield Issue(message=text, file=name)
 
 
 def unlisted_files(folder: DatasetFolder) -> Iterator[Issue]:
@@ -245,29 +233,22 @@ def unlisted_files(folder: DatasetFolder) -> Iterator[Issue]:
 def task_texts(folder: DatasetFolder) -> Iterator[Issue]:
     """Tasks: named, listed once, and known to every episode."""
     texts, file = list(folder.tasks.values()), "meta/tasks"
-    empty = [index for index, text in folder.tasks.items() if not text.strip()]
-    if empty:
-        yield warning(message=f"task {empty[0]} has no text", file=file)
-    for index, text in folder.tasks.items():
-        if text.strip().lower() in _PLACEHOLDERS:
-            yield warning(
-                message=f"task {index}, {text!r}, does not say what is shown: policies are "
-                f"conditioned on it",
-                file=file,
-            )
+    for index, task in folder.tasks.items():
+        if not task.strip():
+            yield warning(message=f"task {index} has no text", file=file)
+        elif task.strip().lower() in _PLACEHOLDERS:
+            text = f"task {index}, {task!r}, does not say what is shown: policies depend on it"
+            yield warning(message=text, file=file)
     if len({*texts}) < len(texts):
         yield warning(message="a task is listed twice", file=file)
-    if folder.info.get("total_tasks", len(texts)) != len(texts):
-        yield warning(
-            message=f"says {folder.info['total_tasks']!r}, but {len(texts)} are listed",
-            file=INFO_PATH,
-            key="total_tasks",
-        )
+    said = folder.info.get("total_tasks", len(texts))
+    if said != len(texts):
+        text = f"says {said!r}, but {len(texts)} are listed"
+        yield warning(message=text, file=INFO_PATH, key="total_tasks")
     for entry in folder.episodes:
         unknown = [task for task in entry.tasks if task not in texts]
         if unknown:
-            text = f"task {unknown[0]!r} is not in the list of tasks"
-            yield entry.warning(text)
+            yield entry.warning(f"task {unknown[0]!r} is not in the list of tasks")
 
 
 def component_names(folder: DatasetFolder) -> Iterator[Issue]:
@@ -287,8 +268,7 @@ def offsets(folder: DatasetFolder) -> Iterator[Issue]:
     for entries in folder.files.values():
         ordered = sorted(entries, key=lambda entry: entry.start)
         for before, entry in pairwise(ordered):
-            if entry.start != before.start + before.length:
-                yield entry.fault(
-                    f"begins at row {entry.start}, but episode {before.index} ends at "
-                    f"{before.start + before.length}: offsets and lengths contradict"
-                )
+            end = before.start + before.length
+            if entry.start != end:
+                text = f"begins at row {entry.start}, but episode {before.index} ends at {end}"
+                yield entry.fault(f"{text}: offsets and lengths contradict")

@@ -113,10 +113,8 @@ def _read_stream(path: Path) -> _Stream:
     except DatasetError:
         raise
     except (av.FFmpegError, IndexError, ValueError, OSError) as error:
-        raise DatasetError(
-            f"is no video that can be read ({error}): the recording was broken off, or the "
-            f"copy is incomplete"
-        ) from error
+        text = f"is no video that can be read ({error})"
+        raise DatasetError(f"{text}: the recording or the copy is incomplete") from error
     if count < promised:
         raise DatasetError(f"breaks off: holds {count} of {promised} images; copy it again")
     return found
@@ -153,14 +151,13 @@ def _length(
         images = stream.images
         if folder.is_v3:
             images = round((segment.stop - segment.start) * fps)
-        if abs(images - entry.length) > 1:
-            yield Issue(
-                message=f"shows {images} images, but the episode has {entry.length} frames: "
-                f"it is that of another episode, or frames were lost",
-                episode=entry.index,
-                severity=abs(images - entry.length),
-                **place,
+        off = abs(images - entry.length)
+        if off > 1:
+            text = (
+                f"shows {images} images, but the episode has {entry.length} frames: it is that "
+                f"of another episode, or frames were lost"
             )
+            yield Issue(message=text, episode=entry.index, severity=off, **place)
     if not folder.is_v3:
         return
     end = max(segment.stop for _, segment in shown)
@@ -171,12 +168,9 @@ def _length(
     ordered = sorted(shown, key=lambda item: item[1].start)
     for (before, first), (entry, second) in pairwise(ordered):
         if second.start < first.stop - 0.5 / fps:
-            yield Issue(
-                message=f"begins at {second.start:.3f} s, before episode {before.index} ends "
-                f"({first.stop:.3f} s)",
-                episode=entry.index,
-                **place,
-            )
+            end = f"episode {before.index} ends ({first.stop:.3f} s)"
+            text = f"begins at {second.start:.3f} s, before {end}"
+            yield Issue(message=text, episode=entry.index, **place)
             return
 
 
@@ -193,8 +187,5 @@ def _images(folder: DatasetFolder, shown: Shown, place: dict[str, Any]) -> Itera
         images = [image_at(segment, frame, folder.fps) for frame in frames]
         if len(images) > 2 and all(np.array_equal(images[0], i) for i in images[1:]):
             blank = "all of one colour" if np.ptp(images[0]) == 0 else "the same image"
-            yield warning(
-                message=f"shows {blank} at the beginning, in the middle and at the end",
-                episode=entry.index,
-                **place,
-            )
+            text = f"shows {blank} at the beginning, in the middle and at the end"
+            yield warning(message=text, episode=entry.index, **place)

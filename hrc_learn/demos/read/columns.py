@@ -28,6 +28,7 @@ MappingSpec = Mapping[str, str | Sequence[str] | None]
 or component names (["j1.pos", "observation.state/j2.pos"]); None leaves the role out."""
 
 _RANGE = re.compile(r"(.+)\[([^\[\]]*)\]")
+_BOUNDS = re.compile(r"(?=.)(\d{0,9})(:?)(\d{0,9})")
 _STATE_KEYS = ("observation.state", "observation.states", "state", "states")
 _ACTION_KEYS = ("action", "actions")
 _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_velocity"}
@@ -75,8 +76,8 @@ class ColumnMapping:
     """Numeric features with components that no role uses."""
     notes: tuple[str, ...]
     """Guesses and omissions, one sentence each."""
-    unmatched: dict[str, tuple[str, ...]]
-    """Role -> joints, for quantities of other joints than `joint_names`."""
+    unmatched: dict[str, str]
+    """Role -> note, for quantities of other joints than `joint_names`."""
 
     def reads_like(self, other: "ColumnMapping") -> bool:
         """True if both mappings read the same numbers under the same names."""
@@ -105,11 +106,7 @@ def map_columns(
     Raises:
         DatasetError: The mapping or the sidecar names a role or column that does not exist.
     """
-    usable = {
-        key: feature
-        for key, feature in features.items()
-        if feature.numeric and key not in INDEX_KEYS
-    }
+    usable = {k: f for k, f in features.items() if f.numeric and k not in INDEX_KEYS}
     notes: list[str] = []
     if kept is not None:
         found = dict(kept)
@@ -125,11 +122,6 @@ def map_columns(
     found = {role: selection for role, selection in found.items() if role not in replaced}
     found |= parse_mapping(mapping or {}, usable)
     names, found, unmatched = _align_joints(found)
-    notes.extend(
-        f"{role} is of other joints ({', '.join(others)}) than the rest ({', '.join(names)}); "
-        f"left among the extra columns"
-        for role, others in unmatched.items()
-    )
     taken = {column for selection in found.values() for column in selection.columns}
     extra = (
         key
@@ -141,7 +133,21 @@ def map_columns(
         joint_names=names,
         extra=tuple(extra),
         notes=tuple(notes),
-        unmatched=unmatched,
+        unmatched={role: _mismatch(role, joints, names) for role, joints in unmatched.items()},
+    )
+
+
+def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str:
+    """Note on a quantity of other joints than the rest, with the remedy."""
+    if set(joints) < set(names):
+        advice = ""
+    elif len(joints) == len(names):
+        advice = f". Leader and follower? --mapping {role} KEY pairs them in their order"
+    else:
+        advice = f". Name them alike, or map one of them (--mapping {role} KEY[0:7])"
+    return (
+        f"{role} is of the joints {', '.join(joints)}, the rest of {', '.join(names)}: "
+        f"left among the extra columns{advice}"
     )
 
 
@@ -181,16 +187,12 @@ def _named_selection(
     width = ROLES[role].width
     if width is not None and len(places) != width:
         raise DatasetError(f"mapping gives {role} {len(places)} columns, it takes {width}")
-    names = [features[key].names for key, _ in places]
-    labels = []
-    for n, (known, (_, index)) in enumerate(zip(names, places, strict=True)):
-        name = f"joint_{n + 1}" if known is None else known[index]
+    named, labels = [features[key].names for key, _ in places], []
+    for number, (names, (_, index)) in enumerate(zip(named, places, strict=True), start=1):
+        name = f"joint_{number}" if names is None else names[index]
         labels.append(joint_of(name) if role in JOINT_FIELDS else name)
     return ColumnSelection(
-        role=role,
-        columns=tuple(places),
-        labels=tuple(labels),
-        numbered=any(known is None for known in names),
+        role=role, columns=tuple(places), labels=tuple(labels), numbered=None in named
     )
 
 
@@ -201,26 +203,23 @@ def _feature_range(
     match = None if text in features else _RANGE.fullmatch(text)
     key = match[1] if match else text
     if key not in features:
-        raise DatasetError(
-            f"mapping takes {role} from a feature that does not exist; numeric features are "
-            f"{', '.join(features)}",
-            file=INFO_PATH,
-            key=key,
+        known = ", ".join(features)
+        text = (
+            f"mapping takes {role} from a feature that does not exist; numeric ones are {known}"
         )
+        raise DatasetError(text, file=INFO_PATH, key=key)
     width = features[key].width
     first, stop = 0, width
     if match:
-        low, colon, high = match[2].partition(":")
-        digits = all(bound.isdecimal() and len(bound) < 10 for bound in (low, high) if bound)
-        first = int(low or 0) if digits and (low or colon) else width
-        stop = first + 1 if not colon else int(high or width) if digits else 0
+        bounds = _BOUNDS.fullmatch(match[2])
+        first = int(bounds[1] or 0) if bounds else width
+        stop = int(bounds[3] or width) if bounds and bounds[2] else first + 1
     if not first < stop <= width:
-        raise DatasetError(
+        text = (
             f"mapping takes {role} from {text!r}, which is no range of its {width} components: "
-            f"write [first:stop] or [index], counted from 0",
-            file=INFO_PATH,
-            key=key,
+            f"write [first:stop] or [index], counted from 0"
         )
+        raise DatasetError(text, file=INFO_PATH, key=key)
     return [(key, index) for index in range(first, stop)]
 
 
@@ -234,13 +233,13 @@ def _component(role: str, name: str, features: Mapping[str, Feature]) -> tuple[s
         if (feature.key, known) == (key, component) or (not slash and known == name)
     ]
     if not places:
-        known = ", ".join(n for feature in features.values() for n in feature.names or ())
-        raise DatasetError(
-            f"mapping takes {role} from a component that does not exist; named components "
-            f"are {known or 'none'}",
-            file=INFO_PATH,
-            key=name,
+        known = (
+            ", ".join(n for feature in features.values() for n in feature.names or ()) or "none"
         )
+        text = (
+            f"mapping takes {role} from a component that does not exist; named ones are {known}"
+        )
+        raise DatasetError(text, file=INFO_PATH, key=name)
     if len(places) > 1:
         options = ", ".join(f"{key}/{name}" for key, _ in places)
         raise DatasetError(f"mapping for {role} is ambiguous: write one of {options}", key=name)

@@ -46,10 +46,8 @@ def require_file(path: Path, name: str | Path, episode: int | None = None) -> No
     except OSError as error:  # circular links too
         raise DatasetError(f"cannot be read: {error.strerror}", **place) from error
     if head == _POINTER:
-        raise DatasetError(
-            "is a pointer of Git LFS, not the file itself: run `git lfs pull` in the dataset",
-            **place,
-        )
+        text = "is a pointer of Git LFS, not the file itself: run `git lfs pull` in the dataset"
+        raise DatasetError(text, **place)
 
 
 def is_inside(root: Path, file: str | Path) -> bool:
@@ -159,11 +157,8 @@ def integer(value: object, name: str, file: str, lowest: int = 0) -> int:
     """
     whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
     if isinstance(value, bool) or not whole or not lowest <= int(value) < 2**53:  # type: ignore[arg-type]
-        raise DatasetError(
-            f"{name} must be a whole number of at least {lowest}, got {value!r}",
-            file=file,
-            key=name,
-        )
+        text = f"{name} must be a whole number of at least {lowest}, got {value!r}"
+        raise DatasetError(text, file=file, key=name)
     return int(value)  # type: ignore[arg-type]
 
 
@@ -179,12 +174,11 @@ def open_parquet(root: Path, file: str, episode: int | None = None) -> pq.Parque
     try:
         return pq.ParquetFile(root / file, page_checksum_verification=True)
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise DatasetError(
+        text = (
             "unreadable: the file is truncated, because the recording was not finalized or "
-            "the copy is incomplete",
-            file=file,
-            episode=episode,
-        ) from error
+            "the copy is incomplete"
+        )
+        raise DatasetError(text, file=file, episode=episode) from error
 
 
 def read_rows(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property, partialmethod
 from itertools import accumulate
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from hrc_learn.demos.issues import DatasetError, Issue
 from hrc_learn.demos.read.dataset_files import (
@@ -45,26 +45,9 @@ class EpisodeEntry:
         """Reading error located in this episode."""
         return DatasetError(message, file=self.file, episode=self.index, frame=frame, key=key)
 
-    def fault(
-        self,
-        message: str,
-        frame: int | None = None,
-        key: str | None = None,
-        components: tuple[str, ...] = (),
-        severity: float = 0.0,
-        level: Literal["error", "warning"] = "error",
-    ) -> Issue:
-        """Issue located in this episode; arguments as in `Issue`."""
-        return Issue(
-            message=message,
-            file=self.file,
-            episode=self.index,
-            frame=frame,
-            key=key,
-            components=components,
-            severity=severity,
-            level=level,
-        )
+    def fault(self, message: str, **details: Any) -> Issue:
+        """Issue located in this episode; further arguments as in `Issue`."""
+        return Issue(message=message, file=self.file, episode=self.index, **details)
 
     warning = partialmethod(fault, level="warning")
 
@@ -157,23 +140,16 @@ def read_info(root: Path) -> dict:
     missing = [key for key in ("codebase_version", "fps", "features") if key not in info]
     if missing:
         raise DatasetError(f"lacks {', '.join(missing)}", file=INFO_PATH)
-    version = info["codebase_version"]
-    if generation(version) is None:
-        raise DatasetError(
-            f"dataset version {version!r} is unknown; versions 2.0, 2.1 and 3.0 can be read",
-            file=INFO_PATH,
-            key="codebase_version",
-        )
-    fps = info["fps"]
+    version, fps = info["codebase_version"], info["fps"]
     number = isinstance(fps, int | float) and not isinstance(fps, bool)
-    if not number or not 0 < fps < _FASTEST:
-        raise DatasetError(
-            f"fps must be positive and below {_FASTEST:g}, got {fps!r}",
-            file=INFO_PATH,
-            key="fps",
-        )
-    if not isinstance(info["features"], dict):
-        raise DatasetError("features must be an object", file=INFO_PATH, key="features")
+    for key, sound, text in (
+        ("codebase_version", generation(version) is not None, "2.0, 2.1 or 3.0"),
+        ("fps", number and 0 < fps < _FASTEST, f"positive and below {_FASTEST:g}"),
+        ("features", isinstance(info["features"], dict), "an object"),
+    ):
+        if not sound:
+            text = f"{key} must be {text}, got {str(info[key])[:80]!r}"
+            raise DatasetError(text, file=INFO_PATH, key=key)
     return info
 
 
@@ -228,61 +204,46 @@ def episode_lists(root: Path) -> list[str]:
 def _episodes_v3(root: Path, info: dict) -> Iterator[EpisodeEntry]:
     files = episode_lists(root)
     if not files:
-        raise DatasetError(
-            "no list of episodes: the recording was not finalized, or the copy is incomplete",
-            file="meta/episodes",
-        )
-    place = ("data/chunk_index", "data/file_index")
-    columns = ("episode_index", "length", "dataset_from_index", *place)
-    rows = []
+        text = "no list of episodes: the recording was not finalized, or the copy is incomplete"
+        raise DatasetError(text, file="meta/episodes")
+    places = ("chunk_index", "file_index")
+    counts = ("episode_index", "length", "dataset_from_index")
+    columns = (*counts, *(f"data/{place}" for place in places))
+    by_file: dict[tuple[int, int], list[dict]] = {}
     for file in files:
         for row in read_rows(root, file, columns, optional=("tasks",)):
-            counts = {name: integer(row[name], name, "meta/episodes") for name in columns}
-            rows.append(row | counts)
-    first_row: dict[tuple[int, int], int] = {}
-    for row in rows:
-        file = row[place[0]], row[place[1]]
-        start = int(row["dataset_from_index"] or 0)
-        first_row[file] = min(first_row.get(file, start), start)
-    # Resolved once per file: following links takes longer than all other work on an episode.
-    template = info.get("data_path")
-    paths = {
-        (chunk, number): path_in(
-            root, template, "data_path", chunk_index=chunk, file_index=number
-        )
-        for chunk, number in first_row
-    }
-    for row in rows:
-        file = row[place[0]], row[place[1]]
-        yield EpisodeEntry(
-            index=row["episode_index"],
-            length=row["length"],
-            tasks=_task_texts(row),
-            file=paths[file],
-            start=row["dataset_from_index"] - first_row[file],
-        )
+            row |= {name: integer(row[name], name, "meta/episodes") for name in columns}
+            by_file.setdefault((row[columns[3]], row[columns[4]]), []).append(row)
+    for numbers, rows in by_file.items():
+        # Once per file: following links takes longer than all other work on an episode.
+        there = dict(zip(places, numbers, strict=True))
+        path = path_in(root, info.get("data_path"), "data_path", **there)
+        first = min(row["dataset_from_index"] for row in rows)
+        for row in rows:
+            yield EpisodeEntry(
+                index=row["episode_index"],
+                length=row["length"],
+                tasks=_task_texts(row.get("tasks")),
+                file=path,
+                start=row["dataset_from_index"] - first,
+            )
 
 
 def _episodes_v2(root: Path, info: dict) -> Iterator[EpisodeEntry]:
     name = "meta/episodes.jsonl"
     rows = read_json_lines(root, name, ("episode_index", "length"))
     size = integer(info.get("chunks_size", 1000), "chunks_size", INFO_PATH, lowest=1)
-    template = info.get("data_path")
     for row in rows:
-        index = integer(row["episode_index"], "episode_index", name)
+        index, length = (integer(row[n], n, name) for n in ("episode_index", "length"))
         # Version 2 keeps one file per episode, and `chunks_size` files per folder.
         places = {"episode_chunk": index // size, "episode_index": index}
-        yield EpisodeEntry(
-            index=index,
-            length=integer(row["length"], "length", name),
-            tasks=_task_texts(row),
-            file=path_in(root, template, "data_path", **places),
-            start=0,
-        )
+        file = path_in(root, info.get("data_path"), "data_path", **places)
+        tasks = _task_texts(row.get("tasks"))
+        yield EpisodeEntry(index=index, length=length, tasks=tasks, file=file, start=0)
 
 
-def _task_texts(row: dict) -> tuple[str, ...]:
-    tasks = row.get("tasks") or ()
+def _task_texts(tasks: object) -> tuple[str, ...]:
+    tasks = tasks or ()
     return tuple(map(str, tasks)) if isinstance(tasks, list | tuple) else (str(tasks),)
 
 
@@ -295,16 +256,17 @@ def read_tasks(root: Path, info: dict) -> dict[int, str]:
     if generation(info["codebase_version"]) == 3:
         file = "meta/tasks.parquet"
         rows = read_rows(root, file, ("task_index",))
-        # pandas leaves the column of texts unnamed if its index had no name.
-        texts = [
-            row.get("task", row.get("__index_level_0__", row.get("index"))) for row in rows
-        ]
     else:
         file = "meta/tasks.jsonl"
         rows = read_json_lines(root, file, ("task_index", "task"))
-        texts = [row["task"] for row in rows]
-    indices = [integer(row["task_index"], "task_index", file) for row in rows]
-    return {index: str(text) for index, text in zip(indices, texts, strict=True)}
+    # pandas leaves the column of texts unnamed if its index had no name.
+    names = ("task", "__index_level_0__", "index")
+    return {
+        integer(row["task_index"], "task_index", file): str(
+            next((row[name] for name in names if name in row), None)
+        )
+        for row in rows
+    }
 
 
 def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
@@ -340,30 +302,24 @@ EpisodeFilter = Callable[[EpisodeEntry], bool]
 
 def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
     """Contradictions between the counts of episodes and frames in the metadata."""
-    entries, info = folder.episodes, folder.info
+    entries, info, listed = folder.episodes, folder.info, "meta/episodes"
     if not entries:
         yield DatasetError("the dataset holds no episodes", file=folder.root)
-    for name, counted in (
-        ("total_episodes", len(entries)),
-        ("total_frames", sum(entry.length for entry in entries)),
-    ):
+    frames = sum(entry.length for entry in entries)
+    for name, counted in (("total_episodes", len(entries)), ("total_frames", frames)):
         if info.get(name, counted) != counted:
-            yield DatasetError(
+            text = (
                 f"says {info[name]}, but the list of episodes counts {counted}: episodes were "
-                f"lost, or the file belongs to another copy; hrc repair counts anew",
-                file=INFO_PATH,
-                key=name,
+                f"lost, or the file belongs to another copy; hrc repair counts anew"
             )
+            yield DatasetError(text, file=INFO_PATH, key=name)
     repeated = [index for index, n in Counter(e.index for e in entries).items() if n > 1]
     for index in repeated:
-        yield DatasetError("is listed more than once", file="meta/episodes", episode=index)
+        yield DatasetError("is listed more than once", file=listed, episode=index)
     missing = sorted(set(range(len(entries))) - {entry.index for entry in entries})
     if missing and not repeated:
-        yield DatasetError(
-            "is missing from the list of episodes: indices must count from 0 without a gap",
-            file="meta/episodes",
-            episode=missing[0],
-        )
+        text = "is missing from the list of episodes: indices must count from 0 without a gap"
+        yield DatasetError(text, file=listed, episode=missing[0])
     for entry in entries:
         if entry.length <= 0:
             yield entry.error("has no frames")
@@ -386,32 +342,28 @@ def select_episodes(
     Raises:
         DatasetError: An episode or task does not exist, or no episode is left.
     """
-    by_index = {entry.index: entry for entry in folder.episodes}
+    by_index, root = {entry.index: entry for entry in folder.episodes}, folder.root
     if not by_index:
-        raise DatasetError("the dataset holds no episodes", file=folder.root)
+        raise DatasetError("the dataset holds no episodes", file=root)
     indices = [*by_index] if episodes is None else episodes
     if not len(indices):
-        raise DatasetError("no episode was asked for; None reads all", file=folder.root)
+        raise DatasetError("no episode was asked for; None reads all", file=root)
     for index in indices:
         if index not in by_index:
-            raise DatasetError(
-                f"there is no such episode; the dataset has {min(by_index)} to {max(by_index)}",
-                file=folder.root,
-                episode=index,
-            )
+            text = f"there is no such episode; there are {min(by_index)} to {max(by_index)}"
+            raise DatasetError(text, file=root, episode=index)
     chosen = [by_index[index] for index in indices]
     if tasks is not None:
         wanted = {tasks} if isinstance(tasks, str) else {*tasks}
         known = {task for entry in folder.episodes for task in entry.tasks}
         if unknown := sorted(wanted - known):
-            raise DatasetError(
-                f"no episode shows the task {unknown[0]!r}; the list of episodes has "
-                f"{', '.join(map(repr, sorted(known))) or 'none'}",
-                file=folder.root,
+            listed = ", ".join(map(repr, sorted(known))) or "none"
+            text = (
+                f"no episode shows the task {unknown[0]!r}; the list of episodes has {listed}"
             )
+            raise DatasetError(text, file=root)
         chosen = [entry for entry in chosen if wanted & {*entry.tasks}]
-    if where is not None:
-        chosen = [entry for entry in chosen if where(entry)]
+    chosen = [entry for entry in chosen if where is None or where(entry)]
     if not chosen:
-        raise DatasetError("no episode is left by the filters given", file=folder.root)
+        raise DatasetError("no episode is left by the filters given", file=root)
     return tuple(chosen)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from itertools import groupby
 
 import numpy as np
 import pyarrow as pa
@@ -93,33 +93,26 @@ def _read_batch(
     keys: Sequence[str],
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
     """Episodes of one file, read together."""
-    file = entries[0].file
-    rows = slice(
-        min(entry.start for entry in entries),
-        max(entry.start + entry.length for entry in entries),
-    )
+    file, first = entries[0].file, min(entry.start for entry in entries)
+    rows = slice(first, max(entry.start + entry.length for entry in entries))
     table = read_table(parquet, file, keys, rows)
     columns = {}
     for key in table.column_names:
 
         def fault(row: int, message: str, key: str = key) -> DatasetError:
-            place = row + rows.start
+            place = row + first
             entry = next(e for e in entries if e.start <= place < e.start + e.length)
             return entry.error(message, frame=place - entry.start, key=key)
 
         columns[key] = to_numpy(table.column(key), fault)
         feature, width = folder.features.get(key), columns[key].shape[1]
         if feature is not None and len(columns[key]) and width != feature.width:
-            raise DatasetError(
-                f"has {width} components, but meta/info.json declares the shape "
-                f"{list(feature.shape)}",
-                file=file,
-                key=key,
-            )
+            shape = list(feature.shape)
+            text = f"has {width} components, but meta/info.json declares the shape {shape}"
+            raise DatasetError(text, file=file, key=key)
     for entry in entries:
-        start = entry.start - rows.start
-        frames = {key: values[start : start + entry.length] for key, values in columns.items()}
-        yield entry, frames
+        own = slice(entry.start - first, entry.start - first + entry.length)
+        yield entry, {key: values[own] for key, values in columns.items()}
 
 
 def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised: int) -> None:
@@ -129,12 +122,12 @@ def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised
         DatasetError: The file holds more or fewer frames.
     """
     if rows != promised:
-        raise DatasetError(
+        text = (
             f"holds {rows} frames, but the list of episodes promises {promised}: frames were "
-            f"lost or repeated, or the metadata belong to another copy",
-            file=file,
-            episode=entries[0].index if len(entries) == 1 else None,
+            f"lost or repeated, or the metadata belong to another copy"
         )
+        episode = entries[0].index if len(entries) == 1 else None
+        raise DatasetError(text, file=file, episode=episode)
 
 
 def _require_episode(entry: EpisodeEntry, frames: RawFrames) -> None:
@@ -144,12 +137,11 @@ def _require_episode(entry: EpisodeEntry, frames: RawFrames) -> None:
         return
     wrong = np.flatnonzero(frames["episode_index"] != entry.index)
     if len(wrong):
-        raise entry.error(
+        text = (
             f"the frame belongs to episode {int(frames['episode_index'][wrong[0], 0])} by its "
-            f"episode_index: the offsets in the list of episodes are wrong",
-            frame=int(wrong[0]),
-            key="episode_index",
+            f"episode_index: the offsets in the list of episodes are wrong"
         )
+        raise entry.error(text, frame=int(wrong[0]), key="episode_index")
 
 
 def each_or_fault[T](
@@ -200,12 +192,14 @@ def read_each(
 
 def disk_runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
     """Split a sequence into runs of episodes that lie on disk in this order."""
-    place = [(entry.file, entry.start) for entry in entries]
-    cuts = [0]
-    for before, here in pairwise(place):
-        cuts.append(cuts[-1] + (here <= before))
-    for _, run in groupby(zip(cuts, entries, strict=True), key=lambda pair: pair[0]):
-        yield [entry for _, entry in run]
+    run: list[EpisodeEntry] = []
+    for entry in entries:
+        if run and (entry.file, entry.start) <= (run[-1].file, run[-1].start):
+            yield run
+            run = []
+        run.append(entry)
+    if run:
+        yield run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,12 +254,11 @@ def _require_finite(
             bad &= seen != 0
         if bad.any():
             frame, component = (int(i) for i in np.argwhere(bad)[0])
-            raise entry.error(
+            text = (
                 f"{role} is {values[frame, component]} there; leave the episode out "
-                f"(episodes=[...]) or repair the recording",
-                frame=frame,
-                key=selections[role].column_name(component),
+                f"(episodes=[...]) or repair the recording"
             )
+            raise entry.error(text, frame=frame, key=selections[role].column_name(component))
 
 
 def select_quantities(
@@ -314,13 +307,12 @@ def frame_timestamps(
     stalled = np.flatnonzero(~(np.diff(time) > 0))
     if len(stalled):
         k = int(stalled[0])
-        raise entry.error(
+        text = (
             f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s: "
             f"drop the repeated frames (hrc repair), or take frames as 1/fps apart "
-            f"(mapping={{'time': None}} if the column is one of true stamps)",
-            frame=k + 1,
-            key=key,
+            f"(mapping={{'time': None}} if the column is one of true stamps)"
         )
+        raise entry.error(text, frame=k + 1, key=key)
     resolution = 2 * np.finfo(np.float32).eps * max(1.0, float(np.abs(time).max()))
     regular = time[0] + np.arange(entry.length) / folder.fps
     if key == "timestamp" and (np.abs(time - regular) <= resolution).all():

@@ -87,12 +87,11 @@ def read_features(info: dict) -> dict[str, Feature]:
             if names is not None and len(names) == 1 < prod(shape):
                 names = None  # openpi's converters name the vector, not its components
             if names is not None and len(names) != prod(shape):
-                raise DatasetError(
+                text = (
                     f"{len(names)} names for {prod(shape)} components; correct names or "
-                    f"shape of the feature",
-                    file=INFO_PATH,
-                    key=key,
+                    f"shape of the feature"
                 )
+                raise DatasetError(text, file=INFO_PATH, key=key)
         features[key] = Feature(key=key, dtype=dtype, shape=shape, names=names)
     return features
 

@@ -129,32 +129,27 @@ class OpenedDataset:
         """
         for role, unit in given.items():  # before any long read
             unit_factor(role, unit)
-        selections, stated = self.columns.selections, {*self.declared_units, *given}
-        guessed = guessed_from_values(selections, stated)
-        sample = self.sample(_SAMPLED_EPISODES)
+        selections, declared = self.columns.selections, self.declared_units
+        guessed = guessed_from_values(selections, {*declared, *given})
+        sample = {entry.index: entry for entry in self.sample(_SAMPLED_EPISODES)}
         wanted = {entry.index: entry for entry in entries}
         roles, first = [*guessed], [*wanted.values()]
-        if "time" in selections and "time" not in stated:
+        if "time" in selections and "time" not in {*declared, *given}:
             roles.append("time")
             first = first if guessed else first[:1]
 
         def episodes() -> Iterator[tuple[EpisodeEntry, Quantities]]:
             for episode in self.read(first, roles) if roles else ():
                 yield episode.entry, episode.quantities
-            for entry in sample if guessed else ():
-                if entry.index not in wanted:
-                    # Its faults are raised when the episode itself is read.
-                    with contextlib.suppress(DatasetError):
-                        for episode in self.read([entry], guessed):
-                            yield entry, episode.quantities
+            for index in sorted(sample.keys() - wanted.keys()) if guessed else ():
+                # Faults are raised when the episode itself is read.
+                with contextlib.suppress(DatasetError):
+                    for episode in self.read([sample[index]], guessed):
+                        yield episode.entry, episode.quantities
 
+        fps = self.folder.fps
         decisions, faults = units_from_episodes(
-            selections,
-            episodes(),
-            self.folder.fps,
-            self.declared_units,
-            given,
-            {entry.index for entry in sample},
+            selections, episodes(), fps, declared, given, sample.keys()
         )
         for fault in faults:
             if fault.episode in wanted:
@@ -188,17 +183,14 @@ class OpenedDataset:
         try:
             decisions = self.decide_units(folder.episodes, units or {})
             profiles = [
-                profile_episode(
-                    episode.entry.index, episode.frames, episode.quantities, folder.fps
-                )
-                for episode in self.read(self.sample(_CONTRACT_EPISODES))
+                profile_episode(raw.entry.index, raw.frames, raw.quantities, folder.fps)
+                for raw in self.read(self.sample(_CONTRACT_EPISODES))
             ]
         except DatasetError as error:
             return self, f"no contract of the columns is kept: {error}"
         contract = infer_contract(folder, self.columns, decisions, profiles)
-        columns = map_columns(
-            folder.features, self.sidecar, kept=contract.selections(folder.features)
-        )
+        kept = contract.selections(folder.features)
+        columns = map_columns(folder.features, self.sidecar, kept=kept)
         if not columns.reads_like(self.columns):
             return self, ""  # such as an order of components that a contract cannot express
         try:
@@ -360,24 +352,19 @@ class DemonstrationSource(Sequence[Demonstration]):
         Raises:
             DatasetError: A joint does not exist.
         """
-        columns = dataset.columns
-        self._dataset = dataset
-        self._entries = tuple(entries)
+        columns, root = dataset.columns, dataset.folder.root
+        self._dataset, self._entries, self._own_notes = dataset, tuple(entries), tuple(notes)
         self._decisions = dict(decisions)
         names = columns.joint_names if joint_names is None else joint_names
         joint_columns(columns.joint_names, names)
-        self.joint_names = tuple(names)
-        self.source = str(dataset.folder.root)
-        self._extracted = None if dataset.own_feature else only_feature(dataset.folder.root)
-        self._own_notes = tuple(notes)
-        self.notes = (*notes, *columns.notes)
-        if dataset.contract_note is not None:
-            self.notes += (dataset.contract_note,)
-        if self._extracted is not None:
-            self.notes += (f"feature: {self._extracted.name}, extracted from the videos",)
-        self.notes += tuple(d.note for d in decisions.values() if d.note)
-        if self._extracted is not None:
-            self.notes += missing_note(self._extracted, [entry.index for entry in entries])
+        self.joint_names, self.source = tuple(names), str(root)
+        noted = [*notes, *columns.notes, *columns.unmatched.values(), dataset.contract_note]
+        noted += [decision.note for decision in decisions.values()]
+        self._extracted = feature = None if dataset.own_feature else only_feature(root)
+        if feature is not None:
+            noted.append(f"feature: {feature.name}, extracted from the videos")
+            noted += missing_note(feature, [entry.index for entry in entries])
+        self.notes = tuple(note for note in noted if note)
 
     @overload
     def __getitem__(self, index: int) -> Demonstration: ...
@@ -449,29 +436,28 @@ class DemonstrationSource(Sequence[Demonstration]):
         Raises:
             DatasetError: Its stamps do not increase, or its orientations are invalid.
         """
-        folder, entry, frames = self._dataset.folder, episode.entry, episode.frames
-        values = {}
+        folder, columns = self._dataset.folder, self._dataset.columns
+        entry, frames, values = episode.entry, episode.frames, {}
         for role, on_disk in episode.quantities.items():
             factor = self._decisions[role].factor
             values[role] = on_disk if np.all(factor == 1) else on_disk * factor
         time = frame_timestamps(folder, entry, frames, values.get("time"))
-        fields = {
-            role: values[role]
-            for role in (*JOINT_FIELDS, "position", "feature")
-            if role in values
-        }
+        fields = {r: values[r] for r in (*JOINT_FIELDS, "position", "feature") if r in values}
         if "gripper" in values:
             fields["gripper"] = values["gripper"][:, 0]
         if "feature_visible" in values:
             fields["feature_visible"] = values["feature_visible"][:, 0] > 0
+        task = entry.tasks[0] if entry.tasks else ""
+        if not entry.tasks and "task_index" in frames:
+            task = folder.tasks.get(int(frames["task_index"][0, 0]), "")
         demo = Demonstration(
             time=time - time[0],
             start_time=float(time[0]),
             fps=folder.fps,
             episode=entry.index,
-            task=_task(folder, episode),
-            joint_names=self._dataset.columns.joint_names,
-            extra={key: frames[key].astype(float) for key in self._dataset.columns.extra},
+            task=task,
+            joint_names=columns.joint_names,
+            extra={key: frames[key].astype(float) for key in columns.extra},
             **fields | self._pose(episode, values),
         )
         if self._extracted is not None:
@@ -485,23 +471,14 @@ class DemonstrationSource(Sequence[Demonstration]):
         role = next((role for role in ORIENTATION_ROLES if role in values), None)
         if role is None:
             return {}
+        # In a transform, the translation alone has a unit.
+        is_matrix = role == "pose_matrix"
+        numbers = episode.quantities[role] if is_matrix else values[role]
         try:
-            if role != "pose_matrix":
-                return {"orientation": to_quaternion(role, values[role])}
-            # In a transform, the translation alone has a unit.
-            matrix = episode.quantities[role]
-            pose = {"orientation": to_quaternion(role, matrix)}
-            if "position" not in values:
-                translation = transforms(matrix)[:, :3, 3].numpy()
-                pose["position"] = translation * self._decisions[role].factor
-            return pose
+            pose = {"orientation": to_quaternion(role, numbers)}
         except ValueError as error:
             raise episode.entry.error(str(error), key=role) from error
-
-
-def _task(folder: DatasetFolder, episode: RawEpisode) -> str:
-    if episode.entry.tasks:
-        return episode.entry.tasks[0]
-    if "task_index" in episode.frames:
-        return folder.tasks.get(int(episode.frames["task_index"][0, 0]), "")
-    return ""
+        if is_matrix and "position" not in values:
+            translation = transforms(numbers)[:, :3, 3].numpy()
+            pose["position"] = translation * self._decisions[role].factor
+        return pose
