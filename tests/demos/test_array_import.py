@@ -30,7 +30,7 @@ def read(path, columns=(), sources=None, **options):
 def test_npz_by_array_names(tmp_path):
     path = tmp_path / "run.npz"
     np.savez(path, t=TIME, q=np.rad2deg(Q), pos=100 * Q, R=TURN.as_quat(), note=np.array("x"))
-    sources = dict(joints="q", time="t", position="pos", orientation="R")
+    sources = {"joints": "q", "time": "t", "position": "pos", "orientation": "R"}
     units = {"joint_position": "deg", "position": "cm"}
     (demo,) = read(path, sources=sources, quaternion_order="xyzw", units=units, task="pour")
     np.testing.assert_allclose(demo.joint_position, Q)

@@ -216,7 +216,7 @@ def switches(feature: FeatureProfiles) -> Iterator[Issue]:
     opposite = np.abs(ends - usual[::-1]) <= 0.1 * usual_span
     # Only components that usually change their level from start to goal.
     switching = ~feature.smooth & (np.ptp(usual, axis=0) > 0.5 * usual_span) & (usual_span > 0)
-    for component in np.flatnonzero(switching):
+    for component in np.flatnonzero(switching).tolist():
         alike = near[:, :, component].all(1)
         if alike.sum() < max(FEWEST, len(alike) - 1):
             continue  # the other episodes differ too
