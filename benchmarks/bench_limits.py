@@ -1,17 +1,25 @@
 """Search for command sequences that break a limit behind the safety filter.
 
-Batches of arms start anywhere, a quarter of the joints near a limit, and receive bang-bang
-commands: first at random, then drawn by the cross-entropy method, which keeps the sequences
-that made the tool fastest and draws the next ones from their distribution. Three points are
-capped: the tool, the elbow and the end of a load 0.2 m past the tool. An independent monitor
-counts the steps beyond any limit; none is wanted.
+Arms start anywhere, a quarter of their joints near a limit, and receive bang-bang commands:
+first at random, then drawn by the cross-entropy method, which keeps the sequences that made a
+point fastest and draws the next ones from their distribution. Tool, elbow and the end of a load
+0.2 m past the tool are capped. An independent monitor counts the steps beyond any limit.
+
+The filter runs as a batch, arm by arm, with the constraint layer, and exported; with float32
+and float64; with readings that are late or wrong, and with a wrong model of the arm, for which
+the filter is given a delay and a lower cap.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -19,15 +27,22 @@ from limit_monitor import LimitMonitor
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
+from torch.utils import _pytree
 
 from hrc_learn import cli
-from hrc_learn.controller import ConstraintConfig, SafetyConfig, SafetyFilter
-from hrc_learn.kinematics import Arm, arm
+from hrc_learn.controller import ConstraintConfig, SafetyConfig, VelocityStep, WantedVelocity
+from hrc_learn.deploy import PackageRunner, export_step
+from hrc_learn.kinematics import SerialChain, arm
 
 KINDS = ("position", "velocity", "acceleration", "jerk", "speed")
-_LOAD = 0.2  # distance of the end of the load from the tool, along its axis [m]
+_LOAD = (0.0, 0.0, 0.2)  # far end of the load in the frame of the tool [m]
 _ELITE = 0.1  # fraction of the sequences that are kept
 _LEVELS = 3.0  # commands reach this multiple of the velocity limits
+_DT = (0.001, 0.02)  # shortest and longest step [s]
+
+type _Filter = Callable[[Tensor, Tensor, float], tuple[Tensor, int]]
+"""Function of joint positions, wanted velocities and the step that returns the velocities sent
+and the number of arms whose speed was reported to exceed the cap."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,19 +50,28 @@ class Search:
     """One configuration of a search."""
 
     arm: str = "panda"
-    dt: float = 0.008
+    path: Literal["batch", "layer", "single", "exported"] = "batch"
+    """The filter for all arms at once, with the constraint layer, arm by arm, or exported and
+    arm by arm."""
+    dt: float = 0.0
     """Step [s]; 0: any from 1 to 20 ms, drawn anew in each step."""
     dtype: torch.dtype = torch.float64
-    layer: bool = False
-    """True: with the constraint layer."""
     cap: float = 1.0
     """Highest speed of the points [m/s]."""
-    batch: int = 256
+    reserve: float = 0.0
+    """Fraction by which the filter's cap is lower."""
+    late: int = 0
+    """Steps by which readings are late; the filter knows their longest duration."""
+    encoder_error: float = 0.0
+    """Largest error of a reading, drawn anew in each step [rad]."""
+    model_error: float = 0.0
+    """Fraction by which the links are longer than the filter knows."""
+    batch: int = 1024
     steps: int = 120
     """Steps of one sequence."""
     knots: int = 12
     """Changes of the command in a sequence."""
-    rounds: int = 10
+    rounds: int = 9
     """Sequences drawn from the elite of the round before; the first round is random."""
     seed: int = 0
 
@@ -55,8 +79,16 @@ class Search:
     def name(self) -> str:
         """Name in tables and files."""
         step = f"{1e3 * self.dt:g} ms" if self.dt else "1-20 ms"
-        layer = ", layer" if self.layer else ""
-        return f"{self.arm}, {step}, {str(self.dtype)[6:]}{layer}"
+        parts = [self.arm, self.path, step, str(self.dtype)[6:]]
+        if self.cap != 1.0:
+            parts.append(f"cap {self.cap:g}")
+        if self.late:
+            parts.append(f"{self.late} late")
+        if self.encoder_error:
+            parts.append(f"encoders {1e3 * self.encoder_error:g} mrad")
+        if self.model_error:
+            parts.append(f"links {100 * self.model_error:g} % longer")
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,22 +99,18 @@ class Found:
     beyond: dict[str, int]
     """Steps beyond each kind of limit."""
     fastest: float
-    """Largest speed of a point [m/s]."""
+    """Largest speed of a point, of the cap."""
     reported: int
-    """Steps in which the filter reported a speed above the cap."""
+    """Steps in which the filter reported a speed above its cap."""
 
 
-def points_of(robot: Arm, q: Float[Tensor, "batch n"]) -> Float[Tensor, "batch 3 3 n"]:
+def points_of(robot: SerialChain, q: Float[Tensor, "batch n"]) -> Float[Tensor, "batch 3 3 n"]:
     """Linear Jacobians of the tool, the end of a load, and the elbow."""
-    J, load = robot.jacobian(q), load_of(robot, q)
-    end = J[:, :3] + torch.linalg.cross(J[:, 3:], load[..., None], dim=1)
+    pose, J = robot.forward_and_jacobian(q)
+    end = pose.apply(torch.tensor(_LOAD).to(q)) - pose.position
+    load = J[:, :3] + torch.linalg.cross(J[:, 3:], end[..., None], dim=1)
     elbow = robot.joint_jacobian(q, robot.elbow)[:, :3]
-    return torch.stack([J[:, :3], end, elbow], dim=1)
-
-
-def load_of(robot: Arm, q: Float[Tensor, "batch n"]) -> Float[Tensor, "batch 3"]:
-    """Vector from the tool to the far end of the load [m]."""
-    return _LOAD * robot.forward(q).matrix()[..., :3, 2]
+    return torch.stack([J[:, :3], load, elbow], dim=1)
 
 
 @torch.inference_mode()
@@ -90,10 +118,6 @@ def search(config: Search) -> Found:
     """Search with one configuration."""
     robot, rng = arm(config.arm), torch.Generator().manual_seed(config.seed)
     n, B = len(robot.joint_names), config.batch
-    settings = SafetyConfig(
-        tcp_speed=config.cap, constraints=ConstraintConfig() if config.layer else None
-    )
-    safety = SafetyFilter(robot, settings).to(config.dtype)
     mean = torch.zeros(config.knots, n, dtype=torch.float64)
     spread, start = torch.ones_like(mean), None
     beyond, fastest, reported = torch.zeros(len(KINDS), dtype=torch.int64), 0.0, 0
@@ -101,7 +125,7 @@ def search(config: Search) -> Found:
         noise = torch.randn(B, config.knots, n, generator=rng, dtype=torch.float64)
         knots = mean + spread * noise
         q = _start(robot, B, rng) if start is None else start
-        speeds, flags, over = _run(config, robot, safety, q, knots, rng)
+        speeds, flags, over = _run(config, robot, q, knots, rng)
         beyond, reported = beyond + flags, reported + over
         fastest = max(fastest, float(speeds.max()))
         best = speeds.topk(max(2, int(_ELITE * B))).indices
@@ -111,12 +135,12 @@ def search(config: Search) -> Found:
     return Found(
         steps=config.rounds * B * config.steps,
         beyond=dict(zip(KINDS, beyond.tolist(), strict=True)),
-        fastest=fastest,
+        fastest=fastest / config.cap,
         reported=reported,
     )
 
 
-def _start(robot: Arm, count: int, rng: torch.Generator) -> Tensor:
+def _start(robot: SerialChain, count: int, rng: torch.Generator) -> Tensor:
     limits, n = robot.limits, len(robot.joint_names)
     draw = torch.rand(count, n, generator=rng, dtype=torch.float64)
     side, near = torch.rand(2, count, n, generator=rng, dtype=torch.float64)
@@ -125,87 +149,179 @@ def _start(robot: Arm, count: int, rng: torch.Generator) -> Tensor:
 
 
 def _run(
-    config: Search,
-    robot: Arm,
-    safety: SafetyFilter,
-    q: Tensor,
-    knots: Tensor,
-    rng: torch.Generator,
+    config: Search, robot: SerialChain, q: Tensor, knots: Tensor, rng: torch.Generator
 ) -> tuple[Tensor, Tensor, int]:
     """Largest speed of each arm, steps beyond each limit, and reported steps."""
-    limits, dtype = robot.limits, config.dtype
-    still = torch.zeros_like(q)
-    watch = LimitMonitor(limits, still, config.dt or 0.01, config.cap)
-    state, largest = safety.initial_state(q.to(dtype)), torch.zeros_like(q[:, 0])
+    limits, real = robot.limits, _longer(robot, config.model_error)
+    watch = LimitMonitor(limits, torch.zeros_like(q), config.dt or 0.01, config.cap)
+    send, largest = _opened(config, robot, q), torch.zeros_like(q[:, 0])
     beyond, reported = torch.zeros(len(KINDS), dtype=torch.int64), 0
+    readings, points = deque([q], config.late + 1), points_of(real, q)
     for k in range(config.steps):
         u = knots[:, k * config.knots // config.steps].clamp(-1, 1) * _LEVELS * limits.velocity
-        dt = config.dt or 1e-3 + 0.019 * float(torch.rand((), generator=rng))
-        points = points_of(robot, q)
-        velocity, state, report = safety.step(
-            state,
-            q.to(dtype),
-            u.to(dtype),
-            dt,
-            jacobian=robot.jacobian(q).to(dtype),
-            load=load_of(robot, q).to(dtype),
-        )
-        v = velocity.double()
+        shortest, longest = _DT
+        drawn = shortest + (longest - shortest) * float(torch.rand((), generator=rng))
+        dt = config.dt or drawn
+        error = 2 * torch.rand(q.shape, generator=rng, dtype=q.dtype) - 1
+        v, over = send(readings[0] + config.encoder_error * error, u, dt)
         q = q + dt * v
-        after = points_of(robot, q)
+        readings.append(q)
+        before, points = points, points_of(real, q)
         # At the start and at the end of the step.
-        beyond += watch.violations(q, v, torch.cat([points, after], dim=1), dt).sum(0)
-        speed = torch.einsum("bpin,bn->bpi", after, v).norm(dim=-1).amax(-1)
-        largest = torch.maximum(largest, speed)
-        reported += int((report.speed_excess > 0).sum())
+        both = torch.cat([before, points], dim=1)
+        beyond += watch.violations(q, v, both, dt).sum(0)
+        speed = torch.einsum("bpin,bn->bpi", both, v).norm(dim=-1).amax(-1)
+        largest, reported = torch.maximum(largest, speed), reported + over
     return largest, beyond, reported
+
+
+def _longer(robot: SerialChain, fraction: float) -> SerialChain:
+    """An arm with longer links."""
+
+    def longer(frames: Tensor) -> Tensor:
+        frames = frames.clone()
+        frames[..., :3, 3] *= 1 + fraction
+        return frames
+
+    return SerialChain(
+        joint_names=robot.joint_names,
+        mounts=longer(robot.mounts),
+        flange=longer(robot.flange),
+        tcp=longer(robot.tcp),
+        limits=robot.limits,
+        ready=robot.ready,
+        kinds=robot.kinds,
+    )
+
+
+def _opened(config: Search, robot: SerialChain, q: Tensor) -> _Filter:
+    """The filter of a configuration, for arms at rest."""
+    longest = config.dt or _DT[1]
+    settings = SafetyConfig(
+        tcp_speed=(1 - config.reserve) * config.cap,
+        delay=config.late * longest,
+        constraints=ConstraintConfig() if config.path == "layer" else None,
+    )
+    step = VelocityStep(robot, settings).to(config.dtype)
+    observation = WantedVelocity(
+        joint_position=q.to(config.dtype),
+        joint_velocity=torch.zeros_like(q, dtype=config.dtype),
+        stop=torch.zeros_like(q[:, 0], dtype=torch.bool),
+        dt=torch.tensor(longest, dtype=config.dtype),
+        load=torch.tensor(_LOAD, dtype=config.dtype).expand(len(q), 3).contiguous(),
+    )
+    if config.path in ("batch", "layer"):
+        return _Eager(step, observation)
+    alone = [
+        _pytree.tree_map(lambda x, k=k: x[k] if x.ndim else x, observation)
+        for k in range(len(q))
+    ]
+    if config.path == "single":
+        return partial(_one_by_one, [_Eager(step, one) for one in alone])
+    package = export_step(step, alone[0])
+    return partial(_one_by_one, [_exported(package, one) for one in alone])
+
+
+class _Eager:
+    """The filter run as it is written."""
+
+    def __init__(self, step: VelocityStep, observation: WantedVelocity):
+        self._step, self._given = step, observation
+        self._state = step.initial_state(observation.joint_position)
+
+    def __call__(self, q: Tensor, u: Tensor, dt: float) -> tuple[Tensor, int]:
+        like = self._given.joint_position
+        given = replace(
+            self._given,
+            joint_position=q.to(like),
+            joint_velocity=u.to(like),
+            dt=torch.full((), dt, dtype=like.dtype),
+        )
+        command, self._state = self._step.step(self._state, given)
+        over = int((command.safety.speed_excess > 0).sum())
+        return command.joint_velocity.double(), over
+
+
+def _exported(package: Path, observation: WantedVelocity) -> _Filter:
+    """The compiled filter of one arm."""
+    runner = PackageRunner(package)
+    runner.observe(observation)
+    runner.start(runner.observation["joint_position"])
+    excess = runner.command("safety.speed_excess")
+
+    def send(q: Tensor, u: Tensor, dt: float) -> tuple[Tensor, int]:
+        runner.observation["joint_position"][:] = q.numpy()
+        runner.observation["joint_velocity"][:] = u.numpy()
+        runner.observation["dt"][...] = dt
+        return torch.from_numpy(runner.step()).double(), int(excess > 0)
+
+    return send
+
+
+def _one_by_one(filters: list[_Filter], q: Tensor, u: Tensor, dt: float) -> tuple[Tensor, int]:
+    """Step of several arms, each with its own filter."""
+    sent, over = zip(*(f(q[k], u[k], dt) for k, f in enumerate(filters)), strict=True)
+    return torch.stack(sent), sum(over)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     arms: tuple[str, ...] = ("panda", "fr3", "ur5e", "so101", "xarm7")
     """Arms to search with."""
-    rounds: int = 10
-    """Rounds of each search."""
-    batch: int = 256
-    """Arms in a batch."""
-    single: bool = True
-    """Search with single arms as well, a hundred times as short."""
+    steps: int = 1_000_000
+    """Steps of each large search. Those with the uncompiled filter arm by arm take a fiftieth,
+    those with errors a quarter."""
+    processes: int = 2
+    """Searches that run at the same time."""
     json: Path | None = None
     """Receives the measured values."""
 
 
 def searches(args: Args) -> Iterator[Search]:
-    """All configurations."""
+    """All configurations; those that compile come first."""
+
+    def sized(one: Search, steps: int) -> Search:
+        return replace(one, rounds=max(2, -(-steps // (one.batch * one.steps))))
+
+    single = torch.float32
     for name in args.arms:
-        one = Search(arm=name, rounds=args.rounds, batch=args.batch)
-        for dt in (0.001, 0.004, 0.008, 0.02, 0.0):
-            yield replace(one, dt=dt, steps=300 if dt == 0.001 else 120)
-        yield replace(one, dtype=torch.float32, dt=0.001, steps=300)
-        yield replace(one, dtype=torch.float32, dt=0.0)
-        yield replace(one, cap=0.25)
-        yield replace(one, layer=True, batch=args.batch // 4, rounds=max(1, args.rounds // 4))
-        if args.single:
-            yield replace(one, batch=2, rounds=max(1, args.rounds // 2))
+        exported = Search(arm=name, path="exported", batch=128)
+        yield sized(exported, args.steps)
+        yield sized(replace(exported, dtype=single), args.steps)
+    for name in args.arms:
+        one = Search(arm=name)
+        yield sized(replace(one, path="layer"), args.steps)
+        yield sized(one, args.steps // 2)
+        yield sized(replace(one, cap=0.25), args.steps // 4)
+        yield sized(replace(one, dt=0.001, steps=300), args.steps // 4)
+        yield sized(replace(one, dtype=single), args.steps // 2)
+        yield sized(replace(one, dtype=single, dt=0.001, steps=300), args.steps // 2)
+        yield sized(replace(one, path="single", batch=8), args.steps // 50)
+        for late in (1, 3):
+            yield sized(replace(one, dt=0.008, late=late), args.steps // 4)
+        wrong = replace(one, dt=0.008, late=1, reserve=0.01, encoder_error=0.002)
+        yield sized(wrong, args.steps // 4)
+        yield sized(replace(one, reserve=0.025, model_error=0.02), args.steps // 4)
 
 
 def main(args: Args) -> int | None:
-    torch.set_num_threads(1)
-    table = Table("search", "steps", *KINDS, "fastest [m/s]", "reported")
+    table = Table("search", "steps", *KINDS, "fastest, of its cap", "reported")
     figures: dict[str, float] = {}
-    for config in searches(args):
-        found = search(config)
-        name = f"{config.name}, cap {config.cap:g}, batch {config.batch}"
-        counts = [str(n) for n in found.beyond.values()]
-        table.add_row(
-            name, str(found.steps), *counts, f"{found.fastest:.3f}", str(found.reported)
-        )
-        key = "_".join(name.replace(",", "").replace(".", "p").split())
-        figures[f"{key}_steps"] = found.steps
-        figures[f"{key}_beyond"] = sum(found.beyond.values())
-        figures[f"{key}_fastest_mps"] = found.fastest
-        Console().print(name, found.steps, found.beyond, f"{found.fastest:.3f}")
-    Console().print(table)
+    configs, console = list(searches(args)), Console()
+    pool = ProcessPoolExecutor(
+        args.processes, get_context("spawn"), torch.set_num_threads, (1,)
+    )
+    with pool:
+        for config, found in zip(configs, pool.map(search, configs), strict=True):
+            counts = [str(n) for n in found.beyond.values()]
+            row = (config.name, str(found.steps), *counts, f"{found.fastest:.4f}")
+            table.add_row(*row, str(found.reported))
+            console.print(*row, found.reported)
+            key = "_".join(config.name.replace(",", "").replace(".", "p").split())
+            figures[f"{key}_steps"] = found.steps
+            figures[f"{key}_beyond"] = sum(found.beyond.values())
+            figures[f"{key}_fastest_ratio"] = found.fastest
+    console.print(table)
     if args.json is not None:
         cli.write_json(args.json, figures)
     return 0 if not sum(v for k, v in figures.items() if k.endswith("_beyond")) else 1
