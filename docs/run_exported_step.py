@@ -1,6 +1,6 @@
 """Run an exported control step without the library that made it.
 
-    python docs/run_exported_step.py step-....pt2
+    python docs/run_exported_step.py step-.../step.pt2
 
 The arm moves as it is told; a real loop would read its joints and write to its driver.
 """

@@ -1,4 +1,4 @@
-"""Ahead-of-time compilation of a control step into one file, named by a hash of its content."""
+"""Ahead-of-time compilation of a control step into a folder named by a hash of its content."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch.utils import _pytree
 
 from hrc_learn.deploy.package import PackedStep, StepObservation, Steppable, describe, machine
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.store import Claim, new_file
+from hrc_learn.store import EXPORT, Claim, replacing
 
 
 class NoCompilerError(RuntimeError):
@@ -29,9 +29,9 @@ def export_step(
 ) -> Path:
     """Compile the step of a controller, unless an equal one has been compiled before.
 
-    A package runs on the machine that built it. Its file name is a hash of torch's version, of
-    the processor, of the source of this library, and of all settings and weights of the
-    controller. With classes from outside this library, whose source is unknown, the hash is
+    A package runs on the machine that built it. The name of its folder is a hash of torch's
+    version, of the processor, of the source of this library, and of all settings and weights of
+    the controller. With classes from outside this library, whose source is unknown, the hash is
     that of the traced step, which takes seconds longer.
 
     Args:
@@ -43,7 +43,7 @@ def export_step(
         folder: Folder of the packages; default: the user's cache.
 
     Returns:
-        Path of the `.pt2` package.
+        Path of the package, `step.pt2` in its folder.
 
     Raises:
         NoCompilerError: There is neither a package nor a C++ compiler.
@@ -58,21 +58,25 @@ def export_step(
     except UnknownCodeError:
         program = trace(step, observation)
         key = _digest(step, program)
-    package = folder / f"step-{key[:24]}.pt2"
+    target = folder / f"step-{key[:24]}"
+    package = target / "step.pt2"
     if package.is_file():
         return package
     _require_compiler()
     folder.mkdir(parents=True, exist_ok=True)
     # Waiting for another process that compiles the same step is faster than compiling it again.
-    with Claim(package, wait=True) as claim:
+    with Claim(target, wait=True) as claim:
         if package.is_file():
             return package
-        with new_file(claim) as part:
+        with replacing(claim, EXPORT, overwrite=True) as new:
+            new.mkdir()
             program = program or trace(step, observation)
             metadata = {"aot_inductor.metadata": describe(step, observation)}
             with torch.no_grad(), tuned_for(step.layouts.state.batch) as options:
                 torch._inductor.aoti_compile_and_package(
-                    program, package_path=str(part), inductor_configs=options | metadata
+                    program,
+                    package_path=str(new / package.name),
+                    inductor_configs=options | metadata,
                 )
     return package
 

@@ -25,6 +25,7 @@ from torch.utils import _pytree
 
 from hrc_learn.controller import Observation, WantedVelocity
 from hrc_learn.kinematics import SerialChain
+from hrc_learn.store import require_unchanged
 
 type StepObservation = Observation | WantedVelocity
 """Observation of a controller's step."""
@@ -273,10 +274,12 @@ def load(path: Path) -> Package:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: `export_step` did not write the file, or wrote it for another machine.
+        ValueError: `export_step` did not write the file, it has changed since, or it was
+            written for another machine.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no package {path}")
+    require_unchanged(path.parent)
     try:
         run, metadata = _open(path)
     except RuntimeError as error:

@@ -25,6 +25,7 @@ from hrc_learn.deploy import package as package_module
 from hrc_learn.deploy.export import trace
 from hrc_learn.deploy.package import PackedStep, Vectors, load
 from hrc_learn.kinematics import panda
+from hrc_learn.store import EXPORT, replacing
 
 ROOT = Path(__file__).parents[2]
 DOUBLE = torch.float64
@@ -201,6 +202,15 @@ def test_a_foreign_file_is_refused(tmp_path, content):
         PackageRunner(path)
 
 
+def test_a_damaged_package_is_refused(tmp_path):
+    with replacing(tmp_path / "step", EXPORT) as new:
+        new.mkdir()
+        (new / "step.pt2").write_bytes(b"compiled")
+    (tmp_path / "step" / "step.pt2").write_bytes(b"compileD")
+    with pytest.raises(ValueError, match=r"step.pt2 has changed since it was written"):
+        PackageRunner(tmp_path / "step" / "step.pt2")
+
+
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no package .*step.pt2"):
         PackageRunner(tmp_path / "step.pt2")
@@ -245,16 +255,16 @@ class TestPackage:
     def test_it_is_built_once(self, package):
         built = package.stat().st_mtime_ns
         controller, observation = controller_and_observation(panda.ready + 0.1)
-        assert export_step(controller, observation, package.parent) == package
+        assert export_step(controller, observation, package.parents[1]) == package
         assert package.stat().st_mtime_ns == built
-        assert list(package.parent.iterdir()) == [package]
+        assert list(package.parents[1].iterdir()) == [package.parent]
 
     def test_it_needs_no_compiler_once_it_is_there(self, package, monkeypatch):
         def missing():
             raise NoCompilerError("no C++ compiler found")
 
         monkeypatch.setattr(export_module, "_require_compiler", missing)
-        runner = open_step(*controller_and_observation(), package.parent)
+        runner = open_step(*controller_and_observation(), package.parents[1])
         assert isinstance(runner, PackageRunner)
         eager = EagerRunner(*controller_and_observation())
         for _ in range(20):
@@ -266,12 +276,12 @@ class TestPackage:
         seconds = []
         for _ in range(5):
             began = time.process_time()
-            open_step(controller, observation, package.parent).step()
+            open_step(controller, observation, package.parents[1]).step()
             seconds.append(time.process_time() - began)
         assert min(seconds) < 0.1
 
     def test_it_allocates_nothing(self, package):
-        runner = open_step(*controller_and_observation(), package.parent)
+        runner = open_step(*controller_and_observation(), package.parents[1])
         velocity = runner.step()
         address = velocity.ctypes.data
         with torch.profiler.profile(profile_memory=True) as profile:
@@ -282,7 +292,7 @@ class TestPackage:
     def test_it_starts_again_anywhere(self, package):
         runners = [
             EagerRunner(*controller_and_observation()),
-            open_step(*controller_and_observation(), package.parent),
+            open_step(*controller_and_observation(), package.parents[1]),
         ]
         q = panda.ready.numpy() + 0.2
         for runner in runners:
