@@ -1,6 +1,6 @@
 // Run an exported control step from C++.
 //
-//     build/run_exported_step step-....pt2
+//     build/run_exported_step step-.../step.pt2
 //
 // The arm moves as it is told; a real loop would read its joints and write to its driver.
 

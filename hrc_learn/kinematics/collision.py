@@ -272,6 +272,12 @@ class GraspedBox:
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """In the frame of the tool centre point [m]."""
 
+    @property
+    def end(self) -> tuple[float, float, float]:
+        """Middle of the face that is furthest along z of the tool [m]."""
+        x, y, z = self.centre
+        return (x, y, z + self.half_size[2])
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Separation:

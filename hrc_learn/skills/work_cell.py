@@ -512,6 +512,7 @@ class WorkCell:
             jacobian=jacobian,
             nullspace_input=torch.from_numpy(push),
             pause=torch.tensor(asked.pause),
+            load=None if self.load is None else joints.new_tensor(self.load.end),
             distances=None if watched is None else watched.distances,
             person_speed_scale=scale,
             explain=bool(push.any()) and (way is None or way.expert),
