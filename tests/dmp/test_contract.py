@@ -159,7 +159,6 @@ class TestOrientationOfUde(TestOrientation):
     """
 
     reproduction = 1e-4
-    fast_gradients = True
     test_a_batch_is_a_loop = None
     test_masked_samples_do_not_matter = None
     test_rates_are_derivatives = None

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion, turning_motion
-from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
     JointDMP,
@@ -26,6 +25,8 @@ from hrc_learn.dmp.exported_dmp import (
 )
 from hrc_learn.geometry import Pose, quaternion
 
+pytestmark = pytest.mark.simulation
+
 
 def make(kind, **options):
     time, position = arm_motion(moving_start=True)
@@ -40,8 +41,7 @@ def make(kind, **options):
 @pytest.fixture(scope="module")
 def exported():
     """Of joints; tracing takes its time."""
-    with shapes_unchecked():
-        return export_dmp(make("joint"))
+    return export_dmp(make("joint"))
 
 
 def random_orientation(rng):
@@ -111,8 +111,7 @@ def eager_arguments(inputs):
 def test_a_program_does_what_the_primitive_does(kind):
     """In a batch that it was not traced with, over goals, pushes and slow-downs."""
     dmp, batch, goal_filter = make(kind), 2, 6.0
-    with shapes_unchecked():
-        program = export_dmp(dmp, goal_filter=goal_filter).program.module()
+    program = export_dmp(dmp, goal_filter=goal_filter).program.module()
     rng = np.random.default_rng(2)
     state = dmp.initial_state(duration=torch.tensor(rng.uniform(1, 3, batch)))
     tensors = state_tensors(state)
@@ -157,10 +156,9 @@ def test_resting_inputs_change_nothing(exported):
 
 def test_an_export_is_written_and_read(exported, tmp_path):
     dmp = exported.dmp
-    with shapes_unchecked():
-        exported.save(tmp_path / "place")
-        exported.save(tmp_path / "place")
-        program = torch.export.load(tmp_path / "place" / "step.pt2").module()
+    exported.save(tmp_path / "place")
+    exported.save(tmp_path / "place")
+    program = torch.export.load(tmp_path / "place" / "step.pt2").module()
     assert dmp.weights.requires_grad
     assert {p.name for p in tmp_path.iterdir()} == {"place"}
     state = state_tensors(dmp.initial_state())
@@ -185,7 +183,7 @@ def test_what_cannot_be_stepped_is_refused(tmp_path):
     with pytest.raises(ValueError, match="takes one primitive, got a batch"):
         export_dmp(JointDMP.fit(time, torch.stack([position, position])))
     complaint = r"takes JointDMP, .* got MovingGoalDMP: use the exported program"
-    with shapes_unchecked(), pytest.raises(ValueError, match=complaint):
+    with pytest.raises(ValueError, match=complaint):
         Stepper(MovingGoalDMP(make("joint")))
     ude = make("orientation", formulation="ude")
     with pytest.raises(ValueError, match="formulation 'log', got OrientationDMP"):

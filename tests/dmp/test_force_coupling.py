@@ -5,10 +5,11 @@ from demo_motions import arm_motion, minimum_jerk
 from dmp_oracle import forcing
 from scipy.integrate import solve_ivp
 from torch.autograd import gradcheck
-from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp.coupling import offset_error, velocity_coupling
+
+pytestmark = pytest.mark.simulation
 
 TAU = 2.0
 S = torch.linspace(0, 1, 400, dtype=torch.float64)
@@ -44,7 +45,7 @@ def printed_form(dmp, goal, end, velocity, lead=0.0):
 def run(dmp, goal, end, n_steps, couple):
     """State after s = end; `couple(k, state)` gives V and its rate."""
     state = dmp.initial_state(goal=goal)
-    with torch.no_grad(), shapes_unchecked():
+    with torch.no_grad():
         for k in range(n_steps):
             V, V_dot, lead = couple(k, state)
             push = velocity_coupling(
@@ -81,9 +82,9 @@ def test_a_force_loop_solves_the_printed_equations_to_first_order(lead):
     expected = printed_form(dmp, goal, 0.6, velocity, lead)
     errors = [
         abs(run(dmp, goal, 0.6, n, couple).position.numpy() - expected).item()
-        for n in (100, 200, 400)
+        for n in (60, 120, 240)
     ]
-    assert errors[-1] < 2e-3
+    assert errors[-1] < 4e-3
     assert_first_order(errors)
 
 
@@ -92,7 +93,7 @@ def press_on_a_wall(dmp, wanted, learned, dt):
     feed_forward = torch.gradient(learned, spacing=dt, dim=0)[0]
     wanted_rate = torch.gradient(wanted, spacing=dt, dim=0)[0]
     forces, state = [], dmp.initial_state()
-    with torch.no_grad(), shapes_unchecked():
+    with torch.no_grad():
         for k in range(len(wanted)):
             depth = state.position - 0.3
             force = STIFFNESS * depth.clamp(min=0)
@@ -181,7 +182,7 @@ def test_linked_arms_solve_the_printed_equations_to_first_order():
 def test_arms_keep_their_offset_when_one_goal_moves():
     """What is left at rest: the shift over 1 + 2 gain tau / beta."""
     dmp = two_arms()
-    a, b = run(dmp, dmp.goal + SHIFT, 3.0, 500, keep).position
+    a, b = run(dmp, dmp.goal + SHIFT, 3.0, 300, keep).position
     left = SHIFT[1] / (1 + 2 * ARM_GAIN * TAU / dmp.spring.beta)
     torch.testing.assert_close(b - a - OFFSET, left, rtol=0, atol=1e-6)
     assert left.norm() < 0.1 * SHIFT.norm()

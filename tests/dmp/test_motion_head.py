@@ -218,7 +218,7 @@ def test_derivatives_of_any_order(head):
         return made.position, made.velocity
 
     assert torch.autograd.gradcheck(motion, inputs, check_forward_ad=True, atol=1e-6)
-    assert torch.autograd.gradgradcheck(motion, inputs, atol=1e-5)
+    assert torch.autograd.gradgradcheck(motion, inputs, atol=1e-5, fast_mode=True)
 
 
 @shapes_unchecked()

@@ -7,13 +7,14 @@ from demo_motions import minimum_jerk, turning_motion
 from dmp_oracle import forcing
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
-from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import angular_velocity
 from hrc_learn.dmp.ude_formulation import UdePrimitive
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate
+
+pytestmark = pytest.mark.simulation
 
 GOAL = quaternion.exp(torch.tensor([0.9, -0.7, 0.6], dtype=torch.float64))
 TURN_RATE = torch.tensor([1.5, -2.0, 0.5], dtype=torch.float64)
@@ -61,7 +62,7 @@ def test_steps_are_of_fourth_order(dmp):
     errors = []
     for n_steps in (6, 12, 24, 200):
         state = dmp.initial_state(None, GOAL, 2.0, TURN_RATE)
-        with torch.no_grad(), shapes_unchecked():
+        with torch.no_grad():
             for _ in range(n_steps):
                 state = dmp.step(state, 1.2 / n_steps)
         errors.append((state.angular_velocity - omega[-1]).norm().item())
@@ -124,7 +125,7 @@ def test_a_goal_that_jumps_moves_nothing_and_a_filtered_one_pulls_no_harder(dmp)
     torch.testing.assert_close(filtered, before, rtol=0, atol=5e-2)
     assert (acceleration(state, goal=GOAL) - before).norm() > 5
     late = dmp.step(state, 0.02, goal=GOAL, goal_filter=8.0)
-    with torch.no_grad(), shapes_unchecked():
+    with torch.no_grad():
         for _ in range(100):
             late = dmp.step(late, 0.08, goal_filter=8.0)
     assert quaternion.angle(late.orientation, GOAL) < 1e-6
