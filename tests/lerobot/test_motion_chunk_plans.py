@@ -67,13 +67,14 @@ def test_plans_without_an_error_are_plans_all_the_same(error):
     torch.testing.assert_close(made, still[0]["action"], rtol=0, atol=1e-3)
 
 
+@pytest.mark.simulation
 def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
     shown = passing()
     policy = chunk_policy(shown, chunk_size=20, n_basis=8, **UNNAMED)
     at_first = float(policy.error)  # of the linear function, which goes between
     assert at_first > 0.3
     assert chunk_policy(decaying(), **UNNAMED).error < 0.05  # whose future is linear
-    train(policy, shown, 400)
+    train(policy, shown, 200)
     assert policy.error < 0.5 * at_first
     policy.save_pretrained(tmp_path)
     assert MotionChunkPolicy.from_pretrained(tmp_path).error == policy.error

@@ -168,12 +168,13 @@ def there_and_back(count=12, frames=60):
     return [{STATE: x, "action": x} for x in (p.expand(-1, 2).clone() for p in paths)]
 
 
+@pytest.mark.simulation
 def test_velocities_tell_the_way_there_from_the_way_back():
     shown = there_and_back()
     errors = []
     for history in (2, 0):
         settings = dict(n_action_steps=5, n_plans=1, history=history, **UNNAMED)
-        policy = train(chunk_policy(shown, **settings), shown, 300)
+        policy = train(chunk_policy(shown, **settings), shown, 150)
         made = played(policy, shown[0])
         errors.append((made - shown[0]["action"])[10:].square().mean().sqrt())
     assert errors[0] < 0.4 * errors[1]
