@@ -224,7 +224,10 @@ def test_an_address_is_ours_alone_unless_asked_for():
 
 
 def test_what_cannot_be_served_is_refused():
-    for port in (99999, -1):
+    assert AddressConfig(port=65535, most_clients=1).port == 65535
+    with pytest.raises(ValueError, match="most_clients must be at least 1"):
+        AddressConfig(most_clients=0)
+    for port in (65536, -1):
         with pytest.raises(ValueError, match="port must be 0 to 65535"):
             AddressConfig(port=port)
     with pytest.raises(ValueError, match="given together"):
@@ -322,5 +325,9 @@ def test_a_phone_reads_the_code():
     lines = qr_code(text).splitlines()
     cells = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
     rows = [[cells[cell][half] for cell in line] for line in lines for half in (0, 1)]
+    rows_of_code = len(rows[0]) - 2  # the code is square, with a light column to either side
+    assert rows_of_code < len(rows) <= rows_of_code + 2
+    assert all(row[0] and row[-1] for row in rows)
+    assert all(all(row) for row in rows[rows_of_code:])
     image = np.kron(np.array(rows, np.uint8) * 255, np.ones((6, 6), np.uint8))
     assert cv2.QRCodeDetector().detectAndDecode(image)[0] == text
