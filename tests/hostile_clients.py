@@ -245,8 +245,14 @@ FOREIGN = (
     "http://user@127.0.0.1",
     "http://[::1]",
     "http://127.0.0.1:",
+    "file://",
+    "chrome-extension://abcdefghijklmnop",
+    "http://localhost:65536",
+    "http://127.0.0.1:80@evil.example",
 )
 """Origins of other sites, some of them on other ports of this host."""
+HOSTS = ("evil.example", "127.0.0.1", "localhost:1", "localhost.evil.example", "", "[abc")
+"""Names under which no page of ours is served."""
 
 ATTACKS = (
     "foreign origin",
@@ -265,6 +271,46 @@ ATTACKS = (
     "stolen drag",
     "vanishing",
 )
+
+
+async def storm(url: str, data: str, count: int, at_once: int = 8) -> None:
+    """Clients under wrong origins and names before a door, of which none is let in.
+
+    Args:
+        url: Address of the page, with its secret.
+        data: Path of something that needs the secret.
+        count: Number of clients.
+        at_once: Number of clients that come at the same time.
+    """
+    address, _, token = url.partition("/#token=")
+    wrong = [{"origin": one} for one in FOREIGN] + [{"host": one} for one in HOSTS]
+    gap = asyncio.Semaphore(at_once)
+
+    def fetch(headers: dict[str, str]) -> int:
+        try:
+            return urlopen(Request(address + data, headers=headers), timeout=20).status
+        except HTTPError as error:
+            return error.code
+
+    async def come(k: int) -> None:
+        sent = wrong[k % len(wrong)]
+        secret = (token, token, "", secrets.token_urlsafe(18))[k // len(wrong) % 4]
+        origin, names = sent.get("origin", address), {}
+        if "host" in sent:
+            names["Host"] = sent["host"]
+        async with gap:
+            where = f"{address.replace('http', 'ws', 1)}/session/{new_client()}"
+            offered = ["hrc", f"secret.{secret}"]
+            options = {"proxy": None, "open_timeout": 20, "additional_headers": names}
+            await refused(connect(where, subprotocols=offered, origin=origin, **options))
+            if secret == token and "host" not in sent:
+                secret = "x"  # no other site knows it, and browsers show it to none
+            status = await asyncio.to_thread(
+                fetch, {"Authorization": f"Bearer {secret}", "Origin": origin, **names}
+            )
+            assert status in (401, 403, 429), status
+
+    await asyncio.gather(*map(come, range(count)))
 
 
 class Leader:

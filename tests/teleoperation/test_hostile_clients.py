@@ -5,25 +5,36 @@ import json
 import math
 import threading
 import time
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
+from clean_sets import write_set
 from hostile_clients import (
     ATTACKS,
     BEAT,
     FOREIGN,
+    HOSTS,
     VISER,
     hands,
     http,
+    new_client,
     packed,
     refused,
     siege,
     socket,
+    storm,
     until_closed,
     viewer,
 )
 from page_in_browser import Session, wait_until
 from websockets.asyncio.client import connect
+
+from hrc_learn.demos.quality.ranking import rank_episodes
+from hrc_learn.teleoperation import dashboard_page
+from hrc_learn.teleoperation.curation_page import CurationPage
+from hrc_learn.teleoperation.dashboard_page import serve_recordings
+from hrc_learn.teleoperation.gate import AddressConfig
 
 pytest.importorskip("viser", reason="the extra `ui` is not installed")
 
@@ -79,6 +90,50 @@ def test_two_hundred_change_nothing(session):
     assert http(session.page, "/")[0] == 200
 
 
+def besiege_door(url, data, count):
+    """Two hundred come from elsewhere while somebody watches who may."""
+
+    async def go():
+        address, _, token = url.partition("/#token=")
+        where = f"{address.replace('http', 'ws')}/session/{new_client()}"
+        options = {"subprotocols": ["hrc", f"secret.{token}"], "origin": address, "proxy": None}
+        async with connect(where, **options) as bystander:
+            await storm(url, data, count)
+            await asyncio.wait_for(await bystander.ping(), 20)
+
+    asyncio.run(go())
+
+
+def doors(name, session, tmp_path):
+    """Address of a page and a path of its data, and what must not change."""
+    if name == "page":
+        return nullcontext((session.page.url, "/xr/scene.json", lambda: session.asked.gripper))
+    if name == "dashboard":
+        (tmp_path / "run.rrd").write_bytes(b"a recording")
+        served = serve_recordings([tmp_path / "run.rrd"], 0)
+        return _with(served, lambda url: (url, "/admitted", lambda: None))
+    root = write_set(tmp_path / "set", "v3.0")
+    page = CurationPage(rank_episodes(root), tmp_path / "out", AddressConfig(port=0))
+    return _with(page, lambda page: (page.url, "/data/state", lambda: dict(page.decisions)))
+
+
+@contextmanager
+def _with(opened, describe):
+    with opened as one:
+        yield describe(one)
+
+
+@pytest.mark.parametrize("name", ["page", "dashboard", "curation"])
+@pytest.mark.parametrize("count", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_clients_from_elsewhere_reach_no_door(name, count, session, tmp_path, monkeypatch):
+    monkeypatch.setattr(dashboard_page, "_viewer_contents", dict)
+    with doors(name, session, tmp_path) as (url, data, state):
+        before = state()
+        besiege_door(url, data, count)
+        assert state() == before
+    wait_until(lambda: session.page.control.people == 0, "everybody gone")
+
+
 def test_data_opens_to_those_who_have_a_secret(session):
     page = session.page
     for secret in (page.address.token, page.address.watch_token):
@@ -94,7 +149,7 @@ def test_data_opens_to_those_who_have_a_secret(session):
     assert "Set-Cookie" not in headers
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1", "localhost:1", "", "[abc"])
+@pytest.mark.parametrize("host", HOSTS)
 def test_a_foreign_name_opens_nothing(session, host):
     assert http(session.page, "/", secret=session.page.address.token, Host=host)[0] == 403
 
