@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from obedient_arm import ObedientArm, cell_with, hindered
-from unchecked import shapes_unchecked
 
 from hrc_learn.controller.joint_path import FAR_ASIDE
 from hrc_learn.geometry import quaternion
@@ -17,6 +16,8 @@ from hrc_learn.skills import TaskFailedError, WorkCellConfig, joint_line
 
 pytestmark = pytest.mark.simulation
 
+DT = 0.02
+"""Step of the long simulations [s]: twice the usual one halves their cost."""
 PUSH = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
 
 
@@ -52,7 +53,7 @@ def test_a_path_is_left_when_its_end_is_told(cell):
     assert cell.follow_path(path, until=lambda: len(cell.log) == 12) == 12
 
 
-def pushed_along(path, push, seconds, **options):
+def pushed_along(path, push, seconds, clearance=None, **settings):
     """A cell that follows a path while a person pushes from its first to its last second."""
     arm = ObedientArm(path[0])
 
@@ -61,16 +62,16 @@ def pushed_along(path, push, seconds, **options):
             d = push if seconds[0] <= state.time < seconds[1] else np.zeros(7)
             return HumanInput(nullspace_input=d)
 
-    cell = cell_with(arm, Person(), **options)
-    with shapes_unchecked():  # hundreds of steps: three times as long checked
-        cell.follow_path(path)
+    config = WorkCellConfig(dt=DT, command_delay=DT, **settings)
+    cell = cell_with(arm, Person(), config=config, clearance=clearance)
+    cell.follow_path(path)
     return cell
 
 
 @cache
 def transfer():
     far = torch.tensor([-0.9, 0.3, 0.1, 0.3, -0.1, 0.3, -0.3], dtype=torch.float64)
-    return joint_line(panda.ready, panda.ready + far, speed=0.4, dt=0.01).numpy()
+    return joint_line(panda.ready, panda.ready + far, speed=0.5, dt=DT).numpy()
 
 
 @cache
@@ -99,7 +100,7 @@ def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_go
     aside = (elbows[1] - elbows[0])[:, 3].norm(dim=-1)
     assert aside.max() > 0.15
     lag, off = hand_off(free)[0], hand_off(pushed)
-    assert off[0] < lag + 1e-3
+    assert off[0] < lag + 2e-3  # the errors of an explicit step of 20 ms
     assert off[1] < 5e-3
     # So far aside that the null space might lead elsewhere by then, the path waits.
     planned = pushed.log["path_joints"]
@@ -108,7 +109,7 @@ def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_go
     assert apart.max() > FAR_ASIDE > apart[moves].max() - 0.1
     # Two seconds after they let go the joints are on their way back, at the end they are there.
     np.testing.assert_allclose(pushed.joints, path[-1], atol=0.04)
-    speed = np.abs(pushed.log["joint_velocity"][260:]).max()
+    speed = np.abs(pushed.log["joint_velocity"][130:]).max()
     assert speed < np.abs(free.log["joint_velocity"]).max() + 0.4
 
 
@@ -172,23 +173,22 @@ def test_who_pushes_is_told_that_a_path_which_waits_leads_the_joints_back():
 def test_a_path_that_waits_is_not_gone_back_while_the_joints_come_nearer():
     """However slowly: here for longer than it takes to give up."""
     path = transfer()
-    cell = pushed_along(path, PUSH, (0.3, 4.0), config=WorkCellConfig(return_speed=0.15))
+    cell = pushed_along(path, PUSH, (0.3, 3.0), return_speed=0.15)
     planned, joints = cell.log["path_joints"], cell.log["joint_position"]
     off = np.linalg.norm(planned - joints, axis=1)
     assert off.max() > FAR_ASIDE
     along = (planned - path[0]) @ (path[-1] - path[0])
     assert np.diff(along).min() > -1e-6
     rests = np.abs(np.diff(planned, axis=0)).max(axis=1) < 1e-6
-    released = cell.log["time"][1:] > 4.0
-    assert 0.01 * (rests & released).sum() > 2.0 + cell.config.back_after
+    released = cell.log["time"][1:] > 3.0
+    assert DT * (rests & released).sum() > 2.0 + cell.config.back_after
     # Until the joints are well on their way back.
     assert off[1:][released & ~rests][0] < 1.45
 
 
 def test_who_holds_the_arm_aside_for_ever_is_not_waited_for_so_long():
-    config = WorkCellConfig(longest_wait=1.0)
     with pytest.raises(TaskFailedError, match="held aside"):
-        pushed_along(transfer(), PUSH, (0.3, 60.0), config=config)
+        pushed_along(transfer(), PUSH, (0.3, 60.0), longest_wait=1.0)
 
 
 def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
@@ -198,16 +198,16 @@ def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
             super().advance(duration)
             self.q[0] = first
 
-    cell, path = cell_with(Stuck(panda.ready.numpy())), transfer()
-    with shapes_unchecked():
-        assert cell.follow_path(path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
+    config = WorkCellConfig(dt=DT, command_delay=DT)
+    cell, path = cell_with(Stuck(panda.ready.numpy()), config=config), transfer()
+    assert cell.follow_path(path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
     assert abs(float(cell.joints[0]) - path[-1, 0]) > 0.5
     assert len(cell.log) == len(path)
 
 
 def test_joints_stay_beside_the_path_if_wanted():
-    path, config = transfer(), WorkCellConfig(after_push="stay")
-    cell = pushed_along(path, PUSH, (0.5, 2.5), config=config)
+    path = transfer()
+    cell = pushed_along(path, PUSH, (0.5, 2.5), after_push="stay")
     assert np.abs(cell.joints.numpy() - path[-1]).max() > 0.2
     assert hand_off(cell)[0] < 4e-3
     assert len(cell.log) == len(path)
@@ -235,7 +235,7 @@ def along_a_singularity():
     """A path on which the shoulder is stretched half-way."""
     start = torch.tensor([-0.3, 0.7, 1.5, -1.9, -0.1, 2.0, -0.3], dtype=torch.float64)
     end = torch.tensor([-0.4, -0.7, 1.6, -1.9, 0.1, 2.0, -0.1], dtype=torch.float64)
-    path = joint_line(start, end, speed=0.4, dt=0.01)
+    path = joint_line(start, end, speed=0.5, dt=DT)
     smallest = torch.linalg.svdvals(panda.jacobian(path))[:, -1]
     assert smallest[[0, -1]].min() > 0.1 > 0.02 > smallest.min()
     return path.numpy(), int(smallest.argmin())
@@ -243,9 +243,9 @@ def along_a_singularity():
 
 def test_a_path_waits_before_its_singularity_while_a_person_holds_the_elbow_aside():
     path, narrow = along_a_singularity()
-    cell = pushed_along(path, 0.5 * PUSH, (0.2, 4.0))
+    cell = pushed_along(path, 0.5 * PUSH, (0.2, 3.0))
     followed = cell.log["path_joints"]
-    time, released = cell.log["time"], cell.log["time"] < 4.0
+    time, released = cell.log["time"], cell.log["time"] < 3.0
     reached = np.linalg.norm(followed[:, None] - path[None], axis=-1).argmin(axis=1)
     assert reached[released].max() < narrow
     assert (np.linalg.norm(cell.log["joint_position"] - followed, axis=1)[released]).max() > 0.1
@@ -253,30 +253,29 @@ def test_a_path_waits_before_its_singularity_while_a_person_holds_the_elbow_asid
     q = torch.from_numpy(cell.log["joint_position"])
     off = panda.forward(q).position - torch.from_numpy(cell.log["goal_position"])
     assert off.norm(dim=-1).max() < 6e-3
-    assert hindered(cell, "task_waits").sum() > 100
+    assert hindered(cell, "task_waits").sum() > 30
     assert not hindered(cell, "task_waits")[~released].any()
     at = reached == narrow
     assert np.abs(cell.log["joint_position"] - followed)[at].max() < 0.03
     np.testing.assert_allclose(cell.joints, path[-1], atol=0.03)
-    assert time[-1] > 4.0 + len(path) * 0.01 / 4
+    assert time[-1] > 3.0 + len(path) * DT / 4
 
 
 def test_joints_that_stay_beside_a_path_come_back_to_it_before_its_singularity():
     path, _ = along_a_singularity()
-    config = WorkCellConfig(after_push="stay")
-    cell = pushed_along(path, 0.5 * PUSH, (0.2, 1.0), config=config)
+    cell = pushed_along(path, 0.5 * PUSH, (0.2, 1.0), after_push="stay")
     np.testing.assert_allclose(cell.joints, path[-1], atol=0.03)
 
 
 def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():
     path, narrow = along_a_singularity()
-    begin = 0.01 * narrow
+    begin = DT * narrow
     cell = pushed_along(path, PUSH, (begin - 0.05, begin + 0.05))
     off = np.abs(cell.log["joint_position"] - cell.log["path_joints"])
     assert off.max() < 0.05
     assert len(cell.log) <= len(path) + 30
     pushed = np.isfinite(cell.log["followed"])
-    assert pushed.sum() == 10
+    assert pushed.sum() == 5
     assert hindered(cell, "narrow_path")[pushed].all()
     assert (cell.log["followed"][pushed] == 0).all()
 

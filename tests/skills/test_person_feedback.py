@@ -17,6 +17,8 @@ from hrc_learn.skills import WorkCell
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.step_report import PersonFeedback
 
+pytestmark = pytest.mark.simulation
+
 Q = panda.ready
 
 

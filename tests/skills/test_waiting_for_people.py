@@ -107,15 +107,15 @@ IN_THE_WAY = sideways(0.35).position.numpy()
 def test_the_arm_waits_before_who_stands_in_its_way_and_goes_on_when_they_have_left(move):
     free = beside(Visitor(IN_THE_WAY, 0.0, 0.0))
     move(free)
-    visitor = Visitor(IN_THE_WAY, 0.0, 4.0)
+    visitor = Visitor(IN_THE_WAY, 0.0, 3.0)
     cell = beside(visitor)
     move(cell)
     # It came near, kept its distance while it did, and rested.
     time, apart = cell.log["time"], distances(cell, visitor)
-    there = time < 4.0
+    there = time < 3.0
     assert SEPARATION.clearance - 1e-4 <= apart[there].min() < SEPARATION.clearance + 0.05
     speed = np.linalg.norm(cell.log["joint_velocity"], axis=1)
-    assert speed[(time > 3.5) & there].max() < 0.02
+    assert speed[(time > 2.5) & there].max() < 0.02
     # Then it went on where it was, and did nothing else than it does with nobody there.
     torch.testing.assert_close(cell.joints, free.joints, rtol=0, atol=5e-3)
     ways = [torch.from_numpy(c.log["joint_position"]) for c in (free, cell)]
@@ -123,7 +123,7 @@ def test_the_arm_waits_before_who_stands_in_its_way_and_goes_on_when_they_have_l
     assert torch.cdist(tips[1], tips[0]).amin(-1).max() < 5e-3
     assert cell.task_time == pytest.approx(free.task_time, abs=0.15)
     assert free.task_time == pytest.approx(free.time, abs=1e-9)
-    assert cell.time > 4.0
+    assert cell.time > 3.0
     assert cell.log["pace"].min() < 0.01
     assert (free.log["pace"] == 1.0).all()
     # It gets under way within 0.2 s, not at once.
