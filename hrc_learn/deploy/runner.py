@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import final
@@ -12,7 +11,6 @@ from typing import final
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch.utils import _pytree
 
 from hrc_learn.deploy.export import NoCompilerError, export_step
 from hrc_learn.deploy.package import (
@@ -28,11 +26,13 @@ from hrc_learn.deploy.package import (
 type _Joints = Float[np.ndarray, "*batch n"]
 
 
-class StepRunner(ABC):
+class StepRunner:
     """A control step with its state, operated by writing into arrays.
 
         runner.observation["joint_position"][:] = q
         velocity = runner.step()
+
+    Numbers of the observation are NaN, and its flags 0, until they are written.
 
     Attributes:
         observation: Arrays that the step reads, by field, for example "joint_position" or
@@ -40,14 +40,29 @@ class StepRunner(ABC):
         joint_velocity: Command of the last step [rad/s]; overwritten by the next.
     """
 
-    def __init__(self, layouts: StepLayouts):
-        self._layouts = layouts
-        self._vectors = Vectors(*(layout.empty() for layout in layouts))
-        self.observation = layouts.observation.arrays(self._vectors.observation)
-        self._command = layouts.command.arrays(self._vectors.command)
-        self.joint_velocity: Float[np.ndarray, "*batch n"] = self._command["joint_velocity"]
+    def __init__(
+        self,
+        run: Callable[[list[torch.Tensor]], object],
+        layouts: StepLayouts,
+        first_state: torch.Tensor,
+    ):
+        """Prepare the vectors.
 
-    @abstractmethod
+        Args:
+            run: Function of the vectors of state, observation and command that updates state
+                and command in place.
+            layouts: Layouts of the vectors.
+            first_state: State of an arm at rest.
+        """
+        self._run, self._layouts, self._first_state = run, layouts, first_state
+        self._vectors = Vectors(*(layout.empty() for layout in layouts))
+        self._vectors.state.copy_(first_state)
+        self._arguments = list(self._vectors)
+        self._state = layouts.state.arrays(self._vectors.state)
+        self._command = layouts.command.arrays(self._vectors.command)
+        self.observation = layouts.observation.arrays(self._vectors.observation)
+        self.joint_velocity: _Joints = self._command["joint_velocity"]
+
     def start(
         self,
         joint_position: _Joints,
@@ -61,14 +76,25 @@ class StepRunner(ABC):
             joint_velocity: Joint velocities [rad/s]; None: at rest.
             joint_acceleration: Joint accelerations [rad/s^2]; None: zero.
         """
+        self._vectors.state.copy_(self._first_state)
+        known = {
+            "safety.position": joint_position,
+            "pose_drift.joint_position": joint_position,
+            "safety.velocity": joint_velocity,
+            "safety.acceleration": joint_acceleration,
+        }
+        for field, value in known.items():
+            if value is not None and field in self._state:
+                self._state[field][...] = value
 
-    @abstractmethod
-    def step(self) -> Float[np.ndarray, "*batch n"]:
+    def step(self) -> _Joints:
         """Take one step with the values in `observation`.
 
         Returns:
             `joint_velocity`.
         """
+        self._run(self._arguments)
+        return self.joint_velocity
 
     def observe(self, observation: StepObservation) -> None:
         """Write all fields of an observation at once."""
@@ -89,7 +115,7 @@ class StepRunner(ABC):
         Raises:
             ValueError: There is no such field.
         """
-        return _named(field, self._layouts.state.arrays(self._state_vector()))
+        return _named(field, self._state)
 
     def set_state(self, field: str, value: Float[np.ndarray, "..."]) -> None:
         """Replace one field of the state, for example after an arm ignored a command.
@@ -97,67 +123,23 @@ class StepRunner(ABC):
         Raises:
             ValueError: There is no such field.
         """
-        vector = self._state_vector()
-        _named(field, self._layouts.state.arrays(vector))[...] = value
-        self._set_state_vector(vector)
-
-    @abstractmethod
-    def _state_vector(self) -> torch.Tensor:
-        """The state after the last step."""
-
-    @abstractmethod
-    def _set_state_vector(self, vector: torch.Tensor) -> None:
-        """Continue from a state."""
+        _named(field, self._state)[...] = value
 
 
 @final
 class PackageRunner(StepRunner):
-    """A step compiled ahead of time; a step allocates nothing.
-
-    Numbers of the observation are NaN, and its flags 0, until they are written.
-    """
+    """A step compiled ahead of time; a step allocates nothing."""
 
     def __init__(self, package: Path):
         """Load a package written by `export_step`, in milliseconds.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: `export_step` did not write the file, or wrote it for another machine.
+            ValueError: `export_step` did not write the file, it has changed since, or it was
+                written for another machine.
         """
         loaded = load(package)
-        super().__init__(loaded.layouts)
-        self._run = loaded.run
-        self._arguments = list(self._vectors)
-        self._first_state = loaded.first_state
-        self._vectors.state.copy_(loaded.first_state)
-
-    def start(
-        self,
-        joint_position: _Joints,
-        joint_velocity: _Joints | None = None,
-        joint_acceleration: _Joints | None = None,
-    ) -> None:
-        self._vectors.state.copy_(self._first_state)
-        state = self._layouts.state.arrays(self._vectors.state)
-        known = {
-            "safety.position": joint_position,
-            "pose_drift.joint_position": joint_position,
-            "safety.velocity": joint_velocity,
-            "safety.acceleration": joint_acceleration,
-        }
-        for field, value in known.items():
-            if value is not None and field in state:
-                state[field][...] = value
-
-    def step(self) -> Float[np.ndarray, "*batch n"]:
-        self._run(self._arguments)
-        return self.joint_velocity
-
-    def _state_vector(self) -> torch.Tensor:
-        return self._vectors.state
-
-    def _set_state_vector(self, vector: torch.Tensor) -> None:
-        self._vectors.state.copy_(vector)
+        super().__init__(loaded.run, loaded.layouts, loaded.first_state)
 
 
 @final
@@ -166,53 +148,14 @@ class EagerRunner(StepRunner):
 
     def __init__(self, controller: Steppable, observation: StepObservation):
         """Prepare the step; later observations have the fields of this one."""
-        super().__init__(PackedStep(controller, observation).layouts)
-        self._controller, self._last_command = controller, None
-        self._leaves, self._structure = _pytree.tree_flatten(observation)
-        views = iter(self._layouts.observation.views(self._vectors.observation))
-        self._views = [
-            (k, next(views), x.dtype)
-            for k, x in enumerate(self._leaves)
-            if isinstance(x, torch.Tensor)
-        ]
+        self._packed = PackedStep(controller, observation)
+        super().__init__(self._run_eagerly, self._packed.layouts, self._packed.first_state)
         self.observe(observation)
         self.start(self.observation["joint_position"])
 
-    def start(
-        self,
-        joint_position: _Joints,
-        joint_velocity: _Joints | None = None,
-        joint_acceleration: _Joints | None = None,
-    ) -> None:
-        dtype = self._layouts.observation.fields[0].dtype
-        known = (joint_position, joint_velocity, joint_acceleration)
-        q, *motion = (None if x is None else torch.tensor(x, dtype=dtype) for x in known)
-        self._state = self._controller.initial_state(q, *motion)
-
     @torch.inference_mode()
-    def step(self) -> Float[np.ndarray, "*batch n"]:
-        for k, view, dtype in self._views:
-            # A state that used the observation's memory would change with the next one.
-            self._leaves[k] = view.to(dtype, copy=True)
-        observation = _pytree.tree_unflatten(self._leaves, self._structure)
-        self._last_command, self._state = self._controller.step(self._state, observation)
-        self.joint_velocity[...] = self._last_command.joint_velocity.numpy()
-        return self.joint_velocity
-
-    def command(self, field: str) -> np.ndarray:
-        if self._last_command is not None:
-            vector = self._layouts.command.pack(tensors_of(self._last_command))
-            self._vectors.command.copy_(vector)
-        return super().command(field)
-
-    def _state_vector(self) -> torch.Tensor:
-        return self._layouts.state.pack(tensors_of(self._state))
-
-    def _set_state_vector(self, vector: torch.Tensor) -> None:
-        leaves, structure = _pytree.tree_flatten(self._state)
-        read = iter(self._layouts.state.unpack(vector))
-        new = [next(read) if isinstance(x, torch.Tensor) else x for x in leaves]
-        self._state = _pytree.tree_unflatten(new, structure)
+    def _run_eagerly(self, vectors: list[torch.Tensor]) -> None:
+        self._packed(*vectors)
 
 
 def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
