@@ -364,8 +364,7 @@ class ConstrainedVelocity(NamedTuple):
     """Excess of the fastest closing speed over the allowed one [m/s]; above zero where joint
     limits or other distances leave no better solution."""
     solved: Bool[Tensor, "*batch"]
-    """False: the arm brakes, because an input was not finite or the solver needed more
-    steps."""
+    """False: the arm brakes, because the solver needed more steps."""
 
 
 def constrained_velocity(
@@ -422,73 +421,36 @@ def constrained_velocity(
     dtype, m = wanted.dtype, jacobian.shape[-2]
     if task_fraction is None:
         task_fraction = torch.ones_like(wanted[..., 0])
-    given, known = _finite(
-        _Program(wanted, task, jacobian, lower, upper, task_fraction, distances)
+    # Weights are 1e7 apart, and float32 has seven digits.
+    wanted, task, J, lower, upper, fraction = (
+        x.double() for x in (wanted, task, jacobian, lower, upper, task_fraction)
     )
-    wanted, distances = given.wanted, given.distances
     # Limits of joints, task and distances, relative to the wanted velocity.
-    zero = torch.zeros_like(given.task_fraction)
-    least = [given.lower - wanted, -given.task_fraction.unsqueeze(-1)]
-    most = [given.upper - wanted, zero.unsqueeze(-1)]
+    zero, gradient = torch.zeros_like(fraction), None
+    least = [lower - wanted, -fraction.unsqueeze(-1)]
+    most = [upper - wanted, zero.unsqueeze(-1)]
     if distances is not None:
+        distances = distances.double()
+        gradient = distances.gradient
         allowed = distances.closing_speed(config, separation or SeparationConfig())
         least.append(torch.full_like(allowed, -torch.inf))
-        most.append(allowed + torch.linalg.vecdot(distances.gradient, wanted.unsqueeze(-2)))
+        most.append(allowed + torch.linalg.vecdot(gradient, wanted.unsqueeze(-2)))
     least, most = torch.cat(least, dim=-1), torch.cat(most, dim=-1)
     if may_branch(wanted) and bool(none_binds(least, most).all()):
-        return ConstrainedVelocity(
-            joint_velocity=wanted.clamp(given.lower, given.upper).to(dtype),
-            slowed=torch.where(known, zero, given.task_fraction).to(dtype),
-            violation=zero.to(dtype),
-            solved=known,
-        )
+        solved = torch.ones_like(zero, dtype=torch.bool)
+        within = wanted.clamp(lower, upper).to(dtype)
+        return ConstrainedVelocity(within, zero.to(dtype), zero.to(dtype), solved)
 
-    basis = _unit_cost_directions(given.jacobian, given.task, config)
-    rows = _limit_rows(basis, None if distances is None else distances.gradient, m, config)
+    basis = _unit_cost_directions(J, task, config)
+    rows = _limit_rows(basis, gradient, m, config)
     change = least_change(rows, least, most, config.steps)
-    y, solved = change.point, known & change.solved
+    y, solved = change.point, change.solved
     u = wanted + matmul(y[..., None, :-1], basis).squeeze(-2)
     # An arm that brakes goes to zero; the clamp removes the rounding of the solver.
-    u = torch.where(solved.unsqueeze(-1), u, 0.0).clamp(given.lower, given.upper)
-    slowed = torch.where(solved, -y[..., m] / config.task_weight, given.task_fraction)
+    u = torch.where(solved.unsqueeze(-1), u, 0.0).clamp(lower, upper)
+    slowed = torch.where(solved, -y[..., m] / config.task_weight, fraction)
     violation = torch.where(solved, y[..., -1] / config.slack_cost, 0.0)
     return ConstrainedVelocity(u.to(dtype), slowed.to(dtype), violation.to(dtype), solved)
-
-
-class _Program(NamedTuple):
-    """Arguments of `constrained_velocity`."""
-
-    wanted: Tensor
-    task: Tensor
-    jacobian: Tensor
-    lower: Tensor
-    upper: Tensor
-    task_fraction: Tensor
-    distances: Distances | None
-
-
-def _finite(given: _Program) -> tuple[_Program, Bool[Tensor, "*batch"]]:
-    """The arguments in float64 with zeros in place of invalid ones, and True where valid."""
-    # Weights are 1e7 apart, and float32 has seven digits.
-    wanted, task, J, lower, upper, fraction = (x.double() for x in given[:-1])
-    distances = None if given.distances is None else given.distances.double()
-    numbers = (wanted, task, lower, upper, J.flatten(-2), fraction.unsqueeze(-1))
-    known = is_number(torch.cat(numbers, dim=-1)).all(-1)
-    if distances is not None:
-        known = known & distances.known()
-        distances = distances.where(known)
-    unknown = ~known.unsqueeze(-1)
-    unbounded = ~is_number(torch.cat([lower, upper], dim=-1)).all(-1, keepdim=True)
-    finite = _Program(
-        wanted=wanted.masked_fill(unknown, 0),
-        task=task.masked_fill(unknown, 0),
-        jacobian=J.masked_fill(unknown.unsqueeze(-1), 0),
-        lower=lower.masked_fill(unbounded, 0),
-        upper=upper.masked_fill(unbounded, 0),
-        task_fraction=fraction.masked_fill(~known, 0),
-        distances=distances,
-    )
-    return finite, known
 
 
 def _unit_cost_directions(

@@ -89,20 +89,9 @@ class PathLaw:
             request: The paths.
         """
         paths, which = request.paths, request.path
-        zero = torch.zeros_like(state.path.progress)
-        goal = paths.position[which, 0]
-        path = replace(
-            state.path,
-            progress=zero,
-            rate=zero + 1,
-            last=zero + paths.last[which],
-            followed=torch.zeros_like(state.aside),
-            goal=goal,
-            waited=zero,
-            nearest=zero + torch.inf,
-            held=zero,
-            direct_return=DirectReturn.none(joint_position),
-        )
+        path = PathState.none(joint_position, state.path.pose)
+        goal, last = paths.position[which, 0], paths.last[which].to(path.last)
+        path = replace(path, goal=goal, last=last)
         return replace(state, aside=begins_aside(goal - joint_position), path=path)
 
     def go_on(self, state: ArmLoopState, reading: ArmReading) -> PathState:

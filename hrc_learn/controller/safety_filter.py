@@ -54,6 +54,7 @@ class _Inputs(NamedTuple):
     jacobian: Tensor | None
     points: Tensor | None
     """Linear Jacobians of the capped points (points, 3, n); None: no cap acts."""
+    distances: Distances | None
     bounds: tuple[Tensor, Tensor]
     """Lowest and highest velocity allowed by position and velocity limits [rad/s]."""
     dt: float | Tensor
@@ -252,7 +253,7 @@ class SafetyFilter(nn.Module):
         v, hard, jerky = self._limit_acceleration(given, target, own)
         report, excess = None, torch.zeros_like(given.state.dt)
         if self.config.constraints is not None:
-            v, report = self._keep_constraints(given, v, distances)
+            v, report = self._keep_constraints(given, v)
         if given.points is not None:
             v, braked = self._keep_speed(given, v, cap)
             speeding = speeding | braked
@@ -298,7 +299,8 @@ class SafetyFilter(nn.Module):
         numbers = [q, u] if jacobian is None else [q, u, jacobian.flatten(-2)]
         invalid = invalid | ~is_number(torch.cat(numbers, dim=-1)).all(-1, keepdim=True)
         if distances is not None:
-            invalid = invalid | ~distances.known().unsqueeze(-1)
+            known = distances.known()
+            invalid, distances = invalid | ~known.unsqueeze(-1), distances.where(known)
         stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
         q = torch.where(invalid, state.position, q)
         if jacobian is not None:
@@ -309,6 +311,7 @@ class SafetyFilter(nn.Module):
             command=u.masked_fill(invalid | stopped, 0),
             jacobian=jacobian,
             points=None,
+            distances=distances,
             bounds=self.velocity_bounds(q),
             dt=dt,
             invalid=invalid,
@@ -456,9 +459,7 @@ class SafetyFilter(nn.Module):
         )
         return v + acceleration * dt
 
-    def _keep_constraints(
-        self, given: _Inputs, v: Tensor, distances: Distances | None
-    ) -> tuple[Tensor, ConstraintReport]:
+    def _keep_constraints(self, given: _Inputs, v: Tensor) -> tuple[Tensor, ConstraintReport]:
         """The velocity nearest to a given one with which limits and distances are kept."""
         state, command = given.state, given.command
         assert given.jacobian is not None
@@ -473,7 +474,7 @@ class SafetyFilter(nn.Module):
             *self.barrier.reachable_velocity(
                 state.velocity, state.acceleration, given.bounds, given.dt
             ),
-            distances,
+            given.distances,
             self.config.constraints,
             fraction.clamp(0, 1),
             self.config.separation,
