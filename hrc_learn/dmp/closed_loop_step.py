@@ -87,7 +87,7 @@ def step(
         pace: Speed of the clock, stored for the velocity.
     """
     spring, s = response.spring, state.s + ds
-    (now,) = host_values(s)
+    now = host_value(s)
     if isinstance(now, float):
         forced = torch.from_numpy(response.forced.at(now))
     else:
@@ -234,20 +234,12 @@ def _filtered(
     return target + lag_after, before, after
 
 
-def host_values(*times: Tensor) -> tuple[Tensor, ...] | tuple[float, ...]:
-    """The times as floats if each is a plain scalar that nothing differentiates or traces."""
-    if not readable(*times) or not all(map(_is_plain_scalar, times)):
-        return times
-    return tuple(time.item() for time in times)
-
-
-def _is_plain_scalar(time: Tensor) -> bool:
-    return (
-        time.ndim == 0
-        and time.is_cpu  # reading from another device would wait for all work queued there
-        and type(time) is Tensor
-        and not time.requires_grad
-    )
+def host_value(time: Tensor) -> Tensor | float:
+    """The time as a number if it is a plain scalar that nothing differentiates or traces."""
+    if not readable(time) or time.ndim or type(time) is not Tensor or time.requires_grad:
+        return time
+    # Reading from another device would wait for all work queued there.
+    return time.item() if time.is_cpu else time
 
 
 def continue_motion(

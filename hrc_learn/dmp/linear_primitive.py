@@ -570,7 +570,7 @@ class LinearPrimitive(nn.Module):
     def _normalised_step(self, dt: Tensor | float, duration: Tensor) -> Tensor | float:
         """Step ds in float64; a plain number if possible, which takes a tenth of the time."""
         if isinstance(dt, float):
-            (known,) = closed_loop_step.host_values(duration)
+            known = closed_loop_step.host_value(duration)
             if isinstance(known, float):
                 return dt / known
         return duration.double().reciprocal() * dt

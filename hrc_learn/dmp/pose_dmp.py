@@ -110,7 +110,7 @@ class PoseDMP(OrientedPrimitive[Pose, PoseTrajectory, PoseState]):
 
     The fit report has residuals by column: position [m], orientation error [rad], body. Those
     of the components of the error bound those of the angle. The largest range, by which
-    `nrmse` divides, mixes units: use `select` to read one kind at a time.
+    `nrmse` divides, mixes units.
     """
 
     error_columns: ClassVar[slice] = ERROR

@@ -58,10 +58,6 @@ class FitReport:
         """RMSE over all samples and coordinates, relative to the largest range."""
         return self.rmse.square().mean(-1).sqrt() / self.span.amax(-1)
 
-    def select(self, columns: slice) -> "FitReport":
-        """Report for a subset of the coordinates."""
-        return FitReport(**{k: x[..., columns] for k, x in self.tensors().items()})
-
     def tensors(self) -> dict[str, Tensor]:
         """Fields that are present, by name."""
         return {name: values for name, values in vars(self).items() if values is not None}

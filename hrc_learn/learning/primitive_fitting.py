@@ -27,7 +27,6 @@ from hrc_learn.learning.reproduction_error import (
     reproduction_error,
 )
 
-type Channel = Literal["joint", "position", "orientation", "pose"]
 type Primitive = JointDMP | OrientationDMP | PoseDMP
 
 CHANNELS: dict[str, tuple[str, ...]] = {

@@ -89,8 +89,8 @@ def _linear(demos: PaddedDemonstrations, shown: Tensor, made: Tensor) -> dict[st
     high = torch.where(mask[..., None], shown, -torch.inf).amax(dim=-2)
     rmse = (error.square().sum(dim=(-2, -1)) / samples).sqrt()
     rougher = [
-        np.subtract(*(log_dimensionless_jerk(time[:n], x[:n]) for x in motions))
-        for time, n, *motions in zip(
+        log_dimensionless_jerk(time[:n], x[:n]) - log_dimensionless_jerk(time[:n], y[:n])
+        for time, n, x, y in zip(
             demos.time.double().numpy(),
             demos.length.tolist(),
             made.double().numpy(),
