@@ -178,11 +178,7 @@ class PositionServo:
         self._motion = self._smoother.step(before, np.asarray(target, dtype=float))
         wanted = self._motion.velocity + self._config.gain * (before.position - here)
         filtered, self.safety, _ = self._filter.step(
-            self.safety,
-            q,
-            torch.from_numpy(wanted),
-            self._dt,
-            jacobian=self._chain.jacobian(q),
+            self.safety, q, torch.from_numpy(wanted), self._dt, jacobian=self._chain.jacobian(q)
         )
         velocity = filtered.numpy()
         self._arm.command(velocity)

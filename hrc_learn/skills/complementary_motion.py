@@ -257,11 +257,7 @@ class ComplementaryMotion:
         return FollowPath(paths=paths, path=torch.tensor(0))
 
     def _reading(
-        self,
-        joints: Float[Tensor, " joints"],
-        push: Float[Tensor, " joints"],
-        *,
-        explain: bool,
+        self, joints: Float[Tensor, " joints"], push: Float[Tensor, " joints"], *, explain: bool
     ) -> ArmReading:
         pose, jacobian = self._chain.forward_and_jacobian(joints)
         return ArmReading(

@@ -23,13 +23,9 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
     Arm,
     SerialChain,
-    TaskSpace,
     UnreachableError,
     arm_angle,
     arm_angle_and_motion,
-    task_basis,
-    task_error,
-    task_rank,
 )
 from hrc_learn.regions import JointRegion
 from hrc_learn.skills.arm_motion import joint_line
@@ -188,15 +184,12 @@ def follow_pose(
     twist: Float[Tensor, "steps 6"],
     angle: Float[Tensor, " steps"] | None,
     dt: float,
-    *,
-    task: TaskSpace = "pose",
 ) -> Float[Tensor, "steps joints"]:
     """Joint path that tracks poses of the end effector, and arm angles in the null space.
 
     u = J^+ (twist + k_e e) + N n (angle' + k_a (angle - angle(q))) - N xi_q, where
     n turns the arm angle at unit rate and xi_q is the gradient of the joint-limit region. The
-    poses are tracked exactly, the arm angle as far as null space and joint limits allow. For a
-    task with fewer dimensions than a pose, J and N are those of the controlled part.
+    poses are tracked exactly, the arm angle as far as null space and joint limits allow.
 
     Args:
         chain: Kinematics of the arm.
@@ -206,27 +199,19 @@ def follow_pose(
         angle: Desired arm angles, continuous [rad]; None: the joint limits alone move the null
             space, if there is one.
         dt: Time between samples [s].
-        task: Tracked part of the poses; an arm of five joints cannot track all of it.
     """
     limits = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
     rate = None if angle is None else torch.gradient(angle, spacing=dt)[0]
     q, path = start, [start]
-    rank = task_rank(chain, task)
     for k in range(len(twist) - 1):
         pose, J = chain.forward_and_jacobian(q)
-        if task == "pose":
-            desired = twist[k] + _POSE_GAIN * pose.twist_to(poses[k])
-        else:
-            desired = twist[k] + _POSE_GAIN * task_error(pose.matrix()[:3], poses[k], task)
+        desired = twist[k] + _POSE_GAIN * pose.twist_to(poses[k])
         null_velocity = -limits.gradient(q)
         if angle is not None and rate is not None:
             measured, motion = arm_angle_and_motion(chain, q, J)
             # The shorter direction around the circle.
             error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
             null_velocity = motion * (rate[k] + _ANGLE_GAIN * error) + null_velocity
-        if task != "pose":
-            basis = task_basis(J, pose.orientation, task, rank)
-            J, desired = basis @ J, basis @ desired
         task_velocity, null = resolved_rate(J, desired, null_velocity)
         q = q + dt * (task_velocity + null)
         path.append(q)

@@ -17,14 +17,7 @@ from torch import Tensor
 from hrc_learn.dmp import InteractionEstimate, InteractionPrimitive
 from hrc_learn.geometry import Pose
 from hrc_learn.protocols import PersonObservation, PersonTracker
-from hrc_learn.skills.grasping import (
-    CLOSED,
-    CLOSING_TIME,
-    OPEN,
-    as_load,
-    holds,
-    move_fingers,
-)
+from hrc_learn.skills.grasping import CLOSED, CLOSING_TIME, OPEN, as_load, holds, move_fingers
 from hrc_learn.skills.task_workplace import GraspObject
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
@@ -306,12 +299,7 @@ def _end(estimate: InteractionEstimate) -> tuple[Float[Tensor, "3"], Float[Tenso
 
 
 def _eased(
-    at: Tensor,
-    velocity: Tensor,
-    goal: Tensor,
-    speed: float,
-    config: ReceivingConfig,
-    dt: float,
+    at: Tensor, velocity: Tensor, goal: Tensor, speed: float, config: ReceivingConfig, dt: float
 ) -> Float[Tensor, "3"]:
     """Velocity towards the goal within limits of speed and acceleration, able to stop there."""
     offset = goal - at

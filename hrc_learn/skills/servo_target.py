@@ -231,10 +231,7 @@ class DrawnGoals:
         return goals, replace(state, away=away)
 
     def turned(
-        self,
-        state: DrawnGoalsState,
-        requested: tuple[float, float, float] | None,
-        most: float,
+        self, state: DrawnGoalsState, requested: tuple[float, float, float] | None, most: float
     ) -> DrawnGoalsState:
         """State turned further towards a requested rotation, within the largest turn.
 

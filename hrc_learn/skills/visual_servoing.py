@@ -217,9 +217,7 @@ class ServoStep:
         pose = self.chain.forward(reading.image_joints)
         estimate = self.controller.estimator.jacobian(state.controller.estimator, pose)
         return replace(
-            state,
-            image_jacobian=estimate.numpy(),
-            image_jacobian_time=reading.markers.time,
+            state, image_jacobian=estimate.numpy(), image_jacobian_time=reading.markers.time
         )
 
     def learned(
@@ -355,11 +353,7 @@ class ServoStep:
         return replace(state, angle=learned, wanted_orientation=wanted)
 
     def _turned_further(
-        self,
-        state: ServoState,
-        target: ServoTarget,
-        feature: Float[np.ndarray, "2"],
-        dt: float,
+        self, state: ServoState, target: ServoTarget, feature: Float[np.ndarray, "2"], dt: float
     ) -> ServoState:
         """State with the goal turned further, unless the marker would leave the image."""
         wanted = state.wanted_orientation

@@ -375,9 +375,7 @@ class WorkCell:
         return None
 
     def follow_path(
-        self,
-        path: Float[np.ndarray, "steps joints"],
-        until: Callable[[], bool] = lambda: False,
+        self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool] = lambda: False
     ) -> int:
         """Move the joints along a path sampled at the control step, yielding to the person.
 

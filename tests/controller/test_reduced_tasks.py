@@ -14,7 +14,6 @@ from hrc_learn.controller.resolved_rate import task_descent
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
 from hrc_learn.kinematics import Arm, arm, panda, solve_inverse, task_basis, task_rank
-from hrc_learn.skills.placing import follow_pose
 
 pytestmark = pytest.mark.simulation
 
@@ -188,32 +187,3 @@ def test_a_pose_of_five_joints_is_refused(five):
     q = torch.zeros(5, dtype=DOUBLE)
     with pytest.raises(ValueError, match="needs six joints"):
         controller.step(controller.initial_state(q), observe(q, goals=goals))
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_a_path_of_poses_is_followed_as_far_as_the_task_goes(five, task):
-    """Along an arc with the tool level and outwards: the plane of the arm turns with it."""
-    chain, dt = five.chain, 0.02
-    angle = torch.linspace(0.0, 1.0, 60, dtype=DOUBLE)
-    radius = 0.45 + 0.05 * angle
-    position = torch.stack(
-        [radius * angle.cos(), radius * angle.sin(), 0.3 - 0.1 * angle], dim=-1
-    )
-    # The tool's axis outwards and 0.3 rad down; a turn about it that the arm does not make.
-    tilt = torch.stack([0 * angle, torch.full_like(angle, np.pi / 2 + 0.3), 0 * angle], -1)
-    yaw = torch.stack([0 * angle, 0 * angle, angle], dim=-1)
-    roll = torch.stack([0 * angle, 0 * angle, 3 * angle], dim=-1)
-    level = quaternion.multiply(quaternion.exp(yaw), quaternion.exp(tilt))
-    poses = Pose(position, quaternion.multiply(level, quaternion.exp(roll)))
-    start = solve_inverse(chain, poses[0], task="position+axis")
-    assert start.found
-    moved = poses[:-1].twist_to(poses[1:]) / dt
-    path = follow_pose(
-        chain, start.position, poses, torch.cat([moved, moved[-1:]]), None, dt, task=task
-    )
-    reached = chain.forward(path)
-    assert (reached.position - position).norm(dim=-1).max() < 1e-3
-    a, b = (quaternion.to_matrix(o)[..., 2] for o in (reached.orientation, level))
-    across = torch.linalg.cross(a, b).norm(dim=-1).max()
-    assert across < 2e-3 if task == "position+axis" else across > 0.02
-    assert (path[:, 4] - path[0, 4]).abs().max() < 0.5
