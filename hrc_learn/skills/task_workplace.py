@@ -19,14 +19,17 @@ class GraspObject(Protocol):
     @property
     def name(self) -> str:
         """Name of the object."""
+        ...
 
     @property
     def half_size(self) -> tuple[float, float, float]:
         """Half edges [m]; the gripper closes along x."""
+        ...
 
     @property
     def marker(self) -> Marker:
         """Marker by which the camera finds it."""
+        ...
 
 
 @runtime_checkable
@@ -36,41 +39,51 @@ class Workplace(Protocol):
     @property
     def robot(self) -> Arm:
         """The arm that works there."""
+        ...
 
     @property
     def tool_marker(self) -> int:
         """ArUco number of the marker on the end effector."""
+        ...
 
     @property
     def hover_height(self) -> float:
         """Height of the tool centre point during visual servoing [m]."""
+        ...
 
     @property
     def fingertip(self) -> float:
         """Distance of the fingertips beyond the tool centre point [m]."""
+        ...
 
     @property
     def palm(self) -> float:
         """Distance of the palm behind the tool centre point [m]."""
+        ...
 
     def lowering(self, half_size: tuple[float, float, float]) -> float:
         """Largest distance that an object of a half size [m] may be lowered at its release [m].
 
         Beyond it, the gripper itself would touch the shelf.
         """
+        ...
 
     @property
     def hover_turns(self) -> tuple[float, float]:
         """Smallest and largest turn of the end effector about the vertical there [rad]."""
+        ...
 
     def hover(self) -> Pose:
         """Pose of the end effector above the middle of the table."""
+        ...
 
     def hover_joints(self) -> Float[Tensor, " joints"]:
         """Preferred joint positions at the hover pose [rad]."""
+        ...
 
     def hover_postures(self) -> Sequence[Float[Tensor, " joints"]]:
         """Several joint positions at the hover pose, the preferred ones first [rad]."""
+        ...
 
     def home_joints(
         self, offset: Float[Tensor, "3"] | None = None, q7_offset: float = 0.0
@@ -85,9 +98,11 @@ class Workplace(Protocol):
         Raises:
             UnreachableError: No joint positions reach the pose.
         """
+        ...
 
     def object_region(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
         """Box of the objects on the table: centre and half edges [m]."""
+        ...
 
     def shelf(self, name: str, half_size: tuple[float, float, float] | None = None) -> Pose:
         """Pose of the end effector at the release of an object of a half size [m] on a shelf.
@@ -95,6 +110,7 @@ class Workplace(Protocol):
         Raises:
             ValueError: There is no such shelf.
         """
+        ...
 
 
 @runtime_checkable
@@ -104,18 +120,22 @@ class Collision(Protocol):
     @property
     def first(self) -> str:
         """Name of the moving body."""
+        ...
 
     @property
     def second(self) -> str:
         """Name of the body that it touches."""
+        ...
 
     @property
     def start(self) -> float:
         """Index of the first sample of the path in contact."""
+        ...
 
     @property
     def depth(self) -> float:
         """Deepest penetration [m]."""
+        ...
 
 
 @runtime_checkable
@@ -126,3 +146,4 @@ class CollisionChecker(Protocol):
         self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
     ) -> Sequence[Collision]:
         """Contacts along a path of joint positions [rad], with an object carried along."""
+        ...

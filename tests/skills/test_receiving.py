@@ -180,3 +180,36 @@ def test_movements_are_cut_from_rest_to_rest_of_a_body_that_stands():
     assert 2.8 < moving[-1] < 3.4
     assert np.ptp(np.diff(moving)) < 1e-9
     assert watch.times == []
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_arm_waits_until_hand_is_away_but_not_for_ever(model, leaves):
+    near = START.numpy() + BESIDE
+    moves = [(-1.0, 0.5, near), (1.0, 1.0, near + np.array([0.5, 0.0, 0.0]) * leaves)]
+    cell = Cell(moves, brings=False)
+    receiving(cell, model).wait_until_away(distance=0.25, longest=3.0)
+    if leaves:
+        times = np.arange(0.0, 3.0, 0.001)
+        apart = [np.linalg.norm(hand_at(t, moves) - START.numpy()) for t in times]
+        gone = times[np.argmax(np.array(apart) > 0.25)]
+        assert gone <= cell.time < gone + 1 / RATE + 2 * cell.config.dt
+    else:
+        assert cell.time == pytest.approx(3.0, abs=1e-6)
+
+
+def test_command_waits_for_an_arm_that_lags_behind(model):
+    class SlowCell(Cell):
+        lag = 0.0
+
+        def track_pose(self, goal, twist):
+            before = self.pose.position
+            ahead = goal.position - before
+            self.lag = max(self.lag, float(ahead.norm()))
+            step = 0.05 * self.config.dt / max(float(ahead.norm()), 1e-9)
+            position = before + min(step, 1.0) * ahead
+            super().track_pose(Pose(position, goal.orientation), twist)
+
+    cell = SlowCell([(1.0, 1.0, np.array([0.3, 0.4, 0.33]) + BESIDE)], brings=False)
+    receiving(cell, model).receive(ITEM)
+    # 4 cm, and what one step adds at 0.5 m/s.
+    assert 0.03 < cell.lag < 0.04 + 0.5 * cell.config.dt + 1e-3
