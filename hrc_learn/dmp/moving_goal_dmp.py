@@ -14,13 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Vectors, to_tensor
+from hrc_learn.dmp._arguments import Vectors, checked_vector
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary
-from hrc_learn.dmp.motion_primitive import (
-    WrappedPrimitive,
-)
+from hrc_learn.dmp.motion_primitive import WrappedPrimitive
 from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.model_files import SavedModel
 
@@ -120,17 +118,9 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         self, given: Boundary, duration: Tensor, end_velocity: Vectors | None = None
     ) -> tuple[Boundary, Tensor]:
         """Start and rate relative to the goal whose motion leads to `end_velocity`."""
-        motion = self.motion
-
-        def value_or(value: Vectors | None, default: Tensor) -> Tensor:
-            if value is None:
-                return default
-            return to_tensor(value, default.dtype, default.device)
-
-        demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
-        start, goal = value_or(given.start, motion.start), value_or(given.goal, motion.goal)
-        rate = value_or(given.start_velocity, demonstrated)
-        end = duration[..., None]
+        motion, end = self.motion, duration[..., None]
+        start, goal, per_s = motion.resolve_boundary(given, duration)
+        rate = per_s / end
         at_rest = motion.rollout_columns(Boundary(start, goal, rate), duration, end)
         at_rest = at_rest.velocity[..., 0, :]
         # A unit of v shifts the start by v and its rate by -v. Columns -2 and -3 of the
@@ -138,7 +128,10 @@ class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
         gain = 1 + at_end[-2] - at_end[-3]
         # The end velocity is linear in v, so the difference gives v directly.
-        v = (value_or(end_velocity, at_rest) - at_rest) / gain.to(at_rest)
+        wanted = at_rest
+        if end_velocity is not None:
+            wanted = checked_vector("end_velocity", end_velocity, at_rest)
+        v = (wanted - at_rest) / gain.to(at_rest)
         return Boundary(start + v * end, goal, rate - v), v
 
     def _trajectory(self, columns: Trajectory, frame: Tensor) -> MovingTrajectory:
