@@ -98,8 +98,10 @@ def besiege_door(url, data, count):
         where = f"{address.replace('http', 'ws')}/session/{new_client()}"
         options = {"subprotocols": ["hrc", f"secret.{token}"], "origin": address, "proxy": None}
         async with connect(where, **options) as bystander:
+            watching = asyncio.create_task(until_closed(bystander))
             await storm(url, data, count)
             await asyncio.wait_for(await bystander.ping(), 20)
+            watching.cancel()
 
     asyncio.run(go())
 
