@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from hrc_learn.geometry import Body, Box, Capsule, Pose, read_mesh
+from hrc_learn.geometry import Body, Box, Capsule, read_mesh
 from hrc_learn.geometry.shapes import Colour
-from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.gate import Content
 
 if TYPE_CHECKING:
@@ -53,43 +52,6 @@ CLIENT = Path(__file__).parent / "xr_client"
 """Sources of the client for headsets and phones; what is built of them lies in `built`."""
 BUILD = "make xr"
 """Builds it."""
-
-
-def scene_state(
-    positions: Float[np.ndarray, "bodies 3"],
-    orientations: Float[np.ndarray, "bodies 4"],
-    links: Pose,
-    arrows: Float[np.ndarray, "arrows 2 3"],
-    colour: str,
-    followed: DrawnRegion | None,
-    drawn: DrawnRegion | None,
-    active: bool,
-    plan: Float[np.ndarray, "points 3"] | None = None,
-) -> dict[str, Any]:
-    """Poses and regions of the scene, for a client that renders it itself.
-
-    Args:
-        positions: Positions of the bodies [m].
-        orientations: Orientations of the bodies (wxyz).
-        links: Frames of the arm; the last is the tool's.
-        arrows: Arrows from the points held to the pointers [m].
-        colour: Colour of the arrows, which shows how far the arm follows.
-        followed: Region to which a controller takes the end effector.
-        drawn: Region that the person draws.
-        active: True if the drawn region attracts the end effector.
-        plan: Planned path of the end effector [m]; None: there is none.
-    """
-    return {
-        "bodies": np.concatenate([positions, orientations], axis=1).round(6).tolist(),
-        "links": links.position.numpy().round(6).tolist(),
-        "tool": links[-1].orientation.numpy().round(6).tolist(),
-        "arrows": arrows.round(6).tolist(),
-        "colour": colour,
-        "followed": None if followed is None else vars(followed),
-        "drawn": None if drawn is None else vars(drawn),
-        "active": active,
-        "plan": [] if plan is None else plan.round(4).tolist(),
-    }
 
 
 def held_joint(body: Body) -> int | Literal["nothing"] | None:

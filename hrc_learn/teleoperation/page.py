@@ -27,14 +27,13 @@ from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate
 from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.messages import (
     Ask,
-    GuiUpdate,
     Hands,
     Message,
     Point,
     TrackedHand,
 )
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
-from hrc_learn.teleoperation.headset import headset_contents, headset_data, scene_state
+from hrc_learn.teleoperation.headset import headset_contents, headset_data
 from hrc_learn.teleoperation.page_operator import (
     GizmoCommand,
     HeadsetHands,
@@ -98,6 +97,7 @@ _MOST_FAILURES = 25
 for no motion, as nothing is posted."""
 
 _logger = logging.getLogger("hrc_learn.page")
+_encode = msgspec.json.Encoder(enc_hook=lambda array: array.tolist()).encode
 
 
 class Page:
@@ -166,7 +166,12 @@ class Page:
         self._hands = HeadsetHands(held, guides=guides)
         self._server, secret = guarded_viser()
         self._sockets = PageSockets(
-            control, self._heard, self._fits, self._told, self._server.get_port(), secret
+            control,
+            self._heard,
+            lambda update: self._panel.fits(update.uuid, update.updates),
+            self._told,
+            self._server.get_port(),
+            secret,
         )
         routes = {"session": self._sockets.session, "view": self._sockets.view}
         contents = {**page_contents(Path(viser.__file__).parent), **headset}
@@ -260,7 +265,9 @@ class Page:
 
     def _links(self) -> Pose | None:
         state = self.human.state
-        return None if state is None else self._chain.link_poses(_joints(state))
+        if state is None:
+            return None
+        return self._chain.link_poses(torch.from_numpy(state.joint_position))
 
     def _guarded(self) -> None:
         """Follow the arm, and renew what is asked of it: at once when hands have moved."""
@@ -284,23 +291,25 @@ class Page:
                     return
 
     def _refresh(self) -> GizmoCommand | None:
-        """Renew the input and the scene of headsets; None before the arm is known."""
-        state = self.human.state
-        if state is None:
+        """Renew the input and the scene of clients that draw it themselves; None before the arm
+        is known.
+        """
+        state, links = self.human.state, self._links()
+        if state is None or links is None:
             return None
-        command = self._command(state)
-        editor = self._panel.editor
-        scene = scene_state(
-            *self._poses,
-            self._chain.link_poses(_joints(state)),
-            command.arrows,
-            followed_colour(self.human.feedback.followed),
-            self._status.region,
-            None if editor is None else editor.drawn,
-            editor is not None and editor.region is not None,
-            self._status.plan,
-        )
-        self._sockets.scene = msgspec.Raw(msgspec.json.encode(scene))
+        command, status, editor = self._command(state), self._status, self._panel.editor
+        scene = {
+            "bodies": np.concatenate(self._poses, axis=1).round(6),
+            "links": links.position.numpy().round(6),
+            "tool": links[-1].orientation.numpy().round(6),
+            "arrows": command.arrows.round(6),
+            "colour": followed_colour(self.human.feedback.followed),
+            "followed": status.region,
+            "drawn": None if editor is None else editor.drawn,
+            "active": editor is not None and editor.region is not None,
+            "plan": () if status.plan is None else status.plan.round(4),
+        }
+        self._sockets.scene = msgspec.Raw(_encode(scene))
         return command
 
     def _draw(self, command: GizmoCommand, *, panel: bool) -> None:
@@ -381,9 +390,6 @@ class Page:
                 loop = self._server.get_event_loop()
                 loop.call_soon_threadsafe(self._panel.hear, message)
 
-    def _fits(self, update: GuiUpdate) -> bool:
-        return self._panel.fits(update.uuid, update.updates)
-
     def _told(self) -> dict[str, Any]:
         """Status for the bar at the top of the page."""
         words = ""
@@ -429,7 +435,3 @@ def slow_words(silence: float, lag: float, config: PageConfig) -> str:
             f"and beyond {config.silence:.2f} s the arm waits."
         )
     return ""
-
-
-def _joints(state: ArmState) -> Float[torch.Tensor, " joints"]:
-    return torch.from_numpy(state.joint_position)

@@ -29,6 +29,7 @@ from hrc_learn.teleoperation.hand_guiding import (
     HandGuidingConfig,
     InputFilter,
     InputFilterConfig,
+    check_positive,
 )
 from hrc_learn.teleoperation.page import Page, PageConfig, PageHuman, PageStatus
 from hrc_learn.viz.palette import GREEN, rgba
@@ -118,9 +119,7 @@ class PageSessionConfig:
     record_every: int = 2
     """Control steps from one recorded frame to the next."""
 
-    def __post_init__(self) -> None:
-        if self.record_every < 1:
-            raise ValueError(f"record_every must be at least 1, but is {self.record_every}.")
+    __post_init__ = check_positive
 
     @property
     def fps(self) -> float:

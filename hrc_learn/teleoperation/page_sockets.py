@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -48,24 +48,6 @@ _STATUS_EVERY = 0.1  # [s]
 _SCENE_EVERY = {"leads": 1 / 60, "watches": 1 / 20}
 """Time between two scenes for the leader, and for each of many who watch [s]."""
 _SECRET_HEADER = "X-Page-Secret"
-
-Role = Literal["leads", "watches"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ControlView:
-    """Control state as shown to one client."""
-
-    role: Role
-    taken: bool
-    """True if any client has control."""
-    asked: bool
-    """For the controlling client: true if another client requests control. For a watching
-    client: true if it has requested control itself.
-    """
-    may_lead: bool = True
-    """False for a client that may only watch."""
-
 
 _MOST_IDLE = 10.0
 """Idle time after which a waiting client gets control [s]."""
@@ -226,18 +208,24 @@ class Control:
         """Number of connected clients."""
         return len(self._clients)
 
-    def view(self, client: str) -> ControlView:
-        """Control state for a client."""
+    def view(self, client: str) -> dict[str, Any]:
+        """Control state as shown to a client.
+
+        Returns:
+            `role` ("leads" or "watches"), `taken` (true if any client has control), `asked`
+            (for the leader: true if another client requests control; for the others: true if
+            they have) and `may_lead` (false for a client that may only watch).
+        """
         with self._lock:
             self._pass_on()
             leads, one = client == self._leader, self._clients.get(client)
             asked = self._waiting() is not None if leads else one and one.asked < math.inf
-            return ControlView(
-                role="leads" if leads else "watches",
-                taken=self._leader is not None,
-                asked=bool(asked),
-                may_lead=one is not None and one.may_lead,
-            )
+            return {
+                "role": "leads" if leads else "watches",
+                "taken": self._leader is not None,
+                "asked": bool(asked),
+                "may_lead": one is not None and one.may_lead,
+            }
 
     def _leading(self) -> _Client | None:
         return self._clients.get(self._leader or "")
@@ -323,7 +311,7 @@ class PageSockets:
                 now = time.monotonic()
                 content: dict[str, Any] = {}
                 if now >= due:
-                    due, view = now + _STATUS_EVERY, vars(self._control.view(visitor.client))
+                    due, view = now + _STATUS_EVERY, self._control.view(visitor.client)
                     content = {"status": {**self._status(), **view}}
                     pause = _SCENE_EVERY[view["role"]] if wants_scene else _STATUS_EVERY
                 if wants_scene and (scene := self.scene) is not last:

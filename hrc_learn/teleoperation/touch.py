@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
+from hrc_learn.teleoperation.hand_guiding import check_positive
 
 Place = Literal["nothing", "elbow", "hand"]
 """Place of a touch; the elbow stands for all links above the wrist."""
@@ -70,10 +71,7 @@ class TouchConfig:
     gripper_settles: float = 0.5
     """Duration after a finger motion in which contact with the object is expected [s]."""
 
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, float) and not value > 0:
-                raise ValueError(f"{name} must be positive, but is {value}.")
+    __post_init__ = check_positive
 
 
 class TorqueBias:

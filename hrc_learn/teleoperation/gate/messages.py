@@ -250,23 +250,20 @@ ViewMessage = (
 )
 """A message of viser's page; see `acts`."""
 
-_DECODERS: dict[str, Any] = {
-    "session": msgspec.json.Decoder(Message),
-    "curation": msgspec.json.Decoder(CurationMessage),
-    "view": msgspec.msgpack.Decoder(ViewMessage),
-}
-
 
 def acts(message: Any) -> bool:
     """True if a message of viser's page acts on the arm or the session."""
     return not isinstance(message, _Watching)
 
 
-def _decoded(kind: str, raw: str | bytes) -> Any:
-    if kind == "view" and isinstance(raw, str):
-        raise MessageError("viser's messages are binary.")
+_session = msgspec.json.Decoder(Message)
+_curation = msgspec.json.Decoder(CurationMessage)
+_view = msgspec.msgpack.Decoder(ViewMessage)
+
+
+def _decoded(decoder: Any, raw: str | bytes) -> Any:
     try:
-        return _DECODERS[kind].decode(raw)
+        return decoder.decode(raw)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MessageError(f"not a message of this page: {error}") from error
 
@@ -277,14 +274,16 @@ def session_message(raw: str | bytes) -> Message:
     Raises:
         MessageError: It fits no schema.
     """
-    return _decoded("session", raw)
+    return _decoded(_session, raw)
 
 
 def curation_message(raw: str | bytes) -> CurationMessage:
     """Decode a message of the curation page, in JSON; errors as in `session_message`."""
-    return _decoded("curation", raw)
+    return _decoded(_curation, raw)
 
 
 def view_message(raw: str | bytes) -> ViewMessage:
     """Decode a message of viser's page, in MessagePack; errors as in `session_message`."""
-    return _decoded("view", raw)
+    if isinstance(raw, str):
+        raise MessageError("viser's messages are binary.")
+    return _decoded(_view, raw)
