@@ -1,11 +1,16 @@
 """On a full disk a command ends in one line that names its result, and leaves nothing of it."""
 
+import contextlib
 import resource
+import shutil
 
 import numpy as np
 import pytest
+from clean_sets import SETS, write_set
 from commands import done, hrc
 from lerobot_folders import joint_path
+
+from hrc_learn.demos import load_demos
 
 COMMANDS = {
     "check": "check {set} --json {out}",
@@ -41,6 +46,17 @@ def places(tmp_path_factory):
     return places
 
 
+@contextlib.contextmanager
+def small_files(size):
+    """A limit on the size of files [bytes], for this process."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
 @pytest.mark.parametrize("size", [60, 3000])
 @pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
 def test_a_full_disk_is_one_line(places, command, size, tmp_path):
@@ -48,12 +64,8 @@ def test_a_full_disk_is_one_line(places, command, size, tmp_path):
     if "--json" in command and size > 60:
         pytest.skip("figures fit into so large a file")
     words = command.format(out=tmp_path / "out", **places).split()
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
+    with small_files(size):
         status, _, errors = hrc(*words)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert status == 2, errors
     last = errors.strip().splitlines()[-1]
     assert last.startswith("error: ")
@@ -67,3 +79,24 @@ def test_a_full_disk_is_one_line(places, command, size, tmp_path):
 def test_a_full_device_is_one_line(places):
     status, _, errors = hrc("check", places["set"], "--json", "/dev/full")
     assert (status, errors) == (2, "error: /dev/full: No space left on device\n")
+
+
+def test_a_decision_that_does_not_fit_keeps_those_before(places, tmp_path):
+    shutil.copytree(places["set"], tmp_path / "set")
+    done("curate", tmp_path / "set", "--no-browser", "--reject", 1)
+    kept = (tmp_path / "set.curation.json").read_bytes()
+    with small_files(60):
+        status, _, errors = hrc("curate", tmp_path / "set", "--no-browser", "--reject", 0)
+    assert (status, errors) == (2, f"error: {tmp_path}/set.curation.json: File too large\n")
+    assert (tmp_path / "set.curation.json").read_bytes() == kept
+    assert {path.name for path in tmp_path.iterdir()} == {"set", "set.curation.json"}
+
+
+def test_a_feature_of_which_nothing_fits_is_none(tmp_path):
+    root = write_set(tmp_path / "set", **SETS["v3.0 with a camera"])
+    with small_files(60):
+        status, _, errors = hrc("extract", root, "--marker", 3)
+    assert status == 2
+    assert errors.strip().splitlines()[-1].endswith("episode_000000.parquet: File too large")
+    (demo,) = load_demos(root, [0])
+    assert demo.feature is None

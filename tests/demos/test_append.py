@@ -21,6 +21,9 @@ from hrc_learn.demos import (
 )
 from hrc_learn.demos.read.metadata import read_sidecar
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 JOINTS = ("a", "b", "c")
 
 

@@ -6,6 +6,9 @@ from clean_sets import SETS, write_set
 
 from hrc_learn.demos import check_dataset
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 SAMPLE = {name: [*KINDS][12 * k :: 36] for k, name in enumerate(SETS)}
 """Every 36th kind of defect for each set, other kinds for other sets; tools/score_checker.py
 tests all of them, on real sets too."""

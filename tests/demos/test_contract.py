@@ -22,6 +22,9 @@ from hrc_learn.demos.read.contract import keep_contract
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.source import open_dataset
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 STATE = "observation.state"
 NAMES = ["shoulder.pos", "elbow.pos", "gripper.pos"]
 FPS, BEHIND = 20, 4

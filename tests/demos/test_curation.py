@@ -25,6 +25,9 @@ from hrc_learn.demos.quality.repair import (
 )
 from hrc_learn.teleoperation.curation_page import CurationPage
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]
 
 

@@ -9,6 +9,9 @@ from lerobot_folders import joint_path, write_folder
 
 from hrc_learn.demos import DatasetError, Issue, check_dataset, load_demos
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 NETWORK = re.compile(r"hub|network|internet|offline|download|connection", re.IGNORECASE)
 
 

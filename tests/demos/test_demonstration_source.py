@@ -19,6 +19,9 @@ from hrc_learn.demos import (
 from hrc_learn.demos.read import frames
 from hrc_learn.demos.read.source import open_dataset
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
 LENGTHS = (20, 25, 30, 35, 40)

@@ -14,6 +14,9 @@ from huggingface_hub import constants
 
 from hrc_learn.demos import DatasetError, load_demos, push_dataset
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path):

@@ -15,6 +15,9 @@ from hrc_learn.demos import (
     repair_dataset,
 )
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 SIZE = (48, 64)
 FRAMES = (45, 50)
 

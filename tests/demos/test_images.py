@@ -14,6 +14,9 @@ from hrc_learn.demos.images import jpeg
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.videos import decode_image, read_segments
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 
 @pytest.fixture(params=["v3.0", "v2.1"])
 def root(request, tmp_path):

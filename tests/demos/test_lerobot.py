@@ -10,6 +10,9 @@ from lerobot_folders import joint_path
 
 from hrc_learn.demos import DatasetWriter, load_demos
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 JOINTS = ("joint_1", "joint_2", "joint_3")
 MOTIONS = [joint_path(n, seed=i).astype(np.float32) for i, n in enumerate((120, 90, 150))]
 TASKS = ("reach", "place", "reach")

@@ -11,6 +11,9 @@ from hrc_learn.demos import load_demos, load_images, thumbnails
 from hrc_learn.demos.images import thumbnail_size
 from hrc_learn.demos.videos import decode_image
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 
 @pytest.mark.parametrize("version", ["v3.0", "v2.1"])
 def test_thumbnails_are_few_and_small_and_at_the_times_of_their_frames(version, tmp_path):

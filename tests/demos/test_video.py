@@ -9,6 +9,9 @@ from unchecked import shapes_unchecked
 from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, recover_dataset
 from hrc_learn.demos.videos import video_path
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 SIZE = (96, 128)
 
 

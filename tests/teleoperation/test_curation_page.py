@@ -19,6 +19,7 @@ from hrc_learn.demos.images import load_images
 from hrc_learn.demos.quality.ranking import rank_episodes
 from hrc_learn.demos.quality.repair import read_decisions
 from hrc_learn.demos.videos import decode_image
+from hrc_learn.teleoperation import curation_page
 from hrc_learn.teleoperation.curation_page import CurationPage
 from hrc_learn.teleoperation.gate import AddressConfig
 
@@ -115,6 +116,19 @@ def test_a_decision_that_makes_no_sense_is_refused_with_its_reason(page, client)
     assert "no episode 9" in client.decide(episode=9, verdict="reject")["refused"]
     assert client.decide(episode=0, verdict="cut", start=5, stop=6)["refused"]
     assert not page.decisions
+
+
+def test_a_decision_on_a_full_disk_is_refused_with_its_reason(page, client, monkeypatch):
+    client.decide(episode=1, verdict="reject")
+
+    def full(*_):
+        raise OSError(28, "No space left on device", "set.curation.json")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(curation_page, "keep_decisions", full)
+        assert "No space left" in client.decide(episode=2, verdict="reject")["refused"]
+    assert [*page.decisions] == [1] == [*read_decisions(page.ranking.path)]
+    assert client.decide(episode=2, verdict="reject")["decisions"]
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from hrc_learn.demos.issues import DatasetError, aligned, plain_text
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import DatasetFolder
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json, read_sidecar
-from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, is_discrete
+from hrc_learn.demos.read.profiles import EpisodeProfile, is_discrete
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES, is_hand, joint_of
 from hrc_learn.demos.read.units import UnitDecision, units_of
 from hrc_learn.store import Count, new_file
@@ -138,15 +138,13 @@ class Contract:
 
         Quantities with a column of unknown unit are left out.
         """
-        known = {(part.key, part.index): part for part in self.components}
-        units = {
-            role: tuple(
-                known[place].unit_as(role) if place in known else ""
-                for place in selection.columns
-            )
-            for role, selection in selections.items()
-        }
-        return {role: each for role, each in units.items() if all(each)}
+        known, units = {(part.key, part.index): part for part in self.components}, {}
+        for role, selection in selections.items():
+            parts = [known.get(place) for place in selection.columns]
+            each = tuple(part.unit_as(role) if part else "" for part in parts)
+            if all(each):
+                units[role] = each
+        return units
 
     def selections(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:
         """Columns of each quantity.
@@ -195,10 +193,8 @@ class Contract:
 
     def content(self) -> dict[str, Any]:
         """The contract as JSON values."""
-        return {
-            "fingerprint": self.fingerprint,
-            "components": [asdict(part) for part in self.components],
-        }
+        parts = [asdict(part) for part in self.components]
+        return {"fingerprint": self.fingerprint, "components": parts}
 
 
 def _faulty(message: str) -> DatasetError:
@@ -335,27 +331,17 @@ def _describe(
         evidence=decision.evidence or "declared",
     )
     tracked = [p.tracking[role] for p in profiles if role in p.tracking]
-    if not tracked:
-        return part
-    fit, slope, delay, agreeing = _agreement(tracked, number)
+    fits = [fit for t in tracked if np.isfinite(fit := t.fit[number])]
+    fit = float(np.median(fits)) if fits else 0.0
     if not fit > _FOLLOWS:
         return part
-    sign = int(np.sign(slope))
+    slope = float(np.nanmedian([t.slope[number] for t in tracked]))
+    delays = np.array([t.delay for t in tracked])
+    delay = float(np.median(delays))
+    # Estimated delays scatter by two frames.
+    agreeing = int((np.abs(delays - delay) <= 2).sum())
     evidence = (
         f"state follows it with slope {slope:.2f}, R2 {fit:.2f}, "
         f"same delay in {agreeing} of {len(tracked)} episodes"
     )
-    return replace(part, sign=sign, delay=delay / fps, evidence=evidence)
-
-
-def _agreement(tracked: Sequence[Tracking], number: int) -> tuple[float, float, float, int]:
-    """Median fit, slope and delay [frames] over episodes, and the number with that delay."""
-    fits = np.array([t.fit[number] for t in tracked])
-    slopes = np.array([t.slope[number] for t in tracked])
-    delays = np.array([t.delay for t in tracked])
-    if not np.isfinite(fits).any():
-        return np.nan, np.nan, np.nan, 0
-    delay = float(np.median(delays))
-    # Estimated delays scatter by two frames.
-    agreeing = int((np.abs(delays - delay) <= 2).sum())
-    return float(np.nanmedian(fits)), float(np.nanmedian(slopes)), delay, agreeing
+    return replace(part, sign=int(np.sign(slope)), delay=delay / fps, evidence=evidence)

@@ -73,16 +73,15 @@ def path_in(root: Path, template: object, key: str, **places: int | str) -> str:
     """
     text = str(template)
     left = _FIELD.sub("", text)
-    if "{" in left or "}" in left or any(m[1] not in places for m in _FIELD.finditer(text)):
-        raise DatasetError(
-            f"{key} {template!r} does not fit the dataset's version", file=INFO_PATH, key=key
-        )
+    fields = {match[1] for match in _FIELD.finditer(text)}
     try:
+        if "{" in left or "}" in left or not fields <= places.keys():
+            raise ValueError("does not fit the dataset's version")
         file = text.format(**places)
+        if not is_inside(root, file):
+            raise ValueError(f"({file!r}) {_OUTSIDE}")
     except ValueError as error:
-        raise DatasetError(f"{key} {template!r}: {error}", file=INFO_PATH, key=key) from error
-    if not is_inside(root, file):
-        raise DatasetError(f"{key} ({file!r}) {_OUTSIDE}", file=INFO_PATH, key=key)
+        raise DatasetError(f"{key} {template!r} {error}", file=INFO_PATH, key=key) from error
     return file
 
 

@@ -262,14 +262,12 @@ def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
     if joints is None or len(joints) < 3:
         return {}
     rates = np.gradient(joints, 1 / fps, axis=0)
-    pairs = {
-        "command_position": (quantities.get("command_position"), joints),
-        "rates": (quantities.get("command_position"), rates),
-        "command_velocity": (quantities.get("command_velocity"), rates),
-    }
-    for name, (given, followed) in pairs.items():
+    for name, role, followed in (
+        ("command_position", "command_position", joints),
+        ("rates", "command_position", rates),
+        ("command_velocity", "command_velocity", rates),
+    ):
+        given = quantities.get(role)
         if given is not None and given.shape == followed.shape:
-            tracking = track(given, followed, fps)
-            if tracking is not None:
-                found[name] = tracking
-    return found
+            found[name] = track(given, followed, fps)
+    return {name: tracking for name, tracking in found.items() if tracking is not None}
