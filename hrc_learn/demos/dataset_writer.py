@@ -151,11 +151,7 @@ class DatasetWriter:
         Raises:
             RuntimeError: The previous episode was neither saved nor discarded.
         """
-        if self._task is not None:
-            raise RuntimeError(
-                f"the previous episode still holds {len(self._buffer)} unsaved frames: call "
-                f"save_episode() or discard_episode() first"
-            )
+        self._require_no_open_episode("first")
         self._task = task
 
     def add_frame(self, *, images: Mapping[str, Image] | None = None, **values: Any) -> None:
@@ -209,8 +205,7 @@ class DatasetWriter:
             RuntimeError: An episode is open.
             ValueError: The joints differ from the dataset's, or as in `save_episode`.
         """
-        if self._task is not None:
-            raise RuntimeError("save or discard the open episode before adding another")
+        self._require_no_open_episode("first")
         if self._video_features:
             raise ValueError("a demonstration holds no images: add its frames one by one")
         if demonstration.joint_names != self.joint_names:
@@ -264,17 +259,12 @@ class DatasetWriter:
             RuntimeError: An episode is open.
             DatasetError: No episode was saved.
         """
-        if self._task is not None:
-            raise RuntimeError(
-                f"the last episode holds {len(self._buffer)} unsaved frames: call "
-                f"save_episode() or discard_episode() before the recording ends"
-            )
+        self._require_no_open_episode("before the recording ends")
         with self._claim:
             if not self._new_episodes:
                 discard(self._staging)
-                raise DatasetError(
-                    "no episode was saved, so there is no dataset", file=self.root
-                )
+                text = "no episode was saved, so there is no dataset"
+                raise DatasetError(text, file=self.root)
             finish(self.root, self._claim)
         return self.root
 
@@ -297,6 +287,13 @@ class DatasetWriter:
         self._saved_frames = sum(entry.length for entry in folder.episodes)
         self.episodes = len(folder.episodes)
         return folder
+
+    def _require_no_open_episode(self, when: str) -> None:
+        if self._task is not None:
+            raise RuntimeError(
+                f"an episode with {len(self._buffer)} unsaved frames is open: call "
+                f"save_episode() or discard_episode() {when}"
+            )
 
     def _open_task(self) -> str:
         if self._task is None:
@@ -339,7 +336,7 @@ class DatasetWriter:
         )
         header = self._header(columns)
         if self._earlier is not None:
-            _require_same_columns(self._earlier, header)
+            self._require_same_columns(self._earlier.info["features"], header.features)
         staged = recorded.StagedEpisode(
             header=header,
             tasks=[task],
@@ -370,13 +367,10 @@ class DatasetWriter:
             ),
         )
 
-
-def _require_same_columns(folder: DatasetFolder, header: recorded.RecordingHeader) -> None:
-    theirs, ours = folder.info["features"], header.features
-    differing = [key for key in theirs | ours if theirs.get(key) != ours.get(key)]
-    if differing:
-        raise ValueError(
-            f"cannot append to {folder.root}: {differing[0]} there is "
-            f"{theirs.get(differing[0])}, here {ours.get(differing[0])}; record the same "
-            f"quantities with the same settings, or a dataset of its own"
-        )
+    def _require_same_columns(self, theirs: dict, ours: dict) -> None:
+        for key in theirs | ours:
+            if theirs.get(key) != ours.get(key):
+                raise ValueError(
+                    f"cannot append to {self.root}: {key} there is {theirs.get(key)}, here "
+                    f"{ours.get(key)}; record the same quantities, or a dataset of its own"
+                )

@@ -84,17 +84,14 @@ class Demonstration:
                 raise ValueError(f"{name} has {len(array)} frames, but time has {frames}")
             width = joints if name in JOINT_FIELDS else _WIDTHS.get(name)
             if width is not None and array.shape[1:] != (width,):
-                raise ValueError(
-                    f"{name} has shape {array.shape}, expected ({frames}, {width})"
-                    + (f" for the joints {', '.join(self.joint_names)}" if joints else "")
-                )
+                text = f"{name} has shape {array.shape}, expected ({frames}, {width})"
+                named = f" for the joints {', '.join(self.joint_names)}" if joints else ""
+                raise ValueError(text + named)
         stalled = np.flatnonzero(np.diff(self.time) <= 0)
         if len(stalled):
             k = int(stalled[0])
-            raise ValueError(
-                f"time must increase, but goes from {self.time[k]:.6g} s to "
-                f"{self.time[k + 1]:.6g} s at frame {k}"
-            )
+            step = f"{self.time[k]:.6g} s to {self.time[k + 1]:.6g} s at frame {k}"
+            raise ValueError(f"time must increase, but goes from {step}")
 
     def __len__(self) -> int:
         return len(self.time)
@@ -126,11 +123,8 @@ class Demonstration:
         if tuple(names) == self.joint_names:
             return self
         columns = joint_columns(self.joint_names, names)
-        chosen = {
-            name: getattr(self, name)[:, columns]
-            for name in self.recorded
-            if name in JOINT_FIELDS
-        }
+        held = [name for name in self.recorded if name in JOINT_FIELDS]
+        chosen = {name: getattr(self, name)[:, columns] for name in held}
         return replace(self, joint_names=tuple(names), **chosen)
 
 

@@ -147,9 +147,8 @@ class ImageReader:
             text = f"has no frames {wanted[0]} to {wanted[-1]}: it has {entry.length}"
             raise entry.error(text)
         in_column = self._folder.features[camera].dtype == "image"
-        yield from (self._from_column if in_column else self._from_video)(
-            entry, camera, wanted, size
-        )
+        read = self._from_column if in_column else self._from_video
+        yield from read(entry, camera, wanted, size)
 
     def entry(self, episode: int) -> EpisodeEntry:
         """An episode of the dataset.

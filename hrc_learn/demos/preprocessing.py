@@ -250,9 +250,8 @@ def cut(demo: Demonstration, start: int, stop: int) -> Demonstration:
         ValueError: The range is empty or exceeds the demonstration.
     """
     if not 0 <= start < stop <= len(demo):
-        raise ValueError(
-            f"frames {start} to {stop} are no part of a demonstration of {len(demo)} frames"
-        )
+        text = f"frames {start} to {stop} are no part of a demonstration of {len(demo)} frames"
+        raise ValueError(text)
     rows = {name: getattr(demo, name)[start:stop] for name in demo.recorded}
     rows["time"] = demo.time[start:stop] - demo.time[start]
     return replace(
@@ -372,10 +371,8 @@ def _fields_at(demo: Demonstration, time: Float64[np.ndarray, " _times"]) -> dic
     if len(demo) < 2:
         raise ValueError("a demonstration of one frame cannot be interpolated")
     if time[0] < demo.time[0] or time[-1] > demo.time[-1]:
-        raise ValueError(
-            f"times from {time[0]:.6g} s to {time[-1]:.6g} s exceed the demonstration, which "
-            f"lasts {demo.duration:.6g} s"
-        )
+        text = f"times from {time[0]:.6g} s to {time[-1]:.6g} s exceed the demonstration"
+        raise ValueError(f"{text}, which lasts {demo.duration:.6g} s")
     moved: dict[str, Any] = {}
     for name in demo.recorded[1:]:
         values = getattr(demo, name)
@@ -422,11 +419,8 @@ def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
             f"a demonstration of {len(demo)} frames cannot be made to last {duration} s"
         )
     scale = duration / demo.duration
-    scaled = {
-        name: getattr(demo, name) / scale
-        for name in ("joint_velocity", "command_velocity")
-        if name in demo.recorded
-    }
+    rates = {"joint_velocity", "command_velocity"} & {*demo.recorded}
+    scaled = {name: getattr(demo, name) / scale for name in rates}
     return replace(demo, time=demo.time * scale, fps=demo.fps / scale, **scaled)
 
 

@@ -131,6 +131,13 @@ def test_results_say_what_they_were_made_from(tmp_path):
     assert contents(out)["model"] == "weights"
 
 
+def test_a_folder_remembers_the_identifier_of_its_source(tmp_path):
+    fill(tmp_path / "made", "new", source="recording 7")
+    assert store.source_of(tmp_path / "made") == "recording 7"
+    (tmp_path / "foreign").mkdir()
+    assert store.source_of(tmp_path / "foreign") == ""
+
+
 def test_results_replace_older_results_only(tmp_path):
     out = tmp_path / "out"
     with new_folder(out, {"seed": 1}):

@@ -146,7 +146,7 @@ def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str
     else:
         advice = f". Name them alike, or map one of them (--mapping {role} KEY[0:7])"
     return (
-        f"{role} is of the joints {', '.join(joints)}, the rest of {', '.join(names)}: "
+        f"is of the joints {', '.join(joints)}, the rest of {', '.join(names)}: "
         f"left among the extra columns{advice}"
     )
 
@@ -204,9 +204,7 @@ def _feature_range(
     key = match[1] if match else text
     if key not in features:
         known = ", ".join(features)
-        text = (
-            f"mapping takes {role} from a feature that does not exist; numeric ones are {known}"
-        )
+        text = f"mapping takes {role} from a feature that does not exist; there are {known}"
         raise DatasetError(text, file=INFO_PATH, key=key)
     width = features[key].width
     first, stop = 0, width
@@ -233,13 +231,11 @@ def _component(role: str, name: str, features: Mapping[str, Feature]) -> tuple[s
         if (feature.key, known) == (key, component) or (not slash and known == name)
     ]
     if not places:
-        known = (
-            ", ".join(n for feature in features.values() for n in feature.names or ()) or "none"
+        known = ", ".join(n for feature in features.values() for n in feature.names or ())
+        text = "from a component that does not exist; named are"
+        raise DatasetError(
+            f"mapping takes {role} {text} {known or 'none'}", file=INFO_PATH, key=name
         )
-        text = (
-            f"mapping takes {role} from a component that does not exist; named ones are {known}"
-        )
-        raise DatasetError(text, file=INFO_PATH, key=name)
     if len(places) > 1:
         options = ", ".join(f"{key}/{name}" for key, _ in places)
         raise DatasetError(f"mapping for {role} is ambiguous: write one of {options}", key=name)

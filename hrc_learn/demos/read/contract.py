@@ -107,10 +107,8 @@ class Contract:
     def rows(self) -> list[tuple[str, ...]]:
         """The contract as a table with its header; similar neighbours are one row."""
         rows = [("column", "role", "unit", "range", "sign", "delay", "sure", "evidence")]
-        for _, alike in groupby(
-            self.components, lambda p: (p.key, p.role, p.unit, p.sign, p.delay)
-        ):
-            group = [*alike]
+        alike = groupby(self.components, lambda p: (p.key, p.role, p.unit, p.sign, p.delay))
+        for group in ([*parts] for _, parts in alike):
             first, last = group[0], group[-1]
             name = first.name if len(group) == 1 else f"{first.name} .. {last.name}"
             low, high = min(p.low for p in group), max(p.high for p in group)

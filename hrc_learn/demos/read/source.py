@@ -107,9 +107,7 @@ class OpenedDataset:
 
     def sample(self, most: int) -> Sequence[EpisodeEntry]:
         """Subset of `most` episodes, spread evenly over the dataset."""
-        every = self.folder.episodes
-        places = np.linspace(0, len(every) - 1, min(len(every), most))
-        return [every[int(place)] for place in places]
+        return _spread(self.folder.episodes, most)
 
     def decide_units(
         self, entries: Sequence[EpisodeEntry], given: Mapping[str, str]
@@ -202,6 +200,11 @@ class OpenedDataset:
         )
         sidecar = replace(self.sidecar, contract=contract.content())
         return replace(self, sidecar=sidecar, contract=contract, columns=columns), note
+
+
+def _spread(entries: Sequence[EpisodeEntry], most: int) -> list[EpisodeEntry]:
+    places = np.linspace(0, len(entries) - 1, min(len(entries), most))
+    return [entries[int(place)] for place in places]
 
 
 def open_dataset(path: str | Path, mapping: MappingSpec | None = None) -> OpenedDataset:
@@ -358,8 +361,9 @@ class DemonstrationSource(Sequence[Demonstration]):
         names = columns.joint_names if joint_names is None else joint_names
         joint_columns(columns.joint_names, names)
         self.joint_names, self.source = tuple(names), str(root)
-        noted = [*notes, *columns.notes, *columns.unmatched.values(), dataset.contract_note]
-        noted += [decision.note for decision in decisions.values()]
+        noted = [*notes, *columns.notes]
+        noted += [f"{role} {note}" for role, note in columns.unmatched.items()]
+        noted += [dataset.contract_note, *(d.note for d in decisions.values())]
         self._extracted = feature = None if dataset.own_feature else only_feature(root)
         if feature is not None:
             noted.append(f"feature: {feature.name}, extracted from the videos")
@@ -378,8 +382,7 @@ class DemonstrationSource(Sequence[Demonstration]):
 
     def spread(self, most: int) -> "DemonstrationSource":
         """Subset of `most` demonstrations, spread evenly over the sequence and still unread."""
-        places = np.linspace(0, len(self) - 1, min(len(self), most)).astype(int)
-        return self._part(self._entries[place] for place in places.tolist())
+        return self._part(_spread(self._entries, most))
 
     def _part(self, entries: Iterable[EpisodeEntry]) -> "DemonstrationSource":
         return DemonstrationSource(
