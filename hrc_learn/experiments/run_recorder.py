@@ -25,11 +25,11 @@ from hrc_learn.experiments.run_measures import (
 )
 from hrc_learn.geometry import Box
 from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.geometry.shapes import Line
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import CameraRecording, JointRanges, LoggedSteps, RunRecording
 from hrc_learn.protocols import HINDRANCES
 from hrc_learn.sim import (
-    Arrow,
     MotionLog,
     OffscreenRenderer,
     RecordedWorld,
@@ -43,7 +43,7 @@ from hrc_learn.skills.servo_target import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
-from hrc_learn.viz.film import CameraInset, Line, Picture, annotated, draw_run, film_mp4
+from hrc_learn.viz.film import CameraInset, Picture, annotated, draw_run, film_mp4
 from hrc_learn.viz.report import Film
 
 # Joint, counted from 1, whose frame is at the elbow of an arm with seven joints: the person
@@ -311,20 +311,9 @@ def _painter(
 
         def paint(step: int, lines: list[Line]) -> Picture:
             world.show(step)
-            return renderer.render(camera, [_arrow(line) for line in lines])
+            return renderer.render(camera, lines)
 
         yield paint
-
-
-def _arrow(line: Line) -> Arrow:
-    r, g, b, _ = palette.rgba(line.colour)
-    return Arrow(
-        start=line.start,
-        end=line.end,
-        colour=(r / 255, g / 255, b / 255, 1.0),
-        width=line.width,
-        head=line.head,
-    )
 
 
 def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str, str]]]:
@@ -371,5 +360,5 @@ def _edges(box: Box, colour: str) -> list[Line]:
 
 
 def _line(start: np.ndarray, end: np.ndarray, colour: str, **more: Any) -> Line:
-    (a, b, c), (x, y, z) = start.tolist(), end.tolist()
-    return Line(start=(a, b, c), end=(x, y, z), colour=colour, **more)
+    r, g, b, _ = palette.rgba(colour)
+    return Line(start=start, end=end, colour=(r / 255, g / 255, b / 255, 1.0), **more)

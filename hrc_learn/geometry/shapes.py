@@ -48,6 +48,21 @@ class Box:
     name: str = ""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Line:
+    """A line, or an arrow, drawn into a picture, in the base frame."""
+
+    start: Float[np.ndarray, "3"]
+    """[m]"""
+    end: Float[np.ndarray, "3"]
+    """[m]"""
+    colour: Colour
+    width: float = 0.006
+    """[m]"""
+    head: bool = False
+    """True for an arrow."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class MeshFile:
     """A drawn shape in a file (`read_mesh`), in the frame of the body that carries it."""

@@ -4,7 +4,6 @@ from hrc_learn.sim.arm_model import FINGER_STROKE as FINGER_STROKE
 from hrc_learn.sim.arm_model import ArmModelConfig as ArmModelConfig
 from hrc_learn.sim.arm_model import Plate as Plate
 from hrc_learn.sim.arm_model import whole_arm as whole_arm
-from hrc_learn.sim.cameras import Arrow as Arrow
 from hrc_learn.sim.cameras import CameraChange as CameraChange
 from hrc_learn.sim.cameras import CameraKind as CameraKind
 from hrc_learn.sim.cameras import ChangingCamera as ChangingCamera

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.shapes import Colour
+from hrc_learn.geometry.shapes import Line
 from hrc_learn.protocols import Camera
 from hrc_learn.sim.recorded_world import DrawnWorld, RecordedWorld
 from hrc_learn.sim.scene import (
@@ -44,32 +44,15 @@ class RenderingUnavailableError(RuntimeError):
     """This machine cannot render without a screen."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arrow:
-    """An arrow, or a line, in a picture."""
-
-    start: tuple[float, float, float]
-    """[m]"""
-    end: tuple[float, float, float]
-    """[m]"""
-    colour: Colour
-    """RGBA, 0 to 1."""
-    width: float = 0.012
-    """Radius of the shaft [m]."""
-    head: bool = True
-    """Without one it is a line."""
-
-    def add_to(self, scene: mujoco.MjvScene) -> None:
-        """Draw it into a scene, as far as there is room for it."""
-        if scene.ngeom == scene.maxgeom:
-            return
-        kind = mujoco.mjtGeom.mjGEOM_ARROW if self.head else mujoco.mjtGeom.mjGEOM_CAPSULE
-        geom, zero, colour = scene.geoms[scene.ngeom], np.zeros(3), np.array(self.colour)
-        mujoco.mjv_initGeom(
-            geom, kind, zero, zero, np.eye(3).ravel(), colour.astype(np.float32)
-        )
-        mujoco.mjv_connector(geom, kind, self.width, np.array(self.start), np.array(self.end))
-        scene.ngeom += 1
+def _add_line(scene: mujoco.MjvScene, line: Line) -> None:
+    """Draw a line into a scene that has room for it."""
+    if scene.ngeom == scene.maxgeom:
+        return
+    kind = mujoco.mjtGeom.mjGEOM_ARROW if line.head else mujoco.mjtGeom.mjGEOM_CAPSULE
+    geom, zero, colour = scene.geoms[scene.ngeom], np.zeros(3), np.float32(line.colour)
+    mujoco.mjv_initGeom(geom, kind, zero, zero, np.eye(3).ravel(), colour)
+    mujoco.mjv_connector(geom, kind, line.width, line.start, line.end)
+    scene.ngeom += 1
 
 
 class OffscreenRenderer:
@@ -101,13 +84,13 @@ class OffscreenRenderer:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
 
     def render(
-        self, camera: CameraModel, arrows: Sequence[Arrow] = ()
+        self, camera: CameraModel, lines: Sequence[Line] = ()
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The image of an undistorted camera of the renderer's size, RGB.
 
         Args:
             camera: Camera to render.
-            arrows: Drawn besides what is in the world.
+            lines: Lines drawn in addition to what is in the world.
         """
         width, height = self._size
         self._gl.make_current()
@@ -121,8 +104,8 @@ class OffscreenRenderer:
             mujoco.mjtCatBit.mjCAT_ALL,
             self._scene,
         )
-        for arrow in arrows:
-            arrow.add_to(self._scene)
+        for line in lines:
+            _add_line(self._scene, line)
         for view in self._scene.camera:
             _set_view(view, camera)
         viewport = mujoco.MjrRect(0, 0, width, height)

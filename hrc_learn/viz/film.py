@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from hrc_learn.geometry import Body, Box, quaternion
-from hrc_learn.geometry.shapes import Colour
+from hrc_learn.geometry.shapes import Colour, Line
 from hrc_learn.log import CameraRecording, RunRecording
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
@@ -33,22 +33,6 @@ _UPRIGHT = np.eye(3)
 
 # A film of 16 s at 720 x 450 px is 0.3 MB then: a report that holds it can be mailed.
 _CODEC = {"preset": "veryfast", "crf": "27"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Line:
-    """A line, or an arrow, drawn into a scene."""
-
-    start: tuple[float, float, float]
-    """[m]"""
-    end: tuple[float, float, float]
-    """[m]"""
-    colour: str
-    """ "#RRGGBB" """
-    width: float = 0.006
-    """[m]"""
-    head: bool = False
-    """True for an arrow."""
 
 
 def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
@@ -206,7 +190,8 @@ def draw_run(
         for _, part in sorted(parts, key=lambda part: -part[0]):
             part.draw(draw)
     for line in lines:
-        (part,) = _capsule(np.array([line.start, line.end]), line.width, line.colour, camera)
+        ends, colour = np.stack([line.start, line.end]), _bytes(line.colour)
+        (part,) = _capsule(ends, line.width, colour, camera)
         part[1].draw(draw)
     return np.asarray(image)
 
@@ -216,7 +201,7 @@ class _Part:
     """A polygon, or a thick line, in pixels."""
 
     points: list[tuple[float, float]]
-    colour: str | tuple[int, int, int]
+    colour: tuple[int, int, int]
     width: float | None = None
     """Width of a line [px]; None for a polygon."""
 
@@ -246,7 +231,7 @@ def _body_parts(body: Body, step: int, camera: CameraModel) -> list[tuple[float,
 def _capsule(
     ends: Float[np.ndarray, "2 3"],
     width: float,
-    colour: str | tuple[int, int, int],
+    colour: tuple[int, int, int],
     camera: CameraModel,
 ) -> list[tuple[float, _Part]]:
     depth = float(camera.to_camera(ends)[:, 2].mean())
@@ -287,6 +272,6 @@ def _bytes(colour: Colour) -> tuple[int, int, int]:
     return r, g, b
 
 
-def _dimmed(colour: str | tuple[int, int, int], light: float) -> tuple[int, int, int]:
-    r, g, b = palette.rgba(colour)[:3] if isinstance(colour, str) else colour
+def _dimmed(colour: tuple[int, int, int], light: float) -> tuple[int, int, int]:
+    r, g, b = colour
     return round(light * r), round(light * g), round(light * b)

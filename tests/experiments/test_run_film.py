@@ -52,7 +52,7 @@ def test_a_pull_is_an_arrow_above_the_forearm_while_it_lasts():
     run, pulled, free = pushed(slice(80, 120)), 100, 20
     lines, _ = film._drawn_in(run, pulled)
     (arrow,) = (line for line in lines if line.head)
-    (forearm,) = (line for line in lines if line.colour == palette.PERSON)
+    (forearm,) = (line for line in lines if line.width == film._HAND)
     np.testing.assert_allclose(np.subtract(arrow.end, arrow.start), [0, 0.45, 0], atol=1e-9)
     np.testing.assert_allclose(forearm.start, [0.1, 0.0, 0.5])
     assert arrow.start[2] > forearm.start[2]
@@ -78,7 +78,7 @@ def test_the_distance_of_a_worker_is_told_while_he_is_near():
 def test_the_edges_of_a_box_are_twelve_and_each_once():
     box = sample_run().region
     lines = film._edges(box, palette.BLUE)
-    ends = {frozenset([line.start, line.end]) for line in lines}
+    ends = {frozenset([tuple(line.start), tuple(line.end)]) for line in lines}
     assert len(ends) == len(lines) == 12
     lengths = sorted(np.linalg.norm(np.subtract(line.end, line.start)) for line in lines)
     np.testing.assert_allclose(lengths, np.repeat(np.sort(2 * np.array(box.half_size)), 4))

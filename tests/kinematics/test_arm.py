@@ -300,3 +300,15 @@ def test_without_scipy_shapes_are_not_fitted_and_it_says_why(monkeypatch):
     box = Shape(pose=np.eye(4), kind="box", size=(0.1, 0.1, 0.1))
     with pytest.raises(ModuleNotFoundError, match=r"SciPy: pip install 'hrc-learn\[meshes\]'"):
         hull_of(box)
+
+
+@pytest.mark.parametrize(("kind", "half"), [("capsule", 0.05), ("sphere", 0.0)])
+def test_round_shapes_are_their_own_capsules(kind, half):
+    pose = np.eye(4)
+    pose[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # z along x of the link
+    pose[:3, 3] = (0.1, 0.2, 0.3)
+    shape = Shape(pose=pose, kind=kind, size=(0.02, half))
+    (capsule,) = fit_body(panda, [(3, shape)]).capsules
+    assert (capsule.link, capsule.radius) == (3, 0.02)
+    np.testing.assert_allclose(capsule.start, (0.1 - half, 0.2, 0.3), atol=1e-12)
+    np.testing.assert_allclose(capsule.end, (0.1 + half, 0.2, 0.3), atol=1e-12)

@@ -8,9 +8,10 @@ import pytest
 from sample_runs import sample_run
 
 from hrc_learn.geometry import Body, Box, Capsule
+from hrc_learn.geometry.shapes import Line
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import palette
-from hrc_learn.viz.film import CameraInset, Line, annotated, draw_run, film_mp4
+from hrc_learn.viz.film import CameraInset, annotated, draw_run, film_mp4
 
 
 @pytest.fixture
@@ -124,9 +125,10 @@ def test_what_is_nearer_hides_what_is_behind_it(camera):
 
 def test_lines_are_drawn_and_those_behind_the_camera_are_not(camera):
     def line(x):
-        return Line(start=(x, -0.3, 0.0), end=(x, 0.3, 0.0), colour=palette.BLUE, width=0.05)
+        start, end = np.array([x, -0.3, 0.0]), np.array([x, 0.3, 0.0])
+        return Line(start=start, end=end, colour=(0.0, 0.0, 1.0, 1.0), width=0.05)
 
-    blue = list(palette.rgba(palette.BLUE)[:3])
+    blue = [0, 0, 255]
     assert pixel(draw_run(run_of(), 0, camera, [line(0.0)]), camera, (0, 0.1, 0)) == blue
     bare = draw_run(run_of(), 0, camera)
     np.testing.assert_array_equal(draw_run(run_of(), 0, camera, [line(4.0)]), bare)
