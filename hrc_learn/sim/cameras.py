@@ -49,7 +49,8 @@ def _add_line(scene: mujoco.MjvScene, line: Line) -> None:
     if scene.ngeom == scene.maxgeom:
         return
     kind = mujoco.mjtGeom.mjGEOM_ARROW if line.head else mujoco.mjtGeom.mjGEOM_CAPSULE
-    geom, zero, colour = scene.geoms[scene.ngeom], np.zeros(3), np.float32(line.colour)
+    geom, zero = scene.geoms[scene.ngeom], np.zeros(3)
+    colour = np.array(line.colour, dtype=np.float32)
     mujoco.mjv_initGeom(geom, kind, zero, zero, np.eye(3).ravel(), colour)
     mujoco.mjv_connector(geom, kind, line.width, line.start, line.end)
     scene.ngeom += 1

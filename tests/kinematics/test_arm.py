@@ -15,6 +15,7 @@ from hrc_learn.kinematics import (
     MissingModelError,
     arm,
     null_space_dimension,
+    panda,
     registered_arms,
     solve_inverse,
 )
