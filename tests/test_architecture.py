@@ -84,7 +84,7 @@ LAYERS = (
 LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
     # Of its modules for commands, each imported when its command runs.
-    "cli": {"torch", "jaxtyping", "numpy", "tyro", "rich"},
+    "cli": {"torch", "jaxtyping", "numpy", "tyro", "rich", "msgspec"},
     "store": {"msgspec"},
     "log": {"jaxtyping", "numpy"},
     "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
@@ -180,8 +180,20 @@ class Import(NamedTuple):
         return f"{self.source.relative_to(ROOT)}:{self.line} imports {self.module}"
 
 
+measure_code = load_program("tools/measure_code.py")
+
+
+@cache
+def package() -> list:
+    """Files of the package, parsed once for all tests."""
+    return measure_code.read_package(ROOT / "hrc_learn")
+
+
 @cache
 def parse(source: Path) -> ast.Module:
+    for file in package():
+        if file.path == source:
+            return file.tree
     return ast.parse(source.read_text(encoding="utf-8"), filename=str(source))
 
 
@@ -277,8 +289,7 @@ def test_no_package_builds_on_itself():
 
 def test_no_module_imports_itself_around_others():
     """Imports in functions and for type checkers count: they only hide a circle."""
-    measure_code = load_program("tools/measure_code.py")
-    assert not measure_code.circles(measure_code.read_package(ROOT / "hrc_learn"))
+    assert not measure_code.circles(package())
 
 
 def test_the_package_itself_imports_its_parts_only():

@@ -6,12 +6,13 @@
 import dataclasses
 import sys
 import tomllib
-import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
+
+import msgspec
 
 from hrc_learn.store import read_toml
 
@@ -78,40 +79,38 @@ def _updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
 
 
 def _converted(value: Any, hint: Any, place: str) -> Any:
-    """A TOML value as its annotated type: a scalar, path, tuple, mapping or dataclass."""
-    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    """A TOML value as its annotated type."""
     if isinstance(hint, typing.TypeAliasType):
-        return _converted(value, hint.__value__, place)
-    if origin in (types.UnionType, typing.Union):
-        if value in ("none", "None") and type(None) in parts:  # TOML has no null
-            return None
-        for part in parts:
-            try:
-                return _converted(value, part, place)
-            except ValueError:
-                continue
-    elif origin is Literal and value in parts:
-        return value
-    elif origin is tuple and isinstance(value, list):
-        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-        if len(kinds) == len(value):
-            return tuple(_converted(v, k, place) for v, k in zip(value, kinds, strict=True))
-    elif origin in (dict, Mapping) and isinstance(value, dict):
-        return {key: _converted(v, parts[1], place) for key, v in value.items()}
-    elif dataclasses.is_dataclass(hint) and isinstance(value, dict):
-        hints = typing.get_type_hints(hint)
-        if unknown := value.keys() - hints.keys():
-            raise ValueError(_unknown(f"{place}.", min(unknown), hints))
-        fields = {k: _converted(v, hints[k], f"{place}.{k}") for k, v in value.items()}
-        return typing.cast("type[Any]", hint)(**fields)
-    elif hint is float and type(value) is int:
-        return float(value)
-    elif hint is Path and isinstance(value, str):
+        hint = hint.__value__
+    if value in ("none", "None") and type(None) in typing.get_args(hint):  # TOML has no null
+        return None
+    try:
+        made = msgspec.convert(value, hint, dec_hook=_custom)
+    except (ValueError, TypeError, NotImplementedError) as error:
+        expected = getattr(hint, "__name__", str(hint))
+        raise ValueError(f"{place} must be {expected}, got {value!r} ({error})") from None
+    _refuse_unknown(value, made, place)
+    return made
+
+
+def _custom(kind: type, value: Any) -> Any:
+    """Value of a type that TOML does not know."""
+    if kind is Path and isinstance(value, str):
         return Path(value)
-    elif isinstance(hint, type) and type(value) is hint:
-        return value
-    expected = getattr(hint, "__name__", str(hint))
-    raise ValueError(f"{place} must be {expected}, got {value!r}")
+    raise ValueError(f"{kind.__name__} cannot be given here")
+
+
+def _refuse_unknown(value: Any, made: Any, place: str) -> None:
+    """Refuse fields that a dataclass does not have, which msgspec ignores."""
+    if isinstance(value, list):
+        for part, item in zip(value, made, strict=True):
+            _refuse_unknown(part, item, place)
+    elif isinstance(value, dict) and dataclasses.is_dataclass(made):
+        known = [field.name for field in dataclasses.fields(made)]
+        for name, part in value.items():
+            if name not in known:
+                raise ValueError(_unknown(f"{place}.", name, known))
+            _refuse_unknown(part, getattr(made, name), f"{place}.{name}")
 
 
 def _listed(name: str, value: Any) -> Iterator[str]:

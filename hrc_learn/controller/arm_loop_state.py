@@ -39,11 +39,11 @@ class ArmLoopConfig(YieldingConfig):
     """Speed of the task relative to its planned speed, above 0 to 1, as for a first run on a
     real arm. Motions of the null space off a path are not slowed down."""
     longest_wait: float = 300.0
-    """Time after which a task fails that people block or hold aside [s]."""
+    """Longest time for which people may block or displace the arm before the task fails [s]."""
     back_after: float = 2.0
-    """Time after which a path goes back whose joints come no nearer [s]."""
+    """Time without progress towards a path after which the path is retraced [s]."""
     direct_return_after: float = 20.0
-    """Time after which joints that come no nearer to their path return to it directly [s]."""
+    """Time without progress after which the joints return to their path directly [s]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Safety filter, with what the arm's driver can do."""
     way_making: WayMakingConfig | None = None

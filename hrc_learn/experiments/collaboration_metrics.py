@@ -66,7 +66,7 @@ def collaboration_metrics(
 def _delivered(
     name: str, of: Callable[[CollaborationRun], Collection[str]], count: int, claim: str = ""
 ) -> Metric[CollaborationRun]:
-    """Metric of the number of objects for which something is true, which must be all."""
+    """Metric of the number of objects that meet a condition, with all of them as the target."""
 
     def others(run: CollaborationRun) -> str:
         names = [item.name for item in run.workplace.scene.objects]

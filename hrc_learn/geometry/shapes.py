@@ -20,7 +20,7 @@ PLAIN: Colour = (0.86, 0.87, 0.89, 1.0)
 """Colour of a robot link without a colour of its own."""
 
 _CREASE = np.deg2rad(40.0)
-"""Angle between two faces from which on the edge between them is drawn sharp [rad]."""
+"""Smallest angle between two faces whose common edge is drawn sharp [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ class MeshFile:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Body:
-    """Something rigid that moves: a link of the arm, a finger, the object it carries."""
+    """A moving rigid body: a link of the arm, a finger, or a carried object."""
 
     name: str
     position: Float[np.ndarray, "time 3"]
@@ -107,7 +107,7 @@ class MeshPart:
     """None: the file gives none."""
 
     def placed(self, mesh: MeshFile) -> "MeshPart":
-        """The same where a body carries it, in the body's frame and never without a colour."""
+        """The part in the frame of its body, with a colour."""
         w, *axis = mesh.orientation
         scale, v = np.array(mesh.scale), np.array(axis)
 

@@ -84,7 +84,10 @@ class LoggedSteps:
         return LoggedSteps([rows], len(self), self.events)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write columns and events as one .npz file, which appears only when complete."""
+        """Write columns and events as one .npz file, which appears only when complete.
+
+        Its arrays are `column/NAME`, `event/time` [s] and `event/text`.
+        """
         arrays: dict[str, Any] = {f"column/{name}": self[name] for name in self.names}
         arrays["event/time"] = np.array([event.time for event in self.events], dtype=float)
         arrays["event/text"] = np.array([event.text for event in self.events], dtype=str)
@@ -158,22 +161,6 @@ class StepLog(LoggedSteps):
     def event(self, time: float, text: str) -> None:
         """Log an event at a time [s]."""
         self.events.append(Event(float(time), text))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "StepLog":
-        """Read a saved log, which can be appended to."""
-        with np.load(path, allow_pickle=False) as file:
-            columns = {
-                key.removeprefix("column/"): file[key]
-                for key in file.files
-                if key.startswith("column/")
-            }
-            times, texts = file["event/time"].tolist(), file["event/text"].tolist()
-        log = cls()
-        log.events = [Event(time, text) for time, text in zip(times, texts, strict=True)]
-        for row in zip(*columns.values(), strict=True):
-            log.append(**dict(zip(columns, row, strict=True)))
-        return log
 
     def _open(self, values: Mapping[str, Value]) -> None:
         kinds = {name: np.asarray(value).dtype == bool for name, value in values.items()}

@@ -33,7 +33,7 @@ def test_whole_first_values_do_not_cut_later_ones():
 
 
 @pytest.mark.parametrize("steps", [1, 8, 17])
-def test_columns_can_be_added_to_what_was_logged(steps, tmp_path):
+def test_columns_can_be_added_to_a_log(steps):
     log = filled(steps, block=8)
     log.event(0.1, "begun")
     far = np.arange(2.0 * steps).reshape(steps, 2)
@@ -43,8 +43,7 @@ def test_columns_can_be_added_to_what_was_logged(steps, tmp_path):
         np.testing.assert_array_equal(more[name], log[name])
     np.testing.assert_array_equal(more["far"], far)
     assert more["seen"].dtype == bool
-    more.save(tmp_path / "log.npz")
-    assert StepLog.load(tmp_path / "log.npz").events == log.events
+    assert more.events == log.events
     assert "far" not in log
     with pytest.raises(ValueError, match="new columns"):
         log.with_columns(far=np.zeros(steps + 1))
@@ -87,26 +86,19 @@ def test_blocks_give_the_rows_from_a_start_on(start):
     assert times == [k / 125 for k in range(start, 20)]
 
 
-@pytest.mark.parametrize("steps", [0, 1, 20])
-def test_a_saved_log_is_read_back_and_can_go_on(tmp_path, steps):
+@pytest.mark.parametrize("steps", [1, 20_000])
+def test_a_saved_log_holds_columns_and_events(tmp_path, steps):
     log = filled(steps)
     log.event(0.5, "Approach, then “servo”")
     log.save(tmp_path / "run.npz")
-    again = StepLog.load(tmp_path / "run.npz")
-    assert again.names == log.names
-    assert again.events == [Event(0.5, "Approach, then “servo”")]
-    for name in log.names:
-        np.testing.assert_array_equal(again[name], log[name])
-        assert again[name].dtype == log[name].dtype
-    again.append(time=1.0, joint=np.zeros(7), J=np.zeros((2, 6)), pushed=True)
-    assert len(again) == steps + 1
+    with np.load(tmp_path / "run.npz", allow_pickle=False) as file:
+        assert file["event/time"].tolist() == [0.5]
+        assert file["event/text"].tolist() == ["Approach, then “servo”"]
+        assert len(file.files) == len(log.names) + 2
+        for name in log.names:
+            np.testing.assert_array_equal(file[f"column/{name}"], log[name])
+            assert file[f"column/{name}"].dtype == log[name].dtype
     assert [file.name for file in tmp_path.iterdir()] == ["run.npz"]
-
-
-def test_a_long_log_is_read_back_across_blocks(tmp_path):
-    log = filled(20_000)
-    log.save(tmp_path / "run.npz")
-    np.testing.assert_array_equal(StepLog.load(tmp_path / "run.npz")["joint"], log["joint"])
 
 
 def test_a_block_holds_at_least_a_row():
