@@ -163,7 +163,7 @@ def test_a_batch_is_a_loop(kind: int):
 
     whole = run(q, camera, effort, goals)
     assert (whole - q).norm(dim=-1).min() > 0.05
-    for i in range(4):
+    for i in (0, 3):
         one_camera = _pytree.tree_map(lambda t, i=i: t[i] if t.dim() > 1 else t, camera)
         one_goals = goals.aimed_at(target[i])
         vision = replace(one_goals.vision, half_size=goals.vision.half_size[i])

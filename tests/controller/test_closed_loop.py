@@ -97,9 +97,9 @@ def test_adaptation_finds_a_camera_turned_upside_down():
     assert success[KalmanEstimator] >= 0.9
 
 
-@pytest.mark.parametrize("dt", [0.008, 0.003])
-def test_a_person_moves_the_elbow_and_not_the_tool(dt: float):
+def test_a_person_moves_the_elbow_and_not_the_tool():
     """Pull of joint 4 the way it can go and back, while the arm servoes on its target."""
+    dt = 0.008
     rng = sampling.generator(9)
     camera = overhead_camera(12)
     q = POSTURE + 0.1 * torch.randn(12, 7, generator=rng, dtype=DOUBLE)
@@ -321,7 +321,7 @@ def test_the_null_space_goes_back_to_rest_and_the_tool_stays(rests):
     state, unseen = controller.initial_state(q), torch.tensor(False)
     away, fastest = [(q - rest).norm()], torch.zeros((), dtype=DOUBLE)
     assert away[0] > 0.5
-    for _ in range(500):
+    for _ in range(500 if rests else 100):
         command, state = controller.step(state, observe(q, dt=0.01, feature_visible=unseen))
         fastest = torch.maximum(fastest, command.joint_velocity.norm())
         q = q + 0.01 * command.joint_velocity

@@ -30,7 +30,7 @@ def test_adaptation_succeeds_where_the_fixed_jacobian_cannot():
 def test_a_filter_that_knows_the_noise_of_poses_keeps_the_better_image_jacobian():
     """At rest encoders that jitter seem to move the tool, and the image does not follow."""
     noisy = replace(QUICK.imperfections, encoder_noise=1e-4)
-    config = replace(QUICK, count=10, duration=12.0, imperfections=noisy)
+    config = replace(QUICK, count=16, duration=8.0, imperfections=noisy)
     ideal = run_trials(KalmanEstimator, replace(config, imperfections=QUICK.imperfections))
     unaware = run_trials(KalmanEstimator, config)
     aware = run_trials(lambda n: KalmanEstimator(n, KalmanConfig(pose_noise=1.5e-4)), config)

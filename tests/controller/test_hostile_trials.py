@@ -10,7 +10,7 @@ from hrc_learn.controller import AdaptiveController, SafetyFilter
 
 @pytest.mark.parametrize("fault", ["none", "nan", "late", "lost"])
 def test_no_limit_is_broken_under_stress(fault: str):
-    config = StressConfig(count=40, seed=3, duration=2.5, fault=fault)
+    config = StressConfig(count=40, seed=3, duration=1.8, fault=fault)
     with shapes_unchecked():  # for speed
         result = run_stress_trials(config)
     assert not result.beyond.any()
