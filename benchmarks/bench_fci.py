@@ -118,9 +118,7 @@ def percentile(histogram: np.ndarray, percent: float) -> float:
 def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, float, int]:
     """Histogram of what cycles cost by the microsecond, the share answered, the reflexes."""
     # The Panda's limits are above an FR3's: this keeps within both.
-    config = FrankaConfig(
-        realtime=False, gripper=False, compiled=compiled, acceleration=0.15, jerk=0.15
-    )
+    config = FrankaConfig(realtime=False, gripper=False, compiled=compiled, dynamics=0.15)
     with FrankaArm(host, panda, config) as arm:
         begin = time.monotonic()
         while (t := time.monotonic() - begin) < seconds:

@@ -52,7 +52,7 @@ def served_world(
     if world is None:
         world = World(SceneConfig(objects=()))
         world.reset(READY)
-    config = config or FrankyConfig(realtime="ignore", dynamics=1.0)
+    config = config or FrankyConfig(realtime=False, dynamics=1.0)
     with serve_world(world, **serving) as server:
         with server.running():
             driver = FrankyArm(server.address, config)

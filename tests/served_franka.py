@@ -41,7 +41,7 @@ class ServedFranka:
 
 @contextmanager
 def served_franka(folder: Path, joints=READY, **settings) -> Iterator[ServedFranka]:
-    """A connected robot, its driver in this process and its watchdog's silence of minutes.
+    """A connected robot whose watchdog tolerates minutes of silence.
 
     Args:
         folder: For LeRobot's calibration.
@@ -50,10 +50,10 @@ def served_franka(folder: Path, joints=READY, **settings) -> Iterator[ServedFran
     """
     world = World(SceneConfig(objects=()))
     world.reset(joints)
-    settings = {"fps": 20.0, "timeout": 600.0, "own_process": False} | settings
+    settings = {"fps": 20.0, "timeout": 600.0} | settings
     with serve_world(world) as server:
         config = FrankaPandaConfig(
-            calibration_dir=folder, ip=server.address, realtime="ignore", **settings
+            calibration_dir=folder, ip=server.address, realtime=False, **settings
         )
         robot = make_robot_from_config(config)
         assert isinstance(robot, FrankaPanda)

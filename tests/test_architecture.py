@@ -102,7 +102,8 @@ LIBRARIES: dict[str, set[str]] = {
     "sim": {"torch", "jaxtyping", "numpy", "mujoco"},
     "skills": {"torch", "jaxtyping", "numpy"},
     "learning": {"torch", "jaxtyping", "numpy", "rerun", "matplotlib"},
-    "hardware": {"torch", "jaxtyping", "numpy"},
+    # Of franky-sim one module makes a robot, imported when one is served.
+    "hardware": {"torch", "jaxtyping", "numpy", "franky_sim"},
     "teleoperation": {"torch", "jaxtyping", "numpy", "scipy", "msgspec"},
     "experiments": {"torch", "jaxtyping", "numpy", "matplotlib"},
     "lerobot": {
@@ -121,7 +122,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "demos": {"av", "scipy", "huggingface_hub"},
     "vision": {"cv2"},
     "viz": {"av", "rich"},
-    "hardware": {"franky", "franky_sim", "pylibfranka", "cv2"},
+    "hardware": {"franky", "pylibfranka", "cv2"},
     "teleoperation": {
         "viser",
         "pygame",

@@ -43,7 +43,7 @@ from hrc_learn.experiments.real_arm import (
     run_on_arm,
 )
 from hrc_learn.experiments.surroundings import workplace_for
-from hrc_learn.hardware import open_camera
+from hrc_learn.hardware import CaptureCamera
 from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
@@ -203,7 +203,7 @@ def _run_on_arm(args: Run, site: ArmSite, workplace: Workplace, task: Task) -> i
         camera = None
         if args.experiment != "placing":
             source = "0" if args.camera == "auto" else args.camera
-            opened = open_camera(source, delay=site.camera_delay)
+            opened = CaptureCamera(source, delay=site.camera_delay)
             camera = stack.enter_context(closing(opened))
         done = run_on_arm(
             site,

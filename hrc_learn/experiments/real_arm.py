@@ -111,14 +111,11 @@ def opened_arm(site: ArmSite) -> Iterator[StoppableArm]:
         raise ValueError("ip is empty: give the address of the control box of the arm.")
     # Never both: each driver registers the same types, and refuses to be loaded with the other.
     if site.driver == "franky":
-        realtime = "enforce" if site.realtime else "ignore"
-        config = FrankyConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=realtime)
+        config = FrankyConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
         with ArmProcess(partial(FrankyArm, site.ip, config), timeout=_SILENCE) as arm:
             yield arm
         return
-    config = FrankaConfig(
-        hold=_SILENCE, acceleration=site.dynamics, jerk=site.dynamics, realtime=site.realtime
-    )
+    config = FrankaConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
     with FrankaArm(site.ip, site.chain, config) as arm:
         yield arm
 

@@ -94,7 +94,7 @@ def through_franky(config: FrankyConfig | None = None, serve: Serve = serve_worl
             force of the simulated gripper.
         serve: Serves the arm over its protocol.
     """
-    config = config or FrankyConfig(realtime="ignore", grip_force=40.0)
+    config = config or FrankyConfig(realtime=False, grip_force=40.0)
     return _through_protocol(partial(FrankyArm, config=config), config.dynamics, serve)
 
 
@@ -107,7 +107,7 @@ def through_franka(chain: SerialChain, serve: Serve = serve_world) -> ArmAccess:
     """
     config = FrankaConfig(realtime=False, lockstep=True)
     driver = partial(FrankaArm, chain=chain, config=config)
-    return _through_protocol(driver, config.acceleration, serve)
+    return _through_protocol(driver, config.dynamics, serve)
 
 
 def _through_protocol(

@@ -1,25 +1,21 @@
 """Real arms, grippers and cameras; a driver is imported when its device is opened."""
 
 from hrc_learn.hardware.arm_process import ArmProcess as ArmProcess
-from hrc_learn.hardware.arm_process import DriverError as DriverError
 from hrc_learn.hardware.arm_process import ending_at_rest as ending_at_rest
 from hrc_learn.hardware.camera_delay import DelayMotion as DelayMotion
 from hrc_learn.hardware.camera_delay import MeasuredDelay as MeasuredDelay
 from hrc_learn.hardware.camera_delay import measure_delay as measure_delay
+from hrc_learn.hardware.driver_process import DriverError as DriverError
 from hrc_learn.hardware.franka_arm import FrankaArm as FrankaArm
-from hrc_learn.hardware.franka_arm import FrankaConfig as FrankaConfig
 from hrc_learn.hardware.franka_arm import LoopTiming as LoopTiming
-from hrc_learn.hardware.franka_memory import CollisionConfig as CollisionConfig
-from hrc_learn.hardware.franka_memory import Load as Load
+from hrc_learn.hardware.franka_settings import CollisionConfig as CollisionConfig
+from hrc_learn.hardware.franka_settings import FrankaConfig as FrankaConfig
+from hrc_learn.hardware.franka_settings import FrankyConfig as FrankyConfig
+from hrc_learn.hardware.franka_settings import Load as Load
+from hrc_learn.hardware.franka_settings import RealtimeError as RealtimeError
 from hrc_learn.hardware.franky_arm import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm
-from hrc_learn.hardware.franky_arm import FrankyConfig as FrankyConfig
-from hrc_learn.hardware.franky_arm import Realtime as Realtime
-from hrc_learn.hardware.franky_arm import RealtimeError as RealtimeError
 from hrc_learn.hardware.gripper import GripperError as GripperError
 from hrc_learn.hardware.gripper import GripperThread as GripperThread
 from hrc_learn.hardware.opencv_cameras import CameraError as CameraError
 from hrc_learn.hardware.opencv_cameras import CaptureCamera as CaptureCamera
-from hrc_learn.hardware.opencv_cameras import VideoEndedError as VideoEndedError
-from hrc_learn.hardware.opencv_cameras import VideoFile as VideoFile
-from hrc_learn.hardware.opencv_cameras import open_camera as open_camera

@@ -8,12 +8,12 @@ the timeout that the other is gone.
 
 from __future__ import annotations
 
-import multiprocessing
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing.connection import Connection
 from types import FrameType, TracebackType
 from typing import Any, Protocol, final, runtime_checkable
@@ -21,6 +21,7 @@ from typing import Any, Protocol, final, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.hardware.driver_process import DriverProcess, answer_calls, opened
 from hrc_learn.protocols import Arm, ArmState, Gripper
 from hrc_learn.watchdog import (
     Report,
@@ -34,8 +35,6 @@ _PATIENCE = 60.0
 """Longest time for which the process keeps trying to stop an arm whose loop has died [s]; a
 control box restarts in less.
 """
-_STARTUP = 60.0
-"""Longest that connecting may take [s]."""
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)
 )
@@ -112,10 +111,6 @@ class StoppableArm(Arm, Gripper, Protocol):
         ...
 
 
-class DriverError(RuntimeError):
-    """The driver of an arm raised an exception; the message has it."""
-
-
 @final
 class ArmProcess:
     """An `Arm` and a `Gripper` behind a driver that runs in another process.
@@ -133,9 +128,8 @@ class ArmProcess:
     After a trip commands are not carried out until the loop has seen that `trips` has changed
     and starts from rest: the first command after one only brings the news.
 
-    Attributes:
-        trips: How often the process had stopped the arm, as of its last answer.
-        failures: How many of its stops had failed.
+    Every method raises `DriverError` with the driver's own exception, and `WatchdogError` if
+    the process does not answer within the timeout.
     """
 
     def __init__(self, open_arm: Callable[[], StoppableArm], *, timeout: float):
@@ -152,70 +146,44 @@ class ArmProcess:
         """
         if not timeout > 0:
             raise ValueError(f"timeout must be positive, but is {timeout}")
-        self.trips, self.failures = 0, 0
-        self._timeout, self._gone = timeout, ""
-        # A forked process would have the loop's threads' locks, but not the threads.
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(
-            target=_serve, args=(theirs, open_arm, timeout), name="arm", daemon=True
-        )
-        self._process.start()
-        theirs.close()  # or its end would never be noticed here
-        try:
-            self._answer(_STARTUP)
-        except BaseException:
-            self._end()
-            raise
+        self._timeout = timeout
+        self._driver = DriverProcess(_serve, open_arm, timeout, name="arm")
+        self._call = partial(self._driver.call, timeout=timeout)
 
     @property
     def pid(self) -> int | None:
         """Number of the process."""
-        return self._process.pid
+        return self._driver.process.pid
+
+    @property
+    def trips(self) -> int:
+        """Number of times that the process had stopped the arm, as of its last answer."""
+        return self._driver.news[0]
+
+    @property
+    def failures(self) -> int:
+        """Number of its stops that had failed, as of its last answer."""
+        return self._driver.news[1]
 
     def read(self) -> ArmState:
-        """Return the newest state.
-
-        Raises:
-            DriverError: The driver does.
-            WatchdogError: The process does not answer.
-        """
-        return self._ask("read")
+        """Return the newest state."""
+        return self._call("read")
 
     def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
-        """Set the joint velocities [rad/s], and report that the loop is alive.
-
-        Raises:
-            DriverError: The driver does; such a command is no sign of life.
-            WatchdogError: The process does not answer.
-        """
-        self._ask("command", np.asarray(joint_velocity, dtype=float), self.trips)
+        """Set the joint velocities [rad/s]. One that the driver accepts is a sign of life."""
+        self._call("command", np.asarray(joint_velocity, dtype=float), self.trips)
 
     def move(self, width: float) -> None:
-        """Set the opening of the gripper [m].
-
-        Raises:
-            DriverError: The driver does.
-            WatchdogError: The process does not answer.
-        """
-        self._ask("move", float(width))
+        """Set the opening of the gripper [m]."""
+        self._call("move", float(width))
 
     def feed(self) -> None:
-        """Report that the loop is alive, with no command.
-
-        Raises:
-            WatchdogError: The process does not answer.
-        """
-        self._ask("feed")
+        """Report that the loop is alive, with no command."""
+        self._call("feed")
 
     def stop(self) -> None:
-        """Bring the arm to rest.
-
-        Raises:
-            DriverError: The driver does.
-            WatchdogError: The process does not answer.
-        """
-        self._ask("stop")
+        """Bring the arm to rest."""
+        self._call("stop")
 
     def close(self) -> None:
         """Bring the arm to rest and end the process.
@@ -224,10 +192,10 @@ class ArmProcess:
             WatchdogError: The arm could not be stopped, or the process was gone.
         """
         try:
-            if not self._ask("close", wait=_PATIENCE + self._timeout):
+            if not self._driver.call("close", timeout=_PATIENCE + self._timeout):
                 raise WatchdogError(f"the arm could not be stopped for {_PATIENCE:g} s.")
         finally:
-            self._end()
+            self._driver.end(self._timeout + 1.0)
 
     def __enter__(self) -> ArmProcess:
         return self
@@ -246,104 +214,35 @@ class ArmProcess:
         except WatchdogError as another:
             error.add_note(str(another))
 
-    def _ask(self, *request: object, wait: float | None = None) -> Any:
-        if self._gone:
-            raise WatchdogError(self._gone)
-        try:
-            self._connection.send(request)
-        except OSError as error:
-            raise self._lost("has ended") from error
-        return self._answer(self._timeout if wait is None else wait)
-
-    def _answer(self, wait: float) -> Any:
-        try:
-            if not self._connection.poll(wait):
-                raise self._lost(f"has not answered for {wait:g} s")
-            value, error, self.trips, self.failures = self._connection.recv()
-        except (EOFError, OSError) as error:
-            raise self._lost("has ended") from error
-        if error:
-            raise DriverError(error)
-        return value
-
-    def _lost(self, what: str) -> WatchdogError:
-        # Later answers would be those of earlier questions.
-        self._gone = (
-            f"the process that watches the arm {what}: make sure that the arm is at rest, and "
-            "connect again."
-        )
-        return WatchdogError(self._gone)
-
-    def _end(self) -> None:
-        self._connection.close()
-        self._process.join(self._timeout + 1.0)
-        if self._gone and self._process.is_alive():
-            # It hangs or is stopped. Without its connection the control box ends the motion.
-            self._process.kill()
-            self._process.join()
-
 
 def _serve(
     connection: Connection, open_arm: Callable[[], StoppableArm], timeout: float
 ) -> None:
     """Answer requests in the driver's process until the loop's process closes or dies."""
-    # Ctrl-C reaches all processes of a terminal: the loop decides what follows from it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        arm = open_arm()
-    except Exception as error:
-        connection.send((None, _describe(error), 0, 0))
+    arm = opened(connection, open_arm)
+    if arm is None:
         return
     dog = Watchdog(timeout, arm.stop)
+
+    def carry_out(name: str, *arguments: Any) -> object:
+        match name:
+            case "close":
+                return bring_to_rest(arm.stop, _PATIENCE)
+            case "command":
+                velocity, trips = arguments
+                # A loop that does not know of a stop would make the arm jump to its velocity.
+                if trips == dog.trips:
+                    arm.command(velocity)
+                dog.feed()
+            case "feed":
+                dog.feed()
+            case _:
+                return getattr(arm, name)(*arguments)
+        return None
+
     with ending_at_rest(arm.stop, patience=_PATIENCE):
         dog.start()
-        connection.send((None, "", 0, 0))
         try:
-            _answer_requests(connection, arm, dog)
+            answer_calls(connection, carry_out, lambda: (dog.trips, dog.failures))
         finally:
             dog.close()
-
-
-def _answer_requests(connection: Connection, arm: StoppableArm, dog: Watchdog) -> None:
-    while True:
-        try:
-            name, *arguments = connection.recv()
-        except (EOFError, OSError):
-            return  # the loop's process has died
-        value, error = None, ""
-        try:
-            value = _carry_out(name, arguments, arm, dog)
-        except Exception as raised:
-            error = _describe(raised)
-        try:
-            connection.send((value, error, dog.trips, dog.failures))
-        except OSError:
-            return
-        if name == "close":
-            return
-
-
-def _carry_out(name: str, arguments: list[Any], arm: StoppableArm, dog: Watchdog) -> Any:
-    if name == "read":
-        return arm.read()
-    if name == "command":
-        velocity, trips = arguments
-        # A loop that does not know of a stop would make the arm jump to its velocity.
-        if trips == dog.trips:
-            arm.command(velocity)
-        dog.feed()
-    elif name == "feed":
-        dog.feed()
-    elif name == "move":
-        arm.move(*arguments)
-    elif name == "stop":
-        arm.stop()
-    elif name == "close":
-        return bring_to_rest(arm.stop, _PATIENCE)
-    else:
-        raise ValueError(f"no request {name!r}")
-    return None
-
-
-def _describe(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"

@@ -17,7 +17,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from types import TracebackType
 from typing import final
@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.controller import SafetyConfig, VelocityStep, WantedVelocity
+from hrc_learn.controller import VelocityStep, WantedVelocity
 from hrc_learn.deploy import (
     EagerRunner,
     NoCompilerError,
@@ -34,18 +34,11 @@ from hrc_learn.deploy import (
     StepRunner,
     export_step,
 )
-from hrc_learn.hardware.arm_process import DriverError
-from hrc_learn.hardware.franka_loop import CYCLE, Robot, import_pylibfranka, serve
-from hrc_learn.hardware.franka_memory import (
-    JOINTS,
-    CollisionConfig,
-    Load,
-    Orders,
-    Phase,
-    Report,
-    Shared,
-)
-from hrc_learn.hardware.gripper import GripperProcess
+from hrc_learn.hardware.driver_process import DriverError
+from hrc_learn.hardware.franka_loop import import_pylibfranka, serve
+from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
+from hrc_learn.hardware.franka_settings import CYCLE, FrankaConfig
+from hrc_learn.hardware.gripper import GripperProcess, GripperThread
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
@@ -68,56 +61,6 @@ _STILL = 0.02
 """Below this it is rest [rad/s]: an encoder's noise of 0.1 mrad is a quarter of it."""
 _PAUSE = 5e-4
 """Between two looks at whether something has happened [s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrankaConfig:
-    """Settings of an arm's 1 kHz loop."""
-
-    hold: float = 0.15
-    """Time for which a velocity holds [s]; then the arm is brought to rest."""
-    acceleration: float = 0.3
-    """Fraction of the arm's acceleration limits that is used, above 0 to 1."""
-    jerk: float = 0.3
-    """Fraction of its jerk limits, above 0 to 1.
-
-    Where an answer comes late, the loop cannot know for which cycle the control box takes it;
-    if for another one, its change of acceleration is off by as much as the acceleration itself.
-    With these fractions that stays allowed on an FR3: 3 rad/s^2 in 1 ms and 1500 rad/s^3 are
-    4500 of its 5000 rad/s^3."""
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-    """Settings of the safety filter, which uses these limits."""
-    realtime: bool = True
-    """True requires a realtime kernel and priority. Without that kernel some cycles are late;
-    the control box tolerates up to 20 in a row. False still takes the priority if the user may
-    have it.
-    """
-    lockstep: bool = False
-    """True for a simulator that stands still until it is answered and while no command comes:
-    no answer is late then, and each state gets one.
-    """
-    compiled: bool = True
-    """True compiles the step, once per machine, in a minute or two. An uncompiled step takes a
-    whole cycle on a busy machine: use it for simulators only.
-    """
-    collision: CollisionConfig = field(default_factory=CollisionConfig)
-    """Thresholds at which the control box stops the arm."""
-    load: Load | None = None
-    """Load besides the end effector."""
-    gripper: bool = True
-    """True if a gripper is mounted."""
-    grip_force: float = 40.0
-    """Grasping force [N]."""
-    grip_speed: float = 0.1
-    """Finger speed [m/s]; the highest of the Franka Hand."""
-
-    def __post_init__(self) -> None:
-        for name in ("acceleration", "jerk"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} must be in (0, 1], but is {getattr(self, name)}")
-        for name in ("hold", "grip_force", "grip_speed"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,7 +91,7 @@ class FrankaArm:
     The loop has a process of its own, and so has the gripper: nothing that Python does here
     holds them up, and no call waits for either, except `stop`, `recover` and `close`. So it
     goes into no `ArmProcess`, which it takes the place of: a velocity holds for
-    `FrankaConfig.hold`; then, or when this process has died, the loop brings the arm to rest
+    `FrankaConfig.timeout`; then, or when this process has died, the loop brings the arm to rest
     and ends the motion. If the loop dies or stalls, the control box stops the arm after 20 ms.
 
     Whatever is commanded, position, velocity, acceleration, jerk and tool speed keep the limits
@@ -156,6 +99,9 @@ class FrankaArm:
 
     A fault leaves the arm stopped by its control box: `command` raises what happened, `read`
     goes on as long as there is a connection, and `recover` makes the arm move again.
+
+    Attributes:
+        gripper: The gripper on its threads; None without one.
     """
 
     def __init__(self, ip: str, chain: SerialChain, config: FrankaConfig | None = None):
@@ -179,25 +125,23 @@ class FrankaArm:
         self._shared, self._orders = Shared(), Orders()
         # Of the threads here that command: the loop is never held up by it.
         self._writing = threading.Lock()
-        robot = Robot(ip, config.realtime, config.collision, config.load, config.lockstep)
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
             target=serve,
-            args=(self._shared, robot, step_of(chain, config), config.hold, os.getpid()),
+            args=(self._shared, ip, config, step_of(chain, config), os.getpid()),
             name="franka",
             daemon=True,
         )
-        self._gripper: GripperProcess | None = None
+        self.gripper: GripperThread | None = None
         self._process.start()
         try:
             self._await(lambda report: report.phase == Phase.IDLE, _STARTUP, "connect")
             if config.gripper:
                 hand = partial(FrankaHand, ip, speed=config.grip_speed, force=config.grip_force)
-                self._gripper = GripperProcess(hand)
-        except BaseException as error:
+                # pylibfranka holds the interpreter while the fingers move.
+                self.gripper = GripperThread(partial(GripperProcess, hand), startup=_STARTUP)
+        except BaseException:
             self._end()
-            if isinstance(error, RuntimeError) and not isinstance(error, DriverError):
-                raise DriverError(str(error)) from error
             raise
 
     @property
@@ -241,7 +185,7 @@ class FrankaArm:
             time=report.time,
             joint_position=report.joint_position,
             joint_velocity=report.joint_velocity,
-            gripper_width=self._gripper.width if self._gripper else math.nan,
+            gripper_width=self.gripper.width if self.gripper else math.nan,
             external_torque=report.external_torque,
         )
 
@@ -286,17 +230,14 @@ class FrankaArm:
     def move(self, width: float) -> None:
         """Open the gripper to a width, or squeeze what is between its fingers [m].
 
-        Returns at once; see `GripperProcess`.
+        Returns at once; failures appear on stderr and are raised by `gripper.check`.
 
         Raises:
-            DriverError: There is no gripper, or the call before has failed.
+            DriverError: There is no gripper.
         """
-        if self._gripper is None:
+        if self.gripper is None:
             raise DriverError("this arm was opened without a gripper.")
-        try:
-            self._gripper.move(width)
-        except RuntimeError as error:
-            raise DriverError(str(error)) from error
+        self.gripper.move(width)
 
     def recover(self) -> None:
         """Make the arm move again after a fault, connecting again if need be; does nothing
@@ -378,8 +319,8 @@ class FrankaArm:
             # It hangs or is stopped. Without its connection the control box ends the motion.
             self._process.kill()
         self._process.join()
-        if self._gripper is not None:
-            self._gripper.close()
+        if self.gripper is not None:
+            self.gripper.close()
 
 
 @final
@@ -411,13 +352,16 @@ class FrankaHand:
         self._gripper.grasp(0.0, self._speed, self._force, 0.1, 0.1)
         return True
 
+    def close(self) -> None:
+        """The connection ends with the process."""
+
 
 def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner]:
     """Open the runner of the loop's step, in any process."""
     limits = replace(
         chain.limits,
-        acceleration=config.acceleration * chain.limits.acceleration,
-        jerk=config.jerk * chain.limits.jerk,
+        acceleration=config.dynamics * chain.limits.acceleration,
+        jerk=config.dynamics * chain.limits.jerk,
     )
     step = VelocityStep(chain.with_limits(limits), config.safety)
     example = WantedVelocity(

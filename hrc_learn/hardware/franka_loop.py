@@ -21,7 +21,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import FrameType
 from typing import Any, final
 
@@ -33,16 +32,12 @@ from hrc_learn.deploy import StepRunner
 from hrc_learn.hardware.franka_memory import (
     COST_BINS,
     JOINTS,
-    CollisionConfig,
-    Load,
     Orders,
     Phase,
     Report,
     Shared,
 )
-
-CYCLE = 1e-3
-"""Period of Franka's control interface [s]."""
+from hrc_learn.hardware.franka_settings import CYCLE, FrankaConfig, RealtimeError
 
 _AGREES = 1e-5
 """Largest rounding difference between the box's commanded velocity and the one sent [rad/s].
@@ -61,51 +56,29 @@ _PARENT_EVERY = 50
 """Cycles between two looks at whether the process that commands still lives."""
 
 
-@dataclass(frozen=True)
-class Robot:
-    """Address of an arm and settings of its control box."""
+def connect(ip: str, config: FrankaConfig) -> Any:
+    """Connect to an arm, clear earlier errors, and send the settings.
 
-    ip: str
-    """Address of the control box."""
-    realtime: bool
-    """True refuses a kernel or a priority without realtime."""
-    collision: CollisionConfig
-    load: Load | None
-    lockstep: bool = False
-    """True for a simulator that waits for each answer, so that none is late."""
+    Raises:
+        ImportError: The driver is not installed.
+        RealtimeError: Real-time scheduling is required and missing.
+        RuntimeError: The arm cannot be reached.
+    """
+    driver = import_pylibfranka()
+    modes = driver.RealtimeConfig
+    _take_priority(config.realtime)
+    try:
+        robot = driver.Robot(ip, modes.kEnforce if config.realtime else modes.kIgnore)
+    except driver.RealtimeException as error:
+        raise RealtimeError(str(error).rstrip(".")) from error
+    recover(robot, config)
+    return robot
 
-    def connect(self) -> Any:
-        """Connect, clear earlier errors, and send the settings.
 
-        Raises:
-            ImportError: The driver is not installed.
-            RuntimeError: The arm cannot be reached, or realtime is missing; the message says
-                which.
-        """
-        driver = import_pylibfranka()
-        config = driver.RealtimeConfig
-        _take_priority(self.realtime)
-        try:
-            robot = driver.Robot(self.ip, config.kEnforce if self.realtime else config.kIgnore)
-        except driver.RealtimeException as error:
-            raise RuntimeError(
-                f"{error} The kernel of this machine is not a realtime one (PREEMPT_RT), with "
-                "which a loop of 1 kHz is late now and then: install one, or accept that with "
-                "realtime=False."
-            ) from error
-        self.recover(robot)
-        return robot
-
-    def recover(self, robot: Any) -> None:
-        """Clear what has stopped the arm, and tell the box again what it may have forgotten."""
-        robot.automatic_error_recovery()
-        torque, force = list(self.collision.torque), list(self.collision.force)
-        robot.set_collision_behavior(torque, torque, force, force)
-        if self.load is not None:
-            # By columns, which for a symmetric matrix is by rows.
-            robot.set_load(
-                self.load.mass, list(self.load.centre), np.ravel(self.load.inertia).tolist()
-            )
+def recover(robot: Any, config: FrankaConfig) -> None:
+    """Clear what has stopped the arm, and send the control box its settings again."""
+    robot.automatic_error_recovery()
+    config.send_to(robot)
 
 
 def import_pylibfranka() -> Any:
@@ -131,18 +104,14 @@ def _take_priority(needed: bool) -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(highest))
     except PermissionError as error:
         if needed:
-            raise RuntimeError(
-                "this user may not have realtime priority: add the line '@realtime - rtprio "
-                "99' to /etc/security/limits.conf, the user to the group realtime, and log in "
-                "again; or accept late cycles with realtime=False."
-            ) from error
+            raise RealtimeError("this user may not have realtime priority") from error
 
 
 def serve(
     shared: Shared,
-    robot: Robot,
+    ip: str,
+    config: FrankaConfig,
     open_runner: Callable[[], StepRunner],
-    hold: float,
     parent: int,
 ) -> None:
     """Run the loop in its process until it is ended or its parent has died."""
@@ -150,7 +119,7 @@ def serve(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
     try:
-        loop = ControlLoop(shared, robot, open_runner(), hold, parent)
+        loop = ControlLoop(shared, ip, config, open_runner(), parent)
     except Exception as error:
         shared.message = f"{type(error).__name__}: {error}"
         shared.report.write(Report(phase=Phase.ENDED, faults=1).line())
@@ -230,20 +199,20 @@ class ControlLoop:
     """
 
     def __init__(
-        self, shared: Shared, robot: Robot, runner: StepRunner, hold: float, parent: int
+        self, shared: Shared, ip: str, config: FrankaConfig, runner: StepRunner, parent: int
     ):
         """Connect to the arm.
 
         Args:
             shared: Memory in common with the commanding process.
-            robot: Arm to connect to.
+            ip: Address of the control box.
+            config: Settings of the loop.
             runner: Exported step with the period `CYCLE`.
-            hold: Time for which a velocity holds [s].
             parent: Number of the commanding process; the loop ends when it has gone.
         """
         self.ending = False
         self._driver = import_pylibfranka()
-        self._robot, self._runner, self._hold, self._parent = robot, runner, hold, parent
+        self._ip, self._config, self._runner, self._parent = ip, config, runner, parent
         self._shared, self._report = shared, Report()
         self._orders, self._costs = Orders(), shared.costs
         self._sent = self._reported = np.full(JOINTS, np.nan)
@@ -252,7 +221,7 @@ class ControlLoop:
         self._position = runner.observation["joint_position"]
         self._stop = runner.observation["stop"]
         self._warm_up()
-        self._link = robot.connect()
+        self._link = connect(ip, config)
 
     def run(self) -> None:
         """Loop until ended."""
@@ -265,9 +234,7 @@ class ControlLoop:
                     self._move()
                 else:
                     self._watch()
-            except (
-                Exception
-            ) as error:  # whatever the driver raises: the box has stopped the arm
+            except Exception as error:  # of the driver: the box has stopped the arm
                 self._fail(error)
         self._publish(Phase.ENDED)
 
@@ -294,7 +261,7 @@ class ControlLoop:
         fault.
         """
         stamp = self._orders.stamp
-        silent = time.monotonic() - stamp >= self._hold
+        silent = time.monotonic() - stamp >= self._config.timeout
         return silent or self._orders.stop or stamp <= self._recovered
 
     def _watch(self) -> None:
@@ -314,7 +281,7 @@ class ControlLoop:
         self._sent = self._reported = np.full(JOINTS, np.nan)  # nothing yet
         report = self._report
         number, finished = 0, False
-        punctuality = Punctuality(lockstep=self._robot.lockstep)
+        punctuality = Punctuality(lockstep=self._config.lockstep)
         while not finished:
             state, period = control.readOnce()
             begin = time.perf_counter()
@@ -388,9 +355,9 @@ class ControlLoop:
         self._publish(Phase.RECOVERING)
         asked = self._orders.recoveries
         try:
-            self._robot.recover(self._link)
+            recover(self._link, self._config)
         except self._driver.NetworkException:
-            self._link = self._robot.connect()
+            self._link = connect(self._ip, self._config)
         finally:
             self._report.recoveries = asked
         self._note(self._link.read_once())

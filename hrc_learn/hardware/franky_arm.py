@@ -10,20 +10,16 @@ import atexit
 import importlib
 import os
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.franka_memory import CollisionConfig, Load
+from hrc_learn.hardware.franka_settings import FrankyConfig, RealtimeError
 from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
-
-Realtime = Literal["enforce", "ignore"]
-"""Policy for a kernel without real-time scheduling: refuse it or accept it."""
 
 _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 """Holds 1 under a kernel with PREEMPT_RT."""
@@ -34,43 +30,6 @@ along a limit rounds."""
 _COMING_TO_REST = 2.0
 """Longest wait for the arm to rest [s]: from the fastest velocity with 0.15 of the driver's
 acceleration."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrankyConfig:
-    """Settings of the driver."""
-
-    dynamics: float = 0.3
-    """Fraction of the driver's own limits of acceleration and jerk, above 0 to 1. Velocities
-    reach the driver's limits whatever it is."""
-    timeout: float = 0.15
-    """Time for which a velocity holds [s]; then the driver brings the arm to rest."""
-    realtime: Realtime = "enforce"
-    """"enforce" refuses a kernel without real-time scheduling; use "ignore" for simulators."""
-    grip_force: float = 20.0
-    """Grasping force [N]."""
-    grip_speed: float = 0.1
-    """Finger speed [m/s]."""
-    collision: CollisionConfig = field(default_factory=CollisionConfig)
-    """Thresholds at which the arm stops by a reflex."""
-    load: Load | None = None
-    """Load on the flange; None leaves the arm's earlier setting."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.dynamics <= 1:
-            raise ValueError(f"dynamics must be in (0, 1], but is {self.dynamics}.")
-        for name in ("timeout", "grip_force", "grip_speed"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
-        if self.realtime not in get_args(Realtime):
-            raise ValueError(
-                f"realtime must be one of {', '.join(get_args(Realtime))}, but is "
-                f"{self.realtime!r}."
-            )
-
-
-class RealtimeError(RuntimeError):
-    """The machine has no real-time scheduling, and it is asked for."""
 
 
 class ArmFaultError(RuntimeError):
@@ -107,7 +66,7 @@ class FrankyArm:
             GripperError: Its gripper cannot be reached.
         """
         self._ip, self.config = ip, config or FrankyConfig()
-        if self.config.realtime == "enforce":
+        if self.config.realtime:
             require_realtime()
         self._franky = _import_franky()
         self._hold = self._franky.Duration(round(1e3 * self.config.timeout))
@@ -229,10 +188,8 @@ class FrankyArm:
 
     def _connect(self) -> None:
         franky, config = self._franky, self.config
-        mode = {
-            "enforce": franky.RealtimeConfig.Enforce,
-            "ignore": franky.RealtimeConfig.Ignore,
-        }[config.realtime]
+        modes = franky.RealtimeConfig
+        mode = modes.Enforce if config.realtime else modes.Ignore
         before = _scheduling()
         try:
             # Makes the thread that connects a realtime one, and all that it starts later: only
@@ -240,7 +197,7 @@ class FrankyArm:
             self._robot = franky.Robot(self._ip, realtime_config=mode)
             self._scheduling = _scheduling()
         except franky.RealtimeException as error:
-            raise _no_realtime(str(error)) from error
+            raise RealtimeError(str(error)) from error
         except (franky.NetworkException, franky.IncompatibleVersionException) as error:
             raise ConnectionError(
                 f"cannot connect to an arm at {self._ip} ({error}): check the cable and the "
@@ -251,17 +208,11 @@ class FrankyArm:
             os.sched_setscheduler(0, *before)
         self._newest: Any = None
         self._recover()
-        robot, collision, load = self._robot, config.collision, config.load
-        robot.relative_dynamics_factor = franky.RelativeDynamicsFactor(
+        self._robot.relative_dynamics_factor = franky.RelativeDynamicsFactor(
             1.0, config.dynamics, config.dynamics
         )
-        robot.set_collision_behavior(
-            collision.torque, collision.torque, collision.force, collision.force
-        )
-        if load is not None:
-            # By columns, which for a symmetric matrix is by rows.
-            robot.set_load(load.mass, load.centre, np.ravel(load.inertia).tolist())
-        self._fastest = np.array(robot.joint_velocity_limit.get(), dtype=float)
+        config.send_to(self._robot)
+        self._fastest = np.array(self._robot.joint_velocity_limit.get(), dtype=float)
 
     def _recover(self) -> None:
         with suppress(Exception):  # what ended the last motion is what is recovered from
@@ -341,7 +292,7 @@ class FrankyArm:
         if self._lost:
             cure = "the control box brings it to rest. Check the cable, then call recover()"
         elif isinstance(error, self._franky.RealtimeException):
-            cure = str(_no_realtime("no permission to schedule in real time"))
+            cure = str(RealtimeError("no permission to schedule in real time"))
         else:
             cure = "it is at rest. Make room around it, then call recover()"
         self._fault = (
@@ -379,6 +330,9 @@ class _FrankyGripper:
         # Whatever its width, a thing between the fingers is a grasp.
         return self._gripper.grasp_async(0.0, speed, force, epsilon_outer=1.0).get()
 
+    def close(self) -> None:
+        """The connection ends with the last reference: a call under way needs it."""
+
 
 def require_realtime() -> None:
     """Check that this machine's kernel schedules in real time.
@@ -391,20 +345,12 @@ def require_realtime() -> None:
     except OSError:
         has = False
     if not has:
-        raise _no_realtime("this kernel does not schedule in real time")
+        raise RealtimeError("this kernel does not schedule in real time")
 
 
 def _scheduling() -> tuple[int, os.sched_param]:
     """Policy and priority of this thread."""
     return os.sched_getscheduler(0), os.sched_getparam(0)
-
-
-def _no_realtime(why: str) -> RealtimeError:
-    return RealtimeError(
-        f"{why}: boot a kernel with PREEMPT_RT and allow the user rtprio 99 in "
-        "/etc/security/limits.d. Where late commands do no harm, as with a simulator, give "
-        "realtime='ignore'; a real arm then stops whenever the machine is late."
-    )
 
 
 def _names(errors: Any) -> list[str]:

@@ -1,21 +1,20 @@
-"""Grippers on threads or in a process, so that no loop waits for their fingers."""
+"""Grippers on threads, so that no loop waits for their fingers."""
 
 from __future__ import annotations
 
 import atexit
-import multiprocessing
-import os
-import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
-from multiprocessing.sharedctypes import RawArray
+from multiprocessing.connection import Connection
 from typing import Protocol, final, runtime_checkable
 
-import numpy as np
-
-from hrc_learn.hardware.franka_memory import TEXT, Mailbox
+from hrc_learn.hardware.driver_process import (
+    DriverError,
+    DriverProcess,
+    answer_calls,
+    opened,
+)
 
 _NARROW = 0.005
 """Openings below this are a request to squeeze, and smaller changes are no new request [m]: a
@@ -28,11 +27,9 @@ _BEFORE_NEXT_TRY = 1.0
 """After the connection failed [s]: a control box takes some seconds to start again."""
 _ENDING = 2.0
 """Longest wait for each thread to end [s]: twice what libfranka waits for a reading."""
-_STARTUP = 60.0
-"""Longest time for connecting in a new process [s]."""
 
 
-class GripperError(RuntimeError):
+class GripperError(DriverError):
     """A gripper failed to move, or cannot be reached."""
 
 
@@ -55,10 +52,9 @@ class GripperDriver(Protocol):
         """Close on what is between the fingers and wait; False: they do not press on it."""
         ...
 
-
-def report_failure(failure: GripperError) -> None:
-    """Print a failure of the gripper on stderr."""
-    print(f"gripper: {failure}", file=sys.stderr)
+    def close(self) -> None:
+        """End the connection; a call under way may fail."""
+        ...
 
 
 @final
@@ -71,29 +67,22 @@ class GripperThread:
             gripper.check()  # raises what has failed since `move`
 
     One thread reads the width; another carries out moves, always the newest request after the
-    current one. A dropped connection is opened again. Failures are passed to `report` and kept
+    current one. A dropped connection is opened again. Failures are printed on stderr and kept
     until the next move, so that a task can check for them at a suitable moment while the
     control loop continues.
     """
 
-    def __init__(
-        self,
-        open_driver: Callable[[], GripperDriver],
-        *,
-        startup: float = 5.0,
-        report: Callable[[GripperError], object] = report_failure,
-    ):
+    def __init__(self, open_driver: Callable[[], GripperDriver], *, startup: float = 5.0):
         """Connect and wait for the first reading.
 
         Args:
             open_driver: Connects to the gripper.
             startup: Longest time for connecting [s].
-            report: Called with each failure, by the thread that met it.
 
         Raises:
             GripperError: The gripper cannot be reached.
         """
-        self._open, self._report = open_driver, report
+        self._open = open_driver
         self._width: float | None = None
         self._failure: GripperError | None = None
         self._driver: GripperDriver | None = None
@@ -138,8 +127,7 @@ class GripperThread:
         Raises:
             GripperError: A move failed, or the gripper cannot be reached.
         """
-        with self._news:
-            failure = self._failure
+        failure = self._failure
         if failure is not None:
             raise failure
 
@@ -164,14 +152,14 @@ class GripperThread:
             self._news.notify_all()
 
     def close(self) -> None:
-        """End the threads, once the driver returns to them; the fingers stay."""
+        """End the connection and the threads; the fingers stay."""
         atexit.unregister(self.close)
         with self._news:
             self._closed = True
             self._news.notify_all()
+        self._disconnect()
         for thread in self._threads:
             thread.join(_ENDING)
-        self._driver = None  # which ends its connection
 
     def __enter__(self) -> GripperThread:
         return self
@@ -188,7 +176,7 @@ class GripperThread:
                     self._width = float(width)
                     self._news.notify_all()
             except Exception as error:  # a driver's, of whatever kind
-                self._driver = None
+                self._disconnect()
                 self._fail("cannot be reached, and is tried again", error)
                 pause = _BEFORE_NEXT_TRY
             with self._news:
@@ -199,7 +187,15 @@ class GripperThread:
         with self._news:
             self._driver = driver
             self._news.notify_all()
+        if self._closed:  # while it was opened
+            self._disconnect()
         return driver
+
+    def _disconnect(self) -> None:
+        with self._news:
+            driver, self._driver = self._driver, None
+        if driver is not None:
+            driver.close()
 
     def _carry_out(self) -> None:
         while True:
@@ -230,126 +226,44 @@ class GripperThread:
             self._failure = failure
             self._news.notify_all()
         if not known and not self._closed:
-            self._report(failure)
+            print(f"gripper: {failure}", file=sys.stderr)
 
 
 @final
 class GripperProcess:
-    """A gripper whose calls are made in another process, one at a time.
+    """A gripper driver whose calls are made in another process, one at a time.
 
-    For drivers that hold the interpreter during a call, as pylibfranka does. While a call runs,
-    the newest request waits, and the width last read stands.
+    For drivers that hold the interpreter during a call, as pylibfranka does. The width is read
+    again after the fingers have moved.
     """
 
-    def __init__(self, open_gripper: Callable[[], GripperDriver]):
+    def __init__(self, open_driver: Callable[[], GripperDriver]):
         """Start the process and connect.
 
         Args:
-            open_gripper: Connects, in the process; it is pickled.
+            open_driver: Connects, in the process; it is pickled.
 
         Raises:
-            RuntimeError: The gripper cannot be reached; it says why.
+            DriverError: The gripper cannot be reached.
+            WatchdogError: The process died, or takes too long.
         """
-        self._wish, self._status = Mailbox(2), Mailbox(3)
-        self._wish.write(np.array([0.0, np.nan]))
-        self._status.write(np.array([np.nan, 0.0, 0.0]))
-        self._text = RawArray("c", TEXT)
-        self._wishes, self._seen, self._width = 0, 0.0, np.nan
-        context = multiprocessing.get_context("spawn")
-        self._process = context.Process(
-            target=_serve_gripper,
-            args=(self._wish, self._status, self._text, open_gripper, os.getpid()),
-            name="gripper",
-            daemon=True,
-        )
-        self._process.start()
-        end = time.monotonic() + _STARTUP
-        while np.isnan(self.width):
-            if not self._process.is_alive() or time.monotonic() > end:
-                self.close()
-                text = self._message or f"no answer for {_STARTUP:g} s."
-                raise RuntimeError(f"the gripper cannot be reached: {text}")
-            time.sleep(0.01)
+        self._driver = DriverProcess(_serve, open_driver, name="gripper")
 
-    @property
-    def width(self) -> float:
-        """Opening, as last read; NaN before the first reading [m]."""
-        line = self._status.read()
-        return np.nan if line is None else float(line[0])
+    def read_width(self) -> float:
+        return self._driver.call("read_width")
 
-    @property
-    def busy(self) -> bool:
-        """True while the newest request is not yet done."""
-        line = self._status.read()
-        return line is not None and bool(line[2] < self._wishes)
+    def move(self, width: float) -> bool:
+        return self._driver.call("move", width)
 
-    def move(self, width: float) -> None:
-        """Open to a width, or squeeze what is between the fingers [m]; returns at once.
-
-        Sent once for each new width.
-
-        Raises:
-            ValueError: The width is not a number.
-            RuntimeError: The call before has failed, or the process has ended; the message
-                says why. The next is tried anew.
-        """
-        if not np.isfinite(width):
-            raise ValueError(f"width must be finite, but is {width}.")
-        if not self._process.is_alive():
-            raise RuntimeError(f"the process of the gripper has ended. {self._message}")
-        line = self._status.read()
-        if line is not None and line[1] > self._seen:
-            self._seen, self._width = line[1], np.nan
-            raise RuntimeError(f"the gripper has failed: {self._message}")
-        if abs(width - self._width) < _NARROW:
-            return
-        self._width = width
-        self._wishes += 1
-        self._wish.write(np.array([float(self._wishes), width]))
+    def squeeze(self) -> bool:
+        return self._driver.call("squeeze")
 
     def close(self) -> None:
         """End the process, whatever call it is in."""
-        if self._process.is_alive():
-            self._process.kill()
-        self._process.join()
-
-    @property
-    def _message(self) -> str:
-        return self._text.value.decode("utf-8", "replace")
+        self._driver.kill()
 
 
-def _serve_gripper(
-    wish: Mailbox,
-    status: Mailbox,
-    text: object,
-    open_gripper: Callable[[], GripperDriver],
-    parent: int,
-) -> None:
-    """Serve the gripper in its process until the parent has gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def note(error: Exception) -> None:
-        message = f"{type(error).__name__}: {error}"
-        text.value = message.encode()[: TEXT - 1]  # pyright: ignore[reportAttributeAccessIssue]
-
-    try:
-        gripper = open_gripper()
-    except Exception as error:
-        note(error)
-        return
-    width, failures, done = np.nan, 0, 0.0
-    while os.getppid() == parent:
-        begin = time.monotonic()
-        try:
-            line = wish.read()
-            if line is not None and line[0] > done:
-                done = line[0]
-                squeezes = line[1] < _NARROW
-                if not (gripper.squeeze() if squeezes else gripper.move(float(line[1]))):
-                    raise GripperError(f"it has not reached {line[1]:g} m.")
-            width = gripper.read_width()
-        except Exception as error:
-            note(error)
-            failures += 1
-        status.write(np.array([width, failures, done]))
-        time.sleep(max(0.0, begin + _BETWEEN_READINGS - time.monotonic()))
+def _serve(connection: Connection, open_driver: Callable[[], GripperDriver]) -> None:
+    driver = opened(connection, open_driver)
+    if driver is not None:
+        answer_calls(connection, lambda name, *arguments: getattr(driver, name)(*arguments))

@@ -14,20 +14,15 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.hardware.franka_settings import CYCLE
 from hrc_learn.protocols import ArmState
-from hrc_learn.sim.arm_model import FINGER_STROKE
 from hrc_learn.sim.world import World
 
-if TYPE_CHECKING:
-    from franky_sim.base_simulator import BaseSimulator
-
-CYCLE = 1e-3
-"""Cycle time of the protocol [s]."""
 _LATE = 0.01
 """Longest wait for the driver's answer in a cycle [s]: ten times what it takes on a busy
 machine.
@@ -35,9 +30,6 @@ machine.
 _SIGN_OF_LIFE = 0.05
 """A driver that has heard nothing for 1 s takes its connection for lost (libfranka). While
 whoever advances the time is busy, a cycle goes by after each of these [s]."""
-_CATCH_UP = 20.0
-"""Rate at which joints commanded by position approach it [1/s]: those of franky's motions move
-on by themselves, so this only takes away what rounding leaves."""
 _BRIDGED = 20
 """Cycles without an answer, in a row, after which a control box stops the arm (libfranka,
 network requirements)."""
@@ -59,7 +51,7 @@ class ArmServer:
     """Steps a world in cycles of the arm's protocol.
 
         with serve_world(world) as server:
-            arm = FrankyArm(server.address, FrankyConfig(realtime="ignore"))
+            arm = FrankyArm(server.address, FrankyConfig(realtime=False))
             with server.running():
                 arm.command(velocity)
             server.advance(0.01)
@@ -107,13 +99,24 @@ class ArmServer:
         self.world = world
         self.cycles = self.missed = self.lost = self.longest_gap = self._gap = 0
         self._loss, self._chance, self._on_cycle = loss, random.Random(0), on_cycle
-        simulator, self._robot, server = _protocol(world)
-        self._server = server(self._robot, list(addresses))
+        try:
+            from hrc_learn.hardware.served_robot import (
+                LossyServer,
+                ServedRobot,
+                ServedSimulator,
+            )
+        except ImportError as error:
+            raise ImportError(
+                "the protocol of the arm is spoken by the package franky-sim: pip install "
+                "'hrc-learn[hardware]'."
+            ) from error
+        self._robot = ServedRobot(world)
+        self._server = LossyServer(self._robot, list(addresses))
         self._server.init()
-        self._simulator = simulator
         self.address: str = self._server.hostname
-        simulator.init()
-        simulator.start()
+        self._simulator = ServedSimulator(world, self._robot)
+        self._simulator.init()
+        self._simulator.start()
         self._server.process_commands()  # none yet, but a step needs a command before it
         self._due = world.time
         # Until when the thread may go on; None: as long as calls of the driver take.
@@ -231,7 +234,8 @@ class ArmServer:
             if not robot.answered and self._gap <= _BRIDGED:
                 robot.go_on()
             if self._on_cycle is not None:
-                self._on_cycle(robot.driven(motion))
+                position = robot.reading.joint_position
+                self._on_cycle(DrivenCycle(motion, robot.velocity, position, robot.answered))
 
     def _await_answer(self) -> None:
         server, give_up = self._server, time.monotonic() + _LATE
@@ -330,160 +334,3 @@ def serve_world(
             server.close()
     finally:
         world.model.opt.timestep = step
-
-
-def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
-    """Simulator, robot and class of the server, as franky-sim wants them."""
-    try:
-        from franky_sim.base_simulator import BaseRobot, BaseSimulator, InnerRobotState
-        from franky_sim.franka_robot_server import FrankaRobotServer
-    except ImportError as error:
-        raise ImportError(
-            "the protocol of the arm is spoken by the package franky-sim: pip install "
-            "'hrc-learn[hardware]'."
-        ) from error
-
-    class ServedRobot(BaseRobot):
-        """The world's arm and gripper, commanded by velocity or position in each cycle.
-
-        Its servos are the world's own, so commands of torque come to nothing.
-        """
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.answered = False
-            self._target: np.ndarray | None = None
-            # Velocities of this cycle and of the two before it.
-            self._velocity = self._last = self._before = np.zeros(7)
-            self._width_goal: float | None = None
-            self._finger_speed = 0.0
-            self._look()
-
-        def _look(self) -> None:
-            self._read = world.arm.read()
-
-        def _get_state(self) -> InnerRobotState:
-            read = self._read
-            assert read.external_torque is not None
-            # franky-sim tells of one kind of torque only: what drivers ask for is the external.
-            return InnerRobotState(
-                q=tuple(read.joint_position.tolist()),
-                dq=tuple(read.joint_velocity.tolist()),
-                tau_j=tuple(read.external_torque.tolist()),
-            )
-
-        def begin_cycle(self) -> None:
-            """Nothing has come yet."""
-            self.answered = False
-            self._before, self._last = self._last, self._velocity
-
-        def go_on(self) -> None:
-            """Without an answer: with the acceleration of the last two cycles.
-
-            Where positions are commanded, the arm waits for the next one instead.
-            """
-            if self._target is None:
-                self._velocity = 2 * self._last - self._before
-                self.joint_velocity_control(self._velocity, has_new_command=False)
-
-        def driven(self, motion: int) -> DrivenCycle:
-            """Record of this cycle."""
-            position = self._read.joint_position
-            return DrivenCycle(motion, self._velocity, position, self.answered)
-
-        def joint_velocity_control(self, target_dq: Any, has_new_command: bool = True) -> None:
-            self.answered |= has_new_command
-            if not has_new_command:
-                target_dq = self._velocity
-            super().joint_velocity_control(target_dq, has_new_command)
-            # The package tells a smoothed acceleration; a control box knows what it commands.
-            self._tracked_state_components["ddq_d"].set(
-                vars(self)["_BaseRobot__t"], (self._velocity - self._last) / CYCLE
-            )
-
-        def joint_position_control(self, target_q: Any, has_new_command: bool = True) -> None:
-            self.answered |= has_new_command
-            super().joint_position_control(target_q, has_new_command)
-
-        def _joint_velocity_control(self, target_dq: np.ndarray) -> None:
-            self._target = None
-            self._drive(np.asarray(target_dq, dtype=float))
-
-        def _joint_position_control(self, target_q: np.ndarray) -> None:
-            if self.server is None or not self.server.current_motion_id:
-                # No motion: its own servos hold the arm where it is.
-                self._target = None
-                self._drive(np.zeros(7))
-                return
-            ahead = np.zeros(7) if self._target is None else target_q - self._target
-            self._target = target_q.copy()
-            behind = target_q - self._read.joint_position
-            self._drive(ahead / CYCLE + _CATCH_UP * behind)
-
-        def _drive(self, velocity: np.ndarray) -> None:
-            self._velocity = velocity
-            world.arm.command(velocity)
-            self.torque_control([0.0] * 7)  # reported commanded torques
-
-        def _torque_control(self, torques: np.ndarray) -> None:
-            pass
-
-        def set_hand_goal(self, width: float, max_velocity: float, max_force: float) -> None:
-            strongest = world.config.arm.grip_force
-            force = min(max_force, strongest)
-            for finger in ("finger_left", "finger_right"):
-                world.model.actuator(finger).forcerange[:] = (-force, force)
-            self._width_goal = width
-            self._finger_speed = max_velocity
-            self._width_now = self._get_hand_width()
-
-        def _get_hand_width(self) -> float:
-            return self._read.gripper_width
-
-        def _pre_step(self) -> None:
-            if self._width_goal is None:
-                return
-            # Both fingers move at the speed, so their distance changes by twice as much.
-            step = 2 * self._finger_speed * CYCLE
-            change = float(np.clip(self._width_goal - self._width_now, -step, step))
-            self._width_now = float(np.clip(self._width_now + change, 0.0, 2 * FINGER_STROKE))
-            world.arm.move(self._width_now)
-
-        def _post_step(self) -> None:
-            self._look()
-            super()._post_step()
-
-    class ServedSimulator(BaseSimulator):
-        """One robot in the world."""
-
-        def _get_robots(self) -> list[BaseRobot]:
-            return [robot]
-
-        def _step(self) -> None:
-            world.advance(CYCLE)
-
-    class LossyServer(FrankaRobotServer):
-        """Drops states, answers, and answers that come late."""
-
-        lose_state = lose_answer = has_lost_answer = False
-
-        def send_state(self) -> None:
-            self.has_lost_answer = False
-            if self.lose_state:
-                # The package cannot leave one out, and has to count it.
-                self._FrankaServer__message_id += 1
-            else:
-                super().send_state()
-
-        def _handle_udp_command(self, command_data: bytes) -> None:
-            # An answer names its state. One to an earlier state comes too late: taken for this
-            # cycle's, each answer would be a cycle late from then on.
-            answered = int.from_bytes(command_data[:8], "little")
-            if answered != self._FrankaServer__message_id - 1:
-                return
-            self.has_lost_answer = self.lose_answer
-            if not self.lose_answer:
-                super()._handle_udp_command(command_data)
-
-    robot = ServedRobot()
-    return ServedSimulator(), robot, LossyServer

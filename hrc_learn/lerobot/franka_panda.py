@@ -5,7 +5,8 @@ Run with its driver against simulators of the arm's network protocol; NOT RUN ON
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,29 +16,16 @@ from jaxtyping import Float
 from lerobot.cameras import CameraConfig, make_cameras_from_configs
 from lerobot.robots import RobotConfig
 
-from hrc_learn.controller import SafetyConfig, Watchdog
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.geometry import Pose
-from hrc_learn.hardware import (
-    ArmProcess,
-    CollisionConfig,
-    FrankyArm,
-    FrankyConfig,
-    Load,
-    Realtime,
-)
+from hrc_learn.hardware import ArmProcess, FrankyArm, FrankyConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
-from hrc_learn.protocols import Arm
-from hrc_learn.watchdog import bring_to_rest
 
 if TYPE_CHECKING:
     from hrc_learn.skills.arm_motion import PositionServo
 
 
-_PATIENCE = 5.0
-"""Duration of attempts to stop the arm at the end [s]; each velocity command expires well
-before.
-"""
 # From reading the joints to the arm following [s], as `Imperfections.nominal()`. Measured with
 # franky against simulators: 2 ms from a command to the servos; the rest is for the network, the
 # scheduling and what computing a step takes, which no simulator has.
@@ -46,36 +34,19 @@ _DELAY = 0.030
 
 @RobotConfig.register_subclass("franka_panda")
 @dataclass(kw_only=True)
-class FrankaPandaConfig(ArmRobotConfig):
+class FrankaPandaConfig(FrankyConfig, ArmRobotConfig):
     """A Franka Panda at its control box; `--robot.type=franka_panda`."""
 
     ip: str
     """Address of the control box."""
-    dynamics: float = 0.3
-    """Fraction of the driver's acceleration and jerk limits."""
     tcp_speed: float = 0.25
     """Cap on the speed of the tool centre point [m/s] (ISO 10218: reduced speed)."""
-    timeout: float = 0.15
-    """Silence of the loop after which the arm is stopped [s]."""
-    own_process: bool = True
-    """Run the driver in a process of its own, which also stops the arm when this process hangs,
-    is stopped or dies.
-    """
-    grip_force: float = 20.0
-    """Grasp force of the gripper [N]."""
-    grip_speed: float = 0.1
-    """Speed of the fingers [m/s]."""
-    realtime: Realtime = "enforce"
-    """Refuse a kernel without real-time scheduling. Choose "ignore" for simulators."""
-    collision: CollisionConfig = field(default_factory=CollisionConfig)
-    """External load from which on the arm stops by a reflex."""
-    load: Load | None = None
-    """Load at the flange in addition to the end effector; None: as configured in the robot."""
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     """Cameras of LeRobot, by name."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        ArmRobotConfig.__post_init__(self)
+        FrankyConfig.__post_init__(self)
         if not 5 <= self.fps <= 1000:
             raise ValueError(f"fps must be from 5 to 1000, but is {self.fps}.")
         if self.person.kind == "scripted":
@@ -87,19 +58,10 @@ class FrankaPandaConfig(ArmRobotConfig):
                 f"timeout must be longer than an action and a half at {self.fps:g} fps, but is "
                 f"{self.timeout} s."
             )
-        self.driver()  # which checks the rest
 
     def driver(self) -> FrankyConfig:
-        """Settings of the driver."""
-        return FrankyConfig(
-            dynamics=self.dynamics,
-            timeout=self.timeout,
-            realtime=self.realtime,
-            grip_force=self.grip_force,
-            grip_speed=self.grip_speed,
-            collision=self.collision,
-            load=self.load,
-        )
+        """Settings of the driver, which its process reads without LeRobot."""
+        return FrankyConfig(**{f.name: getattr(self, f.name) for f in fields(FrankyConfig)})
 
 
 class FrankaPanda(ArmRobot):
@@ -111,18 +73,17 @@ class FrankaPanda(ArmRobot):
     driver, and the driver, which ends every velocity by itself. Keep the stop button in hand.
 
     Attributes:
-        watchdog: While connected; counts its trips.
+        arm: The driver's process, while connected.
     """
 
     config_class = FrankaPandaConfig
     name = "franka_panda"
-    watchdog: Watchdog | ArmProcess
 
     def __init__(self, config: FrankaPandaConfig):
         super().__init__(config, panda)
         self.config = config
         self.cameras = make_cameras_from_configs(config.cameras)
-        self._arm: FrankyArm | ArmProcess
+        self._arm: ArmProcess
         self._servo: PositionServo
         self._trips = 0
 
@@ -135,7 +96,7 @@ class FrankaPanda(ArmRobot):
         return super().observation_features | shapes
 
     @property
-    def arm(self) -> Arm:
+    def arm(self) -> ArmProcess:
         return self._arm
 
     @property
@@ -147,30 +108,20 @@ class FrankaPanda(ArmRobot):
 
         config = self.config
         open_arm = partial(FrankyArm, config.ip, config.driver())
-        if config.own_process:
-            self._arm = self.watchdog = ArmProcess(open_arm, timeout=config.timeout)
-        else:
-            self._arm = open_arm()
-            self.watchdog = Watchdog(config.timeout, self._arm.stop)
         safety = SafetyConfig(tcp_speed=config.tcp_speed, braking=config.dynamics, delay=_DELAY)
-        self._servo = PositionServo(
-            panda.chain, self._arm, self.dt, PositionServoConfig(safety=safety)
-        )
-        for camera in self.cameras.values():
-            camera.connect()
-        if isinstance(self.watchdog, Watchdog):
-            self.watchdog.start()
-        self._trips = self.watchdog.trips
+        with ExitStack() as devices:
+            for camera in self.cameras.values():
+                camera.connect()
+                devices.callback(camera.disconnect)
+            self._arm = devices.enter_context(ArmProcess(open_arm, timeout=config.timeout))
+            self._trips = self._arm.trips
+            self._servo = PositionServo(
+                panda.chain, self._arm, self.dt, PositionServoConfig(safety=safety)
+            )
+            self._devices = devices.pop_all()
 
     def _close(self) -> None:
-        try:
-            self.watchdog.close()
-            if isinstance(self._arm, FrankyArm):
-                bring_to_rest(self._arm.stop, _PATIENCE)
-                self._arm.close()
-        finally:
-            for camera in self.cameras.values():
-                camera.disconnect()
+        self._devices.close()
 
     def get_observation(self) -> dict[str, Any]:
         values = super().get_observation()
@@ -184,12 +135,12 @@ class FrankaPanda(ArmRobot):
     def _command(
         self, joints: Float[np.ndarray, " joints"], width: float
     ) -> Float[np.ndarray, " joints"]:
-        if self.watchdog.trips != self._trips:
-            self._trips = self.watchdog.trips
+        if self._arm.trips != self._trips:
+            self._trips = self._arm.trips
             self._servo.restart()  # the arm is at rest, which the servo does not know
         with torch.inference_mode():
             _, sent = self._servo.follow(joints)
         if np.isfinite(width):
             self._arm.move(width)
-        self.watchdog.feed()
+        self._arm.feed()
         return sent

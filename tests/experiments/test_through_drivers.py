@@ -97,7 +97,7 @@ def place_on_shelf(skill, access):
 @shapes_unchecked()
 @pytest.mark.parametrize("dynamics", [1.0, 0.3])
 def test_an_object_is_placed_also_by_a_gentle_driver(skills, dynamics):
-    config = FrankyConfig(realtime="ignore", grip_force=40.0, dynamics=dynamics)
+    config = FrankyConfig(realtime=False, grip_force=40.0, dynamics=dynamics)
     place_on_shelf(skills[1], through_franky(config))
 
 

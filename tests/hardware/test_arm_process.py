@@ -41,9 +41,7 @@ def connect(log):
 
     yield connect
     for arm in opened:
-        arm._end()
-        if arm._process.is_alive():
-            arm._process.kill()
+        arm._driver.kill()
 
 
 @pytest.fixture
@@ -163,7 +161,7 @@ def test_a_loop_learns_in_time_that_the_process_is_stopped(connect):
     assert TIMEOUT <= time.monotonic() - began < TIMEOUT + SPARE
     with pytest.raises(WatchdogError):
         arm.close()
-    assert arm._process.exitcode == -signal.SIGKILL  # or this program could not end
+    assert arm._driver.process.exitcode == -signal.SIGKILL  # or this program could not end
 
 
 def test_a_driver_that_hangs_does_not_keep_the_arm_moving(connect, log):
@@ -174,13 +172,30 @@ def test_a_driver_that_hangs_does_not_keep_the_arm_moving(connect, log):
     assert wait_for(log, "stop") - commands(log)[0] < TIMEOUT + SPARE
 
 
+def test_answer_of_an_interrupted_call_is_not_taken_for_the_next(connect, log):
+    arm = connect(hanging_read=0.3, timeout=20.0)
+
+    def interrupt(number, frame):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        with pytest.raises(KeyboardInterrupt):
+            arm.read()
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    arm.stop()
+    assert [event for *_, event in events(log)] == ["stop"]
+
+
 def test_sigterm_stops_the_arm_before_the_process_ends(connect, log):
     arm = connect(failing_stops=2, timeout=30.0)
     arm.command(VELOCITY)
     os.kill(arm.pid, signal.SIGTERM)
     wait_for(log, "stop")
-    arm._process.join(20)
-    assert arm._process.exitcode == 128 + signal.SIGTERM
+    arm._driver.process.join(20)
+    assert arm._driver.process.exitcode == 128 + signal.SIGTERM
 
 
 def test_an_arm_that_cannot_be_reached_is_told():

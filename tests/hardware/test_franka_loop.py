@@ -24,7 +24,7 @@ def write_lines(mailbox: Mailbox, seconds: float) -> None:
 
 
 def test_a_line_is_read_whole_while_another_process_writes():
-    mailbox = Mailbox(LONG)
+    mailbox = Mailbox(np.zeros(LONG))
     writer = multiprocessing.get_context("fork").Process(
         target=write_lines, args=(mailbox, 1.0)
     )
@@ -40,12 +40,12 @@ def test_a_line_is_read_whole_while_another_process_writes():
 
 
 def test_a_writer_that_died_in_the_middle_of_a_line_holds_nobody_up():
-    mailbox = Mailbox(3)
+    mailbox = Mailbox(np.zeros(3))
     mailbox.write(np.ones(3))
-    mailbox._line[0] += 1  # as at the moment of its death
+    mailbox._line[0] += 1  # as at the moment of its death, or of a signal
     assert mailbox.read() is None
-    mailbox._line[0] += 1
-    np.testing.assert_array_equal(mailbox.read(), np.ones(3))
+    mailbox.write(np.full(3, 2.0))
+    np.testing.assert_array_equal(mailbox.read(), np.full(3, 2.0))
 
 
 def test_orders_and_reports_come_out_as_they_went_in():
@@ -165,10 +165,10 @@ class TestPunctuality:
 @pytest.mark.parametrize(
     ("make", "named"),
     [
-        (lambda: FrankaConfig(hold=0.0), "hold"),
-        (lambda: FrankaConfig(hold=np.inf), "hold"),
-        (lambda: FrankaConfig(acceleration=1.1), "acceleration"),
-        (lambda: FrankaConfig(jerk=0.0), "jerk"),
+        (lambda: FrankaConfig(timeout=0.0), "timeout"),
+        (lambda: FrankaConfig(timeout=np.inf), "timeout"),
+        (lambda: FrankaConfig(dynamics=1.1), "dynamics"),
+        (lambda: FrankaConfig(dynamics=0.0), "dynamics"),
         (lambda: FrankaConfig(grip_force=-1.0), "grip_force"),
         (lambda: FrankaConfig(grip_speed=np.nan), "grip_speed"),
     ],

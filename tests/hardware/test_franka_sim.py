@@ -180,7 +180,7 @@ def test_an_arm_that_nobody_commands_any_more_is_led_to_rest(server):
     time.sleep(0.5)
     moved = Trace.read(trace)
     # The velocity holds for 0.15 s; from 0.4 rad/s at 3 rad/s^2 rest takes 0.13 s, and ramps.
-    assert moved.rest_after(killed) <= CONFIG.hold + 0.3
+    assert moved.rest_after(killed) <= CONFIG.timeout + 0.3
     assert aborted(trace) == []
 
 

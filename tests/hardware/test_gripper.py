@@ -31,6 +31,9 @@ class SlowGripper:
     def squeeze(self):
         return self._go(("squeeze",), 0.03)
 
+    def close(self):
+        self.let.release(100)
+
     def _go(self, call, width):
         self.calls.append(call)
         self.begun.release()
@@ -48,15 +51,21 @@ def driver():
 
 
 @pytest.fixture
-def told():
-    return []
+def told(capfd):
+    """Returns the failures printed so far."""
+    lines = []
+
+    def read():
+        lines.extend(capfd.readouterr().err.splitlines())
+        return lines
+
+    return read
 
 
 @pytest.fixture
-def gripper(driver, told):
-    with GripperThread(lambda: driver, report=told.append) as gripper:
+def gripper(driver):
+    with GripperThread(lambda: driver) as gripper:
         yield gripper
-        driver.let.release(100)
 
 
 def wait_until(condition):
@@ -114,7 +123,7 @@ def test_a_failed_grasp_is_told_once_and_kept_until_the_next_opening(driver, gri
     for _ in range(3):
         gripper.move(0.0)  # of a loop that goes on: neither raises nor tries again
     assert driver.calls == [("squeeze",)]
-    assert [str(failure) for failure in told] == [str(gripper.failure)]
+    assert told() == [f"gripper: {gripper.failure}"]
     driver.succeeds = True
     gripper.move(0.05)
     assert gripper.failure is None
@@ -124,9 +133,9 @@ def test_a_driver_that_raises_is_told_with_its_words(driver, gripper, told):
     driver.broken = True
     gripper.move(0.05)
     driver.let.release()
-    wait_until(lambda: any("open to 50 mm" in str(failure) for failure in told))
-    wait_until(lambda: any("cannot be reached" in str(failure) for failure in told))
-    assert all("OSError: no route to host" in str(failure) for failure in told)
+    wait_until(lambda: any("open to 50 mm" in failure for failure in told()))
+    wait_until(lambda: any("cannot be reached" in failure for failure in told()))
+    assert all("OSError: no route to host" in failure for failure in told())
     assert gripper.width == 0.08  # the newest known
     driver.broken, driver.width = False, 0.02
     wait_until(lambda: gripper.width == 0.02)  # connected again
@@ -139,7 +148,7 @@ def test_a_connection_that_stays_broken_is_told_once(driver, gripper, told):
     wait_until(lambda: driver.failures == 2)
     driver.broken, driver.width = False, 0.01
     wait_until(lambda: gripper.width == 0.01)
-    assert len(told) == 1
+    assert len(told()) == 1
 
 
 def test_a_gripper_that_cannot_be_reached_is_an_error_at_once():
@@ -147,7 +156,7 @@ def test_a_gripper_that_cannot_be_reached_is_an_error_at_once():
         raise OSError("connection refused")
 
     with pytest.raises(GripperError, match=r"cannot be reached.*connection refused"):
-        GripperThread(refuse, report=lambda failure: None)
+        GripperThread(refuse)
 
 
 def test_a_gripper_that_tells_no_width_is_not_waited_for_for_ever():

@@ -113,7 +113,7 @@ def test_the_gripper_closes_at_its_speed_on_what_is_there():
     workplace = Workplace()
     world, item = World(workplace.scene), workplace.scene.objects[0]
     world.hold(item.name, workplace.home_joints().numpy())
-    config = FrankyConfig(realtime="ignore", grip_speed=0.02, grip_force=15.0)
+    config = FrankyConfig(realtime=False, grip_speed=0.02, grip_force=15.0)
     with served_world(world, config) as served:
         assert world.holds(item.name)  # as it did before
         served.arm.move(0.08)
@@ -223,8 +223,13 @@ def test_servers_beside_each_other_take_addresses_of_their_own():
 
 
 def test_a_controller_is_told_of_the_drivers_delay_and_acceleration():
+<<<<<<< HEAD
     access = through_franky(FrankyConfig(dynamics=0.4, realtime="ignore"))
     sizes = replace(Imperfections.ideal(), command_delay=0.02, slowness=0.3)
+=======
+    access = through_franky(FrankyConfig(dynamics=0.4, realtime=False))
+    sizes = Imperfections(command_delay=0.02, slowness=0.3)
+>>>>>>> 17eee7c (Drive grippers of all Franka arms by one mechanism, with one set of settings)
     told = access.declared(sizes)
     assert told.command_delay == pytest.approx(0.02 + PROTOCOL_DELAY)
     assert told.slowness == pytest.approx(0.6)
@@ -236,5 +241,6 @@ def test_without_the_simulator_its_extra_is_named(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "franky_sim.base_simulator", None)
+    monkeypatch.delitem(sys.modules, "hrc_learn.hardware.served_robot", raising=False)
     with pytest.raises(ImportError, match=r"hrc-learn\[hardware\]"), serve_world(World()):
         pass

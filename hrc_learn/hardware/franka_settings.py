@@ -1,0 +1,144 @@
+"""Settings of a Franka arm, for both of its drivers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hrc_learn.controller import SafetyConfig
+
+CYCLE = 1e-3
+"""Period of Franka's control interface [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """A load on the flange, in addition to the end effector that the arm is configured for."""
+
+    mass: float = 0.0
+    """[kg]"""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Centre of mass, in the flange's frame [m]."""
+    inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
+    """About that centre, along the flange's axes [kg m^2]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.mass < math.inf:
+            raise ValueError(f"mass of a load must not be negative, but is {self.mass} kg.")
+        if not np.isfinite(self.centre).all():
+            raise ValueError(f"centre of a load must be finite, but is {self.centre} m.")
+        tensor = np.array(self.inertia)
+        if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"inertia of a load must be a symmetric matrix, 3 by 3, but is {self.inertia}."
+            )
+        if np.linalg.eigvalsh(tensor).min() < 0:
+            raise ValueError(
+                f"inertia of a load must not be negative about any axis, but is {self.inertia}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollisionConfig:
+    """Estimated external load from which on the arm stops by a reflex.
+
+    The default is that of the maker's own example of joint velocities (libfranka,
+    examples/generate_joint_velocity_motion.cpp), for contacts and collisions alike.
+    """
+
+    torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    """On each joint [N m]."""
+    force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+    """Threshold at the end effector: forces along x, y, z [N], torques about them [N m]."""
+
+    def __post_init__(self) -> None:
+        for name, number in (("torque", 7), ("force", 6)):
+            values = getattr(self, name)
+            if len(values) != number or not all(0 < v < math.inf for v in values):
+                raise ValueError(
+                    f"{name} of a collision must be {number} positive numbers, but is {values}."
+                )
+
+
+class RealtimeError(RuntimeError):
+    """The machine has no real-time scheduling, and it is required."""
+
+    def __init__(self, why: str):
+        """Add the cure to what is missing."""
+        super().__init__(
+            f"{why}: boot a kernel with PREEMPT_RT and allow the user rtprio 99 in "
+            "/etc/security/limits.d. Where late commands do no harm, as with a simulator, give "
+            "realtime=False; a real arm then stops whenever the machine is late."
+        )
+
+
+@dataclass(kw_only=True)  # not frozen: LeRobot's configuration of the arm inherits it
+class FrankyConfig:
+    """Settings of an arm and its gripper."""
+
+    dynamics: float = 0.3
+    """Fraction of the limits of acceleration and jerk that is used, above 0 to 1."""
+    timeout: float = 0.15
+    """Time for which a velocity holds [s]; then the driver brings the arm to rest."""
+    realtime: bool = True
+    """Refuse a machine without real-time scheduling; False is for simulators."""
+    grip_force: float = 20.0
+    """Grasping force [N]."""
+    grip_speed: float = 0.1
+    """Finger speed [m/s]; the highest of the Franka Hand."""
+    collision: CollisionConfig = field(default_factory=CollisionConfig)
+    """External load from which on the arm stops by a reflex."""
+    load: Load | None = None
+    """Load on the flange besides the end effector; None leaves the arm's earlier setting."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.dynamics <= 1:
+            raise ValueError(f"dynamics must be in (0, 1], but is {self.dynamics}.")
+        for name in ("timeout", "grip_force", "grip_speed"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+
+    def send_to(self, robot: Any) -> None:
+        """Set collision thresholds and load of a connected arm.
+
+        Args:
+            robot: Robot of franky or pylibfranka; these calls are the same in both.
+        """
+        torque, force = list(self.collision.torque), list(self.collision.force)
+        robot.set_collision_behavior(torque, torque, force, force)
+        if self.load is not None:
+            # By columns, which for a symmetric matrix is by rows.
+            inertia = np.ravel(self.load.inertia).tolist()
+            robot.set_load(self.load.mass, list(self.load.centre), inertia)
+
+
+@dataclass(kw_only=True)
+class FrankaConfig(FrankyConfig):
+    """Settings of an arm's 1 kHz loop.
+
+    Where an answer comes late, the loop cannot know for which cycle the control box takes it;
+    if for another one, its change of acceleration is off by as much as the acceleration itself.
+    With dynamics of 0.3 that stays allowed on an FR3: 3 rad/s^2 in 1 ms and 1500 rad/s^3 are
+    4500 of its 5000 rad/s^3.
+
+    Without real-time scheduling some cycles are late; the control box tolerates up to 20 in a
+    row. The loop still takes the priority if the user may have it.
+    """
+
+    grip_force: float = 40.0
+    """Grasping force [N]."""
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    """Settings of the safety filter, which uses these limits."""
+    lockstep: bool = False
+    """True for a simulator that stands still until it is answered and while no command comes:
+    no answer is late then, and each state gets one.
+    """
+    compiled: bool = True
+    """True compiles the step, once per machine, in a minute or two. An uncompiled step takes a
+    whole cycle on a busy machine: use it for simulators only.
+    """
+    gripper: bool = True
+    """True if a gripper is mounted."""
