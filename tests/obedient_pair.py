@@ -13,6 +13,8 @@ NAMES = ["a.pos", "b.pos"]
 class ObedientPairConfig(RobotConfig):
     start: float = 0.25
     breaks_after: int = 10**9
+    drift: float = 0.0
+    """Velocity before the first action."""
 
 
 class ObedientPair(Robot):
@@ -27,7 +29,8 @@ class ObedientPair(Robot):
     def __init__(self, config):
         super().__init__(config)
         self.sent, self.times = [[config.start, -config.start]], []
-        self.breaks_after = config.breaks_after
+        self.breaks_after, self.drift = config.breaks_after, config.drift
+        self.made = time.perf_counter()
 
     def connect(self, calibrate=True):
         self.is_connected = True
@@ -41,7 +44,8 @@ class ObedientPair(Robot):
     configure = calibrate
 
     def get_observation(self):
-        return dict(zip(NAMES, self.sent[-1], strict=True))
+        moved = 0.0 if self.times else self.drift * (time.perf_counter() - self.made)
+        return {name: x + moved for name, x in zip(NAMES, self.sent[-1], strict=True)}
 
     def send_action(self, action):
         if len(self.sent) > self.breaks_after:

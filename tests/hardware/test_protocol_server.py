@@ -223,13 +223,8 @@ def test_servers_beside_each_other_take_addresses_of_their_own():
 
 
 def test_a_controller_is_told_of_the_drivers_delay_and_acceleration():
-<<<<<<< HEAD
-    access = through_franky(FrankyConfig(dynamics=0.4, realtime="ignore"))
-    sizes = replace(Imperfections.ideal(), command_delay=0.02, slowness=0.3)
-=======
     access = through_franky(FrankyConfig(dynamics=0.4, realtime=False))
-    sizes = Imperfections(command_delay=0.02, slowness=0.3)
->>>>>>> 17eee7c (Drive grippers of all Franka arms by one mechanism, with one set of settings)
+    sizes = replace(Imperfections.ideal(), command_delay=0.02, slowness=0.3)
     told = access.declared(sizes)
     assert told.command_delay == pytest.approx(0.02 + PROTOCOL_DELAY)
     assert told.slowness == pytest.approx(0.6)

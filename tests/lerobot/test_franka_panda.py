@@ -23,47 +23,41 @@ JOINTS = ArmValues(panda).joints
 pytestmark = pytest.mark.realtime
 
 
-@pytest.fixture(scope="module")
-def served(tmp_path_factory):
-    with served_franka(tmp_path_factory.mktemp("served"), fps=FPS, tcp_speed=0.2) as served:
-        yield served
-
-
 def towards(joints, **more):
     return dict(zip(JOINTS, joints.tolist(), strict=True)) | more
 
 
-def test_real_panda_moves_within_limits(served):
-    velocities = served.drive(towards(READY + 0.4, **{GRIPPER: 0.04}), 80)
-    limits = panda.limits
-    assert (np.abs(velocities) <= limits.velocity.numpy()).all()
-    change = np.abs(np.diff(velocities, axis=0, prepend=0))
-    assert (change <= limits.acceleration.numpy() / FPS * 1.05).all()
-    with served.server.running():
-        values = served.robot.get_observation()
-    assert [values[name] for name in JOINTS] == pytest.approx((READY + 0.4).tolist(), abs=5e-3)
-    assert values[GRIPPER] == pytest.approx(0.04, abs=1e-3)
+def test_real_panda_moves_within_limits_squeezes_and_rests_at_the_end(tmp_path):
+    """One connection does it all, as each starts a process."""
+    with served_franka(tmp_path, fps=FPS, tcp_speed=0.2) as served:
+        velocities = served.drive(towards(READY + 0.4, **{GRIPPER: 0.04}), 80)
+        limits = panda.limits
+        assert (np.abs(velocities) <= limits.velocity.numpy()).all()
+        change = np.abs(np.diff(velocities, axis=0, prepend=0))
+        assert (change <= limits.acceleration.numpy() / FPS * 1.05).all()
+        with served.server.running():
+            values = served.robot.get_observation()
+        reached = [values[name] for name in JOINTS]
+        assert reached == pytest.approx((READY + 0.4).tolist(), abs=5e-3)
+        assert values[GRIPPER] == pytest.approx(0.04, abs=1e-3)
 
+        goal, fastest = towards(READY + 0.4 - np.eye(7)[0]), 0.0
+        for _ in range(30):
+            served.drive(goal, 1)
+            state = served.read()
+            J = panda.jacobian(torch.from_numpy(state.joint_position))
+            twist = J @ torch.from_numpy(state.joint_velocity)
+            fastest = max(fastest, float(twist[:3].norm()))
+        assert 0.15 < fastest <= 0.2 * 1.02  # the servos overshoot a little
 
-def test_tool_of_real_panda_keeps_its_cap(served):
-    goal, fastest = towards(served.read().joint_position - np.eye(7)[0]), 0.0
-    for _ in range(30):
-        served.drive(goal, 1)
-        state = served.read()
-        J = panda.jacobian(torch.from_numpy(state.joint_position))
-        fastest = max(fastest, float((J @ torch.from_numpy(state.joint_velocity))[:3].norm()))
-    assert 0.15 < fastest <= 0.2 * 1.02  # the servos overshoot a little
-
-
-def test_gripper_squeezes_and_arm_rests_at_the_end(served):
-    served.drive(towards(READY + 0.2, **{GRIPPER: 0.0}), 20)
-    assert served.read().gripper_width < 0.04
-    force = served.world.model.actuator("finger_left").forcerange
-    assert force[1] == served.robot.config.grip_force
-    with served.server.running():
-        served.robot.disconnect()
-    assert np.abs(served.world.arm.read().joint_velocity).max() < 1e-2
-    assert not served.robot.is_connected
+        served.drive(towards(READY + 0.2, **{GRIPPER: 0.0}), 20)
+        assert served.read().gripper_width < 0.04
+        force = served.world.model.actuator("finger_left").forcerange
+        assert force[1] == served.robot.config.grip_force
+        with served.server.running():
+            served.robot.disconnect()
+        assert np.abs(served.world.arm.read().joint_velocity).max() < 1e-2
+        assert not served.robot.is_connected
 
 
 def test_options_of_the_driver_reach_it(tmp_path):

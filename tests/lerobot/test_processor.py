@@ -253,9 +253,9 @@ def test_what_is_no_action_or_no_observation_passes():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"jerk": [0.0, 1.0]}, "limit of jerk of a.pos must be positive"),
-        ({"velocity": [float("nan"), 1.0]}, "limit of velocity of a.pos"),
-        ({"lower": [2.0, None]}, "the lowest position of a.pos, 2, must be below the highest"),
+        ({"jerk": [0.0, 1.0]}, "jerk of a.pos must be positive"),
+        ({"velocity": [float("nan"), 1.0]}, "velocity of a.pos"),
+        ({"lower": [2.0, None]}, "lower of a.pos must be below upper"),
         ({"fps": 0.0}, "fps must be positive"),
     ],
 )

@@ -14,6 +14,7 @@ from lerobot.rollout.inference.rtc import RTCInferenceEngine
 from lerobot.rollout.robot_wrapper import ThreadSafeRobot
 from lerobot.utils.errors import DeviceNotConnectedError
 from obedient_pair import NAMES
+from unchecked import shapes_unchecked
 
 from hrc_learn.lerobot.smoothing import ActionLimits, SmoothRobot, SmoothRobotConfig
 
@@ -129,6 +130,22 @@ def test_a_thread_sends_them_in_their_time(make):
     assert path[-1] == pytest.approx(0.2 * (1 - np.cos(2 * 29 / 20)), abs=2e-3)
 
 
+def test_path_starts_from_the_measured_motion(make):
+    robot = make(rate=100.0, options={"start": 0.0, "drift": 0.5})
+    robot.connect()
+    for _ in range(3):
+        time.sleep(0.05)
+        seen = robot.get_observation()
+    robot.send_action(both(1.0))
+    time.sleep(0.1)
+    robot.disconnect()
+    here = np.array([seen[name] for name in NAMES])
+    first, second = np.array(robot.inner.sent[1:3])
+    # At 4 /s^2 the velocity changes by 0.04 from one setpoint to the next.
+    np.testing.assert_allclose(first - here, 0.5 / 100, atol=1e-3)
+    np.testing.assert_allclose(second - first, 0.5 / 100, atol=1e-3)
+
+
 def test_what_the_driver_says_is_told(make):
     robot = make(options={"breaks_after": 5})
     robot.connect()
@@ -173,12 +190,16 @@ def test_limits_are_kept_in_a_file(tmp_path):
     assert ActionLimits.load(file) == LIMITS
     file.write_text(json.dumps({"names": []}))
     with pytest.raises(
-        ValueError, match=r"holds no limits of actions: Missing required field.*acceleration"
+        ValueError, match=r"holds no limits of actions: its keys must be.*acceleration"
     ):
         ActionLimits.load(file)
-    for value in (None, "fast", float("nan"), []):
-        file.write_text(json.dumps(asdict(LIMITS) | {"velocity": [value, 1.0]}))
-        with pytest.raises(ValueError, match=r"limits.json holds no limits of (?s:.)*velocity"):
+    velocities = (None, "fast", float("nan"), [], True, 10**400, -1.0)
+    wrong = [("velocity", [value, 1.0]) for value in velocities]
+    wrong += [("fps", 0), ("names", "ab"), ("lower", 1.0), ("state_columns", [0, 1.5])]
+    for key, value in wrong:
+        file.write_text(json.dumps(asdict(LIMITS) | {key: value}))
+        said = rf"limits\.json holds no limits of actions: {key} "
+        with shapes_unchecked(), pytest.raises(ValueError, match=said):
             ActionLimits.load(file)
     file.write_text("{")
     with pytest.raises(ValueError, match="is damaged"):

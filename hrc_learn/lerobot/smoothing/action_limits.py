@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import draccus
 import numpy as np
 from jaxtyping import Float
 
@@ -44,7 +43,7 @@ class ActionLimits:
     """Limits of every value of an action, in its unit, and where it is measured.
 
     Raises:
-        ValueError: A limit is missing, not positive, or a lower one not below its upper one.
+        ValueError: An entry is missing, of the wrong type, not finite or out of its range.
     """
 
     names: list[str]
@@ -64,27 +63,25 @@ class ActionLimits:
     """Columns of `observation.state` that measure each value; -1: not measured."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.fps < math.inf:
-            raise ValueError(f"fps must be positive and finite, got {self.fps}")
-        kinds = ("velocity", "acceleration", "jerk")
-        for name in (*kinds, "lower", "upper", "state_columns"):
-            if len(getattr(self, name)) != len(self.names):
+        named = isinstance(self.names, list) and self.names
+        if not (named and all(isinstance(name, str) for name in self.names)):
+            raise ValueError(f"names must be a list of texts, but is {self.names!r}")
+        if not _is_positive(self.fps):
+            raise ValueError(f"fps must be positive and finite, but is {self.fps!r}")
+        for key, (fits, needed) in _ENTRIES.items():
+            values = getattr(self, key)
+            if not isinstance(values, list) or len(values) != len(self.names):
                 raise ValueError(
-                    f"smooth actions: {name} must have one entry for each of "
-                    f"{', '.join(self.names)}, but has {len(getattr(self, name))}."
+                    f"{key} must have one entry for each of {', '.join(self.names)}, but is "
+                    f"{values!r}"
                 )
-        for kind in kinds:
-            for name, value in zip(self.names, getattr(self, kind), strict=True):
-                if not (isinstance(value, float | int) and 0 < value < math.inf):
-                    raise ValueError(
-                        f"smooth actions: the limit of {kind} of {name} must be positive and "
-                        f"finite, but is {value}."
-                    )
+            for name, value in zip(self.names, values, strict=True):
+                if not fits(value):
+                    raise ValueError(f"{key} of {name} must be {needed}, but is {value!r}")
         for name, low, high in zip(self.names, *self.positions(), strict=True):
             if not low < high:
                 raise ValueError(
-                    f"smooth actions: the lowest position of {name}, {low:g}, must be below "
-                    f"the highest, {high:g}."
+                    f"lower of {name} must be below upper, but they are {low:g} and {high:g}"
                 )
 
     def positions(self) -> tuple[Float[np.ndarray, " D"], Float[np.ndarray, " D"]]:
@@ -95,35 +92,36 @@ class ActionLimits:
 
     def motion_filter(self, dt: float) -> MotionFilter:
         """Filter that keeps positions, dt [s] apart, within these limits."""
-        velocity, acceleration, jerk = (
-            np.array(limit, dtype=np.float64)
-            for limit in (self.velocity, self.acceleration, self.jerk)
-        )
         lower, upper = self.positions()
         return MotionFilter(
             dt,
-            velocity=velocity,
-            acceleration=acceleration,
-            jerk=jerk,
+            velocity=np.array(self.velocity, dtype=np.float64),
+            acceleration=np.array(self.acceleration, dtype=np.float64),
+            jerk=np.array(self.jerk, dtype=np.float64),
             lower=lower,
             upper=upper,
         )
 
-    def within(self, ranges: Mapping[str, Range]) -> ActionLimits:
-        """The same with limits of position for the values that are named."""
+    def within(
+        self, ranges: Mapping[str, Range], velocities: Mapping[str, float] | None = None
+    ) -> ActionLimits:
+        """The same with other limits for the values that are named.
+
+        Args:
+            ranges: Lowest and highest positions.
+            velocities: Highest velocities, where lower than those of today [1/s].
+        """
         pairs = [
             ranges.get(name, (low, high))
             for name, low, high in zip(self.names, self.lower, self.upper, strict=True)
         ]
-        return replace(self, lower=[p[0] for p in pairs], upper=[p[1] for p in pairs])
-
-    def slower(self, velocities: Mapping[str, float]) -> ActionLimits:
-        """The same with velocities of at most these, for the values that are named."""
         velocity = [
-            min(v, velocities.get(name, math.inf))
+            min(v, (velocities or {}).get(name, math.inf))
             for name, v in zip(self.names, self.velocity, strict=True)
         ]
-        return replace(self, velocity=velocity)
+        return replace(
+            self, lower=[p[0] for p in pairs], upper=[p[1] for p in pairs], velocity=velocity
+        )
 
     def save(self, path: Path) -> None:
         """Write them as JSON; the file is whole or as it was."""
@@ -137,12 +135,40 @@ class ActionLimits:
             FileNotFoundError: There is no such file.
             ValueError: It holds no limits.
         """
+        content, keys = read_json(path), [f.name for f in fields(cls)]
+        if not isinstance(content, dict) or content.keys() != {*keys}:
+            raise ValueError(
+                f"{path} holds no limits of actions: its keys must be {', '.join(keys)}"
+            )
         try:
-            return draccus.decode(cls, read_json(path))
-        except (draccus.utils.DraccusException, AttributeError) as error:
-            # The limits' own refusal is the cause of a ParsingError.
-            why = error.__cause__ if type(error) is draccus.ParsingError else error
-            raise ValueError(f"{path} holds no limits of actions: {why}") from error
+            return cls(**content)
+        except ValueError as error:
+            raise ValueError(f"{path} holds no limits of actions: {error}") from None
+
+
+def _is_number(value: object) -> bool:
+    # Whole numbers of JSON have no bound; no robot has a limit beyond this one.
+    known = isinstance(value, int | float) and not isinstance(value, bool)
+    return known and abs(value) < 1e300
+
+
+def _is_positive(value: Any) -> bool:
+    return _is_number(value) and value > 0
+
+
+def _is_number_or_none(value: object) -> bool:
+    return value is None or _is_number(value)
+
+
+_ENTRIES: dict[str, tuple[Callable[[Any], bool], str]] = {
+    "velocity": (_is_positive, "positive and finite"),
+    "acceleration": (_is_positive, "positive and finite"),
+    "jerk": (_is_positive, "positive and finite"),
+    "lower": (_is_number_or_none, "finite or null"),
+    "upper": (_is_number_or_none, "finite or null"),
+    "state_columns": (lambda x: type(x) is int and x >= -1, "a column, or -1"),
+}
+"""Entries for each value of an action: what they must be, as a check and in words."""
 
 
 def gathered_limits(
@@ -173,7 +199,7 @@ def gathered_limits(
     if urdf is not None:
         ranges, velocities = urdf_limits(urdf, degrees=degrees)
         _require_names(limits, {*ranges, *velocities}, urdf)
-        limits = limits.within(ranges).slower(velocities)
+        limits = limits.within(ranges, velocities)
     if calibration is not None:
         ranges = calibrated_ranges(calibration, degrees=degrees)
         _require_names(limits, set(ranges), calibration)
@@ -271,16 +297,15 @@ def urdf_limits(
     return ranges, velocities
 
 
-def calibrated_ranges(
-    calibration: Path, *, degrees: bool = True, grippers: Sequence[str] = ("gripper",)
-) -> dict[str, Range]:
+def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, Range]:
     """Ranges that a robot's motors were moved through when LeRobot calibrated it.
+
+    Commands of the motor `gripper` are 0 to 100 in either case.
 
     Args:
         calibration: File that LeRobot keeps in `calibration/robots/TYPE/ID.json`.
         degrees: True if the robot is commanded in degrees, LeRobot's `use_degrees`; else in
             percent, -100 to 100.
-        grippers: Motors with commands of 0 to 100 in either case.
 
     Returns:
         Lowest and highest position of `NAME.pos`.
@@ -301,7 +326,7 @@ def calibrated_ranges(
                 f"{calibration} is no calibration of LeRobot: {name} has no range_min below a "
                 "range_max"
             )
-        if name in grippers:
+        if name == "gripper":
             ranges[f"{name}.pos"] = (0.0, 100.0)
         else:
             end = half * 360 / _ENCODER_STEPS if degrees else 100.0

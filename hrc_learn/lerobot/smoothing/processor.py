@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -114,7 +114,6 @@ class WatchStateStep(ProcessorStep):
         return features
 
 
-@dataclass
 class SmoothActionsStep(ProcessorStep):
     """Keeps actions within limits of position, velocity, acceleration and jerk.
 
@@ -123,33 +122,24 @@ class SmoothActionsStep(ProcessorStep):
     (batch, steps, values). A motion begins with the measured position and velocity, and anew
     where the robot is put; a chunk begins where the robot is on the one before. A value whose
     measurement is not finite keeps its motion, and before the first finite one it is held.
+
+    Attributes:
+        limits: Limits of the actions.
+        changes: Report of changes since the last reset.
     """
 
-    fps: float
-    """Actions a second, of the policy's data."""
-    names: list[str]
-    """Names of an action's values."""
-    velocity: list[float]
-    """Limit of each value [1/s]."""
-    acceleration: list[float]
-    """[1/s^2]"""
-    jerk: list[float]
-    """[1/s^3]"""
-    lower: list[float | None]
-    """Lowest of each value; None: no limit."""
-    upper: list[float | None]
-    """Highest of each value; None: no limit."""
-    state_columns: list[int]
-    """Columns of `observation.state` that measure each value; -1: not measured."""
-    changes: Changes = field(init=False, repr=False)
-    """Report of changes since the last reset."""
+    def __init__(self, **limits: Any):
+        """Begin before the first action.
 
-    def __post_init__(self) -> None:
-        self._filter = ActionLimits(**self.get_config()).motion_filter(1.0 / self.fps)
-        self._columns = np.array(self.state_columns)
+        Args:
+            limits: Fields of `ActionLimits`, as checkpoints keep them.
+        """
+        self.limits = ActionLimits(**limits)
+        self._filter = self.limits.motion_filter(1.0 / self.limits.fps)
+        self._columns = np.array(self.limits.state_columns)
         self._watch: weakref.ref[WatchStateStep] | None = None
         _ = self.watch
-        self.changes = Changes(self.names)
+        self.changes = Changes(self.limits.names)
         self._state: MotionState | None = None
         self._chunk: np.ndarray | None = None
         weakref.finalize(self, _log, self.changes)
@@ -165,10 +155,10 @@ class SmoothActionsStep(ProcessorStep):
         action = transition.get(TransitionKey.ACTION)
         if not isinstance(action, Tensor):
             return transition
-        if action.shape[-1] != len(self.names):
+        if action.shape[-1] != len(self.limits.names):
             raise ValueError(
                 f"smooth actions: the policy's actions have {action.shape[-1]} values, but "
-                f"limits are given for {', '.join(self.names)}."
+                f"limits are given for {', '.join(self.limits.names)}."
             )
         whole = action.dim() == 3
         asked = (action if whole else action.unsqueeze(-2)).detach().cpu().double().numpy()
@@ -192,7 +182,7 @@ class SmoothActionsStep(ProcessorStep):
         self._state = self._chunk = None
 
     def get_config(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(ActionLimits)}
+        return asdict(self.limits)
 
     def transform_features(self, features: _Features) -> _Features:
         return features
@@ -214,7 +204,7 @@ class SmoothActionsStep(ProcessorStep):
                 state = self._reached(np.where(finite, measured, here), finite, self._chunk)
             # A value is measured for the first time, or the robot was moved by other means.
             first = finite & np.isnan(self._before)
-            farthest = _JUMP * self._filter.velocity / self.fps
+            farthest = _JUMP * self._filter.velocity / self.limits.fps
             jumped = (np.abs(measured - self._before) > farthest).any(-1, keepdims=True)
             state = _restarted(first | (jumped & finite), measured, state)
         self._before = np.where(finite, measured, self._before)
@@ -242,7 +232,7 @@ class SmoothActionsStep(ProcessorStep):
             np.where(self._columns >= 0, x.double().numpy()[:, self._columns], np.nan)
             for x in (state, previous)
         )
-        velocity = np.nan_to_num((now - before) * self.fps)
+        velocity = np.nan_to_num((now - before) * self.limits.fps)
         slow = (np.abs(velocity) <= self._filter.velocity).all(-1, keepdims=True)
         return now, np.where(slow, velocity, 0.0)
 
@@ -253,8 +243,8 @@ class SmoothActionsStep(ProcessorStep):
         nearest = np.maximum(np.square(seen).sum(-1).argmin(-1), 2)
         rows = np.arange(len(chunk))
         last, middle, first = (chunk[rows, nearest - k] for k in range(3))
-        velocity = (last - middle) * self.fps
-        acceleration = (velocity - (middle - first) * self.fps) * self.fps
+        velocity = (last - middle) * self.limits.fps
+        acceleration = (velocity - (middle - first) * self.limits.fps) * self.limits.fps
         return MotionState.moving(last, velocity, acceleration)
 
 

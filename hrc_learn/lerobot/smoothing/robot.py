@@ -96,14 +96,22 @@ class ActionUpsampler:
     def position(self) -> Float[np.ndarray, "*batch D"]:
         return self._state.position
 
-    def reset(self, position: Float[np.ndarray, "*batch D"]) -> None:
-        """Start at rest at the present position; several robots move at once if there are.
+    def reset(
+        self,
+        position: Float[np.ndarray, "*batch D"],
+        velocity: Float[np.ndarray, "*batch D"] | float = 0.0,
+    ) -> None:
+        """Start from the present motion; several robots move at once if there are.
+
+        Args:
+            position: Position.
+            velocity: Velocity [1/s].
 
         Raises:
-            ValueError: It has another number of values than the limits.
+            ValueError: The position has another number of values than the limits.
         """
         position = self._checked(position)
-        self._state = MotionState.moving(position)
+        self._state = MotionState.moving(position, velocity)
         self._points = np.repeat(position[None], self.degree + 1, axis=0)
         self._newest, self._phase = position, 0.0
 
@@ -256,6 +264,7 @@ class SmoothRobot(Robot):
         self._stop, self._thread = Event(), None
         self._error: Exception | None = None
         self._started: float | None = None
+        self._readings = deque[tuple[float, np.ndarray]](maxlen=2)
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -295,27 +304,45 @@ class SmoothRobot(Robot):
             self._thread.start()
 
     def begin(self) -> None:
-        """Restart the path at rest at the robot's position, as after moving it by hand.
+        """Restart the path from the robot's motion, as after moving it by hand.
 
         Raises:
             ValueError: The robot does not report where a value of its actions is.
         """
+        self._readings.clear()
+        self._observed()
+        _, here = self._readings[-1]
+        if unknown := [n for n, x in zip(self._names, here, strict=True) if x != x]:
+            raise ValueError(
+                f"{self.inner} does not report {', '.join(unknown)}, so it is not known "
+                "where its motion begins: check the sensor"
+            )
         with self._bus:
-            seen = self.inner.get_observation()
-            here = np.array([float(seen.get(name, np.nan)) for name in self._names])
-            if unknown := [n for n, x in zip(self._names, here, strict=True) if x != x]:
-                raise ValueError(
-                    f"{self.inner} does not report {', '.join(unknown)}, so it is not known "
-                    "where its motion begins: check the sensor"
-                )
             self._actions.clear()
             self._started = None
             self.upsampler.reset(here)
 
     def get_observation(self) -> dict[str, Any]:
         self._complain()
+        return self._observed()
+
+    def _observed(self) -> dict[str, Any]:
         with self._bus:
-            return self.inner.get_observation()
+            seen = self.inner.get_observation()
+            here = np.array([float(seen.get(name, np.nan)) for name in self._names])
+            self._readings.append((time.perf_counter(), here))
+            return seen
+
+    def _start(self, now: float) -> None:
+        """Start the path from the motion that was measured before the first action."""
+        (then, before), (last, here) = self._readings[0], self._readings[-1]
+        limits = self.upsampler.limits
+        if now - last > 1 / limits.fps or not np.isfinite(here).all():
+            return  # the robot has been at rest since it was connected, as far as is known
+        velocity = (here - before) / (last - then) if last > then else np.zeros_like(here)
+        # A robot that is put elsewhere between two readings is no faster for it.
+        slow = bool((np.abs(velocity) <= limits.velocity).all())
+        self.upsampler.reset(here, velocity if slow else 0.0)
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Go on to an action.
@@ -390,6 +417,7 @@ class SmoothRobot(Robot):
         """
         fps = self.upsampler.limits.fps
         if self._started is None:
+            self._start(now)
             self._started = now
             self.upsampler.push(self._actions.popleft())
         while (phase := (now - self._started) * fps) >= 1:
