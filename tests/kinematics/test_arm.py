@@ -12,6 +12,7 @@ from torch.testing import assert_close
 from hrc_learn.kinematics import (
     Arm,
     ArmChoice,
+    LinkCapsule,
     MissingModelError,
     arm,
     null_space_dimension,
@@ -313,3 +314,11 @@ def test_round_shapes_are_their_own_capsules(kind, half):
     assert (capsule.link, capsule.radius) == (3, 0.02)
     np.testing.assert_allclose(capsule.start, (0.1 - half, 0.2, 0.3), atol=1e-12)
     np.testing.assert_allclose(capsule.end, (0.1 + half, 0.2, 0.3), atol=1e-12)
+
+
+def test_masses_without_a_description_are_those_of_the_capsules():
+    capsule = LinkCapsule(link=2, start=(0.0, 0.0, 0.1), end=(0.0, 0.0, 0.4), radius=0.05)
+    masses = Arm(name="bare", chain=panda, capsules=[capsule]).masses
+    cylinder, ball = np.pi * 0.05**2 * 0.3, 4 / 3 * np.pi * 0.05**3
+    assert masses[2] == pytest.approx(1200 * (cylinder + ball))
+    assert sum(masses) == masses[2]
