@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Set
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -37,35 +38,31 @@ _HEIGHT = 0.15  # to which the object is lifted [m]
 _TREMOR = 2e-4  # amplitude of the end effector's tremor while it grasps [m]
 
 
+# The expert of placing, and the time at which it lets go [s].
+_PLACING = PlacingDemonstrationConfig()
+_LET_GO = _PLACING.duration + _PLACING.settle
+
+
 @dataclass(frozen=True, kw_only=True)
 class Placing:
     """Put the object in the gripper on a shelf, and let go."""
 
     workplace: Workplace = field(default_factory=Workplace)
     shelf: str = "middle"
-    demonstration: PlacingDemonstrationConfig = field(
-        default_factory=PlacingDemonstrationConfig
-    )
+    duration: ClassVar[float] = _LET_GO + _RELEASE
+    """Duration of the task [s]."""
 
     @property
     def task(self) -> str:
         """Description of the task."""
         return f"place the box on the {self.shelf} shelf"
 
-    @property
-    def duration(self) -> float:
-        return self._let_go + _RELEASE
-
-    @property
-    def _let_go(self) -> float:
-        return self.demonstration.duration + self.demonstration.settle
-
     def begin(self, world: World, rng: np.random.Generator) -> Human:
-        expert = placing_expert(self.workplace, self.shelf, self.demonstration, rng)
+        expert = placing_expert(self.workplace, self.shelf, _PLACING, rng)
         offset = torch.from_numpy(expert.path.position(0.0)) - self.workplace.home().position
         joints = self.workplace.home_joints(offset).numpy()
         world.hold(self.workplace.scene.objects[0].name, joints)
-        return SequencedInput([(0.0, expert, CLOSED), (self._let_go, expert, OPEN)])
+        return SequencedInput([(0.0, expert, CLOSED), (_LET_GO, expert, OPEN)])
 
     def succeeded(self, world: World) -> bool:
         return world.rests_on(self.workplace.scene.objects[0].name, f"board_{self.shelf}")
@@ -76,14 +73,8 @@ class Grasping:
     """Take an object that lies at random on the table, and lift it."""
 
     workplace: Workplace = field(default_factory=Workplace)
-
-    @property
-    def task(self) -> str:
-        return "grasp the box and lift it"
-
-    @property
-    def duration(self) -> float:
-        return _APPROACH + _GRIP + _LIFT + _SETTLE
+    task: ClassVar[str] = "grasp the box and lift it"
+    duration: ClassVar[float] = _APPROACH + _GRIP + _LIFT + _SETTLE
 
     def begin(self, world: World, rng: np.random.Generator) -> Human:
         item = self.workplace.scene.objects[0]
@@ -95,21 +86,20 @@ class Grasping:
         world.reset(joints.numpy(), {item.name: pose})
         grasp = pose[:3, 3]
         above, lifted = (grasp + np.array([0.0, 0.0, h]) for h in (0.08, _HEIGHT))
+
+        def lead(points: list[np.ndarray], duration: float, start: float) -> ScriptedExpert:
+            return ScriptedExpert(
+                self.workplace.robot.chain,
+                GuidedPath(np.vstack(points), duration, start),
+                tremor=Tremor(_TREMOR, rng),
+                orientation=lambda _position, _time: gripper_down(),
+            )
+
         closing = _APPROACH + _GRIP
-        down = self._lead([hover.position.numpy(), above, grasp], _APPROACH, 0.0, rng)
-        up = self._lead([grasp, lifted], _LIFT, closing, rng)
+        down = lead([hover.position.numpy(), above, grasp], _APPROACH, 0.0)
+        up = lead([grasp, lifted], _LIFT, closing)
         return SequencedInput(
             [(0.0, down, OPEN), (_APPROACH, down, CLOSED), (closing, up, CLOSED)]
-        )
-
-    def _lead(
-        self, points: list[np.ndarray], duration: float, start: float, rng: np.random.Generator
-    ) -> ScriptedExpert:
-        return ScriptedExpert(
-            self.workplace.robot.chain,
-            GuidedPath(np.vstack(points), duration, start),
-            tremor=Tremor(_TREMOR, rng),
-            orientation=lambda _position, _time: gripper_down(),
         )
 
     def succeeded(self, world: World) -> bool:
