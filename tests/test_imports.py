@@ -77,7 +77,7 @@ def test_the_core_works_where_no_edge_is_installed(found):
     assert found["jacobian"] == [6, 7]
 
 
-def test_the_person_needs_no_screen_until_a_page_is_opened(found):
+def test_person_needs_no_screen_until_a_page_is_opened(found):
     assert found["person"] == []
 
 

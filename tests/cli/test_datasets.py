@@ -159,7 +159,7 @@ def test_findings_are_written_for_other_programs(recording, tmp_path):
     assert finding["episode"] is None
 
 
-def test_what_was_found_is_written_even_where_the_camera_cannot_be_told(tmp_path, monkeypatch):
+def test_findings_are_written_even_if_the_camera_check_fails(tmp_path, monkeypatch):
     def refuse(demos):
         raise ValueError(f"no marker was seen in {len(demos)} episodes")
 
@@ -284,7 +284,7 @@ def test_images_are_shown_and_a_bad_video_is_listed(tmp_path):
     np.testing.assert_allclose([i.mean() for i in images], shades[frames], atol=4)
 
 
-def test_of_many_demonstrations_some_are_shown(tmp_path, monkeypatch):
+def test_a_sample_of_many_demonstrations_is_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(dashboard_commands, "_SHOWN", 2)
     array = np.linspace(0, 1, 180).reshape(3, 20, 3)
     np.save(tmp_path / "three.npy", array)
@@ -352,7 +352,7 @@ def test_demonstrations_are_opened_from_a_recording_that_does_not_stay(
     assert not Path(viewer[0][-1]).exists()
 
 
-def test_what_cannot_be_shown_is_said(viewer, tmp_path):
+def test_paths_that_cannot_be_shown_are_refused(viewer, tmp_path):
     (tmp_path / "run.rrd").touch()
     refused = hrc("show", tmp_path, "--out", tmp_path / "demos.rrd")
     assert (refused.status, "holds recordings" in refused.error) == (2, True)

@@ -46,7 +46,7 @@ def test_a_second_sigterm_does_not_wait():
 
 
 @pytest.mark.parametrize("lines", [2, 100_000])
-def test_a_reader_that_leaves_ends_a_command_quietly(lines):
+def test_a_closed_output_ends_a_command_quietly(lines):
     loud = PROGRAM.replace("time.sleep(60)", f'time.sleep(0.5), print("x\\n" * {lines})')
     loud = loud.replace('print("tidied up", flush=True)', "pass")
     command = [sys.executable, "-c", loud]

@@ -92,7 +92,7 @@ def test_a_decision_that_does_not_fit_keeps_those_before(places, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"set", "set.curation.json"}
 
 
-def test_a_feature_of_which_nothing_fits_is_none(tmp_path):
+def test_a_feature_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path):
     root = write_set(tmp_path / "set", **SETS["v3.0 with a camera"])
     with small_files(60):
         status, _, errors = hrc("extract", root, "--marker", 3)

@@ -83,7 +83,7 @@ def test_a_model_that_names_no_dataset_is_refused(poses, tmp_path, content):
     assert str(model / "made_by.json") in error
 
 
-def test_an_error_that_is_no_number_meets_no_limit(poses, tmp_path, monkeypatch):
+def test_an_error_of_nan_meets_no_limit(poses, tmp_path, monkeypatch):
     model = tmp_path / "model"
     fit = ("fit", "--dataset", poses, "--out", model, "--n-basis", 20, "--several", "mean")
     done(*fit, "--channels", "position")
@@ -177,7 +177,7 @@ def test_a_fit_shows_few_rows_with_units(poses, tmp_path):
     assert f"{len(metrics) - len(rows)} more" in output
 
 
-def test_a_fit_says_what_predicts_best_and_an_evaluation_takes_it(poses, tmp_path):
+def test_an_evaluation_uses_the_model_that_predicts_best(poses, tmp_path):
     model = tmp_path / "model"
     output = done(
         *("fit", "--dataset", poses, "--n-basis", 20, "--channels", "position", "--out", model)

@@ -42,7 +42,7 @@ def test_it_reports_latencies_and_interventions(tmp_path):
     assert "step_p99_us" in outcome.output
 
 
-def test_it_leads_an_arm_of_another_description(tmp_path):
+def test_it_controls_an_arm_of_another_description(tmp_path):
     six = bare().chain
     file = tmp_path / "cut.urdf"
     file.write_text(to_urdf(six, "cut"), encoding="utf-8")

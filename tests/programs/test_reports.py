@@ -76,7 +76,7 @@ def test_a_single_run_has_its_own_page(runs, tmp_path):
     assert page == (runs[0] / "report.html").read_text(encoding="utf-8")
 
 
-def test_what_is_no_run_is_bad_input(runs, tmp_path):
+def test_folders_without_a_report_are_bad_input(runs, tmp_path):
     out = tmp_path / "page.html"
     (line,) = done("report", runs[0], tmp_path, "--out", out, status=2).error.splitlines()
     assert f"{tmp_path} has no report.json" in line

@@ -81,7 +81,7 @@ def test_person_figure_shades_the_push_and_shows_millimetres():
     assert span.get_x() + span.get_width() == pytest.approx(run.time[119])
 
 
-def test_person_figure_shows_the_time_in_which_the_person_is_about():
+def test_person_figure_shows_the_time_with_a_person_present():
     run = sample_run()
     whole = figures.person_figure(run).axes[-1].get_xlim()
     assert whole == (run.time[0], run.time[-1])
@@ -122,7 +122,7 @@ def test_a_figure_names_the_field_it_lacks(draw, field):
         draw(sample_run(**{field: None}))
 
 
-def test_spells_are_the_runs_of_true_samples():
+def test_active_intervals_are_runs_of_true_samples():
     active = np.zeros(STEPS, dtype=bool)
     active[[0, 1, 5, 198, 199]] = True
     assert active_intervals(active) == [(0, 1), (5, 5), (198, 199)]

@@ -51,12 +51,12 @@ def test_a_film_is_decoded_with_its_rate_size_and_order():
     ("pictures", "complaint"),
     [([], "at least one picture"), ([np.zeros((48, 63, 3), np.uint8)], "not 63 x 48 px")],
 )
-def test_what_makes_no_film_is_said(pictures, complaint):
+def test_pictures_that_make_no_film_are_refused(pictures, complaint):
     with pytest.raises(ValueError, match=complaint):
         film_mp4(pictures, 15.0)
 
 
-def test_text_stands_below_and_the_picture_of_the_camera_above_it():
+def test_the_caption_is_below_the_inset():
     plain = np.full((300, 400, 3), 200, np.uint8)
     inset = np.full((40, 60, 3), 90, np.uint8)
     shown = annotated(plain, "Grasps", "3 s", [("plan", palette.GREEN)], inset)
@@ -69,7 +69,7 @@ def test_text_stands_below_and_the_picture_of_the_camera_above_it():
     np.testing.assert_array_equal(shown[100:200, 100:300], plain[100:200, 100:300])
 
 
-def test_the_picture_of_the_camera_is_the_last_one_seen_with_marker_and_target():
+def test_the_inset_shows_the_last_image_with_marker_and_target():
     run = sample_run()
     recorded = run.camera
     assert recorded is not None
@@ -114,7 +114,7 @@ def test_a_turned_body_is_drawn_turned(camera):
     assert pixel(picture, camera, (0, 0.2, 0)) != [0, 0, 255]
 
 
-def test_what_is_nearer_hides_what_is_behind_it(camera):
+def test_near_objects_hide_far_ones(camera):
     near = Box(centre=(0.5, 0.0, 0.0), half_size=(0.1, 0.2, 0.2), colour=(0.0, 1.0, 0.0, 1.0))
     far = Box(centre=(-0.5, 0.0, 0.0), half_size=(0.1, 0.2, 0.2), colour=(1.0, 0.0, 0.0, 1.0))
     for boxes in ((near, far), (far, near)):

@@ -29,13 +29,13 @@ def test_a_bare_run_shows_its_joints():
     assert [plot.title for plot in tab.plots] == [f"joint{i} [rad]" for i in range(1, 8)]
 
 
-def test_the_tabs_tell_the_story_first():
+def test_the_story_tab_comes_first():
     titles = [tab.title for tab in run_tabs(sample_run())]
     expected = ["Story", "Servoing", "Person and worker", "Primitive", "Safety", "Lyapunov"]
     assert titles == expected
 
 
-def test_colours_are_told_by_legends_that_name_each_curve():
+def test_legends_name_each_curve():
     tabs = {tab.title: tab for tab in run_tabs(sample_run())}
     for tab in tabs.values():
         for plot in tab.plots:
@@ -64,7 +64,7 @@ def test_the_story_shows_what_other_tabs_show_in_detail():
     ]
 
 
-def test_curves_have_a_name_and_a_colour_each_and_a_path_of_their_own():
+def test_each_curve_has_a_name_a_colour_and_a_path():
     tabs = run_tabs(sample_run())
     every = [c for tab in tabs for plot in tab.plots for c in plot.curves]
     assert len({c.path for c in every}) == len(every)
@@ -73,7 +73,7 @@ def test_curves_have_a_name_and_a_colour_each_and_a_path_of_their_own():
         assert len(c.colours) == len(c.names)
 
 
-def test_all_twelve_entries_of_the_jacobian_are_shown_beside_the_truth():
+def test_all_twelve_entries_of_the_jacobian_are_shown_with_the_true_ones():
     run = sample_run()
     shown = curves(run_tabs(run))
     for kind, expected in (
@@ -94,7 +94,7 @@ def test_lengths_are_shown_in_millimetres_and_angles_in_degrees():
     assert shown["person/rotation_deviation"].values.max() == pytest.approx(0.01)
 
 
-def test_the_distance_of_a_worker_is_shown_twice_the_second_time_from_near():
+def test_the_distance_of_a_worker_is_shown_as_a_whole_and_enlarged():
     run = sample_run()
     shown = curves(run_tabs(run))
     far, near = shown["worker/distance"], shown["worker/near"]
@@ -132,7 +132,7 @@ def test_joints_at_their_limits_are_at_the_edges_of_the_bands():
     np.testing.assert_array_equal(shown["safety/velocity/limits"].values[7], [-1.0, 1.0])
 
 
-def test_guards_are_marks_at_heights_of_their_own_where_they_acted():
+def test_each_guard_has_its_own_row_of_marks():
     often = np.arange(STEPS) % 3
     run = sample_run(safety={"never": np.zeros(STEPS), "often_so": often, "at_once": often > 1})
     marks = curves(run_tabs(run))["safety/acted"]
@@ -143,7 +143,7 @@ def test_guards_are_marks_at_heights_of_their_own_where_they_acted():
         assert (marks.values[acted, k] == k + 1).all()
 
 
-def test_hindrances_are_lines_at_heights_of_their_own_while_they_act():
+def test_each_hindrance_has_its_own_row():
     run = sample_run()
     shown = curves(run_tabs(run))
     np.testing.assert_array_equal(shown["person/followed"].values[:, 0], run.followed)

@@ -117,7 +117,7 @@ def test_the_page_holds_everything_it_was_given():
     assert ["numpy", "2.2.6"] in shown.rows
 
 
-def test_what_there_is_none_of_takes_no_place():
+def test_empty_parts_of_a_report_are_left_out():
     shown = Page(reports_page("Page", [Report(title="Bare", summary="Text.")]))
     assert not {"table", "details", "pre", "section"} & shown.tags
 
@@ -233,7 +233,7 @@ def test_claims_of_the_paper_have_a_column_where_there_are_any():
     assert "The paper says" not in page(table=[FREE]).texts
 
 
-def test_claims_widen_only_the_table_that_has_some():
+def test_only_tables_with_claims_have_their_column():
     claimed = Measurement(name="last", value=1, claim="2 (Fig. 8)")
     table = [*(replace(GOOD, name=f"v{i}") for i in range(6)), claimed]
     seen, folded = reports_page("x", [report(table=table)]).split("<details>", 1)
@@ -320,7 +320,7 @@ def test_several_reports_are_listed_with_their_verdicts_first():
         reports_page("None", [])
 
 
-def test_what_several_runs_measured_stands_side_by_side():
+def test_common_values_of_several_runs_are_compared():
     def run(error: float, **others: float) -> Report:
         table = [Measurement(name="error", value=error, unit="mm", target=2)]
         table += [Measurement(name=name, value=value) for name, value in others.items()]
@@ -340,7 +340,7 @@ def test_what_several_runs_measured_stands_side_by_side():
     assert 'class="n miss">5 mm' in html
 
 
-def test_a_folder_holds_page_pictures_and_what_they_were_made_from(tmp_path):
+def test_a_folder_holds_page_pictures_and_data(tmp_path):
     write_report(tmp_path, report())
     files = {str(f.relative_to(tmp_path)) for f in tmp_path.rglob("*") if f.is_file()}
     pictures = {"figures/path.png", "figures/path.svg"}
@@ -350,7 +350,7 @@ def test_a_folder_holds_page_pictures_and_what_they_were_made_from(tmp_path):
     assert html == reports_page("Grasp", [read_report(tmp_path)])
 
 
-def test_the_page_links_to_what_the_run_left_beside_it(tmp_path):
+def test_the_page_links_to_other_files_of_the_run(tmp_path):
     for name in ("run.rrd", "log.npz", "a & b.rrd", "measured.json"):
         (tmp_path / name).touch()
     write_report(tmp_path, report(film=Film(b"an mp4", "The run")))

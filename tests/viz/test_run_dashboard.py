@@ -60,7 +60,7 @@ def names_of(part) -> set[str]:
     return inner | {part.name} if isinstance(getattr(part, "name", None), str) else inner
 
 
-def test_plots_of_nothing_are_left_out_of_what_is_over():
+def test_empty_plots_are_left_out_of_finished_runs():
     nothing = np.full(len(sample_run().time), np.nan)
     run = sample_run(elbow_motion=nothing, potentials={"x": nothing}, potential_rate=None)
     elbow, lyapunov = "Elbow: displacement [mm]", "Lyapunov"
@@ -71,7 +71,7 @@ def test_plots_of_nothing_are_left_out_of_what_is_over():
     assert elbow in names_of(run_layout(sample_run()).root_container)
 
 
-def test_bodies_move_as_they_did(run, rrd):
+def test_bodies_have_their_recorded_poses(run, rrd):
     (body,) = run.bodies
     time = rrd.time("world/bodies/hand")
     assert (np.diff(time) < 0.05).all()
@@ -123,7 +123,7 @@ def test_a_line_joins_worker_and_robot_where_they_are_nearest(tmp_path):
             np.testing.assert_allclose(strip, nearest[k], atol=1e-6)
 
 
-def test_an_arrow_shows_where_a_person_pushes_while_they_do(run, rrd):
+def test_an_arrow_shows_a_push_while_it_lasts(run, rrd):
     time = rrd.time("world/push")
     at = np.searchsorted(run.time, time - 1e-9)
     pushed = np.isfinite(run.push[at, 0, 0])
@@ -155,7 +155,7 @@ def test_images_are_jpeg_at_their_times(run, rrd):
         assert abs(decoded.mean() - image.mean()) < 2
 
 
-def test_marks_vanish_while_there_is_nothing_to_mark(run, rrd):
+def test_marks_vanish_while_the_feature_is_hidden(run, rrd):
     time = rrd.time("world/camera/image/feature")
     at = np.searchsorted(run.time, time - 1e-9)
     seen = np.isfinite(run.camera.feature[at, 0])
@@ -170,12 +170,12 @@ def test_marks_vanish_while_there_is_nothing_to_mark(run, rrd):
     np.testing.assert_allclose(np.mean(crosses[-1], axis=(0, 1)), run.camera.target[-1])
 
 
-def test_the_path_in_the_image_skips_what_was_not_seen(rrd):
+def test_the_path_in_the_image_skips_hidden_features(rrd):
     for (strip,) in rrd.column("world/camera/image/path", "LineStrips2D:strips"):
         assert np.isfinite(strip).all()
 
 
-def test_the_still_things_are_there(run, rrd):
+def test_static_shapes_are_recorded(run, rrd):
     for name, path in (("demonstration", run.demo_path), ("plan", run.plan_path)):
         ((strip,),) = rrd.column(f"world/paths/{name}", "LineStrips3D:strips", static=True)
         np.testing.assert_allclose(strip, path, atol=1e-6)
@@ -262,7 +262,7 @@ def test_every_step_arrives_once_and_in_order(tmp_path):
     assert "live/unsent" not in rrd.entities
 
 
-def test_an_error_of_the_thread_is_raised_where_it_is_closed():
+def test_an_error_of_the_thread_is_raised_at_the_end_of_the_block():
     log = StepLog()
     log.append(time=0.0)
     sender = live_sender(LogStream(log, rr.RecordingStream("test"), ["speed"]).send)
@@ -354,7 +354,7 @@ endsolid cube
 """
 
 
-def test_a_mesh_is_drawn_in_place_of_what_it_shows(tmp_path):
+def test_a_mesh_is_drawn_instead_of_capsules(tmp_path):
     (tmp_path / "cube.stl").write_text(CUBE)
     run = sample_run()
     (body,) = run.bodies
