@@ -310,7 +310,7 @@ class ArmRobot(Device, Robot):
         self._need_connection()
         self._judge()
         where, width = self.values.target_of(action)
-        joints = self._joints_at(where) if isinstance(where, Pose) else where
+        joints = self.servo.joints_at(where) if isinstance(where, Pose) else where
         if self.complement is not None:
             joints, width = self._with_person(self.complement, where, joints, width)
         sent = self._command(joints, width)
@@ -334,10 +334,6 @@ class ArmRobot(Device, Robot):
     @abstractmethod
     def arm(self) -> Arm:
         """The arm, to be read."""
-
-    @abstractmethod
-    def _joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
-        """Joint positions that bring the end effector to a pose [rad]."""
 
     @abstractmethod
     def _command(

@@ -17,7 +17,6 @@ from lerobot.cameras import CameraConfig, make_cameras_from_configs
 from lerobot.robots import RobotConfig
 
 from hrc_learn.controller import SafetyConfig
-from hrc_learn.geometry import Pose
 from hrc_learn.hardware import ArmProcess, FrankyArm, FrankyConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
@@ -128,9 +127,6 @@ class FrankaPanda(ArmRobot):
         for name, camera in self.cameras.items():
             values[name] = camera.read_latest()
         return values
-
-    def _joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
-        return self._servo.joints_at(pose)
 
     def _command(
         self, joints: Float[np.ndarray, " joints"], width: float

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from lerobot.robots import RobotConfig
 from torch import Tensor
 
-from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
@@ -270,9 +269,6 @@ class MujocoArmRobot(ArmRobot):
             self._person.begin(seed)
         self.initial_configurations += 1
         self._rotation = DOWN
-
-    def _joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
-        return self.run.servo.joints_at(pose)
 
     def _command(
         self, joints: Float[np.ndarray, " joints"], width: float
