@@ -264,3 +264,22 @@ def test_joints_that_stay_aside_are_not_led_back_however_far_they_are():
     assert off[-1] > off.max() - 0.1
     assert (elbow(joints) - elbow(postures)).norm(dim=-1)[-1] > 0.1
     assert hand_off(postures, joints)[0] < 1e-6
+
+
+def test_step_that_ends_too_near_an_obstacle_is_not_taken():
+    """An obstacle that the loop did not foresee, as where the correction of the hand leads."""
+    asked = []
+
+    def clearance(q):
+        distance = torch.full(q.shape[:-1], 0.5, dtype=torch.float64)
+        if q.shape == (2, 7) and torch.equal(q[0], panda.ready):
+            asked.append(q)
+            distance[1] = 0.0
+        return distance
+
+    human = Pusher(SIDEWAYS, 0.0, 9.0)
+    wishes = np.repeat(panda.ready.numpy()[None], 4, axis=0)
+    _, joints, _ = followed(wishes, human, clearance=clearance)
+    assert asked
+    assert torch.equal(joints[-1], panda.ready)
+    assert "obstacle" in human.reasons()[-1]
