@@ -132,7 +132,7 @@ class PositionServo:
         """
         self._chain, self._arm, self._dt = chain, arm, dt
         self._config = config = config or PositionServoConfig()
-        self._filter = SafetyFilter(chain.limits, config.safety)
+        self._filter = SafetyFilter(chain, config.safety)
         if not 0 < dt <= config.safety.longest_step:
             raise ValueError(
                 f"targets must come within {config.safety.longest_step:g} s of each other, but "

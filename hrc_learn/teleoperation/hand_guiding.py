@@ -284,7 +284,7 @@ class HandGuidedArm:
         """
         self.config = config or HandGuidingConfig()
         self._chain, self._arm, self._human = chain, arm, human
-        self._filter = SafetyFilter(chain.limits, self.config.safety)
+        self._filter = SafetyFilter(chain, self.config.safety)
         self._feedback = PersonFeedback(chain)
         self._posture: Float[torch.Tensor, " joints"] | None = None
         self.safety: SafetyState

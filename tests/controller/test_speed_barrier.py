@@ -8,7 +8,15 @@ from bench_limits import Search, points_of, search
 from sampling import generator, within
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
+from hrc_learn.controller import (
+    ArmLoop,
+    ArmLoopConfig,
+    ArmReading,
+    SafetyConfig,
+    SafetyFilter,
+    SafetyState,
+)
+from hrc_learn.controller.arm_loop_state import MoveJoints
 from hrc_learn.kinematics import arm, panda
 
 READY = panda.ready
@@ -128,3 +136,25 @@ def test_more_points_than_the_tool_are_capped():
         for _ in range(200):
             v, state, _ = safety.step(state, READY, u, 0.004, **given)
         assert 0.17 < (point @ v).norm() <= 0.2
+
+
+@pytest.mark.parametrize("loaded", [True, False])
+def test_the_arm_loop_caps_the_end_of_a_load(loaded):
+    loop = ArmLoop(panda, ArmLoopConfig(safety=SafetyConfig(tcp_speed=0.2)))
+    pose, J = panda.forward_and_jacobian(READY)
+    end = torch.tensor([0.0, 0.0, 0.3], dtype=torch.float64)
+    reading = ArmReading(
+        joint_position=READY,
+        pose=pose,
+        jacobian=J,
+        nullspace_input=torch.zeros_like(READY),
+        pause=torch.tensor(False),
+        load=end if loaded else None,
+    )
+    wanted = MoveJoints(joint_velocity=torch.tensor([0.0, 0, 0, 0, 0, 1.5, 0]).double())
+    state = loop.initial_state(READY)
+    for _ in range(100):
+        v, state, _ = loop.step(state, reading, wanted)
+    arm_of_load = (pose.apply(end) - pose.position)[:, None]
+    speed = ((J[:3] + torch.linalg.cross(J[3:], arm_of_load, dim=0)) @ v).norm()
+    assert (0.17 < speed <= 0.2) == loaded

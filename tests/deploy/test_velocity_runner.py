@@ -1,6 +1,7 @@
 """The step of an arm that is told velocities, run as loops run it."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,3 +69,16 @@ def test_the_exported_step_equals_the_eager_one(tmp_path):
             sent.append(runner.step().copy())
         np.testing.assert_allclose(sent[1], sent[0], rtol=0, atol=1e-12)
         q += DT * sent[0]
+
+
+def test_a_runner_starts_from_the_measured_motion():
+    runner = EagerRunner(STEP, EXAMPLE)
+    velocity, acceleration = np.linspace(-0.3, 0.3, 7), np.linspace(1.0, 2.0, 7)
+    runner.start(READY, velocity, acceleration)
+    runner.observation["joint_velocity"][:] = velocity
+    state = STEP.initial_state(*(torch.from_numpy(x) for x in (READY, velocity, acceleration)))
+    wanted = replace(EXAMPLE, joint_velocity=torch.from_numpy(velocity))
+    expected, _ = STEP.step(state, wanted)
+    np.testing.assert_allclose(runner.step(), expected.joint_velocity.numpy(), atol=1e-15)
+    runner.start(READY)
+    assert not runner.state("safety.velocity").any()
