@@ -1,6 +1,8 @@
 """Only files written by this package are replaced or deleted."""
 
+import errno
 import json
+import os
 
 import pytest
 from cakes import KIND, cake, contents, fill
@@ -55,7 +57,15 @@ def test_an_empty_folder_may_be_filled(tmp_path):
     assert contents(tmp_path) == cake("new")
 
 
-def test_files_of_other_origin_are_carried_over_on_request(tmp_path):
+@pytest.mark.parametrize("file_system_has_links", [True, False])
+def test_files_of_other_origin_are_carried_over_on_request(
+    file_system_has_links, tmp_path, monkeypatch
+):
+    def refuse(*_, **__):
+        raise OSError(errno.EPERM, "no links here")
+
+    if not file_system_has_links:
+        monkeypatch.setattr(os, "link", refuse)
     out = tmp_path / "out"
     fill(out, "old")
     (out / "notes").mkdir()
@@ -68,6 +78,21 @@ def test_files_of_other_origin_are_carried_over_on_request(tmp_path):
         assert contents(tmp_path) == cake(text) | own
     with pytest.raises(FileExistsError, match="link and 2 more"):
         fill(out, "last", overwrite=True)
+
+
+def test_a_foreign_file_whose_name_is_taken_is_kept_aside(tmp_path):
+    out = tmp_path / "out"
+    fill(out, "old")
+    (out / "notes").write_text("years")
+
+    def write() -> None:
+        with replacing(out, KIND, overwrite=True, others="keep") as folder:
+            folder.mkdir()
+            (folder / "notes").write_text("others")
+
+    with pytest.warns(UserWarning, match=r"out\.kept"):
+        write()
+    assert contents(tmp_path) == {"out/notes": "others", "out.kept/notes": "years"}
 
 
 def test_a_file_put_there_in_the_meantime_is_kept_aside(tmp_path):
