@@ -111,7 +111,7 @@ class ArmServer:
                 "'hrc-learn[hardware]'."
             ) from error
         self._robot = ServedRobot(world)
-        self._server = LossyServer(self._robot, list(addresses))
+        self._server: Any = LossyServer(self._robot, list(addresses))
         self._server.init()
         self.address: str = self._server.hostname
         self._simulator = ServedSimulator(world, self._robot)

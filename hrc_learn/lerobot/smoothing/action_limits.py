@@ -147,9 +147,10 @@ class ActionLimits:
 
 
 def _is_number(value: object) -> bool:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
     # Whole numbers of JSON have no bound; no robot has a limit beyond this one.
-    known = isinstance(value, int | float) and not isinstance(value, bool)
-    return known and abs(value) < 1e300
+    return abs(value) < 1e300
 
 
 def _is_positive(value: Any) -> bool:
