@@ -17,16 +17,16 @@ from hrc_learn.controller.constraint_layer import (
 )
 from hrc_learn.controller.interface import GRIPPER_DOWN as GRIPPER_DOWN
 from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
+from hrc_learn.controller.interface import INTERVENTIONS as INTERVENTIONS
 from hrc_learn.controller.interface import Command as Command
 from hrc_learn.controller.interface import Goals as Goals
 from hrc_learn.controller.interface import Observation as Observation
+from hrc_learn.controller.interface import SafetyConfig as SafetyConfig
+from hrc_learn.controller.interface import SafetyReport as SafetyReport
+from hrc_learn.controller.interface import SafetyState as SafetyState
 from hrc_learn.controller.resolved_rate import BlendingConfig as BlendingConfig
 from hrc_learn.controller.resolved_rate import VisionBlending as VisionBlending
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
-from hrc_learn.controller.safety_state import INTERVENTIONS as INTERVENTIONS
-from hrc_learn.controller.safety_state import SafetyConfig as SafetyConfig
-from hrc_learn.controller.safety_state import SafetyReport as SafetyReport
-from hrc_learn.controller.safety_state import SafetyState as SafetyState
 from hrc_learn.controller.task_pace import WayMakingConfig as WayMakingConfig
 from hrc_learn.controller.velocity_step import VelocityStep as VelocityStep
 from hrc_learn.controller.velocity_step import WantedVelocity as WantedVelocity

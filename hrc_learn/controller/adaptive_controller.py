@@ -12,7 +12,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller.interface import Command, Goals, Observation
+from hrc_learn.controller.interface import (
+    Command,
+    Goals,
+    Observation,
+    SafetyConfig,
+    SafetyReport,
+    SafetyState,
+)
 from hrc_learn.controller.resolved_rate import (
     BlendingConfig,
     BlendingState,
@@ -37,7 +44,6 @@ from hrc_learn.controller.resolved_rate import (
     validated_step,
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
-from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.controller.task_pace import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import ArrayLike, is_number

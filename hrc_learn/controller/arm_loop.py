@@ -34,7 +34,7 @@ from hrc_learn.controller.arm_loop_state import (
     TrackPose,
     WantedMotion,
 )
-from hrc_learn.controller.interface import Command
+from hrc_learn.controller.interface import Command, SafetyReport
 from hrc_learn.controller.null_space_motion import (
     Clearance,
     eased_null_velocity,
@@ -44,7 +44,6 @@ from hrc_learn.controller.null_space_motion import (
 )
 from hrc_learn.controller.path_law import PathLaw
 from hrc_learn.controller.pose_tracking import PoseTracking, twist_of
-from hrc_learn.controller.safety_state import SafetyReport
 from hrc_learn.controller.task_pace import (
     TaskPace,
     closes_in,

@@ -13,10 +13,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.controller.constraint_layer import Distances
-from hrc_learn.controller.interface import Command
+from hrc_learn.controller.interface import Command, SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.controller.joint_path import DirectReturn, JointPaths
 from hrc_learn.controller.null_space_motion import YieldingConfig
-from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.controller.task_pace import TaskPace, WayMakingConfig
 from hrc_learn.geometry import Pose
 from hrc_learn.protocols import Hindrance

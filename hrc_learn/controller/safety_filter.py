@@ -15,14 +15,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from hrc_learn.controller.constraint_layer import Distances, constrained_velocity
-from hrc_learn.controller.limit_barrier import LimitBarrier, SpeedBarrier
-from hrc_learn.controller.safety_state import (
+from hrc_learn.controller.interface import (
     INTERVENTIONS,
     ConstraintReport,
     SafetyConfig,
     SafetyReport,
     SafetyState,
 )
+from hrc_learn.controller.limit_barrier import LimitBarrier, SpeedBarrier
 from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number, may_branch
 from hrc_learn.kinematics import MotionLimits, SerialChain
 

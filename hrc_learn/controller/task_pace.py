@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller.constraint_layer import Distances
+from hrc_learn.controller.interface import ConstraintReport, SafetyConfig
 from hrc_learn.controller.joint_path import CHANGE_OF_RATE, changed_rate
-from hrc_learn.controller.safety_state import ConstraintReport, SafetyConfig
 from hrc_learn.geometry.numerics import safe_norm
 from hrc_learn.pytree import pytree, static
 

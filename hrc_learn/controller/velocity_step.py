@@ -8,8 +8,8 @@ from typing import final
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from hrc_learn.controller.interface import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.controller.safety_filter import SafetyFilter
-from hrc_learn.controller.safety_state import SafetyConfig, SafetyReport, SafetyState
 from hrc_learn.geometry.numerics import matmul
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree
