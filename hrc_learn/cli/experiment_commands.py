@@ -12,8 +12,7 @@ from typing import Any, cast, get_args
 
 from rich.console import Console
 
-from hrc_learn.cli._run import command_line, refuse_existing
-from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli._run import command_line, refuse_existing, with_settings
 from hrc_learn.cli.arguments import (
     Demo,
     FitImageJacobian,

@@ -8,8 +8,7 @@ import torch
 from rich.console import Console
 
 from hrc_learn import distributed
-from hrc_learn.cli._run import refuse_repeats, write_values
-from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli._run import refuse_repeats, with_settings, write_values
 from hrc_learn.cli.arguments import Evaluate, FitImageJacobian
 from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
 from hrc_learn.jacobian import (

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from hrc_learn.cli._run import configuration, write_values
-from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli._run import configuration, with_settings, write_values
 from hrc_learn.cli.arguments import Serve, ServePage, WithDriver
 from hrc_learn.controller import (
     GRIPPER_DOWN,

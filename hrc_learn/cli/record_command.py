@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from rich.progress import Progress, track
 
-from hrc_learn.cli._run import configuration, write_values
-from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli._run import configuration, with_settings, write_values
 from hrc_learn.cli.arguments import Record
 from hrc_learn.experiments.simulated_cell import SIMULATED
 from hrc_learn.kinematics import ArmChoice

@@ -25,7 +25,7 @@ from hrc_learn.hardware import (
     FrankyArm,
     FrankyConfig,
 )
-from hrc_learn.hardware.arm_process import StoppableArm
+from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.kinematics import SerialChain, fr3, panda
 from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World

@@ -20,7 +20,7 @@ from commands import done, hrc
 from hrc_learn import cli
 from hrc_learn.cli import arguments
 from hrc_learn.cli._commands import COMMANDS
-from hrc_learn.cli._settings import with_settings
+from hrc_learn.cli._run import with_settings
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.kinematics import MissingModelError
 from hrc_learn.learning.primitive_fitting import CHANNELS
