@@ -28,9 +28,13 @@ LOOK_AHEAD = 0.15
 # an error of 0.5 mm.
 _BENDING, _METRES_PER_RADIAN = 0.2, 0.1
 _DIFFERENCE_STEP = 1e-4  # [s]
-# Highest speed of the elbow under guidance [m/s], the reduced speed of ISO 10218-1:2011, 3.23,
-# and of a joint [rad/s]: it stops within 0.2 rad by the acceleration reserved for pushes.
-_GUIDED_SPEED, _GUIDED_JOINT_SPEED = 0.25, 1.0
+# Highest speed of the elbow under guidance [m/s]: the reduced speed of ISO 10218-1:2011, 3.23.
+# Fraction of a cap on speed that a guided elbow may use: the speed barrier follows it without
+# lag, as its bound allows for braking and delay (0.15 m/s of 0.25 m/s on a Panda).
+_GUIDED_SPEED, _GUIDED_FRACTION = 0.25, 0.6
+# Highest speed of a joint under guidance [rad/s]: it stops within 0.2 rad by the acceleration
+# reserved for pushes.
+_GUIDED_JOINT_SPEED = 1.0
 # Fractions of a motion, or of the time ahead, at which it is checked.
 _FRACTIONS = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
 # Smallest singular values between which a motion towards a singularity fades out: below the
@@ -67,11 +71,24 @@ class YieldingConfig:
     after_push: Literal["return", "stay"] = "return"
     """Behaviour after a push: the joints return to their planned path, and a servoed arm to its
     posture, or they stay off it."""
+    elbow_speed: float = _GUIDED_SPEED
+    """Highest speed of the elbow while its null space moves [m/s]: `guided_elbow_speed`."""
     return_speed: float = 0.4
     """Highest speed of the return, norm over all joints [rad/s]."""
     clearance: float = 0.03
     """Distance from obstacles that a push cannot reduce further [m]: three times the
     calibration errors of base and table."""
+
+
+def guided_elbow_speed(cap: float) -> float:
+    """Highest speed of a guided elbow that an arm with a cap on its speed follows [m/s].
+
+    An arm that lags behind a curved null-space motion moves its end effector.
+
+    Args:
+        cap: Cap on the speed of the arm's points [m/s]; infinity: none.
+    """
+    return min(_GUIDED_SPEED, _GUIDED_FRACTION * cap)
 
 
 def smallest_singular_value(
@@ -90,6 +107,7 @@ def null_space_slowdown(
     chain: SerialChain,
     joint_position: Float[Tensor, "*batch n"],
     null_velocity: Float[Tensor, "*batch n"],
+    elbow_speed: float,
 ) -> Float[Tensor, "*batch"]:
     """Fraction of a null-space velocity at which the end effector can be kept in place.
 
@@ -102,6 +120,7 @@ def null_space_slowdown(
         chain: Kinematics of the arm.
         joint_position: Joint positions [rad].
         null_velocity: Velocity in the null space of the Jacobian there [rad/s].
+        elbow_speed: Highest speed of any joint's origin [m/s].
 
     Returns:
         Factor of at most 1.
@@ -115,7 +134,7 @@ def null_space_slowdown(
     scale = bending.new_tensor([1.0] * 3 + [_METRES_PER_RADIAN] * 3)
     excess = torch.linalg.vector_norm(scale * bending, dim=-1).amax(0) / _BENDING
     moved = torch.linalg.vector_norm(origins[1, 0] - origins[0, 0], dim=-1)
-    fastest = moved.amax(-1) / _DIFFERENCE_STEP / _GUIDED_SPEED
+    fastest = moved.amax(-1) / _DIFFERENCE_STEP / elbow_speed
     fastest = torch.maximum(fastest, null_velocity.abs().amax(-1) / _GUIDED_JOINT_SPEED)
     return torch.minimum(excess.clamp(min=1.0) ** -0.5, 1 / fastest).clamp(max=1.0)
 
@@ -192,7 +211,7 @@ def eased_null_velocity(
     """
     previous = null_projection(jacobian, previous)
     projected = null_projection(jacobian, requested)
-    slowdown = null_space_slowdown(chain, joint_position, projected)
+    slowdown = null_space_slowdown(chain, joint_position, projected, config.elbow_speed)
     unbounded = projected * slowdown.unsqueeze(-1)
     # Singularities are looked for as far ahead as the arm gets while it slows down.
     last, size = previous.norm(dim=-1, keepdim=True), unbounded.norm(dim=-1, keepdim=True)

@@ -115,7 +115,7 @@ class PoseTracking:
             blocked, distance = torch.zeros_like(moves), torch.full_like(one, torch.inf)
             slowdown, clear = one, one
             if slows:
-                slowdown = null_space_slowdown(self.chain, q, null)
+                slowdown = self._slowdown(q, null)
                 null = slowdown.unsqueeze(-1) * null
             if self.clearance is not None and bool(moves.any()):
                 kept = kept_clear(q, task, null, self.clearance, config.clearance)
@@ -149,6 +149,9 @@ class PoseTracking:
             ),
         )
 
+    def _slowdown(self, q: Tensor, null: Tensor) -> Tensor:
+        return null_space_slowdown(self.chain, q, null, self.config.elbow_speed)
+
     def _within_limits(
         self, q: Tensor, J: Tensor, task: Tensor, null: Tensor, margin: tuple[Tensor, Tensor]
     ) -> Tensor:
@@ -156,7 +159,7 @@ class PoseTracking:
         gives_way = null_space_giving_way(J, task, null, *margin)
         gives_way = apply_where(
             (gives_way != null).any(-1),
-            lambda part: null_space_slowdown(self.chain, *part).unsqueeze(-1) * part[1],
+            lambda part: self._slowdown(*part).unsqueeze(-1) * part[1],
             (q, gives_way),
             gives_way,
         )

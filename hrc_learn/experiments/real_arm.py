@@ -94,6 +94,7 @@ class ArmSite:
             config,
             safety=safety,
             command_delay=_DELAY,
+            elbow_speed=guided_elbow_speed(_REDUCED_SPEED),
             speed=self.speed,
             latency=LatencyConfig(delay=self.camera_delay),
         )

@@ -369,16 +369,17 @@ class ArmRobot(Device, Robot):
 
     def _invite(self, config: PersonConfig) -> None:
         """Connect the person that guides the body."""
-        from hrc_learn.controller.null_space_motion import YieldingConfig
+        from hrc_learn.controller.null_space_motion import YieldingConfig, guided_elbow_speed
         from hrc_learn.skills.complementary_motion import ComplementaryMotion
 
         self._person = Person(config, self.work_arm)
+        elbow_speed = guided_elbow_speed(self.servo.config.safety.tcp_speed)
         self.complement = ComplementaryMotion(
             self.work_arm.chain,
             self._person,
             self.dt,
             self.servo.limits,
-            YieldingConfig(after_push=config.after_push),
+            YieldingConfig(after_push=config.after_push, elbow_speed=elbow_speed),
             self.clearance,
         )
 

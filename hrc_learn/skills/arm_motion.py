@@ -112,6 +112,7 @@ class PositionServo:
     tracked as `MotionFilter` does, so that a jump of the target is none of the arm.
 
     Attributes:
+        config: Settings of the tracking.
         safety: State of the safety filter, with its counts of interventions.
         limits: Limits within which targets are reached when the next one is due.
     """
@@ -131,7 +132,7 @@ class PositionServo:
             ValueError: dt is longer than the safety filter can guarantee its limits for.
         """
         self._chain, self._arm, self._dt = chain, arm, dt
-        self._config = config = config or PositionServoConfig()
+        self.config = config = config or PositionServoConfig()
         self._filter = SafetyFilter(chain, config.safety)
         if not 0 < dt <= config.safety.longest_step:
             raise ValueError(
@@ -176,13 +177,13 @@ class PositionServo:
         state, before = self._arm.read(), self._motion
         here, q = state.joint_position, torch.from_numpy(state.joint_position)
         self._motion = self._smoother.step(before, np.asarray(target, dtype=float))
-        wanted = self._motion.velocity + self._config.gain * (before.position - here)
+        wanted = self._motion.velocity + self.config.gain * (before.position - here)
         filtered, self.safety, _ = self._filter.step(
             self.safety, q, torch.from_numpy(wanted), self._dt, jacobian=self._chain.jacobian(q)
         )
         velocity = filtered.numpy()
         self._arm.command(velocity)
-        if np.abs(before.position - here).max() > self._config.lag:
+        if np.abs(before.position - here).max() > self.config.lag:
             self._motion = MotionState.moving(here + velocity * self._dt, velocity)
         return state, self._motion.position
 

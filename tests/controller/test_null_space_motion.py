@@ -1,5 +1,7 @@
 """Null-space motions that leave the end effector in place and the arm clear."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from hrc_learn.controller.null_space_motion import (
     eased_null_velocity,
     fraction_in_null_space,
     fraction_kept,
+    guided_elbow_speed,
     kept_clear,
     limiting_joint,
     null_space_giving_way,
@@ -56,7 +59,9 @@ def test_the_slowdown_is_that_of_the_bending_of_the_null_space():
         allowed["joint speed"] = 1.0 / float(null.abs().max())
         least = min(allowed, key=allowed.__getitem__)
         bent[least] += 1
-        assert null_space_slowdown(panda, q, null) == pytest.approx(allowed[least], rel=2e-3)
+        assert null_space_slowdown(panda, q, null, 0.25) == pytest.approx(
+            allowed[least], rel=2e-3
+        )
     assert min(bent.values()) > 0, bent
 
 
@@ -179,7 +184,7 @@ def eased(requested, bounds=FREE, steps=300):
 @pytest.mark.parametrize("speed", [0.5, 20.0])
 def test_a_request_is_followed_in_the_null_space_no_faster_than_the_arm_can(speed):
     wanted = self_motion(Q, speed)
-    expected = null_space_slowdown(panda, Q, wanted) * wanted
+    expected = null_space_slowdown(panda, Q, wanted, 0.25) * wanted
     assert (float(expected.norm()) < 0.9 * speed) == (speed > 3)
     across = panda.jacobian(Q)[0]  # moves the end effector: nothing in the null space
     torch.testing.assert_close(eased(wanted + across), expected, rtol=0, atol=1e-6)
@@ -241,3 +246,17 @@ def test_the_limiting_joint_is_the_first_to_reach_its_bound():
         expected = int(np.argmax(np.maximum(scale * v - upper, lower - scale * v)))
         found = limiting_joint(*map(torch.from_numpy, (v, lower, upper)))
         assert found == expected
+
+
+def test_guided_elbow_leaves_room_below_a_cap_on_speed():
+    assert guided_elbow_speed(0.25) == pytest.approx(0.15)
+    assert guided_elbow_speed(1.0) == guided_elbow_speed(math.inf) == 0.25
+    still, J = torch.zeros_like(Q), panda.jacobian(Q)
+    wanted = 5 * null_projection(J, torch.ones_like(Q))
+    bounds = -torch.full_like(Q, 9.0), torch.full_like(Q, 9.0)
+    for speed in (0.25, 0.15):
+        config = YieldingConfig(elbow_speed=speed)
+        v = eased_null_velocity(panda, Q, J, still, wanted, bounds, 0.01, config).unbounded
+        points, _ = panda.chain.joint_origins_and_jacobian(torch.stack([Q, Q + 1e-6 * v]))
+        fastest = (points[1] - points[0]).norm(dim=-1).max() / 1e-6
+        assert fastest <= 1.001 * speed
