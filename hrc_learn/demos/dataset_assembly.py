@@ -1,8 +1,9 @@
-"""A recording on its way to a dataset of version 3.0: new, as an extension, or recovered.
+"""Make or extend datasets of version 3.0 from recordings, also from interrupted ones.
 
 A recording lives in `NAME.recording/`. Its `recording.json` holds an identifier and the number
-of episodes of the dataset that it extends. The finished dataset keeps the identifier, so that
-a recording interrupted between the last two steps is not mistaken for another one.
+of episodes of the dataset that it extends. The finished dataset keeps the identifier. If
+the program stops before it removes the recording, the identifier shows that the dataset already
+holds it.
 """
 
 import itertools
@@ -37,7 +38,7 @@ from hrc_learn.demos.recorded_episode import (
 from hrc_learn.demos.videos import Segments, VideoSegment, video_path
 
 _PACKED = 256
-"""Rows of the list of episodes held as Python objects, which take fifty times their size."""
+"""Rows of the list of episodes kept as Python objects, which take fifty times the memory."""
 
 
 def assemble(
@@ -55,10 +56,10 @@ def assemble(
         paths: Files written by `write_episode`, in order.
         target: Folder of the new dataset.
         earlier: Dataset written by this package that the episodes are appended to. It is not
-            changed; its files get a second name in the new dataset.
+            changed; its files are linked into the new dataset, or copied.
         videos: Video segments of each episode; None for those recorded with the episodes.
-        tasks: Task texts that have an index already, in its order.
-        link_videos: Give videos a second name in the dataset instead of copying them.
+        tasks: Task texts that already have an index, in order of the index.
+        link_videos: Hard-link videos instead of copying them, where possible.
     """
     header = read_episode(paths[0]).header
     for folder in ("meta/episodes/chunk-000", "data"):
@@ -68,7 +69,7 @@ def assemble(
     sidecar = header.sidecar
     if earlier is not None:
         _carry_over(earlier, listed, cameras)
-        # Details and contract kept with the earlier dataset also hold for the longer one.
+        # The longer dataset keeps the details and the contract of the earlier one.
         before = metadata.read_sidecar(earlier)
         details = before.details | sidecar.details
         sidecar = replace(sidecar, details=details, contract=before.contract)
@@ -85,7 +86,7 @@ def assemble(
 
 
 class _EpisodeList:
-    """List of episodes as it grows, one row of `meta/episodes` each.
+    """Growing list of episodes, one row of `meta/episodes` each.
 
     Attributes:
         target: Folder of the new dataset.
@@ -137,7 +138,7 @@ class _EpisodeList:
             self._pack()
 
     def _place_video(self, key: str, segment: VideoSegment) -> dict[str, int | float]:
-        """Place the file of a segment, once for all episodes in it."""
+        """Place the video file of a segment; a file shared by episodes is placed once."""
         if (key, segment.file) not in self._placed:
             number = self.videos.get(key, 0)
             path = self.target / metadata.place(metadata.VIDEO_PATH, number, video_key=key)
@@ -177,7 +178,7 @@ def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def _count_files(table: pa.Table, kind: str) -> int:
-    """Number of files of data, or of a video, in a list of episodes."""
+    """Number of data files, or of a camera's video files, in a list of episodes."""
     chunks, files = (
         table.column(f"{kind}/{part}_index").to_pylist() for part in ("chunk", "file")
     )
@@ -226,7 +227,7 @@ def _write_metadata(
     stacked: dict[str, dict[str, np.ndarray]] = {}
     for name in table.column_names:
         column = table.column(name)
-        # Features with statistics in all episodes have some for the dataset.
+        # The dataset has statistics of those features that have them in all episodes.
         if name.startswith("stats/") and not column.null_count:
             key, _, statistic = name.removeprefix("stats/").rpartition("/")
             stacked.setdefault(key, {})[statistic] = np.array(column.to_pylist())
@@ -236,7 +237,7 @@ def _write_metadata(
 
 
 def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> None:
-    """Give the data and videos of a dataset a second name in the new one."""
+    """Link the data and videos of a dataset into the new one, and continue its lists."""
     folder = open_folder(earlier)
     for file in (*earlier.glob("data/*/*.parquet"), *earlier.glob("videos/**/*.mp4")):
         _put(file, listed.target / file.relative_to(earlier), link=True)
@@ -262,7 +263,7 @@ def _recorded_videos(path: Path, cameras: Sequence[str], fps: float) -> Segments
 
 
 def _put(source: Path, target: Path, *, link: bool) -> None:
-    """Copy a file, or give it a second name: both exist until the dataset is complete."""
+    """Hard-link or copy a file: the original exists until the dataset is complete."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if link:
         try:
@@ -289,15 +290,15 @@ class _Recording:
 
 
 def begin(root: Path, earlier_episodes: int | None) -> None:
-    """Make the folder of a recording, whose claim is held.
+    """Make the folder of a recording; the caller holds its claim.
 
     Args:
         root: Dataset to be made or extended.
         earlier_episodes: Number of episodes of the dataset to extend; None for a new one.
 
     Raises:
-        FileExistsError: `root` exists or may not be replaced by a longer dataset, an
-            interrupted recording of it holds episodes, or a foreign folder has its name.
+        FileExistsError: `root` exists and is not to be extended, an interrupted recording of
+            it holds episodes, or a foreign folder has the name of the recording.
     """
     root, staging = store.resolved(root), staging_folder(root)
     if staging.is_dir():
@@ -317,9 +318,9 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
         staging.mkdir()
     except FileExistsError:
         raise FileExistsError(
-            f"{staging} holds a recording that was interrupted: "
-            f"{recovery_advice(root)} makes a dataset of its saved episodes; remove it to "
-            f"start anew"
+            f"{staging} holds an interrupted recording: "
+            f"{recovery_advice(root)} makes a dataset of its saved episodes; remove the "
+            f"folder to start anew"
         ) from None
     store.write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
 
@@ -342,8 +343,8 @@ def finish(root: Path, claim: store.Claim) -> None:
             return
         if episodes is None and os.path.lexists(root):
             raise FileExistsError(
-                f"{root} already exists: remove {staging} if it is the same recording, or move "
-                f"{root} away to make a dataset of it"
+                f"{root} already exists: remove {staging} if both hold the same recording, or "
+                f"move {root} away to make a dataset of the recording"
             )
         paths = staged_paths(staging, episodes or 0)
         with store.replacing(
@@ -370,7 +371,7 @@ def recover_dataset(root: str | Path) -> Path:
         The same folder, now a dataset.
 
     Raises:
-        BusyError: The recording is still going on.
+        BusyError: The recording is still in progress.
         FileNotFoundError: There is no recording of that name.
         FileExistsError: Another dataset has the name.
         DatasetError: The recording held no saved episode; it is removed.
@@ -391,10 +392,10 @@ def recover_all(path: str | Path) -> list[str]:
     alone.
 
     Args:
-        path: A dataset, folder of results or model, or a folder of such things.
+        path: A dataset, a results folder, a model, or a folder that contains some.
 
     Returns:
-        Actions taken, in words.
+        Descriptions of the actions taken.
 
     Raises:
         BusyError: `path` itself is being written.
@@ -417,7 +418,7 @@ def recover_all(path: str | Path) -> list[str]:
 
 def discard(staging: Path) -> None:
     """Remove the folder of a recording, but no foreign file in it."""
-    # The header goes last: it tells that the rest is not needed, if this is interrupted too.
+    # The header is removed last: it identifies the folder if this is interrupted too.
     store.delete_files(staging, _FILES)
     if not store.delete_files(staging, [_RECORDING]):
         kept = (staging.with_name(f"{staging.name}.kept{n or ''}") for n in itertools.count())
@@ -425,7 +426,7 @@ def discard(staging: Path) -> None:
 
 
 def _read_header(staging: Path) -> _Recording:
-    """Header of a recording; one without was interrupted before it was written."""
+    """Header of a recording; created here if the recording was interrupted before that."""
     path = staging / _RECORDING
     if not path.is_file():
         store.write_json(path, _Recording())

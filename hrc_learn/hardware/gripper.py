@@ -1,4 +1,4 @@
-"""Grippers on threads, so that no loop waits for their fingers."""
+"""Grippers driven by threads, so that no control loop waits for the fingers."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from hrc_learn.hardware.driver_process import (
 )
 
 _NARROW = 0.005
-"""Openings below this are a request to squeeze, and smaller changes are no new request [m]: a
-tenth of the width of an object that two fingers take."""
+"""Requests for a smaller opening squeeze, and smaller changes of a request are ignored [m]: a
+tenth of the width of a typical object."""
 _BETWEEN_READINGS = 0.02
-"""Period of the width readings [s]: skills read it every 10 ms and act on millimetres, for
-which fingers at 0.1 m/s take 20 ms.
+"""Period of the width readings [s]: fingers at 0.1 m/s move 2 mm in it, and skills react only
+to motions of this size.
 """
 _BEFORE_NEXT_TRY = 1.0
-"""After the connection failed [s]: a control box takes some seconds to start again."""
+"""Delay before reconnecting [s]: a control box takes some seconds to restart."""
 _ENDING = 2.0
-"""Longest wait for each thread to end [s]: twice what libfranka waits for a reading."""
+"""Longest wait for each thread to end [s]: twice libfranka's timeout for a reading."""
 
 
 class GripperError(DriverError):
@@ -35,9 +35,9 @@ class GripperError(DriverError):
 
 @runtime_checkable
 class GripperDriver(Protocol):
-    """A gripper whose calls take as long as its fingers do.
+    """A gripper whose `move` and `squeeze` block until the fingers stop.
 
-    The width is read by one thread while another waits in `move` or `squeeze`.
+    One thread reads the width while another waits in `move` or `squeeze`.
     """
 
     def read_width(self) -> float:
@@ -45,15 +45,15 @@ class GripperDriver(Protocol):
         ...
 
     def move(self, width: float) -> bool:
-        """Bring the fingers to an opening [m] and wait; False: they did not get there."""
+        """Move the fingers to an opening [m] and wait; False if they do not reach it."""
         ...
 
     def squeeze(self) -> bool:
-        """Close on what is between the fingers and wait; False: they do not press on it."""
+        """Close the fingers on an object and wait; False if they do not press on one."""
         ...
 
     def close(self) -> None:
-        """End the connection; a call under way may fail."""
+        """Close the connection; a call in progress may fail."""
         ...
 
 
@@ -66,9 +66,9 @@ class GripperThread:
             gripper.width  # newest reading
             gripper.check()  # raises what has failed since `move`
 
-    One thread reads the width; another carries out moves, always the newest request after the
-    current one. A dropped connection is opened again. Failures are printed on stderr and kept
-    until the next move, so that a task can check for them at a suitable moment while the
+    One thread reads the width. Another executes the requests; after each, it continues with the
+    newest. A lost connection is reopened. Failures are printed on stderr and kept until the
+    next move, so that a task can check for them at a suitable moment while the
     control loop continues.
     """
 
@@ -77,7 +77,7 @@ class GripperThread:
 
         Args:
             open_driver: Connects to the gripper.
-            startup: Longest time for connecting [s].
+            startup: Timeout for connecting [s].
 
         Raises:
             GripperError: The gripper cannot be reached.
@@ -94,8 +94,8 @@ class GripperThread:
             threading.Thread(target=work, name=f"gripper {name}", daemon=True)
             for name, work in (("reader", self._read), ("mover", self._carry_out))
         ]
-        # A thread within a driver's own code must not be cut off by the end of the interpreter:
-        # that ends the whole process by a signal.
+        # Join the threads before the interpreter exits: if it ends a thread inside driver code,
+        # a signal kills the process.
         atexit.register(self.close)
         for thread in self._threads:
             thread.start()
@@ -112,7 +112,7 @@ class GripperThread:
 
     @property
     def width(self) -> float:
-        """Newest opening known [m]."""
+        """Newest reading of the opening [m]."""
         assert self._width is not None  # the constructor waits for the first
         return self._width
 
@@ -122,7 +122,7 @@ class GripperThread:
         return self._failure
 
     def check(self) -> None:
-        """Raise what failed since the last new opening was asked for.
+        """Raise the failure since the last new opening was requested, if any.
 
         Raises:
             GripperError: A move failed, or the gripper cannot be reached.
@@ -132,11 +132,11 @@ class GripperThread:
             raise failure
 
     def move(self, width: float) -> None:
-        """Ask for an opening, or to squeeze what is between the fingers [m].
+        """Request an opening [m]; below 5 mm, the fingers squeeze.
 
-        Taken once for each new opening, so that it may be asked for in every step of a loop.
-        One that failed is not tried again before another has been asked for: fingers that move
-        by themselves, once a connection is back, would surprise whoever went to look.
+        A loop may repeat a request in every step: it is executed once. A failed request is not
+        retried until another opening is requested: fingers that move by themselves after a
+        reconnection would surprise a person nearby.
 
         Raises:
             ValueError: The opening is not finite, or negative.
@@ -152,7 +152,7 @@ class GripperThread:
             self._news.notify_all()
 
     def close(self) -> None:
-        """End the connection and the threads; the fingers stay."""
+        """Close the connection and end the threads, without moving the fingers."""
         atexit.unregister(self.close)
         with self._news:
             self._closed = True
@@ -175,9 +175,9 @@ class GripperThread:
                 with self._news:
                     self._width = float(width)
                     self._news.notify_all()
-            except Exception as error:  # a driver's, of whatever kind
+            except Exception as error:  # drivers may raise anything
                 self._disconnect()
-                self._fail("cannot be reached, and is tried again", error)
+                self._fail("cannot be reached; reconnecting", error)
                 pause = _BEFORE_NEXT_TRY
             with self._news:
                 self._news.wait_for(lambda: self._closed, pause)
@@ -187,7 +187,7 @@ class GripperThread:
         with self._news:
             self._driver = driver
             self._news.notify_all()
-        if self._closed:  # while it was opened
+        if self._closed:  # during the connection attempt
             self._disconnect()
         return driver
 
@@ -233,19 +233,19 @@ class GripperThread:
 class GripperProcess:
     """A gripper driver whose calls are made in another process, one at a time.
 
-    For drivers that hold the interpreter during a call, as pylibfranka does. The width is read
-    again after the fingers have moved.
+    For drivers that hold the GIL during a call, as pylibfranka does. Reading the width
+    waits until the fingers have stopped.
     """
 
     def __init__(self, open_driver: Callable[[], GripperDriver]):
         """Start the process and connect.
 
         Args:
-            open_driver: Connects, in the process; it is pickled.
+            open_driver: Connects to the gripper in the new process; must be picklable.
 
         Raises:
             DriverError: The gripper cannot be reached.
-            WatchdogError: The process died, or takes too long.
+            WatchdogError: The process dies or times out.
         """
         self._driver = DriverProcess(_serve, open_driver, name="gripper")
 
@@ -259,7 +259,7 @@ class GripperProcess:
         return self._driver.call("squeeze")
 
     def close(self) -> None:
-        """End the process, whatever call it is in."""
+        """Kill the process, even during a call."""
         self._driver.kill()
 
 

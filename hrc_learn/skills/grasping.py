@@ -2,7 +2,7 @@
 
     detect -> servo -> grasp -> lift
 
-The skill waits for an undetected object. After a missed grasp, or a timeout of servoing, it
+The skill waits until the object is detected. After a missed grasp, or a timeout of servoing, it
 starts again from home.
 """
 
@@ -41,11 +41,11 @@ CLOSING_TIME = 0.7
 
 # Shortest time for the fingers to open before the arm leaves [s].
 _OPENING_TIME = 0.3
-# Timeout of a finger motion [s]: the Franka Hand's whole stroke at a quarter of its speed, 3.2
-# s, plus half a second to start.
+# Timeout of a finger motion [s]: 3.2 s for the Franka Hand's full stroke at a quarter of its
+# speed, half a second to start, and a margin.
 _LONGEST_FINGER_MOTION = 4.0
-# Change of the opening that counts as motion [m], and time with a change below a tenth of it
-# that counts as rest [s], for a gripper that reports its opening at 50 Hz.
+# The fingers have moved if the opening changed by more than the first value [m]. They rest if
+# it changes by less than a tenth of that in the second [s]. Grippers report it at 50 Hz.
 _FINGERS_MOVED, _FINGERS_REST = 0.002, 0.1
 # Distance by which the marker plate protrudes from the arm's capsules [m].
 _PLATE_CLEARANCE = 0.06
@@ -55,7 +55,7 @@ _CHECK_EVERY = 5
 _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
-# Uncertainty of the table height before and after it was touched [m].
+# Uncertainty of the table height before and after the fingers touch it [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 
 
@@ -70,8 +70,8 @@ class GraspingConfig:
             drift_compensation_rate=10.0, command_delay=0.03
         )
     )
-    """Settings of the adaptive controller; the high rate compensates the drift of 10 ms
-    steps."""
+    """Settings of the adaptive controller; the high rate compensates for the drift caused by
+    10 ms steps."""
     approach: bool = True
     """True: approach the table in joint space, along a checked path; False: use the Cartesian
     regions from the start, as in the paper."""
@@ -102,7 +102,7 @@ class GraspResult:
 
 @dataclass(frozen=True)
 class _TableHeight:
-    """Height of the table, as known from touching it."""
+    """Height of the table, estimated by touching it."""
 
     height: float = 0.0
     """Estimate in the base frame [m]."""
@@ -129,9 +129,9 @@ class Grasping:
 
         Args:
             cell: Arm, gripper, camera and person.
-            workplace: Region above the table, and home. Its hover pose has the orientation of
-                the end effector; the simulator's `Workplace.approached` uses the demonstrated
-                one.
+            workplace: Region above the table, and home. Its hover pose sets the orientation of
+                the end effector; the simulator's `Workplace.approached` takes it from the
+                demonstrations.
             skill: Learned image Jacobian and visual target.
             config: Settings of grasping.
             check: Function that raises if a plan must not be executed.
@@ -189,7 +189,7 @@ class Grasping:
                 )
 
     def locate(self, item: GraspObject) -> ServoTarget:
-        """Detect an object while the arm is not above the table; returns the servo target.
+        """Detect an object before the arm moves above the table, and return the servo target.
 
         An arm that is not at home may occlude the object: if it is not detected, the arm goes
         home first.
@@ -249,7 +249,7 @@ class Grasping:
         """Bring the end effector above the object; returns the duration [s].
 
         Raises:
-            MissedGraspError: It takes too long.
+            MissedGraspError: Servoing times out.
         """
         self._cell.begin_phase("servo")
         self._cell.tracked_markers = (self._workplace.tool_marker,)
@@ -299,12 +299,13 @@ class Grasping:
         self._cell.load = as_load(item)
 
     def _touch_table(self, item: GraspObject) -> None:
-        """Touch the table with the fingers about an object, and update its height.
+        """Touch the table with the fingers around an object, and update the table height.
 
         An object that is taller than expected makes the table seem higher, and is grasped at
-        the right distance below its top. Without a contact the estimate stays.
+        the right distance below its top. Without contact, the estimate does not
+        change.
         """
-        # First contact: the table with the fingers, or the top of a tall object with the palm.
+        # First contact: the fingers with the table, or the palm with the top of a tall object.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
         expected, margin = self._table.height + reach, self._table.margin
         self._cell.move_straight(self._at_height(expected + margin), speed=DESCENT_SPEED)
@@ -313,7 +314,7 @@ class Grasping:
             self._table = _TableHeight(float(met.position[2]) - reach, _OBJECT_RANGE)
 
     def _at_height(self, height: float) -> Pose:
-        """Pose of the end effector at a height [m], from here along its own axis."""
+        """Pose of the end effector after moving along its own axis to a height [m]."""
         position = self._cell.pose.position
         orientation = self.servo.orientation(self._workplace.hover().orientation)
         direction = quaternion.to_matrix(orientation)[:, 2]
@@ -418,10 +419,10 @@ def move_fingers(cell: WorkCell, width: float, at_least: float) -> None:
 
 
 def holds(cell: WorkCell, item: GraspObject) -> bool:
-    """True if the opening of the fingers fits an object between them.
+    """True if the opening of the fingers matches an object held between them.
 
-    The thresholds are half the object's width, and the middle between that width and open
-    fingers: far from the opening with an object, and from closed and open fingers.
+    The thresholds lie midway between the object's width and the openings of closed and of open
+    fingers.
     """
     half = item.half_size[0]
     return half < cell.state.gripper_width < half + OPEN / 2
