@@ -1,4 +1,4 @@
-"""`hrc show` and `hrc report`: dashboards in Rerun, and one page of several runs."""
+"""`hrc show` and `hrc report`: Rerun dashboards, and one page that reports several runs."""
 
 import subprocess
 import sys
@@ -51,7 +51,7 @@ def _open(recordings: Sequence[Path], web: bool) -> int:
     try:
         if web or not screen:
             return _serve(recordings)
-        # Run by this Python, so that the viewer need not be on the path.
+        # Started by this interpreter, so that the viewer need not be on PATH.
         command = [sys.executable, "-m", "rerun", *map(str, recordings)]
         return subprocess.run(command, check=False).returncode
     except KeyboardInterrupt:
@@ -59,7 +59,7 @@ def _open(recordings: Sequence[Path], web: bool) -> int:
 
 
 def _serve(recordings: Sequence[Path]) -> int:
-    # The gate, which a window does not need.
+    # Imported here: the desktop viewer does not need the web server.
     from hrc_learn.teleoperation.dashboard_page import serve_recordings
 
     with serve_recordings(recordings) as url:
@@ -73,11 +73,11 @@ def _serve(recordings: Sequence[Path]) -> int:
 _SHOWN, _SHOWN_FRAMES = 200, 1_000_000
 """Largest number of demonstrations and frames shown by default, limited by the viewer."""
 _WITH_TAB = 8
-"""Demonstrations with a tab and images of their own."""
+"""Largest number of demonstrations that get their own tab and images."""
 
 
 def _record_demonstrations(args: Show, out: Path) -> None:
-    # Rerun and PyTorch, which a report does not need.
+    # Imported here: `report` needs neither Rerun nor PyTorch.
     from hrc_learn.demos import open_demos, thumbnails
     from hrc_learn.learning.demonstration_dashboard import record_demonstrations
 
@@ -93,7 +93,7 @@ def _record_demonstrations(args: Show, out: Path) -> None:
     for image in missing:
         print(f"left out: {image}")
     if len(demos) < len(source):
-        print(f"{len(demos)} of {len(source)} demonstrations (--episodes names others)")
+        print(f"{len(demos)} of {len(source)} demonstrations (--episodes selects others)")
     else:
         print(f"{len(demos)} demonstrations")
     seconds = sum(demo.duration for demo in demos)
@@ -101,7 +101,7 @@ def _record_demonstrations(args: Show, out: Path) -> None:
 
 
 def report(args: Report) -> None:
-    """Write one page of the reports of several runs."""
+    """Write the reports of several runs to one page."""
     if not args.runs:
         raise ValueError("name at least one folder with a report.json")
     reports = [read_report(run) for run in args.runs]

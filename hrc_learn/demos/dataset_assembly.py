@@ -38,7 +38,8 @@ from hrc_learn.demos.recorded_episode import (
 from hrc_learn.demos.videos import Segments, VideoSegment, video_path
 
 _PACKED = 256
-"""Rows of the list of episodes kept as Python objects, which take fifty times the memory."""
+"""Largest number of episode rows that are kept as Python objects, which take fifty
+times the memory of a table."""
 
 
 def assemble(
@@ -426,7 +427,7 @@ def discard(staging: Path) -> None:
 
 
 def _read_header(staging: Path) -> _Recording:
-    """Header of a recording; created here if the recording was interrupted before that."""
+    """Read the header of a recording; create one if it was interrupted before that."""
     path = staging / _RECORDING
     if not path.is_file():
         store.write_json(path, _Recording())

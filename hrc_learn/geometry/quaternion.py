@@ -1,11 +1,11 @@
 """Rotations as unit quaternions (w, x, y, z), and the rates of their rotation vectors.
 
-Both signs of a quaternion are the same rotation and give the same answer. Every function
-takes any number of leading batch dimensions, follows the dtype and device of its input, and
-has finite first and second derivatives everywhere, also at the identity and at half turns.
-Nothing branches on data or writes in place, so all of it compiles, exports and vmaps.
+q and -q represent the same rotation and give the same result. Every function takes any
+number of leading batch dimensions, follows the dtype and device of its input, and has finite
+first and second derivatives everywhere, also at the identity and at half turns. No function
+branches on data or writes in place, so all can be compiled, exported and vmapped.
 
-Inputs are taken to be unit: `normalize` what comes from outside.
+Inputs must be unit quaternions: `normalize` external data.
 """
 
 import torch
@@ -28,7 +28,7 @@ _PRODUCT_SIGN = Constant(
     )
 )
 _CONJUGATE_SIGN = Constant(torch.tensor([1, -1, -1, -1], dtype=torch.float64))
-# The sign of the sum is the sign of the first component that is not zero.
+# The sum of the signs with these weights has the sign of the first non-zero component.
 _LEXICOGRAPHIC = Constant(torch.tensor([8, 4, 2, 1], dtype=torch.float64))
 # 4 q q^T = I + sum over three entries of R (row-major) with these signs.
 _OUTER_INDEX = Constant(
@@ -86,8 +86,8 @@ def log(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
     """Rotation vector of the shortest rotation.
 
     Returns:
-        Axis times the full angle [rad], of length 0 to pi. At exactly pi, where two axes
-        serve, the one whose first non-zero component is positive.
+        Axis times the full angle [rad], of length 0 to pi. At exactly pi, two axes are
+        possible; the result is the one whose first non-zero component is positive.
     """
     q = canonical(q)
     w, v = q[..., 0], q[..., 1:]
@@ -122,7 +122,7 @@ def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
 
     Builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its largest row
     (Markley 2008, "Unit quaternion from rotation matrix"): accurate at every angle, and a
-    unit quaternion even where R is a rotation only to rounding.
+    unit quaternion even if R is a rotation only up to rounding.
     """
     if torch.compiler.is_compiling():
         return _written_out_from_matrix(R)
@@ -147,7 +147,7 @@ def slerp(
     q: Float[Tensor, "*#batch 4"],
     t: Float[Tensor, "*#batch"] | float,
 ) -> Float[Tensor, "*batch 4"]:
-    """Turn from p to q the short way at constant rate.
+    """Rotate from p to q along the shortest rotation, at a constant rate.
 
     Args:
         p: Orientation at t = 0.
@@ -160,9 +160,10 @@ def slerp(
 
 
 def mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
-    """The rotation whose matrix is nearest to those of all, whatever the signs.
+    """The rotation whose matrix is nearest to the matrices of all inputs, regardless of sign.
 
-    By the sum of squared Frobenius norms (Markley et al. 2007, "Averaging quaternions").
+    It minimises the sum of squared Frobenius norms of the differences (Markley et al. 2007,
+    "Averaging quaternions").
     """
     q64 = q.double()
     return torch.linalg.eigh(q64.mT @ q64).eigenvectors[:, -1].to(q)
@@ -213,15 +214,15 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
 #     e' = v + n(e, v),   n = e x v / 2 + c(|e|) e x (e x v),   c(a) = (1 - a/2 cot(a/2)) / a^2
 #
 # (the inverse left Jacobian of SO(3); Barfoot 2017, "State estimation for robotics", section
-# 7.1.5). It has no bound as |e| approaches whole turns: there e cannot turn its axis at all,
-# and what v has across e is left out. The inverse of it is
+# 7.1.5). n is unbounded as |e| approaches whole turns: there the axis of e cannot turn, and the
+# component of v perpendicular to e is omitted. The inverse is
 #
 #     v = e' - h(|e|) e x e' + k(|e|) e x (e x e'),
 #     h(a) = (1 - cos a) / a^2,   k(a) = (1 - sin a / a) / a^2
 
-# Below this angle squared the series are exact to rounding and the closed forms are not.
+# Below this squared angle, the series are exact to rounding and the closed forms are not.
 _SMALL = 0.1
-# Fraction of v across e that must be seen in e' for e' to be distinguishable from v.
+# Ratio |v| / |e'| of the components perpendicular to e, below which n is singular.
 _SINGULAR = 1e-3
 
 
@@ -230,12 +231,12 @@ def axis_drift(
 ) -> Float[Tensor, "*batch 3"]:
     """n(e, v), zero where v lies along e; in the unit of v.
 
-    A whole turn or several away, minus what v has across e, so that v + n lies along e.
+    At whole turns, n cancels the component of v perpendicular to e: v + n lies along e.
     """
     square = (e * e).sum(-1, keepdim=True)
     far = square.clamp_min(_SMALL)
     cosine, sinc = cos_and_sinc(far / 4)
-    # Ratio of the component of v across e, as seen in e' the other way round.
+    # |sinc(|e|/2)| is the ratio |v| / |e'| of the components perpendicular to e.
     singular = sinc.abs() < _SINGULAR
     cosecant = torch.where(singular, 0.0, 1 / torch.where(singular, 1.0, sinc))
     series = polynomial(
@@ -249,7 +250,7 @@ def axis_drift(
 def drift_free_rate(
     e: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """The v of which e' = v + n(e, v) is `rate`: minus the angular velocity."""
+    """Solve e' = v + n(e, v) for v, given e' = `rate`; v is minus the angular velocity."""
     square = (e * e).sum(-1, keepdim=True)
     cross = torch.linalg.cross(e, rate)
     return rate - _h(square) * cross + _k(square) * torch.linalg.cross(e, cross)
@@ -263,7 +264,7 @@ def drift_free_slope(
     """v', from e, e' and e'': minus the angular acceleration."""
     square = (e * e).sum(-1, keepdim=True)
     h, k = _h(square), _k(square)
-    # h' = dh/da a' with a a' = e e'; likewise k'. Differences of near equals where a is small.
+    # h' = dh/da a' with a a' = e e'; likewise k'. The closed forms cancel at small a.
     far, near = square.clamp_min(_SMALL), square.clamp_max(_SMALL)
     _, sinc = cos_and_sinc(far)
     h_series = polynomial(near, (-1 / 12, 1 / 180, -1 / 6720, 1 / 453600, -1 / 47900160))
@@ -284,7 +285,7 @@ def left_jacobian_transposed(
 
 
 def _h(square: Tensor) -> Tensor:
-    """(1 - cos a) / a^2 from a squared, by half the angle: nothing cancels."""
+    """(1 - cos a) / a^2 from a^2, by half the angle to avoid cancellation."""
     _, half = cos_and_sinc(square / 4)
     return half**2 / 2
 
@@ -299,8 +300,8 @@ def _k(square: Tensor) -> Tensor:
     return torch.where(square < _SMALL, series, (1 - sinc) / far)
 
 
-# A compiler makes one loop over the batch of what follows, but has to look up every number of
-# what is picked by index above; and inductor of torch 2.11 makes C++ of the `gather` in
+# Compilers turn the functions below into one loop over the batch; the indexing above costs a
+# lookup per number. Also, inductor of torch 2.11 generates C++ for the `gather` in
 # `from_matrix` that does not compile for a batch.
 
 

@@ -17,11 +17,11 @@ from hrc_learn.hardware.driver_process import (
 )
 
 _NARROW = 0.005
-"""Requests for a smaller opening squeeze, and smaller changes of a request are ignored [m]: a
-tenth of the width of a typical object."""
+"""Requests below this opening squeeze; changes below it are ignored [m]. A typical
+object is ten times as wide."""
 _BETWEEN_READINGS = 0.02
-"""Period of the width readings [s]: fingers at 0.1 m/s move 2 mm in it, and skills react only
-to motions of this size.
+"""Period of the width readings [s]: fingers at 0.1 m/s move 2 mm per period, and skills act on
+motions of millimetres.
 """
 _BEFORE_NEXT_TRY = 1.0
 """Delay before reconnecting [s]: a control box takes some seconds to restart."""

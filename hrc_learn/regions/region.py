@@ -24,7 +24,7 @@ class Region(ABC):
 
     @abstractmethod
     def value(self, x: Float[Tensor, "*batch n"]) -> Tensor:
-        """Region function f, at most zero inside; one number or one for each side."""
+        """Region function f, at most zero inside; one value, or one for each component of x."""
 
     @abstractmethod
     def feedback(
@@ -74,8 +74,8 @@ class PositionRegion(Region):
     rotation: Float[Tensor, "*#batch 4"] | None = None
     """Orientation of the box as a unit quaternion (w, x, y, z); None: along the base axes."""
     stiffness: float | tuple[float, float, float] = static(4e-3)
-    """k_c, one for all or one for each axis of the box. Ten times Table I's, with which the
-    excess near a wall of 0.12 m takes 9 s to decay."""
+    """k_c, one for all or one for each axis of the box. Ten times the value of Table I, with
+    which the excess near a wall of a box with half size 0.12 m takes 9 s to decay."""
     formulation: Literal["paper", "saturated"] = static("paper")
 
     def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
@@ -135,9 +135,9 @@ class OrientationRegion(Region):
     which has the same direction and 2 phi times the length.
 
     With `coordinates="rotation_vector"` the gradient is that of the analytic Jacobian, dP over
-    the rotation vector of x: J_l^T times the above. `formulation="paper"` is then twice that,
-    as is the printed chain (PartialV2Quat), (JacobianQuatAngAxisDetailed) wherever its
-    divisions by the components of both quaternions are defined.
+    the rotation vector of x: J_l^T times the above. `formulation="paper"` is then twice that:
+    it equals the printed chain (PartialV2Quat), (JacobianQuatAngAxisDetailed) wherever the
+    chain's divisions by the components of both quaternions are defined.
     """
 
     goal: Float[Tensor, "*#batch 4"]
@@ -196,8 +196,8 @@ class AxisRegion(Region):
 
     f and P are those of `OrientationRegion` for the angle phi between both axes. The gradient
     is dP over a small rotation of the end effector about the base axes. It is perpendicular to
-    both axes, so it requests no rotation about the tool's own axis. Opposite axes are rotated
-    about an axis chosen by the goal.
+    both axes, so it requests no rotation about the tool's own axis. If the two are
+    opposite, the goal determines the axis of rotation.
     """
 
     goal: Float[Tensor, "*#batch 4"]
@@ -294,7 +294,7 @@ class VisionRegion(Region):
         Raises:
             ValueError: The target is not inside the image by more than the border.
         """
-        # Pixels are numbered from 0 to the size less one.
+        # Pixels are numbered from 0 to the size minus one.
         far_edge = target.new_tensor(image_size).repeat(target.shape[-1] // 2) - 1
         half_size = torch.minimum(target, far_edge - target) - border
         if not bool((half_size > 0).all()):

@@ -2,8 +2,8 @@
 
     detect -> servo -> grasp -> lift
 
-The skill waits until the object is detected. After a missed grasp, or a timeout of servoing, it
-starts again from home.
+The skill waits until the object is detected, up to a timeout. If the grasp misses or servoing
+times out, it starts again from home.
 """
 
 from collections.abc import Callable
@@ -302,8 +302,7 @@ class Grasping:
         """Touch the table with the fingers around an object, and update the table height.
 
         An object that is taller than expected makes the table seem higher, and is grasped at
-        the right distance below its top. Without contact, the estimate does not
-        change.
+        the right distance below its top. Without contact, the estimate does not change.
         """
         # First contact: the fingers with the table, or the palm with the top of a tall object.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
