@@ -84,14 +84,14 @@ class Figures:
 
 
 BUDGET: dict[str, float] = {
-    "code": 48_800,
+    "code": 45_950,
     "modules": 235,
     "long_functions": 20,
     "shared_file_names": 0,
     "circles": 0,
     "fragments": 0.03,
     "idiom": 0.3,
-    "docs_words": 35_200,
+    "docs_words": 35_000,
 }
 """Largest allowed figures. They are lowered towards `AIM` as code goes; nothing raises them but
 the lines that CONTRIBUTING.md lists for the code."""
