@@ -237,7 +237,7 @@ def _browser_decisions(args: Curate, ranking: Ranking) -> Decisions:
     """Serve the page until Ctrl-C and return the decisions made there."""
     # The page's server, which the terminal does not need.
     from hrc_learn.teleoperation.curation_page import CurationPage
-    from hrc_learn.teleoperation.gate.admission import AddressConfig
+    from hrc_learn.teleoperation.gate.address import AddressConfig
 
     console = Console()
     page = CurationPage(ranking, args.folder, AddressConfig(port=args.port))

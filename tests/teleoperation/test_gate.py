@@ -10,17 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
-from hrc_learn.teleoperation.gate import Gate, admission, qr_code
-from hrc_learn.teleoperation.gate.admission import (
+from hrc_learn.teleoperation.gate import Gate, address, qr_code
+from hrc_learn.teleoperation.gate.address import (
     Address,
     AddressConfig,
-    Admission,
-    Bucket,
-    RefusedError,
     listening_socket,
     network_name,
     tls_context,
 )
+from hrc_learn.teleoperation.gate.admission import Admission, Bucket, RefusedError
 from hrc_learn.teleoperation.gate.messages import (
     Hands,
     MessageError,
@@ -271,7 +269,7 @@ def test_a_page_on_the_network_has_a_certificate_of_its_own(tmp_path, monkeypatc
 
 def test_a_certificate_that_ends_is_made_anew(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(admission, "_VALID_DAYS", 2)
+    monkeypatch.setattr(address, "_VALID_DAYS", 2)
     config = AddressConfig(host="0.0.0.0", name="arm.local")
     tls_context(config)
     certificate = tmp_path / "hrc_learn" / "tls" / "arm.local.pem"

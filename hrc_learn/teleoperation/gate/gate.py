@@ -20,15 +20,13 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from hrc_learn.teleoperation.gate.address import AddressConfig, listening_socket, tls_context
 from hrc_learn.teleoperation.gate.admission import (
     HEADERS,
-    AddressConfig,
     Admission,
     Bucket,
     RefusedError,
     Right,
-    listening_socket,
-    tls_context,
 )
 from hrc_learn.teleoperation.gate.messages import MessageError
 
