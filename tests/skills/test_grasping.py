@@ -13,9 +13,9 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments.grasping_experiment import GraspingExperiment
-from hrc_learn.experiments.grasping_metrics import (
+from hrc_learn.experiments.grasping_experiment import (
     TRIAL_METRICS,
+    GraspingExperiment,
     descent,
     grasping_metrics,
     jacobian_errors,
