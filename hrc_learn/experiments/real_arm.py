@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from hrc_learn.controller.null_space_motion import guided_elbow_speed
 from hrc_learn.deploy import Rate
 from hrc_learn.experiments.run_recorder import record
 from hrc_learn.hardware import (
