@@ -176,7 +176,8 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         with shapes_unchecked():
             served.drive(dict(zip(JOINTS, start.tolist(), strict=True)), 20)
         read = torch.from_numpy(np.stack([start, served.read().joint_position]))
-        assert (elbow(read)[1] - elbow(read)[0]).norm() > 0.1
+        # The elbow is guided at 0.15 m/s at most, below the cap of 0.25 m/s.
+        assert (elbow(read)[1] - elbow(read)[0]).norm() > 0.08
         hand = panda.forward(read).position
         assert (hand[1] - hand[0]).norm() < 3e-3
         assert device.shown is robot.arm
