@@ -40,6 +40,7 @@ from hrc_learn.controller.null_space_motion import (
     eased_null_velocity,
     fraction_in_null_space,
     fraction_kept,
+    guided_elbow_speed,
     limiting_joint,
 )
 from hrc_learn.controller.path_law import PathLaw
@@ -79,7 +80,9 @@ class ArmLoop:
                 move it anywhere within its limits.
         """
         self.chain, self.clearance = chain, clearance
-        self.config = config = config or ArmLoopConfig()
+        config = config or ArmLoopConfig()
+        elbow_speed = min(config.elbow_speed, guided_elbow_speed(config.safety.tcp_speed))
+        self.config = config = replace(config, elbow_speed=elbow_speed)
         self._tracking = PoseTracking(chain, config, clearance)
         self._paths = PathLaw(self._tracking)
         self.safety = self._tracking.safety

@@ -15,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from hrc_learn.controller.null_space_motion import guided_elbow_speed
 from hrc_learn.deploy import Rate
 from hrc_learn.experiments.run_recorder import record
 from hrc_learn.hardware import (
@@ -95,7 +94,6 @@ class ArmSite:
             config,
             safety=safety,
             command_delay=_DELAY,
-            elbow_speed=guided_elbow_speed(_REDUCED_SPEED),
             speed=self.speed,
             latency=LatencyConfig(delay=self.camera_delay),
         )
