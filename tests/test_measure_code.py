@@ -51,8 +51,14 @@ def test_a_circle_of_a_type_and_a_lazy_import_is_found(tool, package):
 
 
 def test_a_raise_of_the_budget_needs_a_line_with_its_reason(tool):
-    text = "| +200 lines | multiply: object-centred primitives |\n| +300 lines |  |\n"
-    assert tool.budget(text)["code"] == tool.BUDGET["code"] + 200
+    text = (
+        "| +200 lines | multiply: object-centred primitives |\n"
+        "| +100 lines, 2 modules | readers of foreign recordings |\n"
+        "| +300 lines, 4 modules |  |\n"
+    )
+    limits = tool.budget(text)
+    assert limits["code"] == tool.BUDGET["code"] + 300
+    assert limits["modules"] == tool.BUDGET["modules"] + 2
 
 
 def test_excesses_name_the_figure_and_its_limit(tool):

@@ -94,7 +94,7 @@ BUDGET: dict[str, float] = {
     "docs_words": 35_000,
 }
 """Largest allowed figures. They are lowered towards `AIM` as code goes; nothing raises them but
-the lines that CONTRIBUTING.md lists for the code."""
+the rows that CONTRIBUTING.md lists for code and modules."""
 
 AIM: dict[str, float] = BUDGET | {
     "code": 45_000,
@@ -325,7 +325,7 @@ ROWS = {
     "docs_words": ("words in docs/", "{:,.0f}"),
 }
 TABLE = re.compile(r"(<!-- house:begin -->\n).*?(<!-- house:end -->)", re.DOTALL)
-RAISE = re.compile(r"^\| \+(\d+) lines \| (.+?) \|$", re.MULTILINE)
+RAISE = re.compile(r"^\| \+(\d+) lines(?:, (\d+) modules)? \| .+? \|$", re.MULTILINE)
 
 
 def docs_words(root: Path) -> int:
@@ -334,9 +334,12 @@ def docs_words(root: Path) -> int:
 
 
 def budget(contributing: str) -> dict[str, float]:
-    """The budget, its code raised by the lines of CONTRIBUTING.md that give a reason."""
-    raised = sum(int(lines) for lines, _ in RAISE.findall(contributing))
-    return BUDGET | {"code": BUDGET["code"] + raised}
+    """The budget, its code and modules raised by the rows of CONTRIBUTING.md with a reason."""
+    raises = RAISE.findall(contributing)
+    return BUDGET | {
+        "code": BUDGET["code"] + sum(int(lines) for lines, _ in raises),
+        "modules": BUDGET["modules"] + sum(int(modules or 0) for _, modules in raises),
+    }
 
 
 def budget_table(values: dict[str, float], limits: dict[str, float]) -> str:

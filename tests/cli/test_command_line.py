@@ -37,7 +37,7 @@ HEAVY = (
     "pyarrow",
     "cv2",
 )
-MOST_COMMANDS, MOST_OPTIONS = 20, 160
+MOST_COMMANDS, MOST_OPTIONS = 20, 180
 SAME_EVERYWHERE = {
     "dataset": "Path",
     "out": "Path",
