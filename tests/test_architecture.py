@@ -119,7 +119,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "jacobian": {"scipy"},
     "dmp": {"threadpoolctl"},
     "cli": {"huggingface_hub", "httpx"},
-    "demos": {"av", "scipy", "huggingface_hub"},
+    "demos": {"av", "scipy", "huggingface_hub", "h5py", "zarr", "tfrecord"},
     "vision": {"cv2"},
     "viz": {"av", "rich"},
     "hardware": {"franky", "pylibfranka", "cv2"},

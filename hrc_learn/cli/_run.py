@@ -34,6 +34,7 @@ _LIBRARIES = {
     "programs": ("tyro", "rich"),
     "sim": ("mujoco", "cv2"),
     "demos": ("pyarrow", "av", "scipy"),
+    "import": ("h5py", "zarr", "tfrecord"),
     "viz": ("rerun", "matplotlib"),
     "ui": ("viser",),
     "gamepad": ("pygame",),

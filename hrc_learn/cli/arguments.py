@@ -173,33 +173,43 @@ class Curate(OnDataset):
 
 @dataclass(frozen=True, kw_only=True)
 class Import(Measured):
-    """Convert recordings kept as plain arrays (.npz, .npy, .csv) to a LeRobot dataset.
+    """Convert recordings of any format to a LeRobot dataset.
 
-    Each file is one demonstration. An array with three axes (demonstrations, frames,
-    components) holds several. Time stamps are kept in `observation.time`.
+    Reads .npz, .npy, text tables (.csv, .tsv, .txt), Parquet, HDF5 (ALOHA, robomimic and
+    others), zarr, .mat, RLDS and folders of these with videos. A preview lists what each field
+    was understood as; options or a mapping file correct it. Recorded commands become actions.
 
         hrc import pour.npz --out pour --joints q --time t
-        hrc import shelf.npy --out shelf --columns px py pz qw qx qy qz --duration 5
-        hrc import run1.csv run2.csv --out runs --joints j1 j2 j3 j4 j5 j6 --time stamp
+        hrc import episode_*.hdf5 --out aloha --fps 50
+        hrc import demos.zarr --out set --fps 10 --dry-run --mapping map.json
     """
 
     files: tuple[Path, ...]
-    """Recordings to import."""
-    out: Path
+    """Recordings to import: files and folders."""
+    out: Path | None = None
     """Folder of the new dataset, which must not exist."""
+    dry_run: bool = False
+    """Show what was understood and write no dataset."""
+    mapping: Path | None = None
+    """Mapping file (JSON or TOML): fields of each quantity, units, images. With --dry-run, a
+    file that does not exist is written as a template."""
     joints: tuple[str, ...] = ()
     """Array of joint positions, or its columns."""
+    command: tuple[str, ...] = ()
+    """Array of commanded joint positions, or its columns: the action."""
+    gripper: tuple[str, ...] = ()
+    """Array or column of the gripper's opening."""
     position: tuple[str, ...] = ()
     """Array of the end effector's position, or its columns."""
     orientation: tuple[str, ...] = ()
-    """Array of its orientation (quaternion or rotation vector), or its columns."""
+    """Array of its orientation (quaternion, rotation vector, 6D or 4x4), or its columns."""
     time: str | None = None
     """Array or column of time stamps."""
     columns: tuple[str, ...] = ()
-    """Column names of a .npy file or a .csv without a header: px py pz and qw qx qy qz are
+    """Column names of a .npy file or a table without a header: px py pz and qw qx qy qz are
     poses, t is time, all others joints."""
     joint_names: tuple[str, ...] = ()
-    """Joint names. Default: joint1, joint2, ..."""
+    """Joint names. Default: those of the columns, or joint1, joint2, ..."""
     units: dict[str, str] = field(default_factory=dict)
     """Units by quantity, such as: joint_position deg position cm time ms."""
     quaternion_order: Literal["wxyz", "xyzw"] = "wxyz"
@@ -209,12 +219,12 @@ class Import(Measured):
     fps: float | None = None
     """Frame rate [1/s] if there are no time stamps."""
     actions: bool = True
-    """Take the joints (or else the pose) of the next frame as action, as LeRobot's policies
-    need them."""
+    """Where no commands were recorded, take the state of the next frame as action, as LeRobot's
+    policies need them."""
     robot_type: str = "unknown"
     """Robot type stored in the dataset."""
     task: str | None = None
-    """Task in words. Default: the file's name."""
+    """Task in words. Default: the one recorded, or the file's name."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,6 @@
-"""`hrc import` and `hrc extract`: datasets of plain arrays, and markers in videos."""
+"""`hrc import` and `hrc extract`: datasets of recordings, and markers in videos."""
 
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,32 +11,33 @@ from rich.progress import track
 
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments import Extract, Import
-from hrc_learn.demos import DatasetWriter, Demonstration, Detector, extract_features
-from hrc_learn.demos.array_import import ArrayOptions, demonstrations_from_arrays
-from hrc_learn.demos.recorded_episode import rotation_vectors
+from hrc_learn.demos import Detector, extract_features
+from hrc_learn.demos.recording_import import plan_import, write_plan
+from hrc_learn.demos.recording_meaning import ImportOptions
+from hrc_learn.store import read_json, read_toml, write_text
 from hrc_learn.vision import MarkerDetector, centre
 
 
-def import_arrays(args: Import) -> None:
-    """Convert the recordings."""
+def import_recordings(args: Import) -> None:
+    """Show what the recordings hold, and convert them."""
     if not args.files:
         raise ValueError("name at least one recording to import")
-    read = [(path, demo) for path in args.files for demo in _read(args, path)]
-    _refuse_mixture(read)
-    demos = [demo for _, demo in read]
-    fps, features = demos[0].fps, {}
-    if args.actions:
-        demos, features = with_actions(demos)
-    writer = DatasetWriter(args.out, fps, args.robot_type, demos[0].joint_names, features)
-    with writer:
-        for demo in demos:
-            writer.add_episode(demo)
-    summary = {
-        "episodes": len(demos),
-        "frames": sum(map(len, demos)),
-        "seconds": sum(demo.duration for demo in demos),
-        "fps": fps,
-    }
+    if args.out is None and not args.dry_run:
+        raise ValueError("name the folder of the new dataset (--out), or give --dry-run")
+    template = args.dry_run and args.mapping is not None and not args.mapping.exists()
+    options = _import_options(args, None if template else args.mapping)
+    plan = plan_import(args.files, options, _words(args.columns))
+    for line in plan.lines(args.actions):
+        print(line)
+    for warning in plan.meaning.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if template and args.mapping is not None:
+        write_text(args.mapping, plan.meaning.template())
+        print(f"{args.mapping}: a mapping file that says the same; edit it")
+    if args.dry_run or args.out is None:
+        write_values(args.json, plan.counts())
+        return
+    summary = write_plan(plan, args.out, args.robot_type, args.actions)
     print(
         f"{args.out}: {summary['episodes']} demonstrations, {summary['frames']} frames, "
         f"{summary['seconds']:.1f} s"
@@ -43,84 +45,31 @@ def import_arrays(args: Import) -> None:
     write_values(args.json, summary)
 
 
-def _refuse_mixture(demos: Sequence[tuple[Path, Demonstration]]) -> None:
-    """Refuse demonstrations, each with its file, that do not fit into one dataset."""
-    first_path, first = demos[0]
-    for path, demo in demos[1:]:
-        for what, one, two, advice in (
-            ("joints", len(first.joint_names), len(demo.joint_names), "import them separately"),
-            ("joints", first.joint_names, demo.joint_names, "give --joint-names"),
-            ("arrays", first.recorded, demo.recorded, "import them separately"),
-            ("frame rate", first.fps, demo.fps, "give --fps; stamps are kept"),
-        ):
-            if one != two:
-                raise ValueError(
-                    f"{path} and {first_path} do not fit into one dataset: {what} "
-                    f"{_in_words(two)} and {_in_words(one)} ({advice})"
-                )
-
-
-def _in_words(value: float | int | tuple[str, ...]) -> str:
-    return ", ".join(value) if isinstance(value, tuple) else f"{value:g}"
-
-
-_IMPORTED_UNITS = ("joint_position", "position", "time")
-_POSE_ACTION = {
-    "position": ("ee.x", "ee.y", "ee.z"),
-    "orientation": ("ee.wx", "ee.wy", "ee.wz"),
-}
-
-
-def with_actions(
-    demos: Sequence[Demonstration],
-) -> tuple[list[Demonstration], dict[str, tuple[str, ...]]]:
-    """Add actions: the joints, or else the pose, of the next frame. The last one repeats.
-
-    Args:
-        demos: Demonstrations with the same columns.
-
-    Returns:
-        Demonstrations with actions, and the additional features for a `DatasetWriter`.
-    """
-    if demos[0].joint_position is not None:
-        return [replace(d, command_position=_next(d.joint_position)) for d in demos], {}
-    parts = [name for name in _POSE_ACTION if getattr(demos[0], name) is not None]
-    made = []
-    for demo in demos:
-        columns = [getattr(demo, name) for name in parts]
-        columns = [rotation_vectors(c) if c.shape[1] == 4 else c for c in columns]
-        action = _next(np.concatenate(columns, axis=1))
-        made.append(replace(demo, extra={**demo.extra, "action": action}))
-    return made, {"action": tuple(name for part in parts for name in _POSE_ACTION[part])}
-
-
-def _next(values: np.ndarray | None) -> np.ndarray:
-    assert values is not None
-    return np.concatenate([values[1:], values[-1:]])
-
-
-def _read(args: Import, path: Path) -> list[Demonstration]:
-    """Read the demonstrations of one file."""
-    if unknown := args.units.keys() - _IMPORTED_UNITS:
-        raise ValueError(
-            f"--units {min(unknown)}: no such quantity; there are {', '.join(_IMPORTED_UNITS)}"
-        )
-    options = ArrayOptions(
-        arrays={
-            "joints": _words(args.joints),
-            "position": _words(args.position),
-            "orientation": _words(args.orientation),
-            "time": _words([args.time or ""]),
-        },
-        columns=_words(args.columns),
-        units=args.units,
-        quaternion_order=args.quaternion_order,
-        joint_names=_words(args.joint_names),
-        duration=args.duration,
-        fps=args.fps,
-        task=path.stem if args.task is None else args.task,
+def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
+    """Options of the command line, which come before those of the mapping file."""
+    said = ImportOptions()
+    if mapping is not None:
+        read = read_toml if mapping.suffix == ".toml" else read_json
+        said = read(mapping, ImportOptions)
+    turn = _words(args.orientation)
+    columns = {
+        "joint_position": _words(args.joints),
+        "command_position": _words(args.command),
+        "gripper": _words(args.gripper),
+        "position": _words(args.position),
+        f"quaternion_{args.quaternion_order}": turn,
+    }
+    given = {name: words for name, words in columns.items() if words}
+    return replace(
+        said,
+        columns=said.columns | given,
+        units=said.units | args.units,
+        time=args.time or said.time,
+        joint_names=tuple(_words(args.joint_names)) or said.joint_names,
+        duration=args.duration or said.duration,
+        fps=args.fps or said.fps,
+        task=said.task if args.task is None else args.task,
     )
-    return demonstrations_from_arrays(path, options)
 
 
 def _words(values: Sequence[str]) -> list[str]:

@@ -1,0 +1,463 @@
+"""Recordings of every format become demonstrations, or say why they cannot."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from lerobot_folders import joint_path
+from scipy.spatial.transform import Rotation
+
+from hrc_learn.demos import DatasetError
+from hrc_learn.demos.recording_files import open_recordings
+from hrc_learn.demos.recording_import import plan_import
+from hrc_learn.demos.recording_meaning import ImportOptions
+
+TIME = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.004, 40))
+Q = joint_path(40)
+TURN = Rotation.from_rotvec(Q)
+Q_AND_O = {"joint_position": "q", "quaternion_wxyz": "o"}
+POSE_COLUMNS = ("px", "py", "pz", "qw", "qx", "qy", "qz")
+
+
+def plan(*paths, names=(), **options):
+    return plan_import(paths, ImportOptions(**options), names)
+
+
+def read(*paths, names=(), **options):
+    return [one.demonstration for one in plan(*paths, names=names, **options).episodes()]
+
+
+def test_npz_by_array_names(tmp_path):
+    path = tmp_path / "run.npz"
+    np.savez(path, t=TIME, q=np.rad2deg(Q), pos=100 * Q, R=TURN.as_quat(), note=np.array("x"))
+    columns = {"joint_position": "q", "position": "pos", "quaternion_xyzw": "R"}
+    units = {"joint_position": "deg", "position": "cm"}
+    (demo,) = read(path, columns=columns, time="t", units=units, task="pour")
+    np.testing.assert_allclose(demo.joint_position, Q)
+    np.testing.assert_allclose(demo.position, Q)
+    np.testing.assert_allclose(demo.time + demo.start_time, TIME)
+    assert demo.joint_names == ("joint1", "joint2", "joint3")
+    assert (demo.fps, demo.task) == (round(1 / np.median(np.diff(TIME))), "pour")
+    expected = TURN.as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((demo.orientation * expected).sum(1)), 1)
+
+
+def test_npy_of_several_demonstrations_with_named_columns(tmp_path):
+    pose = np.hstack([Q, TURN.as_quat(scalar_first=True)])
+    np.save(tmp_path / "poses.npy", np.stack([pose, pose[::-1]]))
+    demos = read(tmp_path / "poses.npy", names=POSE_COLUMNS, duration=5)
+    assert len(demos) == 2
+    assert demos[1].duration == pytest.approx(5)
+    np.testing.assert_allclose(demos[1].position, Q[::-1])
+    assert demos[0].joint_position is None
+    assert demos[0].joint_names == ()
+
+
+def test_npy_without_names_is_of_joints(tmp_path):
+    np.save(tmp_path / "joints.npy", Q)
+    (demo,) = read(tmp_path / "joints.npy", fps=100, joint_names=("x", "y", "z"))
+    np.testing.assert_array_equal(demo.joint_position, Q)
+    np.testing.assert_allclose(demo.time, np.arange(40) / 100)
+    assert demo.joint_names == ("x", "y", "z")
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", " ", ", "])
+def test_csv_with_and_without_a_header(tmp_path, delimiter):
+    rows = [delimiter.join(map(repr, row)) for row in np.column_stack([TIME, Q]).tolist()]
+    header = delimiter.join(["time", "j1", "j2", "j3"])
+    (tmp_path / "named.csv").write_text("\n".join([header, *rows]))
+    (tmp_path / "bare.csv").write_text("\n".join(rows) + "\n")
+    (named,) = read(tmp_path / "named.csv")
+    (bare,) = read(tmp_path / "bare.csv", names=["t", "a", "b", "c"])
+    for demo in (named, bare):
+        np.testing.assert_allclose(demo.joint_position, Q)
+        np.testing.assert_allclose(demo.time, TIME - TIME[0])
+
+
+@pytest.mark.parametrize("header", ["", "time,q\n"])
+def test_a_byte_order_mark_is_no_part_of_the_first_name(tmp_path, header):
+    path = tmp_path / "run.csv"
+    path.write_text(header + "0,1\n0.1,2\n0.2,3\n", encoding="utf-8-sig")
+    (demo,) = read(path, names=[] if header else ["time", "q"])
+    np.testing.assert_allclose(demo.time, [0, 0.1, 0.2])
+    np.testing.assert_allclose(demo.joint_position, [[1], [2], [3]])
+
+
+def test_names_of_several_words_are_not_taken_apart(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("time,joint position 1,joint position 2\n\n0,1,2\n0.1,3,4\n")
+    (recording,) = open_recordings(path)
+    assert [*recording.fields] == ["time", "joint position 1", "joint position 2"]
+
+
+@pytest.mark.parametrize("name", ["duration", "fps"])
+@pytest.mark.parametrize("value", [0, -1, float("inf")])
+def test_durations_and_rates_are_positive(tmp_path, name, value):
+    np.save(tmp_path / "joints.npy", Q)
+    with pytest.raises(ValueError, match=f"{name} must be positive, got {value}"):
+        read(tmp_path / "joints.npy", **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("arrays", "columns", "message"),
+    [
+        ({"x": Q}, {}, "name the arrays of joints or poses.*it holds x"),
+        ({"q": Q}, {"joint_position": "p"}, "no array 'p' for joint_position; it holds q"),
+        ({"q": Q, "t": TIME[:-2]}, {"joint_position": "q"}, "38 stamps for 40 frames"),
+        (
+            {"a": Q[:, 0], "b": Q[:-1, 1], "t": TIME},
+            {"joint_position": ["a", "b"]},
+            "differ in their numbers.*'a': 40, 'b': 39",
+        ),
+        ({"q": Q[:1], "t": TIME[:1]}, {"joint_position": "q"}, "at least two frames, got 1"),
+        ({"q": Q, "t": 0 * TIME}, {"joint_position": "q"}, "time must increase.*frame 0"),
+        ({"q": Q}, {"joint_position": "q"}, "there are no stamps.*duration or fps"),
+        ({"q": Q * np.nan, "t": TIME}, {"joint_position": "q"}, "q: is nan at frame 0"),
+        ({"q": Q, "t": TIME[::-1]}, {"joint_position": "q"}, "time must increase.*frame 0"),
+        ({"o": np.ones((40, 4)), "q": Q, "t": TIME}, Q_AND_O, "of length 2"),
+        ({"o": Q[:, :2], "q": Q, "t": TIME}, Q_AND_O, "quaternion_wxyz takes 4 columns"),
+        ({"q": 1000 * np.arange(40), "t": TIME}, {"joint_position": "q[1:3]"}, "no range"),
+        ({"q": Q, "t": np.arange(40)}, {}, "t: steps by 1: a count of frames"),
+        ({"q": Q, "t": 200 * TIME}, {}, "t: steps by .*: s, ms, us or ns"),
+    ],
+)
+def test_arrays_that_are_no_demonstrations(tmp_path, arrays, columns, message):
+    path = tmp_path / "run.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(DatasetError, match=message) as raised:
+        read(path, columns=columns)
+    assert raised.value.file == str(path)
+
+
+def saved(save, *arrays, **named):
+    """The bytes of a file of numpy's."""
+    stream = io.BytesIO()
+    save(stream, *arrays, **named)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.npz", saved(np.savez, q=Q)[:-30], "cannot be read"),
+        ("a.npy", saved(np.save, Q)[:-30], "cannot be read"),
+        ("a.npy", saved(np.save, np.array([{}, {}])), "cannot be read.*Python objects"),
+        ("a.pkl", b"junk", "is a pickle"),
+        ("a.h5", b"junk", "cannot be read"),
+        ("a.parquet", b"junk", "cannot be read as Parquet"),
+        ("a.tfrecord", b"junk" * 10, "ends within record 0"),
+        ("a.mp4", b"junk", "is a video"),
+        ("a.npy", saved(np.savez, q=Q), "its name should end in .npz"),
+        ("a.npz", saved(np.save, Q), "its name should end in .npy"),
+        ("a.npz", saved(np.savez, q=Q, o=np.array([{}])), "a.npz, o: cannot be read"),
+        ("a.csv", "0,1\n0.1,2 °\n".encode("latin-1"), "a.csv: is not encoded in UTF-8"),
+        ("a.csv", b"\n \n,,\n", "a.csv: is empty"),
+        ("a.csv", b"t,q\n\n0,1\n0.1\n", "line 4 does not hold 2 numbers"),
+        ("a.npy", b"junk", "cannot be read"),
+        ("a.npz", b"junk", "cannot be read"),
+        ("a.mat", b"junk", "cannot be read"),
+        ("a.doc", b"junk", "is of no kind"),
+        ("a.csv", b"", "is empty"),
+        ("a.csv", b"t,q\n", "no numbers"),
+        ("a.csv", b"t,q\n0,1\n0.1\n", "line 3 does not hold 2 numbers"),
+        ("a.csv", b"0,1\n0.1,x\n", "line 2 does not hold 2 numbers"),
+    ],
+)
+def test_files_that_are_no_arrays(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(DatasetError, match=message):
+        open_recordings(tmp_path / name)
+
+
+def test_a_missing_file_and_wrong_column_names(tmp_path):
+    with pytest.raises(DatasetError, match="not found"):
+        open_recordings(tmp_path / "none.npy")
+    np.save(tmp_path / "a.npy", Q)
+    with pytest.raises(DatasetError, match="2 column names for 3 columns"):
+        open_recordings(tmp_path / "a.npy", ("x", "y"))
+    with pytest.raises(DatasetError, match="2 joint names for 3 columns"):
+        read(tmp_path / "a.npy", fps=10, joint_names=("x", "y"))
+
+
+def write_hdf5(path, arrays, attributes=None):
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values
+        for place, named in (attributes or {}).items():
+            for name, value in named.items():
+                file[place].attrs[name] = value
+
+
+def aloha(frames=40):
+    q = joint_path(frames, 14)
+    images = np.random.default_rng(0).integers(0, 255, (frames, 32, 48, 3), np.uint8)
+    return {
+        "observations/qpos": q,
+        "observations/qvel": np.gradient(q, 0.02, axis=0),
+        "observations/images/cam_high": images,
+        "action": np.roll(q, -1, axis=0),
+    }
+
+
+def test_an_episode_of_aloha_has_arms_grippers_commands_and_images(tmp_path):
+    arrays = aloha()
+    write_hdf5(tmp_path / "episode_0.hdf5", arrays)
+    made = plan(tmp_path / "episode_0.hdf5", fps=50)
+    (one,) = made.episodes()
+    arm = [*range(6), *range(7, 13)]
+    q = arrays["observations/qpos"]
+    np.testing.assert_allclose(one.demonstration.joint_position, q[:, arm])
+    np.testing.assert_allclose(one.demonstration.command_position, arrays["action"][:, arm])
+    np.testing.assert_allclose(one.demonstration.extra["observation.state"], q[:, [6, 13]])
+    assert one.demonstration.joint_names[5:7] == ("left_wrist_rotate", "right_waist")
+    assert made.meaning.kept["action"][1] == ("left_gripper.pos", "right_gripper.pos")
+    assert made.meaning.cameras == {"cam_high": "observations/images/cam_high"}
+
+
+def robomimic(path, order=(2, 0, 10)):
+    arrays, pose = {}, RigidPath()
+    for k in order:
+        group = f"data/demo_{k}"
+        arrays |= {
+            f"{group}/obs/robot0_eef_pos": pose.position + 0.001 * k,
+            f"{group}/obs/robot0_eef_quat": pose.turn.as_quat(),
+            f"{group}/obs/robot0_joint_pos": joint_path(40, 7),
+            f"{group}/obs/robot0_gripper_qpos": np.tile([0.02, -0.02], (40, 1)),
+            f"{group}/obs/object": joint_path(40, 10),
+            f"{group}/next_obs/robot0_eef_pos": pose.position,
+            f"{group}/actions": np.random.default_rng(k).uniform(-1, 1, (40, 7)),
+            f"{group}/rewards": np.zeros(40),
+        }
+    settings = json.dumps({"env_name": "Lift", "env_kwargs": {"control_freq": 20}})
+    write_hdf5(path, arrays, {"data": {"env_args": settings}})
+    return arrays
+
+
+class RigidPath:
+    position = 0.1 * Q + 0.5
+    turn = Rotation.from_rotvec(Q)
+
+
+def test_episodes_of_robomimic_come_in_counting_order_at_the_rate_of_the_file(tmp_path):
+    arrays = robomimic(tmp_path / "lift.hdf5")
+    made = plan(tmp_path / "lift.hdf5")
+    demos = [one.demonstration for one in made.episodes()]
+    assert [one.label for one in made.recordings] == [f"data/demo_{k}" for k in (0, 2, 10)]
+    np.testing.assert_allclose(demos[1].position, RigidPath.position + 0.002)
+    expected = RigidPath.turn.as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((demos[0].orientation * expected).sum(1)), 1)
+    np.testing.assert_allclose(demos[0].gripper, 0.04)
+    assert demos[0].fps == 20
+    # Deltas of a controller for the hand are no commands of seven joints.
+    assert demos[0].command_position is None
+    np.testing.assert_array_equal(demos[0].extra["action"], arrays["data/demo_0/actions"])
+    assert "obs/object" in made.meaning.left_out
+
+
+@pytest.mark.parametrize("name", ["buffer.zarr", "buffer.zarr.zip"])
+def test_a_replay_buffer_is_split_at_its_ends_and_kept_as_recorded(tmp_path, name):
+    import zarr
+    from zarr.storage import LocalStore, ZipStore
+
+    action = np.random.default_rng(0).uniform(0, 500, (60, 2)).astype("f4")
+    state = np.random.default_rng(1).uniform(0, 500, (60, 5)).astype("f4")
+    store = (ZipStore if name.endswith("zip") else LocalStore)(
+        tmp_path / name, **({"mode": "w"} if name.endswith("zip") else {})
+    )
+    group = zarr.open_group(store, mode="w", zarr_format=2)
+    for key, values in (
+        ("data/action", action),
+        ("data/state", state),
+        ("data/img", np.zeros((60, 32, 32, 3), "f4")),
+        ("meta/episode_ends", np.array([25, 60])),
+    ):
+        group.create_array(key, data=values)
+    store.close()
+    made = plan(tmp_path / name, fps=10)
+    demos = [one.demonstration for one in made.episodes()]
+    assert [len(demo) for demo in demos] == [25, 35]
+    np.testing.assert_array_equal(demos[1].extra["observation.state"], state[25:])
+    np.testing.assert_array_equal(demos[1].extra["action"], action[25:])
+    # Numbers up to 500 that nothing names are no joints.
+    assert not made.meaning.selections
+    assert made.meaning.cameras == {"img": "data/img"}
+
+
+def test_cells_of_matlab_are_episodes_with_frames_in_their_columns(tmp_path):
+    from scipy.io import savemat
+
+    cells = np.empty(2, object)
+    for k in range(2):
+        cells[k] = {"pos": 0.1 * Q.T + k, "t": TIME[None]}
+    savemat(tmp_path / "demos.mat", {"demos": cells})
+    demos = read(tmp_path / "demos.mat")
+    np.testing.assert_allclose(demos[1].position, 0.1 * Q + 1)
+    np.testing.assert_allclose(demos[1].time, TIME - TIME[0])
+
+
+def test_a_matlab_file_of_version_7_3_is_read_with_its_axes_turned(tmp_path):
+    write_hdf5(tmp_path / "run.mat", {"run/q": Q.T, "run/time": TIME[None]})
+    content = (tmp_path / "run.mat").read_bytes()
+    # MATLAB writes 512 bytes of its own before the HDF5 signature.
+    header = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    import h5py
+
+    with h5py.File(tmp_path / "seven.mat", "w", userblock_size=512) as file:
+        file["run/q"], file["run/time"] = np.ascontiguousarray(Q.T), TIME[None]
+    with (tmp_path / "seven.mat").open("r+b") as stream:
+        stream.write(header)
+    assert content
+    (demo,) = read(tmp_path / "seven.mat")
+    np.testing.assert_allclose(demo.joint_position, Q)
+
+
+def test_a_parquet_table_of_pandas_is_split_by_its_episodes(tmp_path):
+    pd = pytest.importorskip("pandas")
+    frame = pd.DataFrame({"episode": [0] * 15 + [1] * 25, "t": TIME, "qpos": [*Q]})
+    frame.index += 3
+    frame.to_parquet(tmp_path / "runs.parquet")
+    demos = read(tmp_path / "runs.parquet")
+    assert [len(demo) for demo in demos] == [15, 25]
+    np.testing.assert_allclose(demos[1].joint_position, Q[15:])
+
+
+def test_a_record_of_rlds_is_one_episode(tmp_path):
+    from tfrecord.writer import TFRecordWriter
+
+    writer = TFRecordWriter(str(tmp_path / "set-train.tfrecord-00000-of-00001"))
+    for k in range(2):
+        writer.write(
+            {
+                "steps/observation/joint_pos": ((Q + k).ravel().astype("f4"), "float"),
+                "steps/action": (np.roll(Q + k, -1, 0).ravel().astype("f4"), "float"),
+                "steps/is_first": (np.eye(40, dtype=int)[0], "int"),
+                "steps/language_instruction": ([b"pour the water"] * 40, "byte"),
+            }
+        )
+    writer.close()
+    demos = read(tmp_path, fps=10)
+    assert [demo.task for demo in demos] == ["pour the water"] * 2
+    np.testing.assert_allclose(demos[1].joint_position, Q + 1, atol=1e-6)
+    np.testing.assert_allclose(demos[1].command_position, np.roll(Q + 1, -1, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("content", "names"),
+    [
+        (",time,j1,j2\n0,0.0,1,2\n1,0.1,3,4\n2,0.2,5,6\n", ("j1", "j2")),
+        ("time;j1;j2\n0,0;1,0;2,0\n0,1;3,0;4,0\n0,2;5,0;6,0\n", ("j1", "j2")),
+        ("time\tj1\tj2\tphase\n0,0\t1\t2\tgo\n0,1\t3\t4\tgo\n0,2\t5\t6\tstop\n", ("j1", "j2")),
+        ("# time j1 j2\n0.0 1 2\n0.1 3 4\n# pause\n0.2 5 6\n", ("j1", "j2")),
+        ("0,0 1,0 2,0\n0,1 3,0 4,0\n0,2 5,0 6,0\n", ("a", "b")),
+        ("t,q1,q2,\n2024-05-01 12:00:00.0,1,2,\n2024-05-01 12:00:00.1,3,4,\n"
+         "2024-05-01 12:00:00.2,5,6,\n", ("joint1", "joint2")),
+        ("stamp_ms|joint_1|joint_2\n0|1|2\n100|3|4\n200|5|6\n", ("joint_1", "joint_2")),
+        ("timestamp,actual_q_0,actual_q_1,temperature\n"
+         "1700000000.0,1,2,30\n1700000000.1,3,4,31\n1700000000.2,5,6,32\n", None),
+    ],
+)  # fmt: skip
+def test_text_tables_as_programs_write_them(tmp_path, content, names):
+    path = tmp_path / "run.csv"
+    path.write_text(content)
+    (demo,) = read(path, names=("t", "a", "b") if content[0] == "0" else ())
+    np.testing.assert_allclose(demo.time, [0, 0.1, 0.2], atol=1e-6)
+    np.testing.assert_allclose(demo.joint_position, [[1, 2], [3, 4], [5, 6]])
+    if names:
+        assert demo.joint_names == names
+
+
+def test_transforms_are_poses_and_those_of_a_camera_are_not(tmp_path):
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = TURN.as_matrix(), Q
+    np.savez(tmp_path / "a.npz", poses=poses, camera_extrinsics=poses, t=TIME)
+    (demo,) = read(tmp_path / "a.npz")
+    np.testing.assert_allclose(demo.position, Q)
+    expected = TURN.as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((demo.orientation * expected).sum(1)), 1)
+    assert "camera_extrinsics" in plan(tmp_path / "a.npz").meaning.left_out
+
+
+def test_slower_sensors_hold_their_last_value_and_know_no_future(tmp_path):
+    time, slow = np.arange(100) / 100, np.arange(12) / 10 - 0.05
+    write_hdf5(
+        tmp_path / "run.h5",
+        {
+            "robot/time": time + 5,
+            "robot/q": joint_path(100),
+            "tool/time": slow + 5,
+            "tool/gripper": 0.001 * np.arange(12),
+            "camera/stamps": slow[::2] + 5,
+            "camera/image": np.zeros((6, 32, 32, 3), np.uint8),
+        },
+    )
+    (one,) = plan(tmp_path / "run.h5").episodes()
+    expected = np.floor((time + 0.05) * 10 + 1e-9)
+    np.testing.assert_allclose(one.demonstration.gripper, 0.001 * expected)
+    np.testing.assert_array_equal(one.images["image"][1], np.floor((time + 0.05) * 5 + 1e-9))
+
+
+def test_frames_before_a_sensor_speaks_are_cut_and_a_silent_one_is_named(tmp_path):
+    time = np.arange(200) / 100
+    arrays = {"robot/time": time, "robot/q": joint_path(200), "tool/time": time[50::5]}
+    arrays["tool/gripper"] = np.full(30, 0.01)
+    write_hdf5(tmp_path / "late.h5", arrays)
+    (one,) = plan(tmp_path / "late.h5").episodes()
+    assert len(one.demonstration) == 150
+    assert "50 frames without tool/gripper are cut" in one.notes[0]
+    arrays["tool/time"] = np.concatenate([time[:50:5], time[100::5]])
+    write_hdf5(tmp_path / "gap.h5", arrays)
+    with pytest.raises(DatasetError, match=r"gap.h5, tool/gripper|silent for more than 0.2 s"):
+        list(plan(tmp_path / "gap.h5").episodes())
+
+
+def test_links_and_pickles_are_not_followed(tmp_path):
+    import h5py
+    import zarr
+
+    write_hdf5(tmp_path / "other.h5", {"q": Q})
+    with h5py.File(tmp_path / "linked.h5", "w") as file:
+        file["q"] = h5py.ExternalLink("other.h5", "q")
+    with pytest.raises(DatasetError, match=r"linked.h5, q: is a link"):
+        open_recordings(tmp_path / "linked.h5")
+    group = zarr.open_group(str(tmp_path / "a.zarr"), mode="w", zarr_format=2)
+    group.create_array("q", data=Q)
+    meta = json.loads((tmp_path / "a.zarr/q/.zarray").read_text())
+    meta["filters"] = [{"id": "pickle", "protocol": 5}]
+    (tmp_path / "a.zarr/q/.zarray").write_text(json.dumps(meta))
+    with pytest.raises(DatasetError, match="pickle"):
+        open_recordings(tmp_path / "a.zarr")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/run.npz").symlink_to(tmp_path / "other.h5")
+    with pytest.raises(DatasetError, match="is a link"):
+        open_recordings(tmp_path / "b")
+
+
+def test_a_unit_that_the_file_declares_counts(tmp_path):
+    write_hdf5(tmp_path / "run.h5", {"q": Q, "t": TIME}, {"q": {"units": "degrees"}})
+    (demo,) = read(tmp_path / "run.h5")
+    np.testing.assert_allclose(demo.joint_position, np.deg2rad(Q))
+
+
+def test_large_values_are_no_radians(tmp_path):
+    np.savez(tmp_path / "a.npz", q=np.rad2deg(Q), t=TIME)
+    made = plan(tmp_path / "a.npz")
+    np.testing.assert_allclose(next(made.episodes()).demonstration.joint_position, Q)
+    assert "taken for deg" in made.meaning.warnings[0]
+    said = plan(tmp_path / "a.npz", units={"joint_position": "rad"})
+    assert "degrees?" in said.meaning.warnings[0]
+
+
+def test_six_numbers_of_a_pose_do_not_tell_their_angles(tmp_path):
+    np.savez(tmp_path / "a.npz", tcp_pose=0.1 * joint_path(40, 6), t=TIME)
+    made = plan(tmp_path / "a.npz")
+    assert next(made.episodes()).demonstration.orientation is None
+    assert any("euler_xyz" in name for name in made.meaning.left_out)
+
+
+def test_an_array_without_names_that_holds_quaternions_is_asked_about(tmp_path):
+    np.save(tmp_path / "a.npy", np.hstack([Q, TURN.as_quat()]))
+    with pytest.raises(DatasetError, match="columns 3 to 6 are unit quaternions"):
+        plan(tmp_path / "a.npy", fps=10)
