@@ -224,7 +224,7 @@ def split_episodes(
     Raises:
         DatasetError: The ends do not increase, or exceed the arrays.
     """
-    numbered = _numbered_groups(fields)
+    numbered = _numbered_groups(_by_number(fields))
     if numbered:
         return [
             episode
@@ -236,7 +236,7 @@ def split_episodes(
         whole = replace(whole, fields=_frames_first(whole.fields), orient=False)
     ends = _ends(whole)
     if ends is not None:
-        starts = np.concatenate([[0], ends[:-1]])
+        starts = [0, *ends[:-1]]
         return [
             replace(
                 whole,
@@ -247,7 +247,7 @@ def split_episodes(
                     if field.frames >= ends[-1]
                 },
             )
-            for number, (start, stop) in enumerate(zip(starts.tolist(), ends, strict=True))
+            for number, (start, stop) in enumerate(zip(starts, ends, strict=True))
         ]
     stacked = {n: f for n, f in fields.items() if f.kind == "other" and len(f.shape) == 3}
     if not stacked:
@@ -292,6 +292,20 @@ def _layer(whole: Recording, name: str, field: Field, number: int, count: int) -
         unit=field.unit,
         names=field.names,
     )
+
+
+def _by_number(fields: Mapping[str, Field]) -> Mapping[str, Field]:
+    """The arrays in one group for each number, if all of them count: states_0, actions_0."""
+    found: dict[str, Field] = {}
+    stems: dict[str, set[str]] = {}
+    for name, field in fields.items():
+        match = re.fullmatch(r"(.+)[/_](\d+)", name)
+        if match is None or (field.width < 2 and len(field.shape) > 1):
+            return fields
+        stems.setdefault(match[1], set()).add(match[2])
+        found[f"{match[2]}/{match[1]}"] = field
+    same = len({frozenset(numbers) for numbers in stems.values()}) == 1
+    return found if same and len(stems) > 1 else fields
 
 
 def _numbered_groups(fields: Mapping[str, Field]) -> dict[str, dict[str, Field]]:
@@ -341,7 +355,7 @@ def _ends(whole: Recording) -> list[int] | None:
             changes = np.flatnonzero(np.diff(numbers)) + 1
             if len(changes) + 1 != len(np.unique(numbers)):
                 raise whole.error("numbers the episodes, but comes back to earlier ones", name)
-            return [*changes.tolist(), len(numbers)]
+            return [int(k) for k in (*changes, len(numbers))]
     flags = [
         field.numbers()[:, 0] > 0
         for name, field in whole.fields.items()
@@ -371,7 +385,13 @@ def read_parquet(path: Path) -> list[Recording]:
 
 def read_npy(path: Path, columns: tuple[str, ...] = ()) -> list[Recording]:
     """Episodes of a .npy file, whose columns may be given names."""
-    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except ValueError as error:
+        if "Python objects" in str(error):
+            text = "holds pickled Python objects: save it again as numbers"
+            raise DatasetError(text, file=path) from error
+        raise
     if not isinstance(array, np.ndarray):
         raise DatasetError("holds several arrays: its name should end in .npz", file=path)
     if array.dtype.names:  # a table of named columns

@@ -40,6 +40,7 @@ _TIME = re.compile(
     r"(?:[ _]?[\[(]?"
     r"(?P<unit>s|sec|secs|seconds|ms|msec|millis|us|usec|micros|ns|nsec|nanos)[\])]?)?"
 )
+_NO_CLOCK = re.compile(r"execut|cycle|delay|latency|comput|process|duration|delta|response")
 _COMMAND = re.compile(
     r"(?:^|(?<=[_./ ]))(?:actions?|qaction|cmd|command|commanded|commands|target|desired|des|"
     r"setpoint|leader|master)(?=[_./ \d]|$)[_ ]?"
@@ -367,7 +368,8 @@ def time_unit_in(name: str) -> str:
 def is_time(name: str, one: Field) -> bool:
     """True if the field holds stamps by its name."""
     last = name.split("/")[-1].lower()
-    return one.kind == "number" and one.width == 1 and bool(_TIME.fullmatch(last))
+    is_name = _TIME.fullmatch(last) and not _NO_CLOCK.search(last)
+    return one.kind == "number" and one.width == 1 and bool(is_name)
 
 
 def clock_of(recording: Recording, name: str, preferred: str = "") -> str:
@@ -377,6 +379,7 @@ def clock_of(recording: Recording, name: str, preferred: str = "") -> str:
     """
     group, _, last = name.rpartition("/")
     word = re.split(r"[_\d]", last)[0]
+    word = "\0" if word in ("actual", "target") else word
 
     def rank(other: str) -> tuple:
         parent, _, leaf = other.rpartition("/")
@@ -462,7 +465,7 @@ class _Search:
         self._places[key] = places
 
     def _add_vector(self, name: str, one: Field, names: tuple[str, ...] | None) -> None:
-        *parents, last = name.lower().split("/")
+        *parents, last = re.split(r"[/.]", name.lower())
         command = any(_COMMAND.search(part) for part in (*parents, last))
         bare = _COMMAND.sub("", last).strip("_. ")
         places = [(name, index) for index in range(one.width)]
@@ -709,11 +712,16 @@ def _with_units(
         raise fault
     warned: list[str] = []
     for role, decision in decisions.items():
-        if decision.confidence < _DOUBTFUL:
-            options_of = f"--units {role} {decision.unit}, or another"
+        # Lengths in mm and in cm look alike, and a transform in mm like one in m.
+        length = role in ("position", "pose_matrix") and role not in (*given, *declared)
+        far = (
+            role == "pose_matrix"
+            and _largest(recordings, selections[role], (3, 7, 11)) > _REACH
+        )
+        if decision.confidence < _DOUBTFUL or (length and (decision.converts or far)):
             raise first.error(
-                f"its unit is doubtful: {decision.evidence}, {decision.unit} "
-                f"{100 * decision.confidence:.0f} % sure; give it: {options_of}",
+                f"its unit is doubtful: {decision.evidence or 'its translation is large'}; "
+                f"give it, as in --units {role} {'mm' if length else decision.unit}",
                 _range(selections[role].columns),
             )
         if decision.converts:
@@ -722,14 +730,25 @@ def _with_units(
                 f"{role}: no unit is declared, {said}; overrule with --units {role} ..."
             )
         elif role in given and given[role] == "rad":
-            values = read_columns(first, selections[role].columns)
-            largest = float(np.nanmax(np.abs(values)))
+            largest = _largest(recordings, selections[role])
             if largest > 4 * np.pi:
                 warned.append(
                     f"{role}: rad are given, but values reach {largest:.4g}: degrees?"
                 )
     stated = (*given, *declared)
     return replace(meaning, decisions=decisions, warnings=tuple(warned), given=stated)
+
+
+_REACH = 5.0
+"""Beyond the reach of any arm on a fixed base [m]."""
+
+
+def _largest(
+    recordings: Sequence[Recording], selection: ColumnSelection, columns: Sequence[int] = ()
+) -> float:
+    """Largest absolute value of some columns of a quantity in the first episode."""
+    places = [selection.columns[i] for i in columns] if columns else selection.columns
+    return float(np.nanmax(np.abs(read_columns(recordings[0], places))))
 
 
 _UNIT_WORDS = {

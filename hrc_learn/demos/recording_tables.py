@@ -67,9 +67,10 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     if not header and len(columns) != width:
         text = f"{len(columns)} column names for {width} columns"
         raise DatasetError(text, file=path)
-    if twice := [name for name in names if name and names.count(name) > 1]:
-        raise DatasetError(f"names two columns {twice[0]!r}: rename one", file=path)
-    table = {names[i]: column for i, column in values.items()}
+    table: Table = {}
+    for place, column in values.items():
+        name, count = names[place], names[:place].count(names[place])
+        table[f"{name} ({count + 1})" if count else name] = column
     return _without_index(path, table)
 
 

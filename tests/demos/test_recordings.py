@@ -142,7 +142,7 @@ def saved(save, *arrays, **named):
     [
         ("a.npz", saved(np.savez, q=Q)[:-30], "cannot be read"),
         ("a.npy", saved(np.save, Q)[:-30], "cannot be read"),
-        ("a.npy", saved(np.save, np.array([{}, {}])), "cannot be read.*Python objects"),
+        ("a.npy", saved(np.save, np.array([{}, {}])), "holds pickled Python objects"),
         ("a.pkl", b"junk", "is a pickle"),
         ("a.h5", b"junk", "cannot be read"),
         ("a.parquet", b"junk", "cannot be read as Parquet"),
@@ -461,3 +461,24 @@ def test_an_array_without_names_that_holds_quaternions_is_asked_about(tmp_path):
     np.save(tmp_path / "a.npy", np.hstack([Q, TURN.as_quat()]))
     with pytest.raises(DatasetError, match="columns 3 to 6 are unit quaternions"):
         plan(tmp_path / "a.npy", fps=10)
+
+
+@pytest.mark.parametrize("scale", [40, 500])
+def test_lengths_in_cm_or_mm_are_asked_about(tmp_path, scale):
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, 3] = scale * (0.3 + 0.1 * Q)
+    np.savez(tmp_path / "a.npz", eef_pos=poses[:, :3, 3], t=TIME)
+    np.savez(tmp_path / "b.npz", tcp_pose=poses, t=TIME)
+    for path, role in ((tmp_path / "a.npz", "position"), (tmp_path / "b.npz", "pose_matrix")):
+        with pytest.raises(DatasetError, match=f"doubtful.*--units {role} mm"):
+            plan(path)
+        (demo,) = read(path, units={role: "mm"})
+        np.testing.assert_allclose(demo.position, 1e-3 * poses[:, :3, 3])
+
+
+def test_arrays_that_count_are_episodes(tmp_path):
+    arrays = {f"{name}_{k}": (Q + k)[: 30 + k] for name in ("qpos", "actions") for k in (0, 1)}
+    write_hdf5(tmp_path / "a.h5", arrays)
+    demos = read(tmp_path / "a.h5", fps=10)
+    assert [len(demo) for demo in demos] == [30, 31]
+    np.testing.assert_allclose(demos[1].joint_position, (Q + 1)[:31])
