@@ -33,5 +33,8 @@ from hrc_learn.jacobian.model_selection import HeldOutSamples as HeldOutSamples
 from hrc_learn.jacobian.model_selection import cross_validate as cross_validate
 from hrc_learn.jacobian.model_selection import maximize_evidence as maximize_evidence
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian
+from hrc_learn.jacobian.perspective import CameraFit as CameraFit
 from hrc_learn.jacobian.perspective import MarkerCamera as MarkerCamera
 from hrc_learn.jacobian.perspective import depth_gradient as depth_gradient
+from hrc_learn.jacobian.perspective import fit_camera as fit_camera
+from hrc_learn.jacobian.perspective import unexplained as unexplained

@@ -25,8 +25,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian.fitting import FOLDS, ImageDemonstration, RBFCenters
-from hrc_learn.jacobian.network import RBFImageJacobian
+from hrc_learn.jacobian.fitting import FOLDS, ImageDemonstration
 from hrc_learn.jacobian.perspective import MarkerCamera
 
 # Prior standard deviation of a motion [rad, m]: that of a tripod that was knocked. It resolves
@@ -140,7 +139,9 @@ class CameraReference:
         largest, folds = 0.0, min(FOLDS, len(demonstrations))
         for fold in range(folds):
             others = [d for i, d in enumerate(demonstrations) if i % folds != fold]
-            watch = CameraWatch(_reference(_camera_of(others, image_size), others, np.inf))
+            watch = CameraWatch(
+                _reference(MarkerCamera.fit(others, image_size), others, np.inf)
+            )
             for demo in demonstrations[fold::folds]:
                 watch.clear()
                 for k in demo.visible.nonzero()[:, 0].tolist():
@@ -151,7 +152,7 @@ class CameraReference:
                 f"no demonstration shows the marker {FEWEST_FRAMES} times within {_WINDOW} s: "
                 "record some in which the camera sees the marker."
             )
-        camera = _camera_of(demonstrations, image_size)
+        camera = MarkerCamera.fit(demonstrations, image_size)
         return _reference(camera, demonstrations, _MARGIN * largest)
 
 
@@ -310,7 +311,7 @@ def _camera_of_episodes(
     demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
 ) -> tuple[MarkerCamera, Float[np.ndarray, "episodes 6"]]:
     """Camera of the median episode, and its motion from there in each episode."""
-    camera, twists = _camera_of(demonstrations, image_size), np.zeros(0)
+    camera, twists = MarkerCamera.fit(demonstrations, image_size), np.zeros(0)
     for _ in range(_REFINEMENTS):
         seen = [demo.seen() for demo in demonstrations]
         twists = np.array(
@@ -324,16 +325,8 @@ def _camera_of_episodes(
         for demo, twist in zip(demonstrations, twists, strict=True):
             shift = torch.from_numpy(_displacement(camera, demo.pose, twist))
             unmoved.append(replace(demo, feature=demo.feature.double() - shift))
-        camera = _camera_of(unmoved, image_size)
+        camera = MarkerCamera.fit(unmoved, image_size)
     return camera, twists
-
-
-def _camera_of(
-    demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
-) -> MarkerCamera:
-    neurons = RBFCenters.around(demonstrations)
-    network = RBFImageJacobian.fit(demonstrations, neurons)
-    return MarkerCamera.fit(demonstrations, network.double(), image_size)
 
 
 def _explained(

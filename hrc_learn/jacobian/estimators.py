@@ -136,7 +136,8 @@ class ImageJacobianEstimator(nn.Module, ABC):
             state: State of this estimator.
             r: Position [m] and rotation vector [rad], or a pose.
         """
-        return evaluate(state.weight, self.network.basis(r))
+        learned, first = evaluate(state.weight, self.network.basis(r)), self.network.first(r)
+        return learned if first is None else first + learned
 
     def initial_weight(self, *batch: int) -> Float[Tensor, "*batch entries K"]:
         """The network's weights, repeated for each element of a batch."""
@@ -220,7 +221,7 @@ class MotionSample:
     dr: Float[Tensor, "*batch 6"]
     """Motion of the tool with rotation scaled to metres [m]."""
     dx: Float[Tensor, "*batch rows"]
-    """Motion of the feature [px]."""
+    """Motion of the feature that the network's camera, if it has one, leaves [px]."""
     theta: Float[Tensor, "*batch K"]
     """Neurons half-way, as the mean of both ends."""
     valid: Bool[Tensor, "*batch"]
@@ -356,13 +357,15 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
         moved = measurement.valid & key.present & (distance >= config.least_step)
         valid = moved & (distance <= config.max_step)
+        now, before = map(self.network.first_pixel, (measurement.pose, key.pose))
+        explained = 0.0 if now is None or before is None else now - before
         # An invalid pair may contain NaN; zeros leave every weight unchanged.
         use = valid.unsqueeze(-1)
         twist = torch.where(use, twist, 0.0)
         pair = MotionSample(
             twist=twist,
             dr=twist * self.scale,
-            dx=torch.where(use, measurement.feature - key.feature, 0.0),
+            dx=torch.where(use, measurement.feature - key.feature - explained, 0.0),
             theta=(key.theta + theta) / 2,
             valid=valid,
         )
@@ -401,12 +404,13 @@ class PaperEstimator(ImageJacobianEstimator):
     def update(self, state: WeightState, measurement: Measurement) -> WeightState:
         """Take one explicit Euler step of dt."""
         theta = self.network.basis(measurement.pose)
-        rate = paper_rate(state.weight, theta, measurement, self.gain)
+        J = self.jacobian(state, measurement.pose)
+        rate = paper_rate(J, theta, measurement, self.gain)
         return WeightState(weight=state.weight + measurement.dt * rate)
 
 
 def paper_rate(
-    weight: Float[Tensor, "*batch entries K"],
+    J: Float[Tensor, "*batch rows 6"],
     theta: Float[Tensor, "*batch K"],
     measurement: Measurement,
     gain: float,
@@ -417,7 +421,6 @@ def paper_rate(
     -gain |theta|^2 xi_x s^T at the present pose.
     """
     xi_x = measurement.xi_x.unsqueeze(-1)
-    J = evaluate(weight, theta)
     s = matmul(J.mT, xi_x).squeeze(-1) + measurement.xi_r
     push = (xi_x * s.unsqueeze(-2)).flatten(-2)  # (*batch, 12)
     return -gain * push.unsqueeze(-1) * theta.unsqueeze(-2)
@@ -456,7 +459,8 @@ class CompositeEstimator(KeyFrameEstimator[CompositeConfig]):
         self, state: KeyFrameState, now: Measurement, theta: Tensor, pair: MotionSample
     ) -> KeyFrameState:
         """One step of dt of the paper's term, and the correction by a new pair."""
-        rate = paper_rate(state.weight, theta, now, self.config.task_gain)
+        J = self.jacobian(state, now.pose)
+        rate = paper_rate(J, theta, now, self.config.task_gain)
         change = now.dt * rate + self._correction(state.weight, pair)
         return replace(state, weight=state.weight + change)
 

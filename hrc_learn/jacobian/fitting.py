@@ -402,6 +402,14 @@ class ImageJacobianFitConfig(KeyFrameConfig):
     weight_std: float = 500.0
     """Prior standard deviation of each neuron's deviation from the mean [px/m]."""
 
+    @classmethod
+    def of_residual(cls) -> ImageJacobianFitConfig:
+        """Settings for what a fitted camera leaves: some thousandths of the image Jacobian.
+
+        Pairs are a centimetre apart: over less, the noise of a detector exceeds the residual.
+        """
+        return cls(pixel_noise=0.1, bias_std=5.0, weight_std=2.0, min_step=0.01)
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImageJacobianFitReport:

@@ -8,9 +8,12 @@ demonstrations decides when to stop.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 import torch
@@ -21,6 +24,7 @@ from torch.utils._pytree import tree_map
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import (
+    FOLDS,
     ImageDemonstration,
     ImageJacobianFitConfig,
     MotionSamples,
@@ -28,13 +32,12 @@ from hrc_learn.jacobian.fitting import (
     RegressionStatistics,
     component_scale,
     prior_precision,
-    samples_by_fold,
     solve,
     statistics_by_fold,
     weight_covariance,
-    weights_without_each,
 )
 from hrc_learn.jacobian.network import RBFImageJacobian
+from hrc_learn.jacobian.perspective import fit_camera, unexplained
 from hrc_learn.pytree import pytree
 
 
@@ -307,8 +310,9 @@ def cross_validate(
     demonstrations: Sequence[ImageDemonstration],
     network: RBFImageJacobian,
     config: ImageJacobianFitConfig,
+    image_size: tuple[int, int] | None = None,
 ) -> HeldOutSamples:
-    """Predict every pair with weights fitted to the other folds of the data.
+    """Predict every pair with camera and weights fitted to the other folds of the data.
 
     Each of several processes predicts the pairs of its own demonstrations.
 
@@ -316,32 +320,69 @@ def cross_validate(
         demonstrations: Demonstrations that the network was fitted to.
         network: Network just fitted.
         config: Settings of that fit.
+        image_size: Width and height of the image [px]; for a network with a camera.
 
     Raises:
-        ValueError: The network was loaded, or there is only one fold.
+        ValueError: The network was loaded, there is only one fold, or `image_size` is missing.
     """
     report = network.report
     if report is None:
         raise ValueError("a loaded network has no fit report: pass the network just fitted.")
     network = network.double()
-    K = len(network.centers)
-    folds = statistics_by_fold(network.basis, K, demonstrations, config)
-    if sum(fold.count > 0 for fold in folds) < 2:
+    parts = _parts(demonstrations)
+    seen = {i % FOLDS for i in range(min(len(parts), FOLDS)) if len(parts[i].motion(config).dx)}
+    if len(seen) < 2:
         raise ValueError("held-out errors need pairs in at least two folds of the data.")
-    precision = prior_precision(network.centers, config)
-    without = weights_without_each(folds, precision, report.noise**2)
     pairs: list[HeldOutSamples] = []
-    with torch.no_grad():
-        for fold, motion in samples_by_fold(demonstrations, config):
-            pairs.append(
-                HeldOutSamples(
-                    position=(motion.before.position + motion.after.position) / 2,
-                    motion=motion.dx,
-                    error=motion.dx - motion.regressors(network.basis) @ without[fold],
-                    uncertainty=relative_uncertainty(network, motion.before, config),
-                )
-            )
-    return tree_map(lambda *parts: torch.cat(parts), *pairs)
+    for fold in sorted(seen):
+        others = [parts[i] for i in range(len(parts)) if i % FOLDS != fold]
+        without = copy.deepcopy(network)
+        if network.camera is not None:
+            if image_size is None:
+                raise ValueError("image_size is missing: a camera is fitted to each fold.")
+            without.camera = fit_camera(others, image_size).camera
+            others = unexplained(others, without.camera)
+        K = len(network.centers)
+        total = reduce(add, statistics_by_fold(network.basis, K, others, config))
+        weights, _ = solve(total, prior_precision(network.centers, config), report.noise**2)
+        for i, part in distributed.local_items(parts):
+            if i % FOLDS == fold:
+                pairs.append(_predicted(part, without, weights, config))
+    return tree_map(lambda *columns: torch.cat(columns), *pairs)
+
+
+def _parts(demonstrations: Sequence[ImageDemonstration]) -> Sequence[ImageDemonstration]:
+    """The demonstrations, or consecutive parts of a single one."""
+    if len(demonstrations) > 1:
+        return demonstrations
+    (whole,) = demonstrations
+    pieces = torch.arange(len(whole.visible)).tensor_split(FOLDS)
+    return [
+        ImageDemonstration(
+            pose=whole.pose[piece], feature=whole.feature[piece], visible=whole.visible[piece]
+        )
+        for piece in pieces
+    ]
+
+
+@torch.no_grad()
+def _predicted(
+    part: ImageDemonstration,
+    network: RBFImageJacobian,
+    weights: Float[Tensor, "P 2"],
+    config: ImageJacobianFitConfig,
+) -> HeldOutSamples:
+    motion = part.motion(config)
+    error = motion.dx - motion.regressors(network.basis) @ weights
+    before, after = network.first_pixel(motion.before), network.first_pixel(motion.after)
+    if before is not None and after is not None:
+        error = error - (after - before)
+    return HeldOutSamples(
+        position=(motion.before.position + motion.after.position) / 2,
+        motion=motion.dx,
+        error=error,
+        uncertainty=relative_uncertainty(network, motion.before, config),
+    )
 
 
 def relative_uncertainty(

@@ -1,4 +1,7 @@
-"""The image Jacobian as a network of radial basis functions of the tool pose."""
+"""The image Jacobian: that of a camera, plus a network of radial basis functions.
+
+Without a camera the network is the whole image Jacobian, as in the paper.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,14 @@ from hrc_learn.jacobian.fitting import (
     radial_basis,
     statistics_by_fold,
 )
+from hrc_learn.jacobian.perspective import (
+    SIZE,
+    CameraFit,
+    camera_jacobian,
+    marker_pixels,
+    stepped,
+    unexplained,
+)
 from hrc_learn.model_files import SavedModel, write_model
 
 _KIND = "RBFImageJacobian"
@@ -33,7 +44,11 @@ class RBFImageJacobian(nn.Module):
     """Estimate J_s_hat of the Jacobian from the tool's twist to the motion of its image
     feature.
 
-        x_dot = J_s(r) r_dot,   vec(J_s_hat(r)^T) = W theta(r)      (approxNN_vec)
+        x_dot = J_s(r) r_dot,   vec(J_s_hat(r)^T) = vec(J_camera(r)^T) + W theta(r)
+
+    That of a camera found from demonstrations comes first; the network represents what lens,
+    misalignment and unmodelled kinematics leave. Without a camera the first term is zero, and
+    the second the paper's (approxNN_vec).
 
     r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear, angular)
     in the base frame, *not* the derivative of the rotation vector, so J_s J is the Jacobian
@@ -51,6 +66,10 @@ class RBFImageJacobian(nn.Module):
     covariance: Tensor | None
     """Posterior covariance of one image row of W, (6 K, 6 K) in (component, neuron) order,
     with rotation scaled to metres (`rotation_scale`); None if not fitted."""
+    camera: Tensor | None
+    """Vector of the camera and its marker (see `perspective`), (13,); None: no camera."""
+    camera_covariance: Tensor | None
+    """Covariance of a step from that camera, (13, 13)."""
 
     def __init__(
         self,
@@ -61,6 +80,7 @@ class RBFImageJacobian(nn.Module):
         input_indices: Sequence[int] = (0, 1),
         reference: Float[Tensor, "4"] | None = None,
         normalized: bool = True,
+        camera: CameraFit | None = None,
     ):
         """Build a network with the dtype and device of `centers`.
 
@@ -73,6 +93,7 @@ class RBFImageJacobian(nn.Module):
             reference: Orientation in the middle of those expected: the last three inputs are
                 then the rotation vector from it (see `pose_inputs`).
             normalized: Divide the neurons by their sum (see `radial_basis`).
+            camera: Camera whose image Jacobian comes first; None: none.
 
         Raises:
             ValueError: Centres and indices do not match, or the width is not positive.
@@ -88,6 +109,10 @@ class RBFImageJacobian(nn.Module):
             reference = reference.detach().clone().to(centers)
         self.register_buffer("reference", reference)
         self.register_buffer("covariance", None)
+        none = camera is None
+        self.register_buffer("camera", None if none else camera.camera.to(centers))
+        spread = None if none else camera.covariance.to(centers)
+        self.register_buffer("camera_covariance", spread)
         if weight is None:
             weight = centers.new_zeros(12, len(centers))
         self.weight = nn.Parameter(weight.detach().clone().to(centers))
@@ -120,6 +145,7 @@ class RBFImageJacobian(nn.Module):
         demonstrations: Sequence[ImageDemonstration],
         neurons: RBFCenters,
         config: ImageJacobianFitConfig | None = None,
+        camera: CameraFit | None = None,
     ) -> RBFImageJacobian:
         """Fit to demonstrations read one by one; several processes read a part each.
 
@@ -127,6 +153,8 @@ class RBFImageJacobian(nn.Module):
             demonstrations: Demonstrations in memory, or a sequence that reads them on access.
             neurons: Neurons of the network, whose dtype and device are those of their centres.
             config: Noise, prior and the choice of key frames.
+            camera: Camera fitted to these demonstrations; the network then learns what it
+                leaves, and the prior should be that of a residual. None: none.
 
         Returns:
             The network, with `report` and `covariance` set; the same in all processes.
@@ -140,7 +168,10 @@ class RBFImageJacobian(nn.Module):
             float(neurons.width),
             input_indices=neurons.input_indices,
             reference=neurons.reference,
+            camera=camera,
         )
+        if camera is not None:
+            demonstrations = unexplained(demonstrations, camera.camera)
         K = len(network.centers)
         parts = statistics_by_fold(network.basis, K, demonstrations, config)
         precision = prior_precision(network.centers, config)
@@ -166,7 +197,36 @@ class RBFImageJacobian(nn.Module):
         Returns:
             Rows u and v; columns linear [px/m] then angular [px/rad].
         """
-        return (self.basis(r) @ self.weight.mT).unflatten(-1, (-1, 6))
+        learned = (self.basis(r) @ self.weight.mT).unflatten(-1, (-1, 6))
+        first = self.first(r)
+        return learned if first is None else first + learned
+
+    @property
+    def camera_fit(self) -> CameraFit | None:
+        """The camera with its uncertainty; None: there is none."""
+        if self.camera is None or self.camera_covariance is None:
+            return None
+        return CameraFit(
+            camera=self.camera.double(),
+            covariance=self.camera_covariance.double(),
+            noise=float("nan"),
+        )
+
+    def first(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 2 6"] | None:
+        """Image Jacobian of the camera at a pose; None without a camera."""
+        if self.camera is None:
+            return None
+        pose, batch = _frames(r)
+        return camera_jacobian(self.camera, pose).reshape(*batch, 2, 6)
+
+    def first_pixel(
+        self, r: Pose | Float[Tensor, "*batch 6"]
+    ) -> Float[Tensor, "*batch 2"] | None:
+        """Pixel at which the camera sees the marker at a pose [px]; None without a camera."""
+        if self.camera is None:
+            return None
+        pose, batch = _frames(r)
+        return marker_pixels(self.camera, pose)[0].reshape(*batch, 2)
 
     def basis(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Activation theta(r) of the neurons."""
@@ -177,7 +237,7 @@ class RBFImageJacobian(nn.Module):
     def uncertainty(
         self, r: Pose | Float[Tensor, "*batch 6"], rotation_scale: float = 0.15
     ) -> Float[Tensor, "*batch 6"]:
-        """Posterior standard deviation of the columns of J_s_hat, equal for both rows.
+        """Posterior standard deviation of the columns of J_s_hat, the larger of both rows.
 
         Args:
             r: Pose, as for `forward`.
@@ -194,7 +254,15 @@ class RBFImageJacobian(nn.Module):
         blocks = self.covariance.unflatten(0, (6, -1)).unflatten(-1, (6, -1))
         blocks = blocks.diagonal(dim1=0, dim2=2)  # (K, K, 6)
         variance = torch.einsum("...k,klj,...l->...j", theta, blocks, theta)
-        return variance.clamp_min(0).sqrt() * component_scale(variance, rotation_scale)
+        variance = variance.clamp_min(0) * component_scale(variance, rotation_scale) ** 2
+        if self.camera is not None and self.camera_covariance is not None:
+            pose, batch = _frames(r)
+            # Steps of one standard deviation along independent directions.
+            steps = torch.linalg.cholesky(self.camera_covariance).mT
+            moved = camera_jacobian(stepped(self.camera.expand(SIZE, SIZE), steps), pose)
+            change = (moved - camera_jacobian(self.camera, pose)).square().sum(0)
+            variance = variance + change.amax(-2).reshape(*batch, 6)
+        return variance.sqrt()
 
     def save(self, folder: str | Path) -> None:
         """Write `config.json` and `model.safetensors` into a folder, replacing an older save.
@@ -227,6 +295,7 @@ class RBFImageJacobian(nn.Module):
                 input_indices=saved.get("input_indices", list),
                 reference=saved.tensor("reference") if "reference" in saved.tensors else None,
                 normalized=saved.flag("normalized"),
+                camera=_saved_camera(saved),
             )
         except (TypeError, ValueError) as error:
             raise saved.invalid(error) from error
@@ -243,6 +312,25 @@ class RBFImageJacobian(nn.Module):
             pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
             vector = pose_inputs(pose, self.reference)
         return _components(vector, self.input_indices)
+
+
+def _saved_camera(saved: SavedModel) -> CameraFit | None:
+    if "camera" not in saved.tensors:
+        return None
+    camera, covariance = saved.tensor("camera"), saved.tensor("camera_covariance")
+    if camera.shape != (SIZE,) or covariance.shape != (SIZE, SIZE):
+        raise ValueError(
+            f"camera and camera_covariance must have {SIZE} rows, but have shapes "
+            f"{tuple(camera.shape)} and {tuple(covariance.shape)}: fit again."
+        )
+    return CameraFit(camera=camera, covariance=covariance, noise=float("nan"))
+
+
+def _frames(r: Pose | Float[Tensor, "*batch 6"]) -> tuple[Pose, tuple[int, ...]]:
+    """Poses in one axis of frames, and their batch shape."""
+    pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
+    flat = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
+    return flat, tuple(pose.position.shape[:-1])
 
 
 def _components(vector: Tensor, indices: tuple[int, ...]) -> Tensor:

@@ -1,24 +1,22 @@
-"""Perspective: the change of a point's depth with its position, from its image Jacobian.
+"""A pinhole camera that sees a marker on the tool, found from motion alone.
 
-For a pinhole camera with square pixels, rows r_1, r_2, r_3 of its rotation, and a point at
-depth z that is seen at xi = (x - c) / f, the image Jacobian is
+Thirteen numbers describe camera and marker, as a vector c:
 
-    J = f / z (r_12 - xi r_3^T).
+    log f, (u0, v0), k1, rotation vector w and shift t from base to camera, marker m on the tool
 
-Given the focal length f and the image centre c, the six entries determine rotation and depth in
-closed form. A point at an offset o is then seen at
+A tool at position p with rotation T has its marker at x = exp(w) (p + T m) + t in the camera
+frame, which is seen at  f xi (1 + k1 |xi|^2) + (u0, v0)  with xi = (x, y) / z. Camera and
+marker are found together, so they absorb errors of the tool centre point and of the base.
 
-    x + J o / (1 + g^T o),    g = r_3 / z.
-
-The closed form models neither lens distortion nor an image centre off the middle; a camera
-fitted to demonstrations (`MarkerCamera`) does.
+Functions of c take any leading batch and one further axis of frames.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, permutations, product
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,20 +24,30 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import matmul
 from hrc_learn.jacobian.fitting import ImageDemonstration
-from hrc_learn.jacobian.network import RBFImageJacobian
+
+FOCAL, CENTER, RADIAL = slice(0, 1), slice(1, 3), slice(3, 4)
+ROTATION, SHIFT, MARKER = slice(4, 7), slice(7, 10), slice(10, 13)
+"""Parts of the vector of a camera and its marker."""
+SIZE = 13
+"""Length of that vector."""
 
 # Prior standard deviation of the logarithm of the focal length, about the image width: lenses
 # of 30 to 80 degrees are within one standard deviation.
 _FOCAL_SPREAD = 0.5
-# Residual beyond which a frame counts less [px]: several times a detector's noise, about the
-# calibration error of an arm.
-_PIXEL_NOISE = 1.0
 # Prior standard deviation of the principal point about the middle, relative to the image width:
 # assembled cameras are off by some tens of pixels in two thousand.
 _CENTER_SPREAD = 0.02
 # Prior standard deviation of the radial coefficient: all lenses except fish eyes are within it.
 _RADIAL_SPREAD = 0.2
+# Prior standard deviations of a camera's orientation and place, which anything may be [rad, m],
+# and of the marker about the tool centre point [m].
+_ANY_TURN, _ANY_PLACE, _MARKER_SPREAD = 10.0, 10.0, 0.2
+# Focal lengths from which the search starts, relative to the image width.
+_FOCAL_STARTS = (0.6, 1.0, 1.7)
+# Least standard deviation of a pixel [px]: exact images would make all frames outliers.
+_LEAST_NOISE = 0.02
 # Least depth of a point [m].
 _NEAREST = 1e-3
 _TINY = 1e-12
@@ -48,6 +56,370 @@ _TINY = 1e-12
 _LENS_STEPS = 20
 # Approximate number of frames fitted to: the noise averages out well before.
 _FRAMES = 2000
+# Rounds of the affine start; rounds of robust weights, and steps in each.
+_AFFINE_ROUNDS, _ROUNDS, _STEPS = 10, 8, 6
+# The first search: its frames, its rounds of steps, and the cameras that go on from it.
+_FEW_FRAMES, _SEARCHES, _FINALISTS = 100, 5, 3
+# Least depth of all frames at the start of the search [m].
+_CLEAR = 0.2
+# Residual, in robust standard deviations, beyond which a frame counts less.
+_OUTLIER = 2.5
+# Frames in a row whose errors are summed to measure how far neighbours share their errors.
+_BLOCK = 25
+
+
+def pixels_and_depth(
+    camera: Float[Tensor, "*batch 13"], points: Float[Tensor, "*batch frames 3"]
+) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames 2 3"]]:
+    """Pixels of points of the camera frame [px], and their derivatives by the points [px/m]."""
+    # Points behind the camera are never a solution: keep them far off, yet finite.
+    z = points[..., 2:].clamp_min(_NEAREST)
+    xi = points[..., :2] / z
+    focal, radial = camera[..., None, FOCAL].exp(), camera[..., None, RADIAL]
+    lens = 1 + radial * xi.square().sum(-1, keepdim=True)
+    pixel = focal * lens * xi + camera[..., None, CENTER]
+    along = xi.unsqueeze(-1)
+    eye = torch.eye(2, dtype=points.dtype, device=points.device)
+    slope = lens.unsqueeze(-1) * eye + 2 * radial.unsqueeze(-1) * along * along.mT
+    pinhole = torch.cat([eye.expand(*xi.shape, 2), -along], dim=-1) / z.unsqueeze(-1)
+    return pixel, focal.unsqueeze(-1) * matmul(slope, pinhole)
+
+
+def marker_points(
+    camera: Float[Tensor, "*batch 13"], pose: Pose
+) -> Float[Tensor, "*batch frames 3"]:
+    """The marker in the camera frame [m] at poses of the tool."""
+    lever = quaternion.rotate(pose.orientation, camera[..., None, MARKER])
+    turn = quaternion.exp(camera[..., None, ROTATION])
+    return quaternion.rotate(turn, pose.position + lever) + camera[..., None, SHIFT]
+
+
+def marker_pixels(
+    camera: Float[Tensor, "*batch 13"], pose: Pose
+) -> tuple[Float[Tensor, "*batch frames 2"], Float[Tensor, "*batch frames 2 13"]]:
+    """Pixels of the marker [px], and their derivatives by steps (see `stepped`)."""
+    points = marker_points(camera, pose)
+    pixel, by_point = pixels_and_depth(camera, points)
+    offset = pixel - camera[..., None, CENTER]
+    xi = points[..., :2] / points[..., 2:].clamp_min(_NEAREST)
+    square = xi.square().sum(-1, keepdim=True)
+    by_radial = camera[..., None, FOCAL].exp() * square * xi
+    eye = torch.eye(2, dtype=pixel.dtype, device=pixel.device).expand(*xi.shape, 2)
+    turned = torch.linalg.cross(
+        (points - camera[..., None, SHIFT]).unsqueeze(-2).expand(by_point.shape), by_point
+    )
+    frame = quaternion.multiply(quaternion.exp(camera[..., None, ROTATION]), pose.orientation)
+    by_marker = matmul(by_point, quaternion.to_matrix(frame))
+    parts = [offset[..., None], eye, by_radial[..., None], turned, by_point, by_marker]
+    return pixel, torch.cat(parts, dim=-1)
+
+
+def camera_jacobian(
+    camera: Float[Tensor, "*batch 13"], pose: Pose
+) -> Float[Tensor, "*batch frames 2 6"]:
+    """Image Jacobian of the marker by the tool's twist in the base frame [px/m, px/rad]."""
+    _, by_point = pixels_and_depth(camera, marker_points(camera, pose))
+    turn = quaternion.to_matrix(quaternion.exp(camera[..., None, ROTATION]))
+    rows = matmul(by_point, turn.expand(*by_point.shape[:-2], 3, 3))
+    lever = quaternion.rotate(pose.orientation, camera[..., None, MARKER]).unsqueeze(-2)
+    return torch.cat([rows, torch.linalg.cross(lever.expand(rows.shape), rows)], dim=-1)
+
+
+def stepped(
+    camera: Float[Tensor, "*batch 13"], step: Float[Tensor, "*batch 13"]
+) -> Float[Tensor, "*batch 13"]:
+    """Camera after a step: its rotation turns about the camera's axes, all else adds."""
+    turn = quaternion.multiply(
+        quaternion.exp(step[..., ROTATION]), quaternion.exp(camera[..., ROTATION])
+    )
+    added = camera + step
+    return torch.cat(
+        [added[..., :4], quaternion.log(turn), added[..., SHIFT], added[..., MARKER]], dim=-1
+    )
+
+
+def eye_of(camera: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 3"]:
+    """Place of the camera in the base frame [m]."""
+    back = quaternion.conjugate(quaternion.exp(camera[..., ROTATION]))
+    return -quaternion.rotate(back, camera[..., SHIFT])
+
+
+def rays(
+    camera: Float[Tensor, "*batch 13"], pixel: Float[Tensor, "*batch 2"]
+) -> Float[Tensor, "*batch 3"]:
+    """Directions in the base frame in which a camera sees pixels, of depth 1."""
+    distorted = (pixel - camera[..., CENTER]) / camera[..., FOCAL].exp()
+    xi = distorted
+    for _ in range(_LENS_STEPS):
+        xi = distorted / (1 + camera[..., RADIAL] * xi.square().sum(-1, keepdim=True))
+    ray = torch.cat([xi, torch.ones_like(xi[..., :1])], dim=-1)
+    return quaternion.rotate(quaternion.conjugate(quaternion.exp(camera[..., ROTATION])), ray)
+
+
+def on_plane(
+    camera: Float[Tensor, "*batch 13"],
+    pixel: Float[Tensor, "*batch 2"],
+    height: float | Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch 3"]:
+    """Points of a horizontal plane seen at pixels, in the base frame [m].
+
+    Args:
+        camera: Camera.
+        pixel: Pixels (u, v) [px].
+        height: Height of the plane in the base frame [m].
+    """
+    eye, ray = eye_of(camera), rays(camera, pixel)
+    return eye + ((height - eye[..., 2]) / ray[..., 2])[..., None] * ray
+
+
+def unexplained(
+    demonstrations: Sequence[ImageDemonstration], camera: Float[Tensor, "13"]
+) -> Sequence[ImageDemonstration]:
+    """Demonstrations whose feature is what a camera leaves of it, read on access."""
+    return _Unexplained(demonstrations, camera)
+
+
+class _Unexplained(Sequence[ImageDemonstration]):
+    def __init__(self, whole: Sequence[ImageDemonstration], camera: Tensor):
+        self._whole, self._camera = whole, camera
+
+    def __len__(self) -> int:
+        return len(self._whole)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return _Unexplained(self._whole[index], self._camera)
+        demo = self._whole[index].double()
+        seen, _ = marker_pixels(self._camera, demo.pose)
+        return replace(demo, feature=demo.feature - seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraFit:
+    """Camera and marker fitted to demonstrations, with the uncertainty of both."""
+
+    camera: Float[Tensor, "13"]
+    """Most probable camera."""
+    covariance: Float[Tensor, "13 13"]
+    """Covariance of a step from it (see `stepped`)."""
+    noise: float
+    """Robust standard deviation of a pixel coordinate [px]."""
+
+    def deviation(self, part: slice) -> float:
+        """Largest standard deviation of a part of the vector, such as `FOCAL`."""
+        return float(self.covariance.diagonal()[part].max().clamp_min(0).sqrt())
+
+    def __str__(self) -> str:
+        """Where the camera is and how it sees, in words."""
+        x, y, z = eye_of(self.camera).tolist()
+        matrix = quaternion.to_matrix(quaternion.exp(self.camera[ROTATION]))
+        tilt = float(torch.rad2deg(torch.acos((-matrix[2, 2]).clamp(-1, 1))))
+        focal = float(self.camera[FOCAL].exp())
+        a, b, c = (1e3 * self.camera[MARKER]).tolist()
+        return (
+            f"camera at ({x:.3f}, {y:.3f}, {z:.3f}) m in the base frame, within "
+            f"{1e3 * self.deviation(SHIFT):.1f} mm and "
+            f"{np.rad2deg(self.deviation(ROTATION)):.2f} degrees (one standard deviation), its "
+            f"view {tilt:.0f} degrees from straight down; focal length {focal:.0f} px, within "
+            f"{focal * self.deviation(FOCAL):.0f}; marker at ({a:.0f}, {b:.0f}, {c:.0f}) mm on "
+            f"the tool, within {1e3 * self.deviation(MARKER):.1f}"
+        )
+
+
+def fit_camera(
+    demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
+) -> CameraFit:
+    """Fit camera and marker by robust maximum a posteriori estimation.
+
+    An affine camera in closed form starts a Levenberg-Marquardt search from several focal
+    lengths. Neighbouring frames share errors of calibration; their number counts accordingly.
+
+    Args:
+        demonstrations: Demonstrations in which the tool moved, read one by one.
+        image_size: Width and height of the image [px].
+
+    Raises:
+        ValueError: The marker was seen in fewer than ten frames.
+    """
+    pose, pixel = _sampled(demonstrations)
+    if len(pixel) < 10:
+        raise ValueError(
+            f"the marker is visible in {len(pixel)} frames of the demonstrations, but a camera "
+            "needs ten or more: record with the marker in view."
+        )
+    width = image_size[0]
+    middle = pixel.new_tensor(image_size) / 2
+    prior = torch.cat([pixel.new_tensor([width]).log(), middle, pixel.new_zeros(10)])
+    spread = pixel.new_tensor(
+        [_FOCAL_SPREAD, *[_CENTER_SPREAD * width] * 2, _RADIAL_SPREAD]
+        + [_ANY_TURN] * 3
+        + [_ANY_PLACE] * 3
+        + [_MARKER_SPREAD] * 3
+    )
+    few = slice(None, None, -(-len(pixel) // _FEW_FRAMES))
+    cameras = _starts(pose[few], pixel[few], prior, width)
+    everywhere = pixel.new_full((len(cameras), len(pixel[few])), (100 / width) ** 2)
+    damping = pixel.new_full((len(cameras),), 1e-2)
+    for _ in range(_SEARCHES):
+        cameras, damping, _ = _searched(
+            cameras, damping, pose[few], pixel[few], everywhere, prior, spread
+        )
+    off = (pixel[few] - marker_pixels(cameras, pose[few])[0]).norm(dim=-1).median(-1).values
+    cameras = cameras[off.nan_to_num(torch.inf).argsort()[:_FINALISTS]]
+    damping = pixel.new_full((len(cameras),), 1e-3)
+    gram, noise = torch.zeros(0), pixel.new_ones(len(cameras))
+    for _ in range(_ROUNDS):
+        error = pixel - marker_pixels(cameras, pose)[0]
+        size = error.norm(dim=-1)
+        # For normal errors the median length in the plane is 1.177 standard deviations.
+        noise = (size.median(-1).values / 1.177).clamp_min(_LEAST_NOISE)
+        weight = (_OUTLIER * noise[:, None] / size.clamp_min(_TINY)).clamp(max=1.0)
+        inflation = _inflation(error * weight[..., None], noise)
+        cameras, damping, gram = _searched(
+            cameras,
+            damping,
+            pose,
+            pixel,
+            weight / (noise**2 * inflation)[:, None],
+            prior,
+            spread,
+        )
+    error = pixel - marker_pixels(cameras, pose)[0]
+    best = int(error.norm(dim=-1).median(-1).values.nan_to_num(torch.inf).argmin())
+    return CameraFit(
+        camera=cameras[best],
+        covariance=torch.linalg.inv(gram[best]),
+        noise=float(noise[best]),
+    )
+
+
+def _searched(
+    cameras: Float[Tensor, "starts 13"],
+    damping: Float[Tensor, " starts"],
+    pose: Pose,
+    pixel: Float[Tensor, "frames 2"],
+    weight: Float[Tensor, "starts frames"],
+    prior: Float[Tensor, "13"],
+    spread: Float[Tensor, "13"],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cameras, dampings and information after Levenberg-Marquardt steps."""
+
+    def cost_of(candidates: Tensor) -> Tensor:
+        seen, _ = marker_pixels(candidates, pose)
+        misfit = (weight * (pixel - seen).square().sum(-1)).sum(-1)
+        return misfit + (_from_prior(candidates, prior) / spread).square().sum(-1)
+
+    cost = cost_of(cameras)
+    gram = torch.zeros(0)
+    for _ in range(_STEPS):
+        seen, slope = marker_pixels(cameras, pose)
+        weighted = weight[..., None, None] * slope
+        gram = (
+            torch.einsum("sfij,sfik->sjk", weighted, slope)
+            + spread.square().reciprocal().diag()
+        )
+        towards = torch.einsum("sfij,sfi->sj", weighted, pixel - seen)
+        towards = towards - _from_prior(cameras, prior) / spread.square()
+        scale = gram.diagonal(dim1=-2, dim2=-1)
+        step = torch.linalg.solve(gram + (damping[:, None] * scale).diag_embed(), towards)
+        candidates = stepped(cameras, step)
+        new = cost_of(candidates)
+        better = new < cost
+        cameras = torch.where(better[:, None], candidates, cameras)
+        cost = torch.where(better, new, cost)
+        damping = torch.where(better, damping / 5, damping * 10).clamp(1e-12, 1e6)
+    return cameras, damping, gram
+
+
+def _from_prior(camera: Float[Tensor, "*batch 13"], prior: Float[Tensor, "13"]) -> Tensor:
+    """Distance from the prior mean; zero for the rotation, whose prior is flat."""
+    away = camera - prior
+    return torch.cat([away[..., :4], 0 * away[..., ROTATION], away[..., 7:]], dim=-1)
+
+
+def _inflation(
+    error: Float[Tensor, "starts frames 2"], noise: Float[Tensor, " starts"]
+) -> Float[Tensor, " starts"]:
+    """Factor by which sums over neighbouring frames vary more than independent errors would."""
+    whole = error[:, : error.shape[1] // _BLOCK * _BLOCK]
+    if not whole.shape[1]:
+        return torch.ones_like(noise)
+    sums = whole.unflatten(1, (-1, _BLOCK)).sum(2)
+    return (sums.square().mean((1, 2)) / (_BLOCK * noise**2)).clamp(1.0, float(_BLOCK))
+
+
+def _starts(
+    pose: Pose, pixel: Float[Tensor, "frames 2"], prior: Float[Tensor, "13"], width: int
+) -> Float[Tensor, "starts 13"]:
+    """Cameras in closed form, from an affine camera x = A (p + T m) + b and its marker."""
+    turn, marker = quaternion.to_matrix(pose.orientation), pixel.new_zeros(3)
+    middle, seen = pose.position.mean(0), pixel.mean(0)
+    rows = pixel.new_zeros(2, 3)
+    for _ in range(_AFFINE_ROUNDS):
+        point = pose.position - middle + turn @ marker
+        point = point - point.mean(0)
+        # The ridge leaves directions without motion at zero: a millimetre in all frames.
+        ridge = 1e-6 * len(point) * torch.eye(3, dtype=pixel.dtype)
+        rows = torch.linalg.solve(point.mT @ point + ridge, point.mT @ (pixel - seen)).mT
+        lever = rows @ (turn - turn.mean(0))
+        left = pixel - seen - (pose.position - middle) @ rows.mT
+        ridge = (width / 100 / _MARKER_SPREAD) ** 2 * torch.eye(3, dtype=pixel.dtype)
+        gram = torch.einsum("fij,fik->jk", lever, lever) + ridge
+        marker = torch.linalg.solve(gram, torch.einsum("fij,fi->j", lever, left))
+    # An affine camera of little motion is wrong: the axes of a cube are candidates, too.
+    xi = (seen - prior[CENTER]) / width
+    matrix, _ = _pinhole(rows / width, xi)
+    candidates = torch.cat([matrix[None], _cube_rotations().to(matrix)])
+    starts = []
+    for factor in _FOCAL_STARTS:
+        point = (pose.position + turn @ marker) @ candidates.mT
+        shift = _shifts(point, (pixel - prior[CENTER]) / (factor * width))
+        optics = torch.cat([prior[:1] + float(np.log(factor)), prior[1:4]])
+        rotation = quaternion.log(quaternion.from_matrix(candidates))
+        known = [optics.expand(len(shift), 4), rotation, shift, marker.expand(len(shift), 3)]
+        starts.append(torch.cat(known, dim=-1))
+    return torch.cat(starts)
+
+
+def _shifts(
+    point: Float[Tensor, "starts frames 3"], xi: Float[Tensor, "frames 2"]
+) -> Float[Tensor, "starts 3"]:
+    """Shifts t with (x + t)_12 = xi (x + t)_3 by least squares, a camera in front of it all."""
+    eye = torch.eye(2, dtype=xi.dtype).expand(len(xi), 2, 2)
+    rows = torch.cat([eye, -xi[..., None]], dim=-1).reshape(-1, 3)
+    right = (xi * point[..., 2:] - point[..., :2]).flatten(1)
+    # Without perspective the depth is unknown: a metre, as weak as a pixel in a thousand.
+    depth = 1.0 - point[..., 2].mean(1)
+    ridge = 1e-6 * len(xi) * torch.diag(xi.new_tensor([0.0, 0.0, 1.0]))
+    towards = right @ rows + ridge.diagonal() * depth[:, None]
+    shift = torch.linalg.solve(rows.mT @ rows + ridge, towards.mT).mT
+    nearest = _CLEAR - point[..., 2].amin(1)
+    return torch.cat([shift[:, :2], shift[:, 2:].maximum(nearest[:, None])], dim=-1)
+
+
+def _cube_rotations() -> Float[Tensor, "24 3 3"]:
+    """Rotations that map a cube to itself: no rotation is more than 63 degrees from one."""
+    signed = [
+        torch.eye(3)[list(order)] * torch.tensor(signs)[:, None]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+    ]
+    return torch.stack([matrix for matrix in signed if torch.linalg.det(matrix) > 0])
+
+
+def _pinhole(
+    jacobian: Float[Tensor, "2 3"], xi: Float[Tensor, "2"]
+) -> tuple[Float[Tensor, "3 3"], Float[Tensor, ""]]:
+    """Rotation and depth of a pinhole of focal length 1 with J = (r_12 - xi r_3^T) / z."""
+    square = 1 + xi.square().sum()
+    # trace(J J^T) z^2 = 2 + |xi|^2
+    depth = ((1 + square) / jacobian.square().sum().clamp_min(_TINY)).sqrt()
+    rows = depth * jacobian
+    # The cross product of the rows is along the ray, r_3 + xi_1 r_1 + xi_2 r_2.
+    axis = (torch.linalg.cross(rows[0], rows[1]) - xi @ rows) / square
+    u, _, vt = torch.linalg.svd(torch.stack([*(rows + xi[:, None] * axis), axis]))
+    flip = torch.ones_like(depth) * torch.linalg.det(u @ vt)
+    return u @ torch.diag(torch.stack([*u.new_ones(2), flip])) @ vt, depth
 
 
 def depth_gradient(
@@ -65,36 +437,19 @@ def depth_gradient(
         center: Centre of the image [px].
     """
     xi = (pixel - center) / focal
-    _, depth, axis = _camera(jacobian / focal, xi)
-    return axis / depth[..., None]
-
-
-def _camera(
-    jacobian: Float[np.ndarray, "*batch 2 3"], xi: Float[np.ndarray, "*batch 2"]
-) -> tuple[
-    Float[np.ndarray, "*batch 2 3"], Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]
-]:
-    """First two rows of the rotation, depth, and third row, of a camera of focal length 1."""
     square = 1 + (xi**2).sum(-1)
-    # trace(J J^T) z^2 = 2 + |xi|^2
-    # A Jacobian of zeros, without information, is that of a camera far away.
-    size = np.maximum((jacobian**2).sum((-2, -1)), _TINY)
+    size = np.maximum((jacobian**2).sum((-2, -1)) / focal**2, _TINY)
     depth = np.asarray(np.sqrt((1 + square) / size))
-    rows = depth[..., None, None] * jacobian
-    # The cross product of the rows is along the ray, r_3 + xi_1 r_1 + xi_2 r_2.
+    rows = depth[..., None, None] * jacobian / focal
     ray = np.cross(rows[..., 0, :], rows[..., 1, :])
     axis = (ray - (xi[..., None, :] @ rows)[..., 0, :]) / square[..., None]
     axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), _TINY)
-    return rows + xi[..., :, None] * axis[..., None, :], depth, axis
+    return axis / depth[..., None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerCamera:
-    """A camera and the position of a marker on the tool that it sees, found from motion alone.
-
-    The camera is a pinhole with Brown's first radial coefficient. Marker and camera are found
-    together, so they absorb errors of the tool centre point and of the base.
-    """
+    """A camera and the position of a marker on the tool, as named numbers."""
 
     focal: float
     """Focal length [px]."""
@@ -111,59 +466,40 @@ class MarkerCamera:
 
     @staticmethod
     def fit(
-        demonstrations: Sequence[ImageDemonstration],
-        network: RBFImageJacobian,
-        image_size: tuple[int, int],
-        *,
-        lens: bool = True,
+        demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
     ) -> MarkerCamera:
-        """Fit by robust nonlinear least squares on the pixels.
+        """Camera and marker fitted to demonstrations (see `fit_camera`).
 
         Args:
-            demonstrations: Demonstrations in which the tool moved and turned, read one by one.
-            network: Image Jacobian fitted to them, in float64; gives the initial guess.
+            demonstrations: Demonstrations in which the tool moved, read one by one.
             image_size: Width and height of the image [px].
-            lens: True: fit principal point and radial coefficient too; False: the middle of the
-                image, and zero.
         """
-        # SciPy belongs to extras that read demonstrations or simulate; this package imports
-        # without it.
-        from scipy.optimize import least_squares
+        return MarkerCamera.of(fit_camera(demonstrations, image_size).camera)
 
-        pose, pixel = _sampled(demonstrations)
-        tool, turn = pose.position.numpy(), quaternion.to_matrix(pose.orientation).numpy()
-        seen_at, middle_pixel, width = pixel.numpy(), np.array(image_size) / 2, image_size[0]
-        with torch.no_grad():
-            jacobians = network(pose).numpy()[..., :3]
-        spread = np.array([_CENTER_SPREAD * width] * 2 + [_RADIAL_SPREAD])
-
-        def residuals(unknown: Float[np.ndarray, " unknown"]) -> Float[np.ndarray, " all"]:
-            log_focal, rotation, shift, marker, optics = np.split(unknown, [1, 4, 7, 10])
-            center, radial = _optics(optics, middle_pixel)
-            rows = _matrix(rotation)
-            point = (tool + turn @ marker - middle) @ (rows @ first).T + shift
-            seen = _project(point, width * np.exp(log_focal), center, radial)
-            priors = np.append(log_focal / _FOCAL_SPREAD, optics / spread[: len(optics)])
-            return np.append((seen - seen_at).ravel() / _PIXEL_NOISE, priors)
-
-        middle, xi = tool.mean(0), (seen_at.mean(0) - middle_pixel) / width
-        rows, depth, axis = _camera(jacobians.mean(0) / width, xi)
-        u, _, vt = np.linalg.svd(np.vstack([rows, axis]))
-        first = u @ vt
-        start = np.zeros(13 if lens else 10)
-        start[4:7] = depth * np.append(xi, 1.0)
-        found = least_squares(residuals, start, loss="soft_l1", x_scale="jac").x
-        log_focal, rotation, shift, marker, optics = np.split(found, [1, 4, 7, 10])
-        matrix = _matrix(rotation) @ first
-        center, radial = _optics(optics, middle_pixel)
+    @staticmethod
+    def of(vector: Float[Tensor, "13"]) -> MarkerCamera:
+        """Camera of a vector."""
+        values = vector.tolist()
         return MarkerCamera(
-            focal=width * float(np.exp(log_focal[0])),
-            center=_pair(center),
-            radial=radial,
-            rotation=_triple(_rotation_vector(matrix)),
-            shift=_triple(shift - matrix @ middle),
-            marker=_triple(marker),
+            focal=float(np.exp(values[0])),
+            center=(values[1], values[2]),
+            radial=values[3],
+            rotation=(values[4], values[5], values[6]),
+            shift=(values[7], values[8], values[9]),
+            marker=(values[10], values[11], values[12]),
         )
+
+    @property
+    def vector(self) -> Float[Tensor, "13"]:
+        """Vector of the camera, in float64."""
+        values = [float(np.log(self.focal)), *self.center, self.radial]
+        values += [*self.rotation, *self.shift, *self.marker]
+        return torch.tensor(values, dtype=torch.float64)
+
+    @property
+    def rotation_matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Rotation from base to camera frame."""
+        return quaternion.to_matrix(quaternion.exp(self.vector[ROTATION])).numpy()
 
     def points(self, pose: Pose) -> Float[np.ndarray, "*batch 3"]:
         """The marker in the camera frame [m] at poses of the tool, in float64."""
@@ -174,14 +510,10 @@ class MarkerCamera:
         """Points of the base frame in the camera frame [m]."""
         return points @ self.rotation_matrix.T + np.array(self.shift)
 
-    @property
-    def rotation_matrix(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation from base to camera frame."""
-        return _matrix(np.array(self.rotation))
-
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
         """Pixels of points in the camera frame [px]."""
-        return _project(points, self.focal, np.array(self.center), self.radial)
+        flat = torch.from_numpy(points).reshape(-1, 3)
+        return pixels_and_depth(self.vector, flat)[0].reshape(*points.shape[:-1], 2).numpy()
 
     def on_plane(
         self, pixel: Float[np.ndarray, "*batch 2"], height: float
@@ -192,14 +524,8 @@ class MarkerCamera:
             pixel: Pixels (u, v) [px].
             height: Height of the plane in the base frame [m].
         """
-        distorted = (pixel - np.array(self.center)) / self.focal
-        xi = distorted
-        for _ in range(_LENS_STEPS):
-            xi = distorted / (1 + self.radial * (xi**2).sum(-1, keepdims=True))
-        back = self.rotation_matrix.T
-        ray = np.concatenate([xi, np.ones_like(xi[..., :1])], axis=-1) @ back.T
-        eye = -back @ np.array(self.shift)
-        return eye + (height - eye[2]) / ray[..., 2:] * ray
+        camera = self.vector.expand(*pixel.shape[:-1], SIZE)
+        return on_plane(camera, torch.from_numpy(pixel), height).numpy()
 
     def motion_jacobian(
         self, points: Float[np.ndarray, "*batch 3"]
@@ -212,72 +538,23 @@ class MarkerCamera:
         Args:
             points: Points in the camera frame [m].
         """
-        x, y, z = np.moveaxis(points, -1, 0)
-        z = z.clip(min=_NEAREST)
-        xi = np.stack([x / z, y / z], axis=-1)
-        square = (xi**2).sum(-1)[..., None, None]
-        lens = (1 + self.radial * square) * np.eye(2) + 2 * self.radial * (
-            xi[..., :, None] * xi[..., None, :]
-        )
-        zero = np.zeros_like(z)
-        pinhole = np.stack(
-            [
-                np.stack([1 / z, zero, -x / z**2], axis=-1),
-                np.stack([zero, 1 / z, -y / z**2], axis=-1),
-            ],
-            axis=-2,
-        )
+        flat = torch.from_numpy(points).reshape(-1, 3)
+        _, by_point = pixels_and_depth(self.vector, flat)
         # For a camera that turns by w and moves by v, points move by p x w - v.
-        turned = np.cross(points[..., None, :], np.eye(3)).swapaxes(-1, -2)
-        moved = np.concatenate([turned, np.broadcast_to(-np.eye(3), turned.shape)], axis=-1)
-        return self.focal * lens @ pinhole @ moved
+        turned = torch.linalg.cross(by_point, flat[:, None].expand(by_point.shape))
+        whole = torch.cat([turned, -by_point], dim=-1)
+        return whole.reshape(*points.shape[:-1], 2, 6).numpy()
 
     def moved(self, twist: Float[np.ndarray, "6"]) -> MarkerCamera:
         """The camera turned by a rotation vector [rad] about its own axes, then moved along the
         axes it had before the turn [m].
         """
-        back = _matrix(twist[:3]).T
-        return replace(
-            self,
-            rotation=_triple(_rotation_vector(back @ _matrix(np.array(self.rotation)))),
-            shift=_triple(back @ (np.array(self.shift) - twist[3:])),
-        )
-
-
-def _project(
-    points: Float[np.ndarray, "*batch 3"],
-    focal: float | Float[np.ndarray, "1"],
-    center: Float[np.ndarray, "2"],
-    radial: float,
-) -> Float[np.ndarray, "*batch 2"]:
-    # Points behind the camera are never a solution: keep them far off, yet finite.
-    xi = points[..., :2] / points[..., 2:].clip(min=_NEAREST)
-    return focal * xi * (1 + radial * (xi**2).sum(-1, keepdims=True)) + center
-
-
-def _optics(
-    optics: Float[np.ndarray, " optics"], middle: Float[np.ndarray, "2"]
-) -> tuple[Float[np.ndarray, "2"], float]:
-    """Principal point [px] and radial coefficient from the unknowns of a fit."""
-    return (middle + optics[:2], float(optics[2])) if len(optics) else (middle, 0.0)
-
-
-def _matrix(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    return quaternion.to_matrix(quaternion.exp(torch.from_numpy(rotation))).numpy()
-
-
-def _rotation_vector(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
-    return quaternion.log(quaternion.from_matrix(torch.from_numpy(matrix))).numpy()
-
-
-def _pair(values: Float[np.ndarray, "2"]) -> tuple[float, float]:
-    u, v = values.tolist()
-    return u, v
-
-
-def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
+        back, shift = quaternion.exp(-torch.from_numpy(twist[:3])), self.vector[SHIFT]
+        vector = self.vector
+        turn = quaternion.multiply(back, quaternion.exp(vector[ROTATION]))
+        vector[SHIFT] = quaternion.rotate(back, shift - torch.from_numpy(twist[3:]))
+        vector[ROTATION] = quaternion.log(turn)
+        return MarkerCamera.of(vector)
 
 
 def _sampled(

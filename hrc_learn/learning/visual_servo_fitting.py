@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -17,11 +18,12 @@ from hrc_learn.jacobian import (
     EvidenceRound,
     ImageDemonstration,
     ImageJacobianFitConfig,
-    MarkerCamera,
     RBFCenters,
     RBFImageJacobian,
     cross_validate,
+    fit_camera,
     maximize_evidence,
+    unexplained,
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
@@ -54,7 +56,7 @@ def fit_visual_servo(
     Args:
         demos: Demonstrations with image features and end-effector poses, or a Panda's joints.
         neurons: Neurons of the network. Default: around the demonstrated poses.
-        config: Noise, prior and choice of key frames.
+        config: Noise, prior and choice of key frames of what the camera leaves.
         learning: Learning of neurons, noise and prior. None, or too few demonstrations to hold
             one out: they stay as they are.
         on_round: Called after every round of learning.
@@ -62,18 +64,26 @@ def fit_visual_servo(
     Raises:
         ValueError: A demonstration lacks a column; the message names it and the episode.
     """
-    camera = feature_trajectories(demos)
-    config = config or ImageJacobianFitConfig()
-    neurons = neurons or RBFCenters.around(camera)
+    watched = feature_trajectories(demos)
+    camera = fit_camera(watched, IMAGE_SIZE)
+    config = config or ImageJacobianFitConfig.of_residual()
+    neurons = neurons or RBFCenters.around(watched)
     learned = None
     if learning is not None and len(demos) >= learning.hold_out:
-        learned = maximize_evidence(camera, neurons, config, learning, on_round)
+        left = unexplained(watched, camera.camera)
+        learned = maximize_evidence(left, neurons, config, learning, on_round)
         neurons, config = learned.neurons, learned.config
-    network = RBFImageJacobian.fit(camera, neurons, config)
-    cells = cross_validate(camera, network, config).by_cell()
+    network = RBFImageJacobian.fit(watched, neurons, config, camera)
+    held_out = cross_validate(watched, network, config, IMAGE_SIZE)
+    assert network.report is not None
+    network.report = replace(
+        network.report,
+        motion=float(held_out.motion.square().sum(-1).mean().sqrt()),
+        held_out_error=float(held_out.error.square().sum(-1).mean().sqrt()),
+    )
+    cells = held_out.by_cell()
     ends = _ends(demos, network)
-    double = copy.deepcopy(network).double()
-    focal = MarkerCamera.fit(camera, double, IMAGE_SIZE, lens=False).focal
+    focal = float(camera.camera[0].exp())
     return VisualServoSkill(
         jacobian=network,
         target=_visual_target(ends, focal) if ends else None,

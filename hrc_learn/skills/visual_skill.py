@@ -31,6 +31,7 @@ from hrc_learn.jacobian import (
     RBFImageJacobian,
     depth_gradient,
 )
+from hrc_learn.jacobian.perspective import FOCAL, SHIFT
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.marker_sensor import MarkerAngle
 from hrc_learn.store import Metres, Pixels, read_json, write_json
@@ -295,6 +296,13 @@ class VisualServoSkill:
             "held_out_relative": report.held_out_error / report.motion,
             "held_out_relative_worst_cell": float(known.max()),
         }
+        camera = self.jacobian.camera_fit
+        if camera is not None:
+            values |= {
+                "focal_px": float(camera.camera[FOCAL].exp()),
+                "focal_relative_std": camera.deviation(FOCAL),
+                "camera_place_std_mm": 1e3 * camera.deviation(SHIFT),
+            }
         if self.learned is not None:
             first, best = self.learned.rounds[0], self.learned.rounds[self.learned.best]
             values |= {

@@ -17,8 +17,6 @@ from hrc_learn.jacobian import (
     ImageDemonstration,
     MarkerCamera,
     ObjectPlane,
-    RBFCenters,
-    RBFImageJacobian,
     camera_placements,
 )
 from hrc_learn.jacobian.camera_motion import from_moved, refined_twist
@@ -72,9 +70,7 @@ def reference(demonstrations):
 
 @pytest.fixture(scope="module")
 def camera(demonstrations):
-    neurons = RBFCenters.around(demonstrations)
-    network = RBFImageJacobian.fit(demonstrations, neurons)
-    return MarkerCamera.fit(demonstrations, network.double(), IMAGE)
+    return MarkerCamera.fit(demonstrations, IMAGE)
 
 
 def test_the_camera_is_found_with_its_lens(camera):
