@@ -1,6 +1,7 @@
 """Recording demonstrations as a LeRobot dataset of version 3.0."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -324,6 +325,11 @@ class DatasetWriter:
             raise ValueError(f"episode {self.episodes} has no frames")
         episode = recorded.complete(episode, self.fps)
         columns = recorded.columns_for(episode.keys(), self.joint_names, self.features)
+        if self._earlier is not None and recorded.OLD_TIME_KEY in self._earlier.features:
+            columns = [
+                replace(c, key=recorded.OLD_TIME_KEY) if c.role == "time" else c
+                for c in columns
+            ]
         try:
             if self._columns and columns != self._columns:
                 first = [column.given for column in self._columns]

@@ -19,7 +19,11 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json
 
 STATE_KEY = "observation.state"
-TIME_KEY = "observation.time"
+TIME_KEY = "time"
+"""Feature of the true stamps. A policy would take `observation.time` for an input, and no robot
+has such an observation."""
+OLD_TIME_KEY = "observation.time"
+"""Feature of the true stamps in datasets that were written before."""
 _METADATA_KEY = b"hrc_learn"
 
 Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]
@@ -97,7 +101,7 @@ def lerobot_features(columns: Sequence[RecordedColumn]) -> dict[str, dict]:
     return {
         key: {
             # Policies expect float32, in which a Unix stamp has a resolution of two minutes.
-            "dtype": "float64" if key == TIME_KEY else "float32",
+            "dtype": "float64" if key in (TIME_KEY, OLD_TIME_KEY) else "float32",
             "shape": [len(components)],
             "names": components,
         }

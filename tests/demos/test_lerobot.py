@@ -43,7 +43,7 @@ def theirs(tmp_path_factory, lerobot_dataset):
     features = {
         "observation.state": vector | {"names": [f"{j}.pos" for j in JOINTS]},
         "action": vector | {"names": [f"{j}.vel" for j in JOINTS]},
-        "observation.time": {"dtype": "float64", "shape": (1,), "names": ["time"]},
+        "time": {"dtype": "float64", "shape": (1,), "names": ["time"]},
     }
     dataset = lerobot_dataset.create(
         "local/set", 50, features, root=root, robot_type="panda", use_videos=False
@@ -54,7 +54,7 @@ def theirs(tmp_path_factory, lerobot_dataset):
                 {
                     "observation.state": q,
                     "action": 2 * q,
-                    "observation.time": np.array([0.02 * k]),
+                    "time": np.array([0.02 * k]),
                     "task": task,
                 }
             )
@@ -96,7 +96,7 @@ def test_lerobot_records_on_after_us(ours, lerobot_dataset, tmp_path):
             {
                 "observation.state": q,
                 "action": q,
-                "observation.time": np.array([0.02 * k]),
+                "time": np.array([0.02 * k]),
                 "task": "push",
             }
         )

@@ -108,7 +108,7 @@ def repair_dataset(
     """Repair a dataset of version 2.0, 2.1 or 3.0 into a new one of version 3.0.
 
     The old dataset is not changed. Columns keep their keys, names and units. If no column holds
-    true stamps and the frames are not resampled, `observation.time` is added with LeRobot's old
+    true stamps and the frames are not resampled, `time` is added with LeRobot's old
     stamps, because the new `timestamp` is frame / fps by definition.
 
     Args:
