@@ -292,6 +292,8 @@ def _updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
         current = getattr(config, name)
         if dataclasses.is_dataclass(current) and isinstance(value, Mapping):
             values[name] = _updated(current, value, f"{place}{name}.")
+        elif isinstance(current, dict) and isinstance(value, dict):
+            values[name] = _merged(current, _converted(value, hints[name], f"{place}{name}"))
         else:
             values[name] = _converted(value, hints[name], f"{place}{name}")
     try:
@@ -299,6 +301,13 @@ def _updated(config: Any, given: Mapping[str, Any], place: str) -> Any:
     except ValueError as error:
         error.add_note(f"({place}{', '.join(values)})")
         raise
+
+
+def _merged(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """Settings without classes of ours, one given after the other."""
+    both = old.keys() & new.keys()
+    inner = {k for k in both if isinstance(old[k], dict) and isinstance(new[k], dict)}
+    return old | new | {k: _merged(old[k], new[k]) for k in inner}
 
 
 def _converted(value: Any, hint: Any, place: str) -> Any:

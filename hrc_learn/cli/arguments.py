@@ -422,8 +422,8 @@ class Report(Measured):
 
 Shelf = Literal["lower", "middle", "upper"]
 """Shelves of `hrc_learn.sim.workplace.Workplace`."""
-ArmDriver = Literal["sim", "franky", "franka"]
-"""The simulated arm, and `hrc_learn.experiments.on_arm.Driver`."""
+ArmDriver = Literal["sim", "franky", "franka", "lerobot"]
+"""The simulated arm, and `hrc_learn.experiments.real_arm.Driver`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -441,7 +441,8 @@ class WithDriver(WithRobot):
     """A command for a simulated or a real arm."""
 
     arm: ArmDriver = "sim"
-    """Driver: simulated, the package franky, or our own loop at 1 kHz (franka)."""
+    """Driver: simulated, the package franky, our own loop at 1 kHz (franka), or a robot of
+    LeRobot, with its options: --robot.type=so101_follower --robot.port=/dev/ttyACM0."""
     ip: str = ""
     """Address of the arm's control box. "sim" serves the simulated arm there."""
     config: tuple[str, ...] = ()
@@ -458,6 +459,10 @@ class WithDriver(WithRobot):
             ValueError: An address without a driver, a driver without an address, or an option
                 of the simulated work cell.
         """
+        if self.arm == "lerobot":
+            refuse_given(self, ["ip"], "is for Franka arms: LeRobot's have --robot.port")
+            refuse_given(self, simulated_only, "is for simulated arms, not for a real one")
+            return True
         if self.arm == "sim":
             if self.ip:
                 raise ValueError(

@@ -85,6 +85,11 @@ def run(args: Run) -> int:
             refuse_given(args, [name], f"is an option of hrc run {' and '.join(experiments)}")
     refuse_existing(_folder(args), args.overwrite)
     is_real = args.drives_real_arm(_SIMULATED_ONLY)
+    if args.arm == "lerobot":
+        raise ValueError(
+            "hrc run leads Franka arms only, not --arm lerobot: hrc page guides the arm and "
+            "hrc play carries out a model."
+        )
     experiment = _experiment(_with_models(args))
     settings = with_settings(args.config, _Settings(experiment=experiment))
     if is_real:

@@ -72,9 +72,9 @@ def _access(
     Returns:
         Function that connects, and the configuration of the safety filter for this arm.
     """
-    if args.drives_real_arm():
+    if args.arm == "lerobot" or args.drives_real_arm():
         site = replace(site, driver=args.arm, ip=args.ip)
-        return partial(_real_arm, site, world), site.cell_config().safety
+        return partial(_real_arm, site, world, world.arm.robot.chain), site.cell_config().safety
     access = access_by(args.arm, world.arm.robot)
     delay = safety.delay + access.delay
     braking = min(safety.braking, access.dynamics)
@@ -82,8 +82,8 @@ def _access(
 
 
 @contextmanager
-def _real_arm(site: ArmSite, world: World) -> Iterator[OpenedArm]:
-    with opened_arm(site) as arm:
+def _real_arm(site: ArmSite, world: World, chain: SerialChain) -> Iterator[OpenedArm]:
+    with opened_arm(site, chain) as arm:
         world.follow(arm.read())
         yield OpenedArm(arm=arm, gripper=arm, advance=lambda _time: world.follow(arm.read()))
 

@@ -7,7 +7,7 @@ and follows the arm for the recording.
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +24,8 @@ from hrc_learn.hardware import (
     FrankaConfig,
     FrankyArm,
     FrankyConfig,
+    LeRobotArm,
+    LeRobotConfig,
 )
 from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.kinematics import SerialChain, fr3, panda
@@ -40,14 +42,17 @@ from hrc_learn.store import new_folder, write_json
 from hrc_learn.teleoperation import ScriptedDrawing, Touch
 from hrc_learn.viz.run_dashboard import record_run
 
-Driver = Literal["franky", "franka"]
-"""Driver of a real arm: the package franky, or our loop at 1 kHz through pylibfranka."""
+Driver = Literal["franky", "franka", "lerobot"]
+"""Driver of a real arm: the package franky, our loop at 1 kHz through pylibfranka, or a robot
+of LeRobot."""
 
 _SILENCE = 0.15
 """Silence of the loop after which the arm is stopped [s], as in `franka_panda`."""
 _DELAY = 0.03
 """Delay from reading the joints to the motion of the arm [s]: that of
 `Imperfections.nominal`, not measured."""
+_SERVO_DELAY = 0.08
+"""The same delay of position servos on a bus that is read at 50 Hz [s], not measured."""
 _REDUCED_SPEED = 0.25
 """Speed of the tool near people [m/s] (ISO 10218-1, reduced speed)."""
 
@@ -61,7 +66,11 @@ class ArmSite:
     ip: str = ""
     """Address of the control box."""
     robot: Literal["panda", "fr3"] = "panda"
-    """Arm with its limits."""
+    """Franka arm with its limits."""
+    device: dict[str, Any] = field(default_factory=dict)
+    """LeRobot's settings of the robot, which `--robot.NAME=VALUE` sets: type, port, id."""
+    lerobot: LeRobotConfig = field(default_factory=LeRobotConfig)
+    """Settings of LeRobot's robot as our driver leads it."""
     camera_delay: float = 0.0
     """Delay from exposure to arrival of an image [s]: `hrc_learn.hardware.measure_delay`."""
     realtime: bool = True
@@ -87,26 +96,36 @@ class ArmSite:
     def cell_config(self) -> WorkCellConfig:
         """Configuration of the loop on this arm."""
         config = WorkCellConfig()
+        delay = _SERVO_DELAY if self.driver == "lerobot" else _DELAY
         safety = replace(
-            config.safety, braking=self.dynamics, delay=_DELAY, tcp_speed=_REDUCED_SPEED
+            config.safety, braking=self.dynamics, delay=delay, tcp_speed=_REDUCED_SPEED
         )
         return replace(
             config,
             safety=safety,
-            command_delay=_DELAY,
+            command_delay=delay,
             speed=self.speed,
             latency=LatencyConfig(delay=self.camera_delay),
         )
 
 
 @contextmanager
-def opened_arm(site: ArmSite) -> Iterator[StoppableArm]:
+def opened_arm(site: ArmSite, chain: SerialChain | None = None) -> Iterator[StoppableArm]:
     """Connect to the arm; it is at rest when the block ends, also after an error.
+
+    Args:
+        site: Arm and driver.
+        chain: Kinematics of a robot of LeRobot; None: a Franka arm's.
 
     Raises:
         ValueError: If the site has no address.
         DriverError: If the arm cannot be reached; says why.
     """
+    if site.driver == "lerobot":
+        opened = partial(LeRobotArm, site.device, chain or site.chain, site.lerobot)
+        with ArmProcess(opened, timeout=_SILENCE) as arm:
+            yield arm
+        return
     if not site.ip:
         raise ValueError("ip is empty: give the address of the control box of the arm.")
     # Never both: each driver registers the same types, and refuses to be loaded with the other.

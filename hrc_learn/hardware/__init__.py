@@ -17,5 +17,7 @@ from hrc_learn.hardware.franky_arm import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm
 from hrc_learn.hardware.gripper import GripperError as GripperError
 from hrc_learn.hardware.gripper import GripperThread as GripperThread
+from hrc_learn.hardware.lerobot_arm import LeRobotArm as LeRobotArm
+from hrc_learn.hardware.lerobot_arm import LeRobotConfig as LeRobotConfig
 from hrc_learn.hardware.opencv_cameras import CameraError as CameraError
 from hrc_learn.hardware.opencv_cameras import CaptureCamera as CaptureCamera

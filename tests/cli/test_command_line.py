@@ -19,7 +19,7 @@ from commands import done, hrc
 
 from hrc_learn import cli
 from hrc_learn.cli import arguments
-from hrc_learn.cli._commands import COMMANDS
+from hrc_learn.cli._commands import COMMANDS, device_settings
 from hrc_learn.cli._run import with_settings
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.kinematics import MissingModelError
@@ -329,3 +329,33 @@ def test_the_dataset_may_be_the_working_folder(monkeypatch, tmp_path):
     assert (tmp_path / "set_model" / "metrics.json").is_file()
     done("repair", ".")
     assert (tmp_path / "set_repaired" / "meta" / "info.json").is_file()
+
+
+def test_options_of_a_lerobot_device_become_settings():
+    typed = [
+        "--out",
+        "o",
+        "--robot",
+        "so101",
+        "--robot.type=so101_follower",
+        "--robot.port",
+        "/p",
+    ]
+    settings = ["site.device.type=so101_follower", "site.device.port=/p"]
+    expected = ["--out", "o", "--robot", "so101", "--config", *settings]
+    assert device_settings(typed) == expected
+    given = [*typed, "--config", "site.speed=0.1", "--arm", "lerobot"]
+    assert device_settings(given) == [
+        *expected,
+        "site.speed=0.1",
+        "--arm",
+        "lerobot",
+    ]
+
+
+def test_a_lerobot_arm_needs_its_type_and_no_address(tmp_path):
+    out = str(tmp_path / "set")
+    asked = done("page", "--arm", "lerobot", "--ip", "sim", "--out", out, status=2)
+    assert "--ip is for Franka arms: LeRobot's have --robot.port" in asked.error
+    asked = done("run", "placing", "--arm", "lerobot", "--out", out, status=2)
+    assert "hrc run leads Franka arms only" in asked.error

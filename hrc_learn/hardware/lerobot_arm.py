@@ -1,0 +1,295 @@
+"""An arm of LeRobot behind the `Arm` and `Gripper` protocols, such as the SO-101 follower.
+
+Run with LeRobot's driver and the maker's SDK against a simulation of the servos' bus; NOT RUN
+ON HARDWARE.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.hardware.franky_arm import ArmFaultError
+from hrc_learn.hardware.lerobot_device import JointUnits, open_device
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.protocols import ArmState
+
+_SLOPE = 5
+"""Readings that the velocity is the slope of: one step of a 12-bit encoder between two readings
+at 50 Hz would be 0.08 rad/s."""
+_STATUS = 0.5
+"""Time between two readings of the servos' status [s]."""
+_ALARMS = ("voltage", "angle sensor", "temperature", "current", "", "overload")
+"""Meaning of the bits of a Feetech servo's register "Status"."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeRobotConfig:
+    """Settings of an arm that LeRobot drives."""
+
+    rate: float = 50.0
+    """Readings and position commands a second: six servos take 3 ms of the bus."""
+    timeout: float = 0.15
+    """Longest time that a velocity holds without another command [s]."""
+    silence: float = 0.4
+    """Longest time without a reading [s]: LeRobot waits 50 ms for a reply, three times."""
+    lag: float = 0.35
+    """Largest distance of the commanded positions from the measured ones [rad]."""
+    blocked: float = 1.0
+    """Time at this distance after which the arm counts as blocked [s]."""
+    opening: float = 0.08
+    """Opening of the gripper at LeRobot's 100 % [m]."""
+    unit: Literal["", "deg", "rad"] = ""
+    """Unit of the joints. Empty: from the robot's calibration."""
+    zeros: dict[str, float] = field(default_factory=dict)
+    """Positions in the arm's description of joints that LeRobot calls 0 [rad]."""
+    reversed: tuple[str, ...] = ()
+    """Joints that turn against those of the description."""
+
+
+class LeRobotArm:
+    """A robot of LeRobot with joint positions, driven by velocities.
+
+    A thread reads the positions and sends the next ones, into which the velocities are
+    integrated. Without a command for the config's `timeout` they stay where they are: position
+    servos then hold the arm. A bus that is silent, a servo that reports a fault and a joint
+    that stays behind stop the arm: every command raises `ArmFaultError` until `recover`
+    succeeds.
+    """
+
+    def __init__(
+        self,
+        settings: Mapping[str, Any],
+        chain: SerialChain,
+        config: LeRobotConfig | None = None,
+    ):
+        """Connect. The servos hold the arm where it is from then on.
+
+        Args:
+            settings: LeRobot's settings of the robot: type, port, id and others.
+            chain: Kinematics and limits of the arm.
+            config: How the driver leads the arm.
+
+        Raises:
+            ValueError: There is no such robot or setting, or its joints are not the chain's.
+            ConnectionError: The robot cannot be reached, or is not calibrated.
+        """
+        self.config = config = config or LeRobotConfig()
+        self._robot = open_device("robot", settings)
+        try:
+            self.units = JointUnits.of(
+                self._robot, chain.joint_names, config.unit, config.zeros, config.reversed
+            )
+            self._names, limits = chain.joint_names, chain.limits
+            self._fastest = limits.velocity.numpy()
+            ends = self.units.reachable()
+            self._lower = np.maximum(limits.lower.numpy(), ends[0])
+            self._upper = np.minimum(limits.upper.numpy(), ends[1])
+            self._readings: deque[tuple[float, np.ndarray]] = deque(maxlen=_SLOPE)
+            # One thread at a time on the bus, and in the numbers; both only in this order.
+            self._bus, self._lock = threading.Lock(), threading.Lock()
+            self._ended = threading.Event()
+            self._fault, self._failure = "", ""
+            self._behind_since, self._status_at = math.inf, -math.inf
+            self._velocity = np.zeros(len(self._names))
+            self._look()
+            self._goal = self._readings[-1][1].copy()
+            self._moved_at = self._commanded_at = time.monotonic()
+            self._share = self._width / config.opening
+        except BaseException:
+            self._robot.disconnect()
+            raise
+        self._thread = threading.Thread(target=self._keep_going, name="lerobot", daemon=True)
+        self._thread.start()
+        # A process that ends without `close` leaves the torque as LeRobot's settings say, too.
+        atexit.register(self.close)
+
+    def read(self) -> ArmState:
+        """Return the newest state; `time` is this machine's monotonic clock [s].
+
+        Raises:
+            ArmFaultError: The bus has been silent for too long.
+        """
+        with self._lock:
+            self._refuse_silence()
+            times = np.array([t for t, _ in self._readings])
+            positions = np.array([q for _, q in self._readings])
+            velocity = np.zeros(len(self._names))
+            if len(times) > 1:
+                since = times - times.mean()
+                velocity = since @ positions / (since @ since)
+            return ArmState(
+                time=float(times[-1]),
+                joint_position=positions[-1].copy(),
+                joint_velocity=velocity,
+                gripper_width=self._width,
+            )
+
+    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
+        """Set the joint velocities to hold [rad/s].
+
+        Raises:
+            ValueError: They are not finite, or beyond the limits of the arm's description.
+            ArmFaultError: The arm has stopped, or its bus is silent.
+        """
+        velocity = np.asarray(joint_velocity, dtype=float)
+        if velocity.shape != (len(self._names),) or not np.isfinite(velocity).all():
+            raise ValueError(
+                f"joint_velocity must be {len(self._names)} finite numbers, but is {velocity}."
+            )
+        beyond = np.abs(velocity) > self._fastest * (1 + 1e-6)
+        if beyond.any():
+            i = int(beyond.argmax())
+            raise ValueError(
+                f"{self._names[i]}: {velocity[i]:.3f} rad/s is beyond its limit of "
+                f"{self._fastest[i]:.3f} rad/s."
+            )
+        with self._lock:
+            self._refuse_silence()
+            if self._fault:
+                raise ArmFaultError(self._fault)
+            self._advance()
+            self._velocity, self._commanded_at = velocity, time.monotonic()
+
+    def move(self, width: float) -> None:
+        """Set the opening of the gripper [m]; it is reached in the gripper's own time."""
+        with self._lock:
+            self._share = float(np.clip(width / self.config.opening, 0.0, 1.0))
+
+    def stop(self) -> None:
+        """Let the servos hold the arm where it is commanded to be.
+
+        A silent bus leaves them at the last positions sent, so that this needs no answer.
+        """
+        with self._lock:
+            self._advance()
+            self._velocity = np.zeros(len(self._names))
+
+    def recover(self) -> None:
+        """Make the arm ready again after a fault, once its cause is gone.
+
+        Raises:
+            ArmFaultError: The fault remains; the message says which.
+        """
+        with self._bus:
+            try:
+                self._look()
+                fault = self._alarm()
+                bus = getattr(self._robot, "bus", None)
+                if bus is not None and not fault:  # a servo cuts its torque with an alarm
+                    bus.enable_torque()
+            except Exception as error:
+                fault = f"the bus does not answer ({_text(error)}): check cable and power."
+            with self._lock:
+                self._fault = fault
+                if fault:
+                    raise ArmFaultError(fault)
+                self._goal, self._velocity = self._readings[-1][1].copy(), 0 * self._velocity
+                self._behind_since = math.inf
+
+    def close(self) -> None:
+        """Stop the arm and disconnect; LeRobot switches the torque off, unless told not to."""
+        atexit.unregister(self.close)
+        self._ended.set()
+        self._thread.join(5.0)
+        with suppress(Exception):  # a bus that has gone, or a servo with an alarm
+            self._robot.disconnect()
+
+    def __enter__(self) -> LeRobotArm:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _keep_going(self) -> None:
+        """Read and send until the arm is closed."""
+        period = 1 / self.config.rate
+        due = time.monotonic()
+        while not self._ended.wait(max(0.0, due - time.monotonic())):
+            due = max(due + period, time.monotonic())
+            try:
+                with self._bus:
+                    self._turn()
+            except Exception as error:  # a lost reply: the silence counts
+                self._failure = _text(error)
+
+    def _turn(self) -> None:
+        """Read once, and send the next positions."""
+        self._look()
+        now, alarm = time.monotonic(), ""
+        if now - self._status_at > _STATUS:
+            alarm, self._status_at = self._alarm(), now
+        with self._lock:
+            self._advance()
+            self._judge(alarm)
+            goal, share, holds = self._goal.copy(), self._share, bool(self._fault)
+        if not holds:
+            self._robot.send_action(self.units.action(goal, share))
+
+    def _look(self) -> None:
+        """Read positions and gripper."""
+        position, share = self.units.observed(self._robot.get_observation())
+        with self._lock:
+            self._readings.append((time.monotonic(), position))
+            self._width = share * self.config.opening
+
+    def _alarm(self) -> str:
+        """Fault that a servo reports; empty without one."""
+        for motor, status in self.units.alarms(self._robot).items():
+            if status:
+                bits = [word for i, word in enumerate(_ALARMS) if status >> i & 1 and word]
+                return (
+                    f"servo {motor} reports {' and '.join(bits) or f'status {status}'}: let it "
+                    "cool down, check power and load, and recover or connect again."
+                )
+        return ""
+
+    def _advance(self) -> None:
+        """Integrate the velocity up to now, or to the end of its time."""
+        now = time.monotonic()
+        until = min(now, self._commanded_at + self.config.timeout)
+        elapsed = max(0.0, until - self._moved_at)
+        here, lag = self._readings[-1][1], self.config.lag
+        goal = self._goal + (0.0 if self._fault else elapsed) * self._velocity
+        # An arm that starts beyond an end may move back, but not further out.
+        lower, upper = np.minimum(self._lower, here), np.maximum(self._upper, here)
+        self._goal = np.clip(np.clip(goal, here - lag, here + lag), lower, upper)
+        self._moved_at = now
+
+    def _judge(self, alarm: str) -> None:
+        """Stop an arm with an alarm, or with a joint that stays behind."""
+        now, behind = time.monotonic(), np.abs(self._goal - self._readings[-1][1])
+        if behind.max() < 0.99 * self.config.lag:
+            self._behind_since = math.inf
+        elif self._behind_since == math.inf:
+            self._behind_since = now
+        if not self._fault and (alarm or now - self._behind_since > self.config.blocked):
+            name = self._names[int(behind.argmax())]
+            self._fault = alarm or (
+                f"{name} stays {behind.max():.2f} rad behind its command: it is blocked, "
+                "overloaded or without power."
+            )
+            self._velocity = np.zeros(len(self._names))
+
+    def _refuse_silence(self) -> None:
+        silent = time.monotonic() - self._readings[-1][0]
+        if silent > self.config.silence:
+            why = f" ({self._failure})" if self._failure else ""
+            raise ArmFaultError(
+                f"no reading of the arm for {silent:.2f} s{why}: its servos hold the last "
+                "positions. Check cable and power, and connect again."
+            )
+
+
+def _text(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
