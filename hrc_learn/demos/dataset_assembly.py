@@ -323,7 +323,11 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
             f"{recovery_advice(root)} makes a dataset of its saved episodes; remove the "
             f"folder to start anew"
         ) from None
-    store.write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
+    try:
+        store.write_json(staging / _RECORDING, _Recording(episodes=earlier_episodes))
+    except OSError:
+        staging.rmdir()  # without its header it is no recording of ours
+        raise
 
 
 def finish(root: Path, claim: store.Claim) -> None:

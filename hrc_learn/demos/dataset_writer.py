@@ -132,19 +132,22 @@ class DatasetWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if error is None:
-            with self._claim:
-                self.finalize()
-            return
         with self._claim:
+            if error is None:
+                self.finalize()
+                return
             self.discard_episode()
-            if not self._new_episodes:
+            if self._new_episodes:
+                error.add_note(self._kept())
+            else:
                 discard(self._staging)
-        if self._new_episodes:
-            error.add_note(
-                f"The {self._new_episodes} episodes saved so far are kept in "
-                f"{self._staging}; {recovery_advice(self.root)} makes a dataset of them."
-            )
+
+    def _kept(self) -> str:
+        """Place of the saved episodes, and the way to a dataset of them."""
+        return (
+            f"The {self._new_episodes} episodes saved so far are kept in {self._staging}; "
+            f"{recovery_advice(self.root)} makes a dataset of them."
+        )
 
     def start_episode(self, task: str) -> None:
         """Begin an episode of a task, described in words.
@@ -259,6 +262,7 @@ class DatasetWriter:
         Raises:
             RuntimeError: An episode is open.
             DatasetError: No episode was saved.
+            OSError: The disk is full or read-only. The saved episodes are kept.
         """
         self._require_no_open_episode("before the recording ends")
         with self._claim:
@@ -266,7 +270,11 @@ class DatasetWriter:
                 discard(self._staging)
                 text = "no episode was saved, so there is no dataset"
                 raise DatasetError(text, file=self.root)
-            finish(self.root, self._claim)
+            try:
+                finish(self.root, self._claim)
+            except OSError as error:
+                error.add_note(self._kept())
+                raise
         return self.root
 
     @property

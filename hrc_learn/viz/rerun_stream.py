@@ -37,10 +37,10 @@ def rrd_file(
         title: Title of the recording.
         blueprint: Layout; None: a `RunStream` sends layout and title.
     """
-    stream = rr.RecordingStream("hrc_learn")
-    # Not by `stream.save`: on a full disk it loses data, and its `flush` never returns.
-    content = stream.binary_stream()
     with new_file(Path(path)) as part:
+        stream = rr.RecordingStream("hrc_learn")
+        # Not by `stream.save`: on a full disk it loses data, and its `flush` never returns.
+        content = stream.binary_stream()
         try:
             if blueprint is not None:
                 stream.send_blueprint(blueprint, make_active=False)
@@ -48,6 +48,7 @@ def rrd_file(
             yield stream
             part.write_bytes(content.read() or b"")
         finally:
+            content.read()  # Rerun warns of data that are not taken
             stream.disconnect()
 
 

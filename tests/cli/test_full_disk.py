@@ -1,6 +1,7 @@
 """On a full disk a command ends in one line that names its result, and leaves nothing of it."""
 
 import contextlib
+import gc
 import resource
 import shutil
 
@@ -10,7 +11,7 @@ from clean_sets import SETS, write_set
 from commands import done, hrc
 from lerobot_folders import joint_path
 
-from hrc_learn.demos import load_demos
+from hrc_learn.demos import DatasetWriter, load_demos
 
 COMMANDS = {
     "check": "check {set} --json {out}",
@@ -69,11 +70,42 @@ def test_a_full_disk_is_one_line(places, command, size, tmp_path):
     assert status == 2, errors
     last = errors.strip().splitlines()[-1]
     assert last.startswith("error: ")
-    assert last.endswith("File too large")
+    assert "File too large" in last
     assert "Traceback" not in errors
     assert ".writing" not in last
-    # Only the saved episodes of a recording are kept, for `hrc recover`.
-    assert {path.name for path in tmp_path.iterdir()} <= {"out.recording"}
+    # Only the saved episodes of a recording are kept, for `hrc recover`, and the line says so.
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == ({"out.recording"} if "hrc recover" in last else set())
+
+
+def test_episodes_that_wait_for_room_on_the_disk_become_the_dataset(tmp_path):
+    writer = DatasetWriter(tmp_path / "set", 20, "any")
+    writer.start_episode("wait")
+    for _ in range(30):
+        writer.add_frame(position=[0.1, 0.2, 0.3])
+    writer.save_episode()
+    with small_files(60), pytest.raises(OSError, match="File too large") as full:
+        writer.finalize()
+    assert "hrc recover" in full.value.__notes__[0]
+    done("recover", tmp_path)
+    (demo,) = load_demos(tmp_path / "set")
+    assert len(demo) == 30
+
+
+def test_a_recording_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path):
+    with small_files(10), pytest.raises(OSError, match="File too large"):
+        DatasetWriter(tmp_path / "set", 20, "any")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_dashboard_in_the_way_is_one_line(places, tmp_path, capfd):
+    """Rerun writes its warnings past Python, to the process's own stderr."""
+    out = tmp_path / "out.rrd"
+    out.mkdir()
+    status, _, errors = hrc("show", places["set"], "--out", out)
+    assert (status, errors) == (2, f"error: {out} is a folder: choose another file\n")
+    gc.collect()
+    assert capfd.readouterr().err == ""
 
 
 def test_a_full_device_is_one_line(places):
