@@ -1,5 +1,8 @@
 """The image Jacobian: learned offline from demonstrations, adapted online."""
 
+from hrc_learn.jacobian.camera_estimator import CameraConfig as CameraConfig
+from hrc_learn.jacobian.camera_estimator import CameraEstimator as CameraEstimator
+from hrc_learn.jacobian.camera_estimator import CameraState as CameraState
 from hrc_learn.jacobian.camera_motion import CameraCorrection as CameraCorrection
 from hrc_learn.jacobian.camera_motion import CameraMotion as CameraMotion
 from hrc_learn.jacobian.camera_motion import CameraPlacement as CameraPlacement

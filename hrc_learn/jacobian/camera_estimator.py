@@ -1,0 +1,472 @@
+"""Online estimate of a camera that may have been moved, with what the camera leaves.
+
+The state holds a window of key frames. Unknown are the camera c, thirteen numbers, and the
+weights W of the residual network. Along the path of the key frames, the pixel of the marker is
+
+    x_i = pixel(c, r_i) + W Phi_i + noise,    Phi_i = sum of dr (x) theta since the first frame
+
+W enters linearly with a Gaussian prior, so it is integrated out: the errors of the frames are
+correlated by Phi_i^T P Phi_j, and the camera follows by Gauss-Newton steps of generalised least
+squares, from several turns about the optical axis at once. Given the camera, W has a closed
+form. Both together are the maximum a posteriori estimate.
+
+Optics and marker keep the posterior of the demonstrations as their prior; place and orientation
+of the camera have a wide one. Several images in a row far from where the marker should be mean
+that the camera was moved: the window is then emptied and the search begins again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.utils._pytree import tree_map
+
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import is_number, may_branch
+from hrc_learn.jacobian.estimators import ImageJacobianEstimator, Measurement, evaluate
+from hrc_learn.jacobian.fitting import component_scale, weight_covariance
+from hrc_learn.jacobian.network import RBFImageJacobian
+from hrc_learn.jacobian.perspective import (
+    MARKER,
+    ROTATION,
+    SHIFT,
+    SIZE,
+    camera_jacobian,
+    eye_of,
+    marker_pixels,
+    stepped,
+)
+from hrc_learn.pytree import pytree
+
+# Optics and marker: components of the vector with the posterior of the demonstrations.
+_KNOWN = [0, 1, 2, 3, 10, 11, 12]
+# Largest turn of a Gauss-Newton step [rad], and largest change of place [m]: beyond it the
+# linearisation does not hold.
+_LONGEST_TURN, _LONGEST_MOVE = 0.4, 0.15
+# Error beyond which a frame counts less, in median errors of the window.
+_OUTLIER = 3.0
+# Standard deviation without any information [px, px/m].
+_UNKNOWN = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraConfig:
+    """Window, noise and prior of the estimate."""
+
+    frames: int = 40
+    """Key frames in the window."""
+    min_step: float = 0.005
+    """Least motion between key frames [m], rotation scaled with `rotation_scale`."""
+    max_step: float = 0.1
+    """Largest motion between key frames across which the residual is followed [m]."""
+    rotation_scale: float = 0.15
+    """Metres per radian, a typical lever arm [m/rad]."""
+    pixel_noise: float = 0.25
+    """Standard deviation of a pixel coordinate [px]: 0.1 px of the detector in blurred images,
+    and what noise of the encoders adds."""
+    hypotheses: int = 8
+    """Turns about the optical axis from which the search starts."""
+    steps: int = 1
+    """Gauss-Newton steps an image."""
+    tilt: float = 0.15
+    """Prior standard deviation of a tilt of the camera since the demonstrations [rad]; its turn
+    about the optical axis may be any."""
+    place: float = 0.1
+    """Prior standard deviation of a shift of the camera along each axis [m]."""
+    marker: float = 1e-3
+    """Standard deviation of the marker's place on the tool since the demonstrations [m]."""
+    residual: float = 8.0
+    """Prior standard deviation of the mean of the residual image Jacobian [px/m]: half a
+    percent of that of ordinary cameras, as encoder zeros off by 2 mrad leave."""
+    bump: float = 4.0
+    """Least error that counts as a sign of a moved camera [px]."""
+    surprises: int = 3
+    """Images in a row with such an error after which the camera counts as moved."""
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "hypotheses", "steps", "surprises"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}.")
+        for name in ("min_step", "pixel_noise", "tilt", "place", "marker", "residual", "bump"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class CameraState:
+    """Cameras, weights of the residual, and the window of key frames."""
+
+    weight: Float[Tensor, "*batch entries K"]
+    """W of the most probable camera [px/m, px/rad]."""
+    cameras: Float[Tensor, "*batch hypotheses 13"]
+    """Hypotheses of the camera."""
+    cost: Float[Tensor, "*batch hypotheses"]
+    """Negative log posterior of each, up to a constant."""
+    covariance: Float[Tensor, "*batch 13 13"]
+    """Covariance of a step from the most probable camera."""
+    position: Float[Tensor, "*batch frames 3"]
+    """Positions of the tool in the window [m], the newest last."""
+    orientation: Float[Tensor, "*batch frames 4"]
+    """Orientations of the tool (w, x, y, z)."""
+    pixel: Float[Tensor, "*batch frames 2"]
+    """Pixels of the marker [px]."""
+    path: Float[Tensor, "*batch frames P"]
+    """Regressors of the residual along the path, up to each frame [m]."""
+    known: Bool[Tensor, "*batch frames"]
+    """True for frames of the window that hold an image."""
+    surprises: Float[Tensor, "*batch"]
+    """Images in a row with the marker far from where it should be."""
+    moves: Float[Tensor, "*batch"]
+    """Times that the camera was found moved."""
+
+    @property
+    def best(self) -> Float[Tensor, "*batch 13"]:
+        """Most probable camera."""
+        index = self.cost.argmin(-1, keepdim=True)[..., None]
+        return self.cameras.gather(-2, index.expand(*index.shape[:-1], SIZE)).squeeze(-2)
+
+    @property
+    def probability(self) -> Float[Tensor, "*batch hypotheses"]:
+        """Posterior probability of each hypothesis."""
+        return torch.softmax(-self.cost, dim=-1)
+
+    @property
+    def camera(self) -> Float[Tensor, "*batch 13"]:
+        """Most probable camera, in the name of a network's."""
+        return self.best
+
+
+class _Fit(NamedTuple):
+    """Gauss-Newton step of all hypotheses."""
+
+    gram: Tensor
+    towards: Tensor
+    cost: Tensor
+
+
+class CameraEstimator(ImageJacobianEstimator):
+    """Camera and residual from a window of key frames, by maximum a posteriori estimation."""
+
+    def __init__(self, network: RBFImageJacobian, config: CameraConfig | None = None):
+        """Prepare the prior.
+
+        Args:
+            network: Network with the camera of the demonstrations, in float64.
+            config: Window, noise and prior.
+
+        Raises:
+            ValueError: The network has no camera.
+        """
+        super().__init__(network)
+        self.config = config = config or CameraConfig()
+        if network.camera is None or network.camera_covariance is None:
+            raise ValueError(
+                "the image Jacobian has no camera: fit it again with `hrc fit image-jacobian`, "
+                "or choose another estimator."
+            )
+        camera, K = network.camera, len(network.centers)
+        known = network.camera_covariance[_KNOWN][:, _KNOWN]
+        widened = [0.0] * 4 + [config.marker**2] * 3
+        precision = torch.linalg.inv(known + camera.new_tensor(widened).diag())
+        bias, scale = config.residual, component_scale(camera, config.rotation_scale)
+        one = weight_covariance(network.centers, bias, bias / 2)
+        self.register_buffer("reference", camera, persistent=False)
+        self.register_buffer("precision", precision, persistent=False)
+        self.register_buffer("residual", torch.block_diag(*[one] * 6), persistent=False)
+        self.register_buffer("scale", scale, persistent=False)
+        turns = torch.arange(config.hypotheses) * (2 * math.pi / config.hypotheses)
+        rolls = camera.new_zeros(config.hypotheses, 3)
+        rolls[:, 2] = turns
+        self.register_buffer("rolls", quaternion.exp(rolls), persistent=False)
+        self.size = 6 * K
+
+    reference: Tensor
+    """Camera of the demonstrations, (13,)."""
+    precision: Tensor
+    """Prior precision of optics and marker, (7, 7)."""
+    residual: Tensor
+    """Prior covariance of the weights of either image row, (P, P)."""
+    scale: Tensor
+    """Metres per unit of each component of a twist, (6,)."""
+    rolls: Tensor
+    """Turns about the optical axis of the hypotheses, (hypotheses, 4)."""
+
+    def initial_state(self, *batch: int) -> CameraState:
+        """The camera of the demonstrations, turned in all ways, and an empty window."""
+        config, like = self.config, self.reference
+        frames = (*batch, config.frames)
+        upright = like.new_tensor([1.0, 0, 0, 0])
+        cameras = self._rolled(like.expand(*batch, SIZE))
+        return CameraState(
+            weight=self.initial_weight(*batch),
+            cameras=cameras,
+            cost=self._roll_cost(cameras),
+            covariance=self._prior_covariance(*batch),
+            position=like.new_zeros(*frames, 3),
+            orientation=upright.expand(*frames, 4).clone(),
+            pixel=like.new_zeros(*frames, 2),
+            path=like.new_zeros(*frames, self.size),
+            known=torch.zeros(frames, dtype=torch.bool, device=like.device),
+            surprises=like.new_zeros(batch),
+            moves=like.new_zeros(batch),
+        )
+
+    def jacobian(
+        self, state: CameraState, r: Pose | Float[Tensor, "*batch 6"]
+    ) -> Float[Tensor, "*batch rows 6"]:
+        """J_s_hat at a pose: that of the most probable camera, and the residual."""
+        pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
+        one = Pose(pose.position.unsqueeze(-2), pose.orientation.unsqueeze(-2))
+        first = camera_jacobian(state.best, one).squeeze(-3)
+        return first + evaluate(state.weight, self.network.basis(pose))
+
+    def restored(self, state: CameraState) -> CameraState:
+        """The state, reset where it is not finite."""
+        known = is_number(state.cameras).flatten(-2).all(-1)
+        known = known & is_number(state.weight).flatten(-2).all(-1)
+        known = known & is_number(state.pixel).flatten(-2).all(-1)
+        if may_branch(known) and bool(known.all()):
+            return state
+        return _where(known, state, self.initial_state(*known.shape))
+
+    def update(self, state: CameraState, measurement: Measurement) -> CameraState:
+        """State after an image; unchanged without a visible marker."""
+        seen = measurement.valid & is_number(measurement.feature).all(-1)
+        if may_branch(seen) and not bool(seen.any()):
+            return state
+        state = self._watched(state, measurement, seen)
+        state, kept = self._with_key_frame(state, measurement, seen)
+        return _where(seen & kept, self._searched(state), state)
+
+    def _rolled(
+        self, camera: Float[Tensor, "*batch 13"]
+    ) -> Float[Tensor, "*batch hypotheses 13"]:
+        """A camera turned about its optical axis by each hypothesis."""
+        turn = quaternion.multiply(
+            self.rolls, quaternion.exp(camera[..., ROTATION]).unsqueeze(-2)
+        )
+        shift = quaternion.rotate(self.rolls, camera[..., SHIFT].unsqueeze(-2))
+        whole = camera.unsqueeze(-2).expand(*camera.shape[:-1], len(self.rolls), SIZE)
+        parts = [whole[..., :4], quaternion.log(turn), shift, whole[..., MARKER]]
+        return torch.cat(parts, dim=-1)
+
+    def _roll_cost(self, cameras: Float[Tensor, "*batch hypotheses 13"]) -> Tensor:
+        """Preference for small turns, which decides only before there is any motion."""
+        turn = quaternion.exp(cameras[..., ROTATION])
+        return 0.05 * quaternion.angle(turn, quaternion.exp(self.reference[ROTATION]))
+
+    def _prior_covariance(self, *batch: int) -> Float[Tensor, "*batch 13 13"]:
+        zero = self.reference.new_zeros(1, SIZE)
+        _, slope = self._prior_error(self.reference.unsqueeze(0) + zero)
+        gram = slope[0].mT @ slope[0] + self._known_precision()
+        gram = gram + torch.eye(SIZE).to(gram) * 1e-2
+        return torch.linalg.inv(gram).expand(*batch, SIZE, SIZE).clone()
+
+    def _known_precision(self) -> Float[Tensor, "13 13"]:
+        whole = self.reference.new_zeros(SIZE, SIZE)
+        index = torch.tensor(_KNOWN, device=whole.device)
+        return whole.index_put((index[:, None], index[None]), self.precision)
+
+    def _prior_error(
+        self, cameras: Float[Tensor, "*batch 13"]
+    ) -> tuple[Float[Tensor, "*batch 5"], Float[Tensor, "*batch 5 13"]]:
+        """Tilt and shift of the camera in prior deviations, and their derivatives by steps."""
+        config = self.config
+        home = quaternion.to_matrix(quaternion.exp(self.reference[ROTATION]))
+        R = quaternion.to_matrix(quaternion.exp(cameras[..., ROTATION]))
+        zero = torch.zeros_like(R[..., 0])
+        # Axis of view in the camera of the demonstrations, whose own is (0, 0, 1).
+        tilt = (R[..., 2, :] @ home.mT)[..., :2] / config.tilt
+        by_turn = torch.stack([R[..., 1, :], -R[..., 0, :], zero], dim=-1)
+        by_turn = (home @ by_turn)[..., :2, :] / config.tilt
+        away = (eye_of(cameras) - eye_of(self.reference)) / config.place
+        t = cameras[..., SHIFT]
+        # e = -R^T t becomes e + R^T (w x t) - R^T dt.
+        cross = torch.linalg.cross(
+            torch.eye(3).to(t).expand(*t.shape[:-1], 3, 3), t.unsqueeze(-2)
+        ).mT
+        place_by_turn = R.mT @ cross / config.place
+        empty = R.new_zeros(*R.shape[:-2], 5, 4)
+        rotation = torch.cat([by_turn, place_by_turn], dim=-2)
+        shift = torch.cat([torch.zeros_like(by_turn), -R.mT / config.place], dim=-2)
+        slope = torch.cat([empty, rotation, shift, torch.zeros_like(shift)], dim=-1)
+        return torch.cat([tilt, away], dim=-1), slope
+
+    def _watched(
+        self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]
+    ) -> CameraState:
+        """State with an empty window where the camera was moved."""
+        config = self.config
+        one = Pose(now.pose.position.unsqueeze(-2), now.pose.orientation.unsqueeze(-2))
+        expected, slope = marker_pixels(state.best, one)
+        error = now.feature - expected.squeeze(-2)
+        slope = slope.squeeze(-3)
+        spread = slope @ state.covariance @ slope.mT
+        deviation = spread.diagonal(dim1=-2, dim2=-1).amax(-1).clamp_min(0).sqrt()
+        settled = state.known.sum(-1) >= config.surprises
+        limit = config.bump + 5 * (deviation + config.pixel_noise)
+        far = seen & settled & (error.norm(dim=-1) > limit)
+        surprises = torch.where(far, state.surprises + 1, torch.where(seen, 0, state.surprises))
+        moved = surprises >= config.surprises
+        fresh = replace(
+            state,
+            weight=self.initial_weight(*moved.shape),
+            cameras=self._rolled(state.best),
+            known=torch.zeros_like(state.known),
+            surprises=torch.zeros_like(surprises),
+            moves=state.moves + 1,
+        )
+        return _where(moved, fresh, replace(state, surprises=surprises))
+
+    def _with_key_frame(
+        self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]
+    ) -> tuple[CameraState, Bool[Tensor, "*batch"]]:
+        """State with this image in the window if the tool has moved, and True where it may be
+        learned from: not while it may mean that the camera was moved.
+        """
+        config = self.config
+        last = Pose(state.position[..., -1, :], state.orientation[..., -1, :])
+        twist = last.twist_to(now.pose)
+        distance = (twist * self.scale).norm(dim=-1)
+        first = ~state.known[..., -1]
+        calm = state.surprises == 0
+        add = seen & calm & (first | (distance >= config.min_step))
+        theta = (self.network.basis(last) + self.network.basis(now.pose)) / 2
+        follow = ~first & (distance <= config.max_step)
+        phi = ((twist * self.scale)[..., :, None] * theta[..., None, :]).flatten(-2)
+        path = state.path[..., -1, :] + torch.where(follow[..., None], phi, 0.0)
+        feature = torch.where(seen[..., None], now.feature, 0.0)
+
+        def pushed(window: Tensor, newest: Tensor) -> Tensor:
+            return torch.cat([window[..., 1:, :], newest.unsqueeze(-2)], dim=-2)
+
+        longer = replace(
+            state,
+            position=pushed(state.position, now.pose.position),
+            orientation=pushed(state.orientation, now.pose.orientation),
+            pixel=pushed(state.pixel, feature),
+            path=pushed(state.path, path),
+            known=torch.cat([state.known[..., 1:], torch.ones_like(first)[..., None]], dim=-1),
+        )
+        return _where(add, longer, state), calm
+
+    def _searched(self, state: CameraState) -> CameraState:
+        """State after Gauss-Newton steps, and the residual of the most probable camera."""
+        config, known = self.config, state.known
+        newest = known.to(state.path).cumsum(-1)
+        start = ((newest == 1) & known).to(state.path)
+        # Regressors since the first frame of the window.
+        path = state.path - (start[..., None] * state.path).sum(-2, keepdim=True)
+        path = torch.where(known[..., None], path, 0.0)
+        covaried = path @ self.residual
+        kernel = covaried @ path.mT
+        one = Pose(state.position.unsqueeze(-3), state.orientation.unsqueeze(-3))
+        mean = self._flat_weight(self.initial_weight()) @ path.mT
+        pixel = state.pixel - mean.mT
+        cameras, cost = state.cameras, state.cost
+        inverse, fit = kernel, None
+        for _ in range(config.steps):
+            inverse = self._information(state, cameras, cost, pixel, kernel)
+            fit = self._fit(cameras, one, pixel, known, inverse)
+            cost = fit.cost
+            cameras = stepped(cameras, _shortened(torch.linalg.solve(fit.gram, fit.towards)))
+        assert fit is not None
+        index = cost.argmin(-1)[..., None, None, None]
+        gram = fit.gram.gather(-3, index.expand(*index.shape[:-2], SIZE, SIZE)).squeeze(-3)
+        learned = replace(state, cameras=cameras, cost=cost)
+        best = learned.best
+        poses = Pose(state.position, state.orientation)
+        error = torch.where(known[..., None], pixel - marker_pixels(best, poses)[0], 0.0)
+        whitened = inverse @ error
+        change = (covaried.mT @ whitened).mT.unflatten(-1, (6, -1))
+        weight = self.initial_weight() + (change * self.scale[:, None]).flatten(-3, -2)
+        # Errors larger than assumed make the estimate as much less certain.
+        count = (2 * known.sum(-1) - SIZE + len(_KNOWN)).clamp_min(1)
+        misfit = ((error * whitened).sum((-2, -1)) / count).clamp_min(1.0)
+        covariance = torch.linalg.inv(gram) * misfit[..., None, None]
+        return replace(learned, weight=weight, covariance=covariance)
+
+    def _flat_weight(self, weight: Tensor) -> Float[Tensor, "*batch 2 P"]:
+        """Weights as factors of regressors whose rotation is scaled to metres."""
+        return (weight.unflatten(-2, (2, 6)) / self.scale[:, None]).flatten(-2)
+
+    def _information(
+        self,
+        state: CameraState,
+        cameras: Tensor,
+        cost: Tensor,
+        pixel: Float[Tensor, "*batch frames 2"],
+        kernel: Float[Tensor, "*batch frames frames"],
+    ) -> Float[Tensor, "*batch frames frames"]:
+        """Inverse covariance of the frames; those off the most probable camera count less."""
+        best = replace(state, cameras=cameras, cost=cost).best
+        seen, _ = marker_pixels(best, Pose(state.position, state.orientation))
+        size = torch.where(state.known, (pixel - seen).norm(dim=-1), 0.0)
+        # The median over known frames: unknown ones are first in order.
+        count = state.known.sum(-1, keepdim=True)
+        place = size.shape[-1] - 1 - count // 2
+        median = size.sort(-1).values.gather(-1, place.clamp(0, size.shape[-1] - 1))
+        most = (_OUTLIER * median).clamp_min(_OUTLIER * self.config.pixel_noise)
+        inverse_weight = (size / most).clamp_min(1.0).square()
+        noise = torch.where(state.known, self.config.pixel_noise**2 * inverse_weight, _UNKNOWN)
+        return torch.linalg.inv(kernel + torch.diag_embed(noise))
+
+    def _fit(
+        self,
+        cameras: Float[Tensor, "*batch hypotheses 13"],
+        poses: Pose,
+        pixel: Float[Tensor, "*batch frames 2"],
+        known: Bool[Tensor, "*batch frames"],
+        inverse: Float[Tensor, "*batch frames frames"],
+    ) -> _Fit:
+        """Normal equations and cost of each hypothesis."""
+        seen, slope = marker_pixels(cameras, poses)
+        use = known[..., None, :, None]
+        error = torch.where(use, pixel.unsqueeze(-3) - seen, 0.0)
+        # Rows u of all frames, then v: one information matrix serves both.
+        slope = torch.where(use[..., None], slope, 0.0).transpose(-3, -2)
+        error = error.mT
+        information = inverse[..., None, None, :, :]
+        weighted = information @ slope
+        gram = (slope.mT @ weighted).sum(-3)
+        towards = (weighted.mT @ error.unsqueeze(-1)).sum(-3).squeeze(-1)
+        cost = (error * (information @ error.unsqueeze(-1)).squeeze(-1)).sum((-2, -1))
+        prior, by_step = self._prior_error(cameras)
+        gram = gram + by_step.mT @ by_step + self._known_precision()
+        towards = towards - (by_step.mT @ prior.unsqueeze(-1)).squeeze(-1)
+        away = (cameras - self.reference)[..., _KNOWN]
+        pull = away @ self.precision
+        optics, marker = pull[..., :4], pull[..., 4:]
+        zero = torch.zeros_like(cameras[..., 4:10])
+        towards = towards - torch.cat([optics, zero, marker], dim=-1)
+        cost = cost + prior.square().sum(-1) + (away * pull).sum(-1)
+        # Nearly flat directions, the roll before any motion, move little.
+        gram = gram + 1e-2 * torch.eye(SIZE).to(gram)
+        return _Fit(gram, towards, cost / 2 + self._roll_cost(cameras))
+
+
+def _shortened(step: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 13"]:
+    """A step within the reach of its linearisation."""
+    turn, move = step[..., ROTATION].norm(dim=-1), step[..., SHIFT].norm(dim=-1)
+    factor = torch.maximum(turn / _LONGEST_TURN, move / _LONGEST_MOVE).clamp_min(1.0)
+    return step / factor[..., None]
+
+
+def _where(condition: Bool[Tensor, "*batch"], one: Any, other: Any) -> Any:
+    """Elements of one state where the condition holds, else of the other."""
+    if may_branch(condition):
+        if bool(condition.all()):
+            return one
+        if not bool(condition.any()):
+            return other
+
+    def chosen(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(condition[(..., *[None] * (a.dim() - condition.dim()))], a, b)
+
+    return tree_map(chosen, one, other)

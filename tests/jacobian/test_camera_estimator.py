@@ -1,0 +1,237 @@
+"""A camera that was moved is found again online; truth and images are OpenCV's."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+from unchecked import shapes_unchecked
+
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import (
+    CameraConfig,
+    CameraEstimator,
+    ImageDemonstration,
+    ImageJacobianFitConfig,
+    Measurement,
+    RBFCenters,
+    RBFImageJacobian,
+    fit_camera,
+    paper_grid,
+)
+from hrc_learn.jacobian.perspective import marker_pixels
+
+IMAGE, LEVER = (1440, 1080), np.array([-0.008, 0.145, -0.083])
+INTRINSICS = np.array([[1900.0, 0, 731.0], [0, 1900.0, 528.0], [0, 0, 1.0]])
+LENS = np.array([-0.06, 0.02, 0.0, 0.0])
+TURN, EYE = np.array([np.pi - 0.05, 0.05, 0.1]), np.array([0.25, 0.5, 1.5])
+VIEW = cv2.Rodrigues(TURN)[0], EYE
+SCALE = torch.tensor([1, 1, 1, 1 / 0.15, 1 / 0.15, 1 / 0.15]).double()
+
+
+def pixels(view, position, matrix):
+    """Pixels of the marker for a camera (rotation, eye)."""
+    rotation, eye = view
+    points = (position + matrix @ LEVER).reshape(-1, 3)
+    vector, shift = cv2.Rodrigues(rotation)[0], -rotation @ eye
+    return cv2.projectPoints(points, vector, shift, INTRINSICS, LENS)[0][:, 0]
+
+
+def jacobian(view, position, matrix):
+    """True image Jacobian at one pose, by central differences."""
+    columns = []
+    for axis in range(6):
+        twist = np.zeros(6)
+        twist[axis] = 1e-5
+        ahead, behind = (
+            pixels(view, position + s * twist[:3], cv2.Rodrigues(s * twist[3:])[0] @ matrix)
+            for s in (1, -1)
+        )
+        columns.append((ahead - behind)[0] / 2e-5)
+    return torch.from_numpy(np.stack(columns, axis=-1))
+
+
+def moved(rng, degrees, distance, roll):
+    """The camera after a tilt about any axis, a shift, and a turn about its optical axis."""
+    axis, shift = rng.normal(size=(2, 3))
+    tilt = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0]
+    turn = cv2.Rodrigues(np.array([0.0, 0.0, roll]))[0]
+    return turn @ tilt @ VIEW[0], EYE + distance * shift / np.linalg.norm(shift)
+
+
+def path(rng, length=0.1, frames=40, turn=0.2):
+    """Two straight pieces of the tool's path, of this length together."""
+    ways = rng.normal(size=(2, 3)) * [1, 1, 0.7]
+    ways *= length / frames / np.linalg.norm(ways, axis=1, keepdims=True)
+    steps = np.repeat(ways, frames // 2, axis=0)
+    start = np.array([0.25, 0.5, 0.25]) + rng.uniform(-0.06, 0.06, 3) * [1, 1, 0.5]
+    position = start + np.cumsum(steps, axis=0)
+    spin = torch.zeros(frames, 3, dtype=torch.float64)
+    spin[:, 2] = torch.linspace(0, turn, frames)
+    # A little tilt shows how high the marker is on the tool.
+    spin[:, :2] = 0.3 * turn * torch.sin(torch.linspace(0, 3, frames))[:, None]
+    down = torch.tensor([0.0, 1.0, 0.0, 0.0]).double()
+    orientation = quaternion.multiply(quaternion.exp(spin), down)
+    return position, orientation
+
+
+def seen(view, position, orientation, rng):
+    matrix = quaternion.to_matrix(orientation).numpy()
+    noise = rng.normal(0, 0.1, (len(position), 2))
+    return torch.from_numpy(pixels(view, position, matrix) + noise)
+
+
+@pytest.fixture(scope="module")
+def network():
+    rng, demos = np.random.default_rng(0), []
+    for _ in range(3):
+        position, orientation = path(rng, 0.5, 100, turn=rng.normal())
+        demos.append(
+            ImageDemonstration(
+                pose=Pose(torch.from_numpy(position), orientation),
+                feature=seen(VIEW, position, orientation, rng),
+                visible=torch.ones(len(position), dtype=torch.bool),
+            )
+        )
+    config, found = ImageJacobianFitConfig.of_residual(), fit_camera(demos, IMAGE)
+    return RBFImageJacobian.fit(demos, RBFCenters.around(demos), config, found).double()
+
+
+def measurements(position, orientation, feature):
+    """Measurements in time, of poses that encoders report with an error of calibration."""
+    rigid = cv2.Rodrigues(np.array([2e-3, -1e-3, 2e-3]))[0]
+    reported = torch.from_numpy(position @ rigid.T + [1e-3, -1e-3, 0])
+    batch = feature.shape[:-2]
+    return [
+        Measurement(
+            pose=Pose(reported[..., k, :], orientation[..., k, :]),
+            feature=feature[..., k, :],
+            valid=torch.ones(batch, dtype=torch.bool),
+            dt=0.04,
+            xi_x=torch.zeros(*batch, 2, dtype=torch.float64),
+            xi_r=torch.zeros(*batch, 6, dtype=torch.float64),
+        )
+        for k in range(feature.shape[-2])
+    ]
+
+
+def run(estimator, state, frames):
+    with shapes_unchecked():
+        for frame in frames:
+            state = estimator.update(state, frame)
+    return state
+
+
+def error(estimator, state, view, position, orientation):
+    truth = jacobian(view, position[-1], quaternion.to_matrix(orientation[-1]).numpy()) * SCALE
+    pose = Pose(torch.from_numpy(position[-1]), orientation[-1])
+    return float((estimator.jacobian(state, pose) * SCALE - truth).norm() / truth.norm())
+
+
+@pytest.mark.parametrize(("roll", "bound"), [(0.0, 0.05), (np.pi, 0.1)])
+def test_a_moved_camera_is_found_within_ten_centimetres(network, roll, bound):
+    estimator, rng, errors, before = CameraEstimator(network), np.random.default_rng(1), [], []
+    for _ in range(8):
+        view = moved(rng, 10 if roll == 0 else 5, 0.1, rng.uniform(-roll, roll))
+        position, orientation = path(rng)
+        frames = measurements(position, orientation, seen(view, position, orientation, rng))
+        state = estimator.initial_state()
+        before.append(error(estimator, state, view, position, orientation))
+        state = run(estimator, state, frames)
+        errors.append(error(estimator, state, view, position, orientation))
+    assert np.sort(errors)[-2] < bound  # in seven of eight
+    assert np.median(before) > 5 * np.median(errors)
+
+
+def test_a_bump_is_noticed_and_the_camera_is_found_again(network):
+    estimator, rng = CameraEstimator(network), np.random.default_rng(2)
+    position, orientation = path(rng, 0.2, 80)
+    view = moved(rng, 5, 0.05, 0.1)
+    feature = torch.cat(
+        [
+            seen(v, position[part], orientation[part], rng)
+            for v, part in ((VIEW, slice(40)), (view, slice(40, None)))
+        ]
+    )
+    frames = measurements(position, orientation, feature)
+    still = run(estimator, estimator.initial_state(), frames[:40])
+    assert int(still.moves) == 0
+    state = run(estimator, still, frames[40:])
+    assert int(state.moves) == 1
+    assert error(estimator, state, view, position, orientation) < 0.05
+    # A marker half hidden in one image is no moved camera.
+    wrong = replace(frames[39], feature=frames[39].feature + 9.0)
+    assert int(run(estimator, still, [wrong, *frames[38:40]]).moves) == 0
+
+
+def test_a_batch_is_its_elements_and_what_is_not_seen_teaches_nothing(network):
+    estimator, rng = CameraEstimator(network, CameraConfig(frames=12)), np.random.default_rng(3)
+    paths = [path(rng, 0.05, 12) for _ in range(3)]
+    position, orientation = np.stack([p for p, _ in paths]), torch.stack([q for _, q in paths])
+    feature = torch.stack([seen(VIEW, *p, rng) for p in paths])
+    frames = measurements(position, orientation, feature)
+    together = run(estimator, estimator.initial_state(3), frames)
+    for i in range(3):
+        frames = measurements(position[i], orientation[i], feature[i])
+        alone = run(estimator, estimator.initial_state(), frames)
+        assert_close(together.best[i], alone.best, rtol=1e-6, atol=1e-6)
+        assert_close(together.weight[i], alone.weight, rtol=1e-5, atol=1e-5)
+        blind = replace(
+            frames[0], valid=torch.tensor(False), feature=torch.full((2,), torch.nan)
+        )
+        assert_close(estimator.update(alone, blind).cameras, alone.cameras)
+
+
+def test_the_covariance_of_the_camera_covers_its_error(network):
+    """The pixel of a point 25 cm below the marker, in predicted deviations."""
+    estimator, rng, scores = CameraEstimator(network), np.random.default_rng(4), []
+    for _ in range(8):
+        view = moved(rng, 5, 0.05, rng.uniform(-3, 3))
+        position, orientation = path(rng, 0.15)
+        frames = measurements(position, orientation, seen(view, position, orientation, rng))
+        state = run(estimator, estimator.initial_state(), frames)
+        points = state.best[10:] - torch.tensor([0.0, 0.0, -0.25]).double()
+        lowered = torch.cat([state.best[:10], points])
+        pose = Pose(torch.from_numpy(position[-1:]), orientation[-1:])
+        pixel, slope = marker_pixels(lowered, pose)
+        matrix = quaternion.to_matrix(orientation[-1]).numpy()
+        offset = matrix @ (points.numpy() - LEVER)
+        truth = pixels(view, position[-1] + offset, matrix)[0]
+        spread = (slope[0] @ state.covariance @ slope[0].mT).trace().sqrt()
+        scores.append(float(np.linalg.norm(pixel[0].numpy() - truth)) / float(spread))
+    assert np.median(scores) < 2.5
+    assert np.max(scores) < 8
+
+
+def test_a_network_without_a_camera_is_refused():
+    plain = RBFImageJacobian.from_jacobian(torch.zeros(2, 6), paper_grid(), 0.1)
+    with pytest.raises(ValueError, match="has no camera: fit it again"):
+        CameraEstimator(plain)
+    with pytest.raises(ValueError, match="frames must be at least 1"):
+        CameraConfig(frames=0)
+
+
+def test_it_is_exported(network):
+    estimator = CameraEstimator(network, CameraConfig(frames=6, hypotheses=2))
+    rng = np.random.default_rng(5)
+    position, orientation = path(rng, 0.04, 8)
+    frames = measurements(position, orientation, seen(VIEW, position, orientation, rng))
+
+    class Step(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.estimator = estimator
+
+        def forward(self, state, frame):
+            return self.estimator.update(state, frame)
+
+    with shapes_unchecked(), torch.no_grad():
+        state = estimator.initial_state()
+        ready = [replace(f, dt=torch.tensor(0.04).double()) for f in frames]
+        exported = torch.export.export(Step(), (state, ready[0])).module()
+        for frame in ready:
+            expected = estimator.update(state, frame)
+            state = exported(state, frame)
+            assert_close(state.best, expected.best, rtol=1e-7, atol=1e-7)
