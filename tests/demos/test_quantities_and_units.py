@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hrc_learn.demos.read.quantities import (
+from hrc_learn.demos.read.naming import (
     ComponentMeaning,
     is_hand,
     meaning_of_component,

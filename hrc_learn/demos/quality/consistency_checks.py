@@ -17,7 +17,8 @@ from hrc_learn.demos.read.profiles import (
     gain_over,
     is_discrete,
 )
-from hrc_learn.demos.read.quantities import INDEX_KEYS, meaning_of_component
+from hrc_learn.demos.read.naming import meaning_of_component
+from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 FEWEST = 3
 """Fewest episodes among which one can be compared with the others."""

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float64
 from hrc_learn.demos.issues import Issue
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames
-from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, is_hand, to_quaternion
+from hrc_learn.demos.read.naming import is_hand
+from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion
 from hrc_learn.demos.read.units import Quantities
 
 _REPEATED = 0.05

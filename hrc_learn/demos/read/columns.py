@@ -12,16 +12,16 @@ from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import INFO_PATH
 from hrc_learn.demos.read.metadata import Feature, Sidecar
-from hrc_learn.demos.read.quantities import (
-    INDEX_KEYS,
-    ORIENTATION_ROLES,
-    ROLES,
+from hrc_learn.demos.read.naming import (
     ComponentMeaning,
     joint_of,
     meaning_of_component,
     names_joint_quantity,
+    names_no_joint,
     role_of_key,
+    without_unit,
 )
+from hrc_learn.demos.read.quantities import INDEX_KEYS, ORIENTATION_ROLES, ROLES
 
 MappingSpec = Mapping[str, str | Sequence[str] | None]
 """Role -> columns: a feature ("observation.qpos"), a range of one ("observation.state[0:7]"),
@@ -33,6 +33,7 @@ _STATE_KEYS = ("observation.state", "observation.states", "state", "states")
 _ACTION_KEYS = ("action", "actions")
 _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_velocity"}
 _POSES = ("position", *ORIENTATION_ROLES)
+_ORIENTATIONS = (*ORIENTATION_ROLES, "quaternion", "rotation")
 # Content of a pose feature without component names, by its width: the encoding of the
 # orientation after x, y, z, and the assumption to report.
 _CARTESIAN = {
@@ -53,12 +54,16 @@ class ColumnSelection:
     """Joint names, or component names for quantities without joints."""
     numbered: bool = False
     """True if the dataset gives no names, so that the labels only count."""
+    units: tuple[str, ...] = ()
+    """Unit in the name of each column, "" for none; () if no name states one."""
 
     def only(self, labels: Sequence[str]) -> "ColumnSelection":
         """The columns of these labels, in this order."""
         place = dict(zip(self.labels, self.columns, strict=True))
         columns = tuple(place[label] for label in labels)
-        return replace(self, columns=columns, labels=tuple(labels))
+        units = dict(zip(self.labels, self.units, strict=False))
+        stated = tuple(units[label] for label in labels) if units else ()
+        return replace(self, columns=columns, labels=tuple(labels), units=stated)
 
     def column_name(self, number: int) -> str:
         """Feature and label of a column, for messages."""
@@ -121,6 +126,7 @@ def map_columns(
     replaced = replaced_roles(mapping or {})
     found = {role: selection for role, selection in found.items() if role not in replaced}
     found |= parse_mapping(mapping or {}, usable)
+    found = {role: _with_units(s, usable) for role, s in found.items()}
     names, found, unmatched = _align_joints(found)
     taken = {column for selection in found.values() for column in selection.columns}
     extra = (
@@ -135,6 +141,16 @@ def map_columns(
         notes=tuple(notes),
         unmatched={role: _mismatch(role, joints, names) for role, joints in unmatched.items()},
     )
+
+
+def _with_units(selection: ColumnSelection, features: Mapping[str, Feature]) -> ColumnSelection:
+    """The selection with the units that the names of features and components state."""
+    units = []
+    for key, index in selection.columns:
+        names = features[key].names
+        unit = "" if names is None else without_unit(names[index])[1]
+        units.append(unit or without_unit(re.split(r"[./]", key)[-1])[1])
+    return replace(selection, units=tuple(units) if any(units) else ())
 
 
 def _mismatch(role: str, joints: tuple[str, ...], names: tuple[str, ...]) -> str:
@@ -250,6 +266,13 @@ class _Conventions:
         """Receives the assumptions made."""
 
     def find(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:
+        self._commanded = {
+            joint_of(name)
+            for feature in features.values()
+            if feature.key in _ACTION_KEYS
+            for name in feature.names or ()
+        }
+        """Joints that an action names."""
         whole: dict[str, ColumnSelection] = {}
         by_component: dict[str, ColumnSelection] = {}
         for feature in features.values():
@@ -265,7 +288,7 @@ class _Conventions:
         if role is None or (_is_command(feature) and role not in _COMMANDS):
             return []
         named = [meaning_of_component(name) for name in feature.names or ()]
-        if any(meaning and meaning.role in ORIENTATION_ROLES for meaning in named):
+        if any(meaning and meaning.role in _ORIENTATIONS for meaning in named):
             return [*self._grouped(feature, named)]
         indices = range(feature.width)
         if role == "cartesian":
@@ -277,6 +300,9 @@ class _Conventions:
             self._notes.append(
                 f"{feature.key}: assumed to be a quaternion in the order x, y, z, w"
             )
+        if role == "gripper" and feature.width == 2:  # two fingers, as in robomimic
+            self._notes.append(f"{feature.key}: its first finger is taken for the gripper")
+            return [_select(role, feature, indices[:1])]
         width = ROLES[role].width
         if width is not None and width != feature.width:
             return []
@@ -315,20 +341,54 @@ class _Conventions:
             ]
         elif not any(map(names_joint_quantity, names)):
             meanings = [
-                meaning or ComponentMeaning("joint_position", name)
+                meaning or self._joint(feature, name)
                 for name, meaning in zip(names, meanings, strict=True)
             ]
         yield from self._grouped(feature, meanings)
+
+    def _joint(self, feature: Feature, name: str) -> ComponentMeaning | None:
+        """Meaning of a component whose name says nothing: a joint, unless names tell otherwise.
+
+        An action names the joints that move: what only the state has is no joint of the arm.
+        """
+        joint = joint_of(name)
+        if names_no_joint(name):
+            reason = "its name is not that of a joint"
+        elif self._commanded and not _is_command(feature) and joint not in self._commanded:
+            named = {joint_of(other) for other in feature.names or ()}
+            if not named & self._commanded:
+                return ComponentMeaning("joint_position", joint)
+            reason = "no action has it"
+        else:
+            return ComponentMeaning("joint_position", joint)
+        self._notes.append(f"{feature.key} ({name}): no joint of the arm, {reason}")
+        return None
 
     def _grouped(
         self, feature: Feature, meanings: Sequence[ComponentMeaning | None]
     ) -> Iterator[ColumnSelection]:
         """One selection for each role among the components."""
-        groups: dict[str, dict[str | int, int]] = {}
+        groups: dict[tuple[str, str], dict[str | int, int]] = {}
         for index, meaning in enumerate(meanings):
             if meaning is not None:
-                groups.setdefault(meaning.role, {})[meaning.slot] = index
-        for role, slots in groups.items():
+                groups.setdefault((meaning.role, meaning.side), {})[meaning.slot] = index
+        for role, side in [*groups]:
+            if role == "pose_matrix" and len(groups[role, side]) in _CARTESIAN:
+                # Numbered components of a pose in one of the encodings without names.
+                slots = groups.pop((role, side))
+                encoding, content = _CARTESIAN[len(slots)]
+                self._notes.append(f"{feature.key}: assumed to be {content}")
+                groups["position", side] = {k: slots[k] for k in range(3)}
+                groups[encoding, side] = {k - 3: slots[k] for k in range(3, len(slots))}
+        first: dict[str, str] = {}
+        for (role, side), slots in groups.items():
+            role = self._encoding(feature, role, slots)
+            if first.setdefault(role, side) != side:
+                self._notes.append(
+                    f"{feature.key}: one pose is read, that of the {first[role]} arm; the "
+                    f"{side} one stays among the extra columns"
+                )
+                continue
             if _is_command(feature):
                 if role not in _COMMANDS:
                     continue
@@ -340,13 +400,36 @@ class _Conventions:
                     f"{width}; left among the extra columns"
                 )
                 continue
-            order = sorted(slots) if role in _POSES else list(slots)
+            order = sorted(slots, key=_slot) if role in _POSES else list(slots)
             yield ColumnSelection(
                 role=role,
                 columns=tuple((feature.key, slots[slot]) for slot in order),
                 labels=tuple(map(str, order)),
                 numbered=feature.names is None,
             )
+
+    def _encoding(self, feature: Feature, role: str, slots: Mapping[str | int, int]) -> str:
+        """Encoding of a rotation by its components, with a note where it is assumed."""
+        if role not in ("quaternion", "rotation"):
+            return role
+        known = {3: "rotation_vector", 6: "rotation_6d", 9: "rotation_matrix"}
+        if {*slots} == {*"wxyz"}:
+            return "quaternion_wxyz"
+        found = known.get(len(slots), "quaternion_xyzw")
+        orders = {
+            "quaternion_xyzw": "quaternion in the order x, y, z, w; if it is w, x, y, z, give "
+            "--mapping quaternion_wxyz with its columns",
+            "rotation_vector": "rotation vector; if it holds roll, pitch, yaw, give --mapping "
+            "euler_xyz with its columns",
+        }
+        if found in orders:
+            self._notes.append(f"{feature.key}: assumed to be a {orders[found]}")
+        return found
+
+
+def _slot(slot: str | int) -> int:
+    """Place of a component in its role: a number, or that of w, x, y, z."""
+    return slot if isinstance(slot, int) else "wxyz".find(slot)
 
 
 def _select(role: str, feature: Feature, indices: Sequence[int]) -> ColumnSelection:

@@ -20,8 +20,9 @@ from hrc_learn.demos.issues import DatasetError, aligned, plain_text
 from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import DatasetFolder
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json, read_sidecar
+from hrc_learn.demos.read.naming import is_hand, joint_of
 from hrc_learn.demos.read.profiles import EpisodeProfile, is_discrete
-from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES, is_hand, joint_of
+from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES
 from hrc_learn.demos.read.units import UnitDecision, units_of
 from hrc_learn.store import Count, new_file
 

@@ -1,11 +1,12 @@
-"""Units of a dataset's values: given by the caller, declared, or guessed from their size.
+"""Units of a dataset's values: given by the caller, declared, or guessed from evidence.
 
-LeRobot declares no units, and radians, degrees, encoder ticks and -100..100 all occur.
+LeRobot declares no units, and radians, degrees, encoder ticks and -100..100 all occur. A name
+that states a unit decides; else the values and the type of the robot are the evidence.
 """
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,7 +15,22 @@ from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
-from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES, is_hand
+from hrc_learn.demos.read.naming import is_hand
+from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
+from hrc_learn.demos.read.unit_evidence import (
+    CONFIDENT,
+    ROTATION_LIMITS,
+    Guess,
+    Sizes,
+    guess_fingers,
+    guess_gripper,
+    guess_joints,
+    guess_position,
+    guess_rotation,
+    is_hobby_arm,
+    measure,
+    typical,
+)
 
 _DIMENSIONS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180, "tick": 2 * math.pi / 4096},
@@ -23,30 +39,20 @@ _DIMENSIONS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "torque": {"N m": 1.0, "N mm": 1e-3},
     "pixels": {"px": 1.0},
-    "ratio": {"1": 1.0, "%": 1e-2},
+    "ratio": {"1": 1.0, "%": 1e-2, "byte": 1 / 255},
 }
 """Dimension -> unit -> factor to the SI unit. A tick is 1/4096 of a turn, as the encoders of
-hobby servos count; the position of their zero is unknown."""
+hobby servos count; the position of their zero is unknown. A byte counts from 0 to 255, as
+grippers and hands of Robotiq and Inspire do."""
 
-# Two turns: wrists turn further than one, and no demonstration stays within 13 degrees.
-_JOINT_LIMITS = {"rad": 4 * math.pi, "deg": 400.0}
-# Beyond the reach of any arm on a fixed base.
-_REACH = {"m": 5.0, "cm": 500.0}
-# One turn and some noise; two turns for an unwrapped vector.
-_ROTATION_LIMIT = {
-    "euler_xyz": 2 * math.pi + 0.1,
-    "euler_intrinsic_xyz": 2 * math.pi + 0.1,
-    "rotation_vector": 4 * math.pi,
-}
-# Largest fraction of a range, allowing for noise, and widest opening of a gripper [m].
-_FINGER_RATIO, _GRIPPER_RATIO, _PERCENT, _WIDEST_GRIPPER = 1.05, 2.0, 105.0, 0.2
 _FOLLOWERS = {
     "joint_velocity": "joint_position",
     "command_position": "joint_position",
     "command_velocity": "joint_position",
 }
 """Quantity -> quantity whose unit it takes over if nothing is declared."""
-_GUESSABLE = ("joint_position", "command_position", "position", "gripper", *_ROTATION_LIMIT)
+_JOINTS = ("joint_position", "command_position")
+_GUESSABLE = (*_JOINTS, "position", "gripper", *ROTATION_LIMITS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +72,8 @@ class UnitDecision:
     """Confidence, 0 to 1."""
     evidence: str = ""
     """Evidence for a guess, in words."""
+    other: str = ""
+    """Second candidate for the unit; "" if there is none."""
 
     @property
     def factor(self) -> float | Float64[np.ndarray, " components"]:
@@ -73,6 +81,24 @@ class UnitDecision:
         if not self.units:
             return unit_factor(self.role, self.unit)
         return np.array([unit_factor(self.role, unit) for unit in self.units])
+
+    @property
+    def doubt(self) -> str | None:
+        """Question to the user if the guess is not sure enough to be used; else None."""
+        if self.confidence >= CONFIDENT:
+            return None
+        candidates = [self.unit, *filter(None, [self.other])]
+        ways = " or ".join(f"--units {self.role} {unit}" for unit in candidates)
+        return (
+            f"{self.role} is in {' or '.join(candidates)}? {self.evidence} (taken for "
+            f"{self.unit}, {100 * self.confidence:.0f} % sure): say {ways}, or leave columns "
+            f"out with --mapping {self.role} COLUMNS"
+        )
+
+    @property
+    def si_unit(self) -> str:
+        """Unit after the conversion: that of the quantity, or "1" for a fraction of a range."""
+        return "1" if self.unit in _DIMENSIONS["ratio"] else ROLES[self.role].unit
 
     def unit_of(self, component: int) -> str:
         """Unit of one component."""
@@ -113,20 +139,23 @@ def guessed_from_values(roles: Iterable[str], stated: Collection[str]) -> list[s
 
 
 def decide_units(
-    largest: Mapping[str, float | Sequence[float]],
+    sizes: Mapping[str, float | Sequence[float] | Sizes],
     declared: Mapping[str, str | Sequence[str]],
     given: Mapping[str, str],
     frame_step: float = 1.0,
-    hands: Mapping[str, Sequence[bool]] | None = None,
+    selections: Mapping[str, ColumnSelection] | None = None,
+    robot_type: str = "",
 ) -> dict[str, UnitDecision]:
     """Decide on a unit for every quantity.
 
     Args:
-        largest: Usual largest absolute value on disk by role: of all components, or of each.
+        sizes: Values on disk by role: their sizes, or the usual largest absolute value of all
+            components or of each.
         declared: Units by role, or of each component, from the sidecar.
         given: Units by role from the caller, which take precedence.
         frame_step: Step of the true stamps on disk, as a multiple of the nominal period [s].
-        hands: Role -> True for each finger or gripper; no hands if not given.
+        selections: Columns of the quantities, whose names are evidence.
+        robot_type: Robot type of the dataset, "" if unknown.
 
     Raises:
         DatasetError: A unit is unknown, or does not fit its quantity.
@@ -143,21 +172,36 @@ def decide_units(
                 ) from error
     stated = {**declared, **given}
     decisions: dict[str, UnitDecision] = {}
-    for role in sorted(largest, key=lambda role: role in _FOLLOWERS):
+    for role in sorted(sizes, key=lambda role: role in _FOLLOWERS):
+        own, selection = sizes[role], (selections or {}).get(role)
+        named = _named_units(role, selection)
         if role in stated:
             decisions[role] = _stated(role, stated[role])
+        elif all(named) and named:
+            decisions[role] = replace(
+                _stated(role, named), confidence=0.99, evidence="the names state it"
+            )
         elif (leader := decisions.get(_FOLLOWERS.get(role, ""))) is not None:
             decisions[role] = _following(role, leader)
         elif role == "time":
             decisions[role] = _guess_time(frame_step)
-        elif role == "gripper":
-            decisions[role] = _guess_gripper(float(np.max(largest[role])))
         elif role in _GUESSABLE:
-            peaks = np.atleast_1d(np.asarray(largest[role], float))
-            decisions[role] = _guess(role, peaks, (hands or {}).get(role, ()))
+            known = own if isinstance(own, Sizes) else Sizes.of_peaks(own)
+            decisions[role] = _guess(role, known, selection, robot_type, named)
         else:
             decisions[role] = UnitDecision(role=role, unit=ROLES[role].unit)
     return decisions
+
+
+def _named_units(role: str, selection: ColumnSelection | None) -> tuple[str, ...]:
+    """Unit of each component that its name states and the quantity can have; "" for none."""
+    units = () if selection is None else selection.units
+    rate = "/s" if role.endswith("velocity") else ""
+    known = units_of(role)
+    return tuple(
+        next((u for u in (unit, unit.removesuffix("/s") + rate) if unit and u in known), "")
+        for unit in units
+    )
 
 
 def _stated(role: str, unit: str | Sequence[str]) -> UnitDecision:
@@ -182,79 +226,63 @@ def _following(role: str, leader: UnitDecision) -> UnitDecision:
     )
 
 
-def _guess(role: str, peaks: np.ndarray, hands: Sequence[bool]) -> UnitDecision:
-    """Guess from the largest value of each component."""
-    is_arm = np.ones(len(peaks), bool)
-    if len(hands) == len(peaks):
-        is_arm = ~np.asarray(hands, bool)
-    largest = float(peaks[is_arm].max() if is_arm.any() else peaks.max())
-    unit, confidence = guess_unit(role, largest), 0.95
+def _guess(
+    role: str,
+    sizes: Sizes,
+    selection: ColumnSelection | None,
+    robot_type: str,
+    named: Sequence[str],
+) -> UnitDecision:
+    """Guess from the values of each component, and the names that state a unit."""
     units: tuple[str, ...] = ()
-    if role in ("joint_position", "command_position"):
-        units = tuple(
-            unit if arm else _finger_unit(float(peak), unit)
-            for peak, arm in zip(peaks, is_arm, strict=True)
-        )
-        # Radians beyond a turn are rare; small values in degrees are not.
-        confidence = 0.95 if largest <= 2 * math.pi else 0.8
-    caution = {
-        "deg": " (LeRobot's -100..100 look alike)" if role not in _ROTATION_LIMIT else "",
-        "tick": " (1/4096 of a turn, zero unknown)",
-    }.get(unit, "")
-    if caution:
-        # A range of exactly 100 is typical of normalised values.
-        confidence = 0.5 if 95 <= largest <= 101 else 0.8
-    others = sorted({*units} - {unit})
-    fingers = f", fingers for {', '.join(others)}" if others else ""
-    return UnitDecision(
-        role=role,
-        unit=unit,
-        units=units if others else (),
-        note=_note(role, f"values usually reach {largest:.4g}", f"{unit}{caution}{fingers}"),
-        converts=unit != ROLES[role].unit,
-        confidence=confidence,
-        evidence=f"values usually reach {largest:.3g}",
-    )
-
-
-def _note(role: str, evidence: str, unit: str) -> str:
-    return (
-        f"{role}: no unit declared, {evidence}: taken for {unit}; "
+    if role in _JOINTS:
+        guess, units = _guess_joint_units(sizes, selection, robot_type, named)
+    elif role == "position":
+        guess = guess_position(sizes)
+    elif role == "gripper":
+        guess = guess_gripper(sizes)
+    else:
+        guess = guess_rotation(role, sizes)
+    others = sorted({*units} - {guess.unit})
+    fingers = f", others for {', '.join(others)}" if others else ""
+    sure = f" ({100 * guess.confidence:.0f} % sure)" if guess.confidence < CONFIDENT else ""
+    converts = any(unit_factor(role, unit) != 1 for unit in (guess.unit, *units))
+    note = (
+        f"{role}: no unit declared, {guess.evidence}: taken for {guess.unit}{sure}{fingers}; "
         f"overrule with units={{{role!r}: ...}}"
     )
-
-
-def guess_unit(role: str, largest: float) -> str:
-    """Unit that usually gives values of this size."""
-    if role == "position":
-        return next((unit for unit, limit in _REACH.items() if largest <= limit), "mm")
-    if role in _ROTATION_LIMIT:
-        return "rad" if largest <= _ROTATION_LIMIT[role] else "deg"
-    return next((unit for unit, limit in _JOINT_LIMITS.items() if largest <= limit), "tick")
-
-
-def _finger_unit(peak: float, arm: str) -> str:
-    """Unit of a finger by its largest value and the unit of the arm."""
-    if peak <= _FINGER_RATIO:
-        return "1"
-    if peak <= _JOINT_LIMITS["rad"]:
-        return "rad"
-    return "%" if peak <= _PERCENT and arm != "deg" else arm
-
-
-def _guess_gripper(largest: float) -> UnitDecision:
-    limits = {"m": _WIDEST_GRIPPER, "1": _GRIPPER_RATIO, "%": _PERCENT, "mm": math.inf}
-    unit = next(unit for unit, limit in limits.items() if largest <= limit)
-    converts = unit_factor("gripper", unit) != 1
-    note = _note("gripper", f"values usually reach {largest:.4g}", unit)
+    # A gripper in metres or as a fraction of its opening is the usual case.
+    silent = role == "gripper" and not converts
     return UnitDecision(
-        role="gripper",
-        unit=unit,
-        note=note if converts else None,
+        role=role,
+        unit=guess.unit,
+        units=units if others else (),
+        note=None if silent else note,
         converts=converts,
-        confidence=0.8,
-        evidence=f"values usually reach {largest:.3g}",
+        confidence=guess.confidence,
+        evidence=guess.evidence,
+        other=guess.other,
     )
+
+
+def _guess_joint_units(
+    sizes: Sizes, selection: ColumnSelection | None, robot_type: str, named: Sequence[str]
+) -> tuple[Guess, tuple[str, ...]]:
+    """Unit of the arm, and of each joint and finger."""
+    labels = () if selection is None else selection.labels
+    hand = np.array([is_hand(label) for label in labels] or [False] * len(sizes.peak))
+    if len(hand) != len(sizes.peak) or hand.all():
+        hand = np.zeros(len(sizes.peak), bool)
+    stated = np.array([bool(unit) for unit in named] or [False] * len(hand))
+    if len(stated) != len(hand):
+        stated = np.zeros(len(hand), bool)
+    guess = guess_joints(sizes, ~hand & ~stated, labels, robot_type)
+    fingers = guess_fingers(sizes, guess.unit, is_hobby_arm(robot_type, labels))
+    units = tuple(
+        named[i] if stated[i] else fingers[i] if hand[i] else guess.unit
+        for i in range(len(hand))
+    )
+    return guess, units
 
 
 def _guess_time(frame_step: float) -> UnitDecision:
@@ -271,23 +299,14 @@ def _guess_time(frame_step: float) -> UnitDecision:
 
 Quantities = dict[str, Float64[np.ndarray, "_frames _components"]]
 """Role -> values during one episode, in the units on disk."""
-Peaks = dict[str, Float64[np.ndarray, " _components"]]
-"""Role -> 99.5 % quantile of the absolute values of each component in one episode."""
-# Frames that suffice to estimate the size of an episode's values.
 _SAMPLED_FRAMES = 1000
+"""Frames that suffice to estimate the size of an episode's values."""
 
 
-def usual_peaks(quantities: Quantities, roles: Sequence[str]) -> Peaks:
-    """Size of the values of each component in one episode, robust against single outliers."""
-    peaks: Peaks = {}
-    for role in roles:
-        values = quantities[role]
-        sizes = np.abs(values[:: 1 + len(values) // _SAMPLED_FRAMES])
-        sizes[~np.isfinite(sizes)] = 0.0
-        if len(sizes):
-            place = int(0.995 * (len(sizes) - 1))
-            peaks[role] = np.partition(sizes, place, axis=0)[place]
-    return peaks
+def _sampled(
+    values: Float64[np.ndarray, "frames components"],
+) -> Float64[np.ndarray, "sampled components"]:
+    return values[:: 1 + len(values) // _SAMPLED_FRAMES]
 
 
 def units_from_episodes(
@@ -297,6 +316,7 @@ def units_from_episodes(
     declared: Mapping[str, str | Sequence[str]],
     given: Mapping[str, str],
     sample: Collection[int] | None = None,
+    robot_type: str = "",
 ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
     """Unit of each quantity, from the size of its values where it must be guessed.
 
@@ -310,6 +330,7 @@ def units_from_episodes(
         declared: Units from the sidecar, as in `decide_units`.
         given: Units from the caller, which take precedence.
         sample: Indices of the episodes that decide; None for all.
+        robot_type: Robot type of the dataset, "" if unknown.
 
     Returns:
         The decisions, and the episodes and columns that contradict them.
@@ -319,31 +340,28 @@ def units_from_episodes(
     """
     guessed = guessed_from_values(selections, {*declared, *given})
     steps: list[float] = []
-    peaks: list[tuple[EpisodeEntry, Peaks]] = []
+    measured: list[tuple[EpisodeEntry, dict[str, Sizes]]] = []
     for entry, quantities in episodes:
-        peaks.append((entry, usual_peaks(quantities, [r for r in guessed if r in quantities])))
+        known = {r: _sampled(quantities[r]) for r in guessed if r in quantities}
+        measured.append((entry, {r: measure(v) for r, v in known.items() if len(v)}))
         time = quantities.get("time", np.empty((0, 1)))
         if len(time) > 1:
             # As a multiple of the nominal period.
             steps.append(float(np.nanmedian(np.diff(time[:, 0]))) * fps)
-    usual: dict[str, float | Sequence[float]] = dict.fromkeys(selections, 0.0)
-    deciding = [p for entry, p in peaks if sample is None or entry.index in sample]
-    deciding = deciding or [p for _, p in peaks]
+    sizes: dict[str, float | Sizes] = dict.fromkeys(selections, 0.0)
+    deciding = [m for entry, m in measured if sample is None or entry.index in sample]
+    deciding = deciding or [m for _, m in measured]
     for role in guessed:
-        known = [p[role] for p in deciding if role in p]
-        if known:
-            usual[role] = np.median(known, axis=0).tolist()
-    hands = {
-        role: [is_hand(label) for label in selection.labels]
-        for role, selection in selections.items()
-    }
+        found = [own[role] for own in deciding if role in own]
+        if found:
+            sizes[role] = typical(found)
     step = float(np.median(steps)) if steps else 1.0
-    decisions = decide_units(usual, declared, given, step, hands)
+    decisions = decide_units(sizes, declared, given, step, selections, robot_type)
     faults = [
         fault
         for role in guessed
-        if isinstance(usual[role], list)
-        for fault in _contradictions(selections[role], usual[role], decisions[role], peaks)
+        if isinstance(own := sizes[role], Sizes)
+        for fault in _contradictions(selections[role], own.peak, decisions[role], measured)
     ]
     return decisions, faults
 
@@ -355,18 +373,18 @@ _NEAR = math.log(2.5)
 
 def _contradictions(
     selection: ColumnSelection,
-    usual: float | Sequence[float],
+    size: Float64[np.ndarray, " components"],
     decision: UnitDecision,
-    peaks: Sequence[tuple[EpisodeEntry, Peaks]],
+    measured: Sequence[tuple[EpisodeEntry, Mapping[str, Sizes]]],
 ) -> Iterator[DatasetError]:
     """Episodes about 57.3 times as large or small as the others: degrees among radians."""
-    role, size = selection.role, np.asarray(usual)
+    role = selection.role
     if role not in ("joint_position", "command_position", *ORIENTATION_ROLES):
         return
     # Components that hardly move have no size to compare, and fractions are no angles.
-    angles = np.array([decision.unit_of(i) for i in range(len(size))]) != "1"
-    moving = (size > 1e-2) & angles
-    known = [(entry, p[role]) for entry, p in peaks if role in p and len(p[role]) == len(size)]
+    units = [decision.unit_of(i) for i in range(len(size))]
+    moving = (size > 1e-2) & [unit not in _DIMENSIONS["ratio"] for unit in units]
+    known = [(entry, own[role].peak) for entry, own in measured if role in own]
     if not moving.any() or not known:
         return
     reached = np.stack([own[moving] for _, own in known])

@@ -1,0 +1,230 @@
+"""Meaning of the names of features and components, as they occur in published datasets.
+
+There is no single convention. Unknown names are left to the caller's explicit mapping.
+"""
+
+import re
+from dataclasses import dataclass
+
+JOINT_SUFFIXES = {
+    "joint_position": ("pos", "position", "obs_pos", "cmd_pos", "qpos"),
+    "joint_velocity": ("vel", "velocity", "obs_vel", "cmd_vel", "qvel"),
+    "joint_effort": (
+        "torque",
+        "effort",
+        "obs_torque",
+        "obs_effort",
+        "external_torque",
+        "obs_external_torque",
+    ),
+    "human_effort": ("human_effort", "human_torque"),
+}
+"""Suffixes of `JOINT.SUFFIX`, as lerobot-record and the Franka plug-ins write them."""
+
+_JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort": "joint_effort"}
+
+# `joint_1_vel`: only after an unmistakable joint name, since `ee_pos` and `x_vel` are none.
+_UNDERSCORED = re.compile(
+    r"(.*(?:joint|motor|axis)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)", re.IGNORECASE
+)
+_GRIPPER = re.compile(r"gripper|(?:^|[._/ ])(?:jaw|claw)(?:$|[._/ ])")
+_HAND = re.compile(
+    r"finger|thumb|pinky|knuckle|"
+    r"(?:^|[._/ ])(?:hand|palm|index|middle|ring|little|claw|jaw|gripper)(?:$|[._/ \d])"
+)
+_CAMEL = re.compile(r"(?<=[a-z\d])(?=[A-Z])")
+"""Word boundaries of a name such as `kRightHandIndex`."""
+
+_UNITS = {
+    "deg": "degrees|degree|degs|deg|°",
+    "rad": "radians|radian|rads|rad",
+    "mm": "millimeters|millimetres|mm",
+    "cm": "cm",
+    "m": "meters|metres|m",
+    "tick": "ticks|tick|counts|steps",
+    "%": "percent|pct|%",
+}
+"""Unit -> its spellings in names (regular expression)."""
+_SPELLED = "|".join(f"(?P<u{i}>{spelled})" for i, spelled in enumerate(_UNITS.values()))
+# After a separator or in brackets, at the end or before a number: `q_deg`, `q (deg)`, `q_deg_3`.
+_UNIT_AT_END = re.compile(
+    rf"(?P<stem>.*[^\W_]\)?)(?:[._/ -]+|\s*(?=[(\[]))[(\[]?(?:{_SPELLED})"
+    rf"(?P<rate>/s|_?per_s(?:ec)?|_s|ps)?[)\]]?(?P<number>[._]?\d+)?",
+    re.IGNORECASE,
+)
+_METRES = re.compile(r"(?:^|[._/ ])(?:p?[xyz]|pos|position|width|height|lift|opening)$")
+"""Stems after which a lone `m` is the unit, and no name."""
+
+# No joint of an arm, although its name stands among joints.
+_NO_JOINT = re.compile(
+    r"(?:^|[._/ ])(?:object|obj|cube|block|target|goal|marker|tag|pixels?|px|image|feature|"
+    r"bbox|lift|elevator|mast|base|wheels?|wheel_\w+|odom\w*|imu|battery|force|wrench|ft|"
+    r"reward|success|done|phase|time|temperature|current|voltage)(?:$|[._/ \d])"
+)
+
+# Words before a component that only name the tool or the robot.
+_TOOL = (
+    r"(?:(?:ee|eef|tcp|tool\d*|end_?effector|flange|fingertip|cartesian)"
+    r"(?:_(?:pose|transform))?_?)"
+)
+_OWNER = r"(?:(?P<side>left|right)_)?"
+_OTHER_OWNER = r"(?:(?P<side2>left|right)_)?"
+_WORDS = r"(?:(?:robot\d*|arm\d*|states?|observations?|obs|actions?|actual|measured)_)*"
+_BEFORE = rf"{_WORDS}{_OWNER}{_WORDS}(?P<tool>{_TOOL}|(?:pose|transform)_)?{_OTHER_OWNER}"
+_POSITION = r"(?:p|pos|position|translation|trans|xyz|location)"
+_QUATERNION = r"(?:q|quat|quaternion|rot_?quat|orientation_quat(?:ernion)?)"
+_ROTATION = r"(?:orientation|orient|ori|orn|rotation|rot)"
+_VECTOR = r"(?:rotvec|rot_?vec|rotation_vector|axis_angle|axisangle|rot_axis_angle)"
+_EULER = r"(?:(?:rot_|orientation_)?(?:euler|rpy))"
+_SIX = r"(?:rot_?6d|r6d|rotation_6d|ortho6d|rot6)"
+_COMPONENTS: list[tuple[str, str]] = [
+    # Role of the component, and the rest of its name with its slot.
+    ("position", rf"{_POSITION}?_?(?P<slot>[xyz])"),
+    ("quaternion_wxyz", rf"{_QUATERNION}_?(?P<slot>[wxyz])"),
+    ("quaternion", rf"(?:quat|quaternion|rot_?quat)_?(?P<slot>[0-3])"),
+    ("rotation_vector", rf"(?:{_VECTOR}|w|r)_?(?P<slot>[xyz])"),
+    ("rotation_vector", rf"{_VECTOR}_?(?P<slot>[0-2])"),
+    ("euler_xyz", rf"{_EULER}_?(?P<slot>[xyz0-2])"),
+    ("euler_xyz", rf"(?:{_EULER}_|{_ROTATION}_)?(?P<slot>roll|pitch|yaw)"),
+    ("rotation_6d", rf"{_SIX}_?(?P<slot>[0-5])"),
+    ("rotation", rf"{_ROTATION}_?(?P<slot>[wxyz0-8])"),
+    ("rotation", rf"(?:{_ROTATION}_)?(?:matrix|mat)_?(?P<slot>[0-8])"),
+]
+_NAMES = [(role, re.compile(_BEFORE + rest)) for role, rest in _COMPONENTS]
+# A number after `pos` may count joints: only with a word for the tool before it.
+_NUMBERED_POSITION = re.compile(rf"{_BEFORE}{_POSITION}_?(?P<slot>[0-2])")
+_MATRIX = re.compile(rf"{_BEFORE}(?:pose|matrix|transform)?_?(?P<slot>\d\d?)")
+_SLOTS = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
+_QUATERNION_SLOTS = {"w": 0, "x": 1, "y": 2, "z": 3}
+
+_OF_TOOL = r"(?:ee|eef|tcp|tool\d*|end_?effector|flange)_(?:pose_)?"
+KEY_ROLES = {
+    "joint_position": "joint_position|joint_positions|joint_pos|joints|qpos",
+    "joint_velocity": "joint_velocity|joint_velocities|joint_vel|qvel|velocity",
+    "joint_effort": "joint_effort|joint_efforts|joint_torque|joint_torques|torque|effort",
+    "position": rf"{_OF_TOOL}(?:pos|position|xyz|translation)",
+    "rotation_vector": rf"{_OF_TOOL}(?:rotvec|rotation_vector|(?:rot_)?axis_?angle)",
+    "euler_xyz": rf"{_OF_TOOL}(?:euler|rpy)",
+    "rotation_6d": rf"{_OF_TOOL}(?:rot_?6d|rotation_6d)",
+    "quaternion_xyzw": rf"{_OF_TOOL}(?:quat|quaternion|orientation|ori|orn)",
+    "rotation_matrix": rf"{_OF_TOOL}(?:rot|rotation|rot_mat|rotation_matrix|mat)",
+    "cartesian": rf"cartesian_position|cartesian_pose|(?:ee|eef|tcp|tool\d*|end_?effector)"
+    rf"(?:_pose|_transform)?",
+    "gripper": "gripper|gripper_position|gripper_width|gripper_pos|gripper_qpos",
+    "feature": "image_feature",
+    "human_effort": "human_effort",
+    "time": "time|time_stamp|timestamp|stamp",
+}
+"""Role of a whole feature -> last part of its key (regular expression)."""
+_KEY_PREFIX = re.compile(r"(?:(?:robot\d*|arm\d*|states?|observations?|obs|left|right)_)+")
+
+
+@dataclass(frozen=True)
+class ComponentMeaning:
+    """Role of one component, and its place within the role."""
+
+    role: str
+    """Role; "quaternion" is one of unknown order, "rotation" one of unknown encoding."""
+    slot: str | int
+    """Joint name, or index of the component."""
+    side: str = ""
+    """The arm of two, "left" or "right"."""
+
+
+def without_unit(name: str) -> tuple[str, str]:
+    """Name without the unit that it states, and the unit; "" if it states none."""
+    match = _UNIT_AT_END.fullmatch(name.strip())
+    if match is None:
+        return name, ""
+    unit = next(unit for i, unit in enumerate(_UNITS) if match[f"u{i}"])
+    stem, number = match["stem"], (match["number"] or "").lstrip("._")
+    bare = unit == "m" and "(" not in name and "[" not in name
+    if bare and (number or not _METRES.search(stem.lower())):
+        return name, ""
+    return (f"{stem}_{number}" if number else stem), unit + ("/s" if match["rate"] else "")
+
+
+def meaning_of_component(name: str) -> ComponentMeaning | None:
+    """Meaning of a component by its name; None if the name alone does not tell."""
+    name = without_unit(name)[0]
+    plain = name.strip().lower()
+    pose = _meaning_in_pose(plain)
+    if pose is not None:
+        return pose
+    stem, suffix = split_name(name.strip())
+    roles = [role for role, names in JOINT_SUFFIXES.items() if suffix in names]
+    of_tool = re.match(r"(?:ee|eef|tcp|end_effector)[._/](.+)", plain)
+    if (of_tool and "gripper" in of_tool[1]) or (
+        _GRIPPER.search(plain) and (not stem or roles)
+    ):
+        # The velocity or force of a gripper must not be mistaken for its opening.
+        if re.search(r"_(?:vel|velocity|torque|effort|force|current)$", plain):
+            return None
+        return ComponentMeaning("gripper", name) if roles in ([], ["joint_position"]) else None
+    if stem and roles:
+        return ComponentMeaning(roles[0], stem)
+    prefix, _, number = plain.rpartition("_")
+    if number.isdigit() and prefix in _JOINT_PREFIXES:
+        return ComponentMeaning(_JOINT_PREFIXES[prefix], f"joint_{number}")
+    return None
+
+
+def _meaning_in_pose(plain: str) -> ComponentMeaning | None:
+    """Meaning of a name in lower case as a component of a pose, or None."""
+    words = re.sub(r"[^a-z\d]+", "_", plain).strip("_")
+    for role, pattern in _NAMES:
+        if match := pattern.fullmatch(words):
+            slots = _QUATERNION_SLOTS if role == "quaternion_wxyz" else _SLOTS
+            slot = match["slot"]
+            if role == "rotation" and not slot.isdigit():
+                place: str | int = slot
+            else:
+                place = int(slot) if slot.isdigit() else slots[slot]
+            return ComponentMeaning(role, place, match["side"] or match["side2"] or "")
+    if (match := _NUMBERED_POSITION.fullmatch(words)) and match["tool"]:
+        return ComponentMeaning("position", int(match["slot"]), match["side"] or "")
+    if (match := _MATRIX.fullmatch(words)) and match["tool"] and int(match["slot"]) < 16:
+        return ComponentMeaning("pose_matrix", int(match["slot"]), match["side"] or "")
+    return None
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Joint and quantity in a name such as `joint_1.pos` or `joint_1_vel`; "" for no joint."""
+    name = without_unit(name)[0]
+    stem, dot, suffix = name.rpartition(".")
+    if not dot and (match := _UNDERSCORED.fullmatch(name)):
+        known = any(match[2].lower() in names for names in JOINT_SUFFIXES.values())
+        stem, suffix = (match[1], match[2]) if known else ("", name)
+    return stem, suffix.lower()
+
+
+def names_joint_quantity(name: str) -> bool:
+    """True if the name is a joint with a suffix of `JOINT_SUFFIXES`."""
+    stem, suffix = split_name(name)
+    return bool(stem) and any(suffix in names for names in JOINT_SUFFIXES.values())
+
+
+def joint_of(name: str) -> str:
+    """Joint of a component: its name without its unit and the suffix of the quantity."""
+    return split_name(name)[0] if names_joint_quantity(name) else without_unit(name)[0]
+
+
+def is_hand(name: str) -> bool:
+    """True if the name is that of a finger, hand or gripper joint."""
+    words = _CAMEL.sub("_", name.strip())
+    return bool(_HAND.search(words.lower()))
+
+
+def names_no_joint(name: str) -> bool:
+    """True if the name is that of an object, an image point, a base or another sensor."""
+    return bool(_NO_JOINT.search(_CAMEL.sub("_", name.strip()).lower()))
+
+
+def role_of_key(key: str) -> str | None:
+    """Role of a whole feature by its key; None for a state or action of mixed content."""
+    last = without_unit(re.split(r"[./]", key)[-1])[0].lower()
+    known = (last, _KEY_PREFIX.sub("", last, count=1))
+    for role, pattern in KEY_ROLES.items():
+        if any(re.fullmatch(pattern, name) for name in known):
+            return role
+    return None

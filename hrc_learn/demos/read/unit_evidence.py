@@ -1,0 +1,241 @@
+"""Evidence for the units of values: their size, their steps, and the robot that made them."""
+
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+CONFIDENT = 0.75
+"""Confidence from which a guessed unit is used without a question."""
+
+# Two turns: wrists turn further than one, and no demonstration stays within 13 degrees.
+_RADIANS, _DEGREES = 4 * math.pi, 400.0
+# Largest fraction of a range, allowing for noise, and widest opening of a gripper [m].
+_FINGER_RATIO, _GRIPPER_RATIO, _PERCENT, _WIDEST_GRIPPER = 1.05, 2.0, 105.0, 0.2
+_BYTE = 255.5
+# LeRobot clips normalised positions at exactly 100.
+_CLIPPED = 0.002
+"""Fraction of the frames at exactly 100 from which a column counts as clipped."""
+# Reach of an arm on a fixed base: 5 m, and what 1.5 m are in cm; poses below 60 mm are rare.
+_REACH = (5.0, 60.0, 150.0)
+# One turn and some noise; two turns for an unwrapped vector.
+ROTATION_LIMITS = {
+    "euler_xyz": 2 * math.pi + 0.1,
+    "euler_intrinsic_xyz": 2 * math.pi + 0.1,
+    "rotation_vector": 4 * math.pi,
+}
+_UNIT_LENGTH = 2e-3
+"""Deviation of a quaternion's length, of float32 and of few printed digits."""
+# Arms of hobby servos, whose positions LeRobot stores in degrees or as -100..100.
+_HOBBY = re.compile(
+    r"so_?-?10[01]|so_follower|so_leader|koch|lekiwi|moss|omx|openarm_mini|bi_so", re.IGNORECASE
+)
+_HOBBY_JOINTS = {"shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"}
+
+
+class Sizes(NamedTuple):
+    """Values of each component, over the frames of one or more episodes."""
+
+    peak: Float64[np.ndarray, " components"]
+    """99.5 % quantile of the absolute values."""
+    clipped: Float64[np.ndarray, " components"]
+    """Fraction of the frames at exactly 100 or -100."""
+    whole: Bool[np.ndarray, " components"]
+    """True where all values are whole numbers."""
+    unit_length: Bool[np.ndarray, " components"]
+    """True where this component and the three after it have unit length, and move."""
+
+    @classmethod
+    def of_peaks(cls, peak: float | Sequence[float]) -> "Sizes":
+        """Sizes of which only the peaks are known."""
+        peaks = np.atleast_1d(np.asarray(peak, float))
+        no = np.zeros(len(peaks), bool)
+        return cls(peaks, np.zeros(len(peaks)), no, no)
+
+
+class Guess(NamedTuple):
+    """Unit that the evidence speaks for."""
+
+    unit: str
+    confidence: float
+    evidence: str
+    other: str = ""
+    """Second candidate; "" if there is none."""
+    outliers: tuple[int, ...] = ()
+    """Components that do not fit the unit of the rest."""
+
+
+def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
+    """Sizes of the values of one episode, robust against single outliers."""
+    known = np.where(np.isfinite(values), values, 0.0)
+    sizes = np.abs(known)
+    place = int(0.995 * (len(sizes) - 1))
+    squares = known * known
+    length = np.ones(values.shape[1], bool)
+    length[-3:] = False
+    for first in np.flatnonzero(length):
+        four = squares[:, first : first + 4].sum(1)
+        moves = np.ptp(known[:, first : first + 4], axis=0).max() > 1e-3
+        length[first] = bool((np.abs(four - 1) < 2 * _UNIT_LENGTH).all() and moves)
+    return Sizes(
+        peak=np.partition(sizes, place, axis=0)[place],
+        clipped=(sizes == 100.0).mean(0),
+        whole=(known == np.rint(known)).all(0),
+        unit_length=length,
+    )
+
+
+def typical(sizes: Sequence[Sizes]) -> Sizes:
+    """Sizes over episodes: no single episode decides."""
+    return Sizes(
+        peak=np.median([s.peak for s in sizes], axis=0),
+        clipped=np.mean([s.clipped for s in sizes], axis=0),
+        whole=np.all([s.whole for s in sizes], axis=0),
+        unit_length=np.all([s.unit_length for s in sizes], axis=0),
+    )
+
+
+def is_hobby_arm(robot_type: str, labels: Sequence[str]) -> bool:
+    """True for arms of hobby servos, by robot type or names of joints."""
+    named = {label.lower().removeprefix("main_") for label in labels}
+    return bool(_HOBBY.search(robot_type)) or len(named & _HOBBY_JOINTS) >= 3
+
+
+def guess_joints(
+    sizes: Sizes, arm: Bool[np.ndarray, " components"], labels: Sequence[str], robot_type: str
+) -> Guess:
+    """Unit of an arm's joints.
+
+    Args:
+        sizes: Sizes of all components.
+        arm: True for each joint of the arm, False for fingers.
+        labels: Joint names.
+        robot_type: Robot type of the dataset, "" if unknown.
+    """
+    peaks = np.where(arm, sizes.peak, 0.0)
+    # All other columns may move little: they speak for no unit.
+    moving = peaks > 1e-6
+    if not moving.any():
+        return Guess("rad", 0.9, "the joints do not move")
+    quaternion = np.flatnonzero(sizes.unit_length & arm)
+    if len(quaternion):
+        return _as_quaternion(int(quaternion[0]), labels)
+    most = np.median(peaks[moving])
+    limit = next((x for x in (_RADIANS, _DEGREES) if most <= x), math.inf)
+    fitting = moving & (peaks <= limit)
+    outliers = tuple(np.flatnonzero(moving & ~fitting).tolist())
+    largest = float(peaks[fitting].max())
+    reach = f"values usually reach {largest:.3g}"
+    if limit == _RADIANS:
+        # Radians beyond a turn are rare; small values in degrees are not.
+        guess = Guess("rad", 0.95 if largest <= 2 * math.pi else 0.8, reach, "deg")
+    elif limit == _DEGREES:
+        guess = _degrees_or_range(sizes, fitting, largest, labels, robot_type)
+    else:
+        whole = bool(sizes.whole[fitting].all())
+        guess = Guess("tick", 0.8 if whole else 0.4, reach, "deg")
+    if not outliers:
+        return guess
+    beyond = ", ".join(f"{labels[i] if labels else i} {peaks[i]:.3g}" for i in outliers)
+    return guess._replace(
+        confidence=0.3,
+        evidence=f"{reach}, but not those of all joints ({beyond})",
+        outliers=outliers,
+        other="" if guess.unit == "deg" else "deg",
+    )
+
+
+def _as_quaternion(first: int, labels: Sequence[str]) -> Guess:
+    named = [labels[i] if labels else f"component {i}" for i in (first, first + 3)]
+    text = f"{named[0]} .. {named[1]} always have unit length, as a quaternion has"
+    return Guess("rad", 0.3, text, outliers=tuple(range(first, first + 4)))
+
+
+def _degrees_or_range(
+    sizes: Sizes,
+    fitting: Bool[np.ndarray, " components"],
+    largest: float,
+    labels: Sequence[str],
+    robot_type: str,
+) -> Guess:
+    """Degrees, or LeRobot's -100..100 of a joint's range."""
+    reach = f"values usually reach {largest:.3g}"
+    hobby = is_hobby_arm(robot_type, labels)
+    if largest > 100.5:
+        return Guess("deg", 0.9 if hobby else 0.8, reach, "%")
+    if (sizes.clipped[fitting] > _CLIPPED).any():
+        share = 100 * float(sizes.clipped[fitting].max())
+        return Guess(
+            "%", 0.9, f"a joint is at exactly 100 in {share:.0f} % of the frames", "deg"
+        )
+    if hobby and any(label.lower().startswith("main_") for label in labels):
+        # These names went when LeRobot introduced -100..100 (lerobot 0.2, June 2025).
+        return Guess("deg", 0.85, f"{reach}, names are of the time before -100..100", "%")
+    if hobby:
+        return Guess("deg", 0.5, f"{reach}; this arm is recorded in both units", "%")
+    return Guess("deg", 0.75, reach, "%")
+
+
+def guess_fingers(sizes: Sizes, arm_unit: str, hobby: bool) -> list[str]:
+    """Unit of each component if it is a finger, from its size and the unit of the arm."""
+    return [
+        _finger_unit(float(peak), bool(whole), arm_unit, hobby)
+        for peak, whole in zip(sizes.peak, sizes.whole, strict=True)
+    ]
+
+
+def _finger_unit(peak: float, whole: bool, arm_unit: str, hobby: bool) -> str:
+    if peak <= _FINGER_RATIO:
+        return "1"
+    if peak <= _RADIANS and not hobby:
+        return "rad"
+    # LeRobot gives grippers from 0 to 100, also where its arms are in degrees.
+    if peak <= _PERCENT and (hobby or arm_unit != "deg"):
+        return "%"
+    if peak <= _BYTE and (whole or arm_unit != "deg"):
+        return "byte"
+    return arm_unit
+
+
+def guess_gripper(sizes: Sizes) -> Guess:
+    """Unit of the opening of a gripper."""
+    largest, whole = float(sizes.peak.max()), bool(sizes.whole.all())
+    reach = f"values usually reach {largest:.3g}"
+    if largest <= _WIDEST_GRIPPER:
+        return Guess("m", 0.8, reach, "1")
+    if largest <= _GRIPPER_RATIO:
+        return Guess("1", 0.8, reach, "m")
+    if largest <= _PERCENT:
+        return Guess("%", 0.8, reach, "mm")
+    if whole and largest <= _BYTE:
+        return Guess("byte", 0.8, reach, "mm")
+    return Guess("mm", 0.8, reach, "tick")
+
+
+def guess_position(sizes: Sizes) -> Guess:
+    """Unit of a position of the end effector."""
+    largest = float(sizes.peak.max())
+    reach = f"values usually reach {largest:.3g}"
+    metres, few, arm = _REACH
+    if largest <= metres:
+        return Guess("m", 0.95, reach)
+    if largest <= few:
+        return Guess("cm", 0.5, reach, "mm")
+    if largest <= arm:
+        return Guess("cm", 0.6, reach, "mm")
+    return Guess("mm", 0.9, reach, "cm")
+
+
+def guess_rotation(role: str, sizes: Sizes) -> Guess:
+    """Unit of the angles of an orientation."""
+    largest = float(sizes.peak.max())
+    radians = largest <= ROTATION_LIMITS[role]
+    return Guess(
+        "rad" if radians else "deg",
+        0.95 if radians else 0.8,
+        f"values usually reach {largest:.3g}",
+        "deg" if radians else "",
+    )
