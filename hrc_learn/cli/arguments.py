@@ -337,8 +337,6 @@ class FitPrimitives(Columns, Fit):
     """Scaling of the forcing term with start and goal."""
     joint_names: tuple[str, ...] = ()
     """Joints to learn, in this order. Default: all."""
-    keep_contract: bool = True
-    """Store the meaning of the columns in DATASET/meta/hrc_learn.json if it is not there."""
     as_lerobot_policy: bool = False
     """Write a trained LeRobot policy of type dmp instead, from observations to actions."""
 

@@ -83,8 +83,11 @@ def _store_contract(dataset: Path, contract: Contract | None) -> None:
     if contract is None:
         raise ValueError(f"{dataset}: no columns could be read to store a contract of")
     contract.selections(open_folder(dataset).features)  # refuses an unreadable contract
-    keep_contract(dataset, contract)
+    sure, doubtful = contract.without_doubt()
+    keep_contract(dataset, sure)
     print(f"contract stored in {dataset / SIDECAR_PATH}: edit it there")
+    if doubtful:
+        print(f"note: unit left open, as the evidence is weak: {', '.join(doubtful)}")
 
 
 def _write_findings(args: Check, report: ValidationReport, counts: Mapping[str, int]) -> None:

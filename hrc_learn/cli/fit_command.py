@@ -13,6 +13,7 @@ from hrc_learn import distributed
 from hrc_learn.cli._run import command_line, configuration, refuse_repeats, write_values
 from hrc_learn.cli.arguments import FitPrimitives, refuse_given
 from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.learning.fit_dashboards import fit_report, record_fit, shown_fit
 from hrc_learn.learning.large_datasets import fit_all, fit_streamed, sampled
@@ -45,9 +46,9 @@ def fit_primitives(args: FitPrimitives) -> None:
     if args.several == "streamed":
         _fit_streamed(args)
         return
-    source = open_demos(args.dataset, **_wanted(args), keep_contract=args.keep_contract)
+    source, left_out = _open(args)
     demos = sampled(source)
-    notes = [*demos.notes, _SAMPLE_NOTE] if _is_sample(demos, source) else demos.notes
+    notes = [*left_out, *demos.notes, *[_SAMPLE_NOTE] * _is_sample(demos, source)]
     print(*(f"note: {note}\n" for note in notes), sep="", end="")
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(source)} demonstrations"):
@@ -60,13 +61,13 @@ def fit_primitives(args: FitPrimitives) -> None:
 
 
 def fit_silently(args: FitPrimitives) -> None:
-    """Fit the models of `fit_primitives` without contract, report or messages.
+    """Fit the models of `fit_primitives` without report or messages.
 
     Raises:
         ValueError: The demonstrations hold no motion, or lack a column that a channel needs.
     """
     torch.manual_seed(0)
-    source = open_demos(args.dataset, **_wanted(args))
+    source, _ = _open(args)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         _learn(args, source, sampled(source), folder)
 
@@ -122,21 +123,38 @@ _SAMPLE_NOTE = (
 )
 
 
-def _wanted(args: FitPrimitives) -> dict[str, Any]:
-    """Arguments of `open_demos`."""
-    return {
-        "episodes": args.episodes or None,
-        "joint_names": args.joint_names or None,
-        "mapping": args.columns(),
-        "units": args.units,
-    }
+def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
+    """The demonstrations, and notes on those left out.
+
+    Raises:
+        DatasetError: The dataset cannot be read, or a unit is doubtful.
+    """
+    left_out: list[int] = []
+
+    def moves(entry: EpisodeEntry) -> bool:
+        if entry.length < 2 and not args.episodes:
+            left_out.append(entry.index)
+            return False
+        return True
+
+    source = open_demos(
+        args.dataset,
+        args.episodes or None,
+        args.columns(),
+        args.units,
+        args.joint_names or None,
+        where=moves,
+        refuse_doubt=True,
+    )
+    one_frame = "episodes of a single frame are left out: "
+    return source, [one_frame + ", ".join(map(str, left_out))] if left_out else []
 
 
 def _fit_streamed(args: FitPrimitives) -> None:
     assert args.n_basis is not None
     with distributed.processes() as rank:
-        demos = open_demos(args.dataset, **_wanted(args))
-        for note in () if rank else demos.notes:
+        demos, left_out = _open(args)
+        for note in () if rank else (*left_out, *demos.notes):
             print(f"note: {note}")
         fits, metrics = fit_streamed(demos, args.n_basis, channels=args.channels)
         if rank:
@@ -152,12 +170,9 @@ def _fit_policy(args: FitPrimitives, console: Console) -> None:
     from hrc_learn.lerobot.policy.dmp_policy import write_closed_form_policy
 
     assert args.n_basis is not None
-    if (args.dataset / "meta/info.json").is_file():
-        dataset, kept = open_dataset(args.dataset), ""
-        if args.keep_contract:
-            dataset, kept = dataset.keep_first_contract()
-        for note in filter(None, (kept, dataset.contract_note)):
-            print(f"note: {note}")
+    known = (args.dataset / "meta/info.json").is_file()
+    if known and (note := open_dataset(args.dataset).contract_note):
+        print(f"note: {note}")
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status("Fitting a policy"):
             metrics = write_closed_form_policy(

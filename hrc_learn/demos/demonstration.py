@@ -183,6 +183,7 @@ class DemonstrationSet(Sequence[Demonstration]):
     Attributes:
         notes: Guesses and conversions of the reader, one sentence each, for the user.
         source: Folder of the dataset, "" for demonstrations made in memory.
+        joint_unit: Unit of the joint positions: "rad", or "1" for fractions of a range.
     """
 
     def __init__(
@@ -191,12 +192,14 @@ class DemonstrationSet(Sequence[Demonstration]):
         *,
         notes: Sequence[str] = (),
         source: str = "",
+        joint_unit: str = "rad",
     ):
         """
         Args:
             demonstrations: Demonstrations with the same joints.
             notes: Notes for the user.
             source: Folder of the dataset.
+            joint_unit: Unit of the joint positions.
 
         Raises:
             ValueError: The demonstrations differ in their joints.
@@ -204,6 +207,7 @@ class DemonstrationSet(Sequence[Demonstration]):
         self._demonstrations = tuple(demonstrations)
         self.notes = tuple(notes)
         self.source = source
+        self.joint_unit = joint_unit
         names = {demo.joint_names for demo in self._demonstrations}
         if len(names) > 1:
             raise ValueError(
@@ -233,7 +237,9 @@ class DemonstrationSet(Sequence[Demonstration]):
         )
 
     def _like(self, demonstrations: Sequence[Demonstration]) -> "DemonstrationSet":
-        return DemonstrationSet(demonstrations, notes=self.notes, source=self.source)
+        return DemonstrationSet(
+            demonstrations, notes=self.notes, source=self.source, joint_unit=self.joint_unit
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -17,15 +17,9 @@ from hrc_learn.demos.issues import aligned
 from hrc_learn.demos.read.columns import ColumnSelection, map_columns, replaced_roles
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.metadata import Feature, Sidecar
+from hrc_learn.demos.read.naming import is_hand, joint_of, meaning_of_component, role_of_key
 from hrc_learn.demos.read.profiles import track
-from hrc_learn.demos.read.quantities import (
-    ORIENTATION_ROLES,
-    ROLES,
-    is_hand,
-    joint_of,
-    meaning_of_component,
-    role_of_key,
-)
+from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.units import UnitDecision, unit_factor, units_from_episodes
 from hrc_learn.demos.recording_files import UNNAMED, Field, Recording
 

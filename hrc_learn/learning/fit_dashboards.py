@@ -46,6 +46,9 @@ from hrc_learn.viz.rerun_stream import (
     tab_view,
 )
 
+_JOINT_UNITS = {"rad": "rad", "1": "of the range"}
+_THOUSANDTHS = {"rad": "mrad", "m": "mm", "of the range": "1/1000 of the range"}
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShownFit:
@@ -55,7 +58,7 @@ class ShownFit:
     names: tuple[str, ...]
     """Names of the coordinates."""
     unit: str
-    """Unit of the coordinates: "rad" or "m"."""
+    """Unit of the coordinates: "rad", "m" or "of the range"."""
     time: tuple[Float[np.ndarray, "_"], ...]
     """Time grid of each demonstration [s]."""
     demos: tuple[Float[np.ndarray, "_ coordinates"], ...]
@@ -98,7 +101,7 @@ def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
     limits, paths, reproduced = None, (), ()
     if channel != "joint":
         paths, reproduced = cut(demos), cut(made)
-    elif limits := panda_ranges(motions.joint_names):
+    elif motions.joint_unit == "rad" and (limits := panda_ranges(motions.joint_names)):
         paths = cut(panda.forward(demos.double()).position)
         reproduced = cut(panda.forward(made.double()).position)
     residual = {}
@@ -107,7 +110,7 @@ def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
     return ShownFit(
         title=title,
         names=motions.joint_names if channel == "joint" else ("x", "y", "z"),
-        unit="rad" if channel == "joint" else "m",
+        unit=_JOINT_UNITS[motions.joint_unit] if channel == "joint" else "m",
         time=cut(motions.demos.time),
         demos=cut(demos),
         reproductions=cut(made),
@@ -154,7 +157,8 @@ def _tab(fit: ShownFit, i: int) -> Tab:
         for j, name in enumerate(fit.names)
     ]
     error = several(f"{root}/error", fit.names, 1e3 * (made - demo))
-    plots.append(Plot(title=f"Error, all together [m{fit.unit}]", curves=(error,)))
+    title = f"Error, all together [{_THOUSANDTHS[fit.unit]}]"
+    plots.append(Plot(title=title, curves=(error,)))
     return Tab(title=f"Demonstration {i + 1}", plots=tuple(plots), columns=2)
 
 
@@ -166,7 +170,7 @@ def _fit_summary(fit: ShownFit) -> str:
             zip(fit.time, fit.demos, fit.reproductions, strict=True), start=1
         )
     ]
-    heads = ("demonstration", "duration [s]", f"largest error [m{fit.unit}]")
+    heads = ("demonstration", "duration [s]", f"largest error [{_THOUSANDTHS[fit.unit]}]")
     colours = joints_title(True, fit.limits is not None, position="reproduction")
     lines = [f"# {fit.title}", "", colours, "", *markdown_table(heads, rows)]
     if fit.residual:
@@ -199,7 +203,7 @@ def fit_report(
     ]
     joints = joint_grid_figure(fit.names, motions, fit.limits, fit.unit)
     caption = "The first four demonstrations and their reproductions."
-    figures = [Picture("joints" if fit.unit == "rad" else "position", joints, caption)]
+    figures = [Picture("position" if fit.unit == "m" else "joints", joints, caption)]
     if fit.residual:
         caption = "Held-out error by number of basis functions, and the selected number."
         figures.append(Picture("n_basis", residual_figure(fit.residual, fit.n_basis), caption))

@@ -70,7 +70,8 @@ def sampled(source: DemonstrationSource) -> DemonstrationSet:
         note = f"{count} of {len(lengths)} demonstrations, evenly spread, are a sample"
     if max(lengths) > longest:
         note += f"; of longer ones {longest} frames are used"
-    return DemonstrationSet(demos, notes=(*source.notes, note), source=source.source)
+    notes, unit = (*source.notes, note), source.joint_unit
+    return DemonstrationSet(demos, notes=notes, source=source.source, joint_unit=unit)
 
 
 def fit_all(fitted: FittedPrimitives, source: DemonstrationSource) -> FittedPrimitives:
@@ -117,15 +118,16 @@ def _fit_channel(
 def _batches(source: DemonstrationSource, longest: int) -> Iterator[DemonstrationSet]:
     """Batches of demonstrations within `FITTED_AT_ONCE`."""
     batch: list[Demonstration] = []
+    made = partial(DemonstrationSet, source=source.source, joint_unit=source.joint_unit)
     for demo in source:
         demo = _thinned(demo, longest)
         padded = max(len(one) for one in (*batch, demo)) * (len(batch) + 1)
         if batch and padded * _width(source) > FITTED_AT_ONCE:
-            yield DemonstrationSet(batch, source=source.source)
+            yield made(batch)
             batch = []
         batch.append(demo)
     if batch:
-        yield DemonstrationSet(batch, source=source.source)
+        yield made(batch)
 
 
 def _width(source: DemonstrationSource) -> int:
@@ -174,7 +176,7 @@ def fit_streamed(
             LazyMap(demos, column),
             n_basis,
             joint_names=names,
-            units="rad" if channel == "joint" else "m",
+            units=demos.joint_unit if channel == "joint" else "m",
         )
         fits[channel] = fit
         metrics[f"mean_{channel}_rmse"] = float(fit.rmse.square().mean().sqrt())

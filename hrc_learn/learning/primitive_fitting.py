@@ -70,6 +70,8 @@ class Motions:
     demos: PaddedDemonstrations
     joint_names: tuple[str, ...]
     source: str
+    joint_unit: str = "rad"
+    """Unit of the joint positions, "1" for fractions of the joints' ranges."""
 
     @classmethod
     def of(cls, demos: DemonstrationSet) -> "Motions":
@@ -84,12 +86,18 @@ class Motions:
         for demo in demos:
             require_motion(demo, demos.source)
         padded = demos.padded()
-        joints = padded.joint_position if demos.joint_names == panda.joint_names else None
+        is_panda = (demos.joint_names, demos.joint_unit) == (panda.joint_names, "rad")
+        joints = padded.joint_position if is_panda else None
         if joints is not None and padded.position is None and padded.orientation is None:
             tool = panda.forward(joints)
             pose = {"position": tool.position, "orientation": tool.orientation}
             padded = PaddedDemonstrations(**(vars(padded) | pose))
-        return cls(demos=padded, joint_names=demos.joint_names, source=demos.source)
+        return cls(
+            demos=padded,
+            joint_names=demos.joint_names,
+            source=demos.source,
+            joint_unit=demos.joint_unit,
+        )
 
     def available(self) -> tuple[str, ...]:
         """Channels whose columns were recorded."""
@@ -112,7 +120,7 @@ class Motions:
     def naming(self, channel: str) -> dict[str, Any]:
         """Arguments of `JointDMP.fit` that name the coordinates and their unit."""
         if channel == "joint":
-            return {"joint_names": self.joint_names or None, "units": "rad"}
+            return {"joint_names": self.joint_names or None, "units": self.joint_unit}
         return {"joint_names": ("x", "y", "z"), "units": "m"}
 
     def fit(self, channel: str, n_basis: int, **options: Any) -> Primitive:

@@ -146,7 +146,12 @@ def _check_content(
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
     episodes = _first_pass(folder, report, columns, profiles)
     decisions, faults = units_from_episodes(
-        columns.selections, episodes, folder.fps, dataset.declared_units, units
+        columns.selections,
+        episodes,
+        folder.fps,
+        dataset.declared_units,
+        units,
+        robot_type=folder.robot_type or "",
     )
     for fault in faults:
         report.add_error(fault)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 from hrc_learn.demos.issues import Issue, warning
 from hrc_learn.demos.read.columns import ColumnMapping
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
+from hrc_learn.demos.read.naming import meaning_of_component
 from hrc_learn.demos.read.profiles import (
     ColumnProfile,
     EpisodeProfile,
@@ -17,7 +18,6 @@ from hrc_learn.demos.read.profiles import (
     gain_over,
     is_discrete,
 )
-from hrc_learn.demos.read.naming import meaning_of_component
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 FEWEST = 3

@@ -16,8 +16,8 @@ from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, select_quantities
-from hrc_learn.demos.read.profiles import is_discrete, profile_columns
 from hrc_learn.demos.read.naming import is_hand
+from hrc_learn.demos.read.profiles import is_discrete, profile_columns
 from hrc_learn.demos.read.units import Quantities, UnitDecision
 from hrc_learn.geometry import quaternion
 

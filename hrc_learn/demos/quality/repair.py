@@ -147,7 +147,12 @@ class _Repair:
         self.out, self.options, columns = out, options, dataset.columns
         declared, fps = dataset.declared_units, dataset.folder.fps
         decisions, faults = units_from_episodes(
-            columns.selections, self._readable(), fps, declared, units
+            columns.selections,
+            self._readable(),
+            fps,
+            declared,
+            units,
+            robot_type=dataset.folder.robot_type or "",
         )
         self.faults = {fault.episode: fault for fault in faults}
         """Episodes that contradict the units of the others."""

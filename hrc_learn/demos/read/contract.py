@@ -23,6 +23,7 @@ from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json, read
 from hrc_learn.demos.read.naming import is_hand, joint_of
 from hrc_learn.demos.read.profiles import EpisodeProfile, is_discrete
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES
+from hrc_learn.demos.read.unit_evidence import CONFIDENT
 from hrc_learn.demos.read.units import UnitDecision, units_of
 from hrc_learn.store import Count, new_file
 
@@ -189,6 +190,12 @@ class Contract:
             else:
                 parts.append(replace(old, low=part.low, high=part.high))
         return replace(self, components=tuple(parts))
+
+    def without_doubt(self) -> tuple["Contract", list[str]]:
+        """The contract without its doubtful units, and the components that have them."""
+        doubtful = [p for p in self.components if p.unit and p.confidence < CONFIDENT]
+        parts = [replace(p, unit="") if p in doubtful else p for p in self.components]
+        return replace(self, components=tuple(parts)), [f"{p.key}/{p.name}" for p in doubtful]
 
     def content(self) -> dict[str, Any]:
         """The contract as JSON values."""

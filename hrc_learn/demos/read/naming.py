@@ -46,7 +46,7 @@ _UNITS = {
 }
 """Unit -> its spellings in names (regular expression)."""
 _SPELLED = "|".join(f"(?P<u{i}>{spelled})" for i, spelled in enumerate(_UNITS.values()))
-# After a separator or in brackets, at the end or before a number: `q_deg`, `q (deg)`, `q_deg_3`.
+# After a separator or in brackets, perhaps before a number: `q_deg`, `q (deg)`, `q_deg_3`.
 _UNIT_AT_END = re.compile(
     rf"(?P<stem>.*[^\W_]\)?)(?:[._/ -]+|\s*(?=[(\[]))[(\[]?(?:{_SPELLED})"
     rf"(?P<rate>/s|_?per_s(?:ec)?|_s|ps)?[)\]]?(?P<number>[._]?\d+)?",
@@ -81,7 +81,7 @@ _COMPONENTS: list[tuple[str, str]] = [
     # Role of the component, and the rest of its name with its slot.
     ("position", rf"{_POSITION}?_?(?P<slot>[xyz])"),
     ("quaternion_wxyz", rf"{_QUATERNION}_?(?P<slot>[wxyz])"),
-    ("quaternion", rf"(?:quat|quaternion|rot_?quat)_?(?P<slot>[0-3])"),
+    ("quaternion", r"(?:quat|quaternion|rot_?quat)_?(?P<slot>[0-3])"),
     ("rotation_vector", rf"(?:{_VECTOR}|w|r)_?(?P<slot>[xyz])"),
     ("rotation_vector", rf"{_VECTOR}_?(?P<slot>[0-2])"),
     ("euler_xyz", rf"{_EULER}_?(?P<slot>[xyz0-2])"),
@@ -108,8 +108,8 @@ KEY_ROLES = {
     "rotation_6d": rf"{_OF_TOOL}(?:rot_?6d|rotation_6d)",
     "quaternion_xyzw": rf"{_OF_TOOL}(?:quat|quaternion|orientation|ori|orn)",
     "rotation_matrix": rf"{_OF_TOOL}(?:rot|rotation|rot_mat|rotation_matrix|mat)",
-    "cartesian": rf"cartesian_position|cartesian_pose|(?:ee|eef|tcp|tool\d*|end_?effector)"
-    rf"(?:_pose|_transform)?",
+    "cartesian": r"cartesian_position|cartesian_pose|(?:ee|eef|tcp|tool\d*|end_?effector)"
+    r"(?:_pose|_transform)?",
     "gripper": "gripper|gripper_position|gripper_width|gripper_pos|gripper_qpos",
     "feature": "image_feature",
     "human_effort": "human_effort",

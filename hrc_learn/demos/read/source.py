@@ -3,7 +3,7 @@
 import contextlib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol, overload, runtime_checkable
@@ -19,13 +19,7 @@ from hrc_learn.demos.demonstration import (
 from hrc_learn.demos.image_features import missing_note, only_feature, with_feature
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
 from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
-from hrc_learn.demos.read.contract import (
-    Contract,
-    fingerprint,
-    infer_contract,
-    keep_contract,
-    read_contract,
-)
+from hrc_learn.demos.read.contract import Contract, fingerprint, read_contract
 from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
@@ -36,7 +30,6 @@ from hrc_learn.demos.read.dataset_folder import (
 )
 from hrc_learn.demos.read.frames import RawEpisode, disk_runs, frame_timestamps, read_quantities
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar, read_sidecar
-from hrc_learn.demos.read.profiles import profile_episode
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
 from hrc_learn.demos.read.units import (
     Quantities,
@@ -48,8 +41,6 @@ from hrc_learn.demos.read.units import (
 
 _SAMPLED_EPISODES = 32
 """Episodes that decide on units."""
-_CONTRACT_EPISODES = 200
-"""Episodes that a contract is inferred from; more change nothing and take longer."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,7 +138,13 @@ class OpenedDataset:
 
         fps = self.folder.fps
         decisions, faults = units_from_episodes(
-            selections, episodes(), fps, declared, given, sample.keys()
+            selections,
+            episodes(),
+            fps,
+            declared,
+            given,
+            sample.keys(),
+            self.folder.robot_type or "",
         )
         for fault in faults:
             if fault.episode in wanted:
@@ -159,47 +156,6 @@ class OpenedDataset:
     ) -> Iterator[RawEpisode]:
         """Episodes one after another; arguments and errors as in `read_quantities`."""
         return read_quantities(self.folder, self.columns, entries, roles)
-
-    def keep_first_contract(
-        self, units: Mapping[str, str] | None = None
-    ) -> tuple["OpenedDataset", str]:
-        """Keep the inferred contract with a dataset that declares nothing itself.
-
-        Later readers then interpret the dataset in the same way, whatever is added, and report
-        changes. A dataset with a contract, or one of `DatasetWriter`, needs none. The contract
-        never changes what is read: otherwise it is not kept.
-
-        Args:
-            units: Units on disk by role, as in `load_demos`.
-
-        Returns:
-            The dataset with its contract, and a note for the user, empty if nothing was kept.
-        """
-        if self.contract is not None or self.sidecar.columns:
-            return self, ""
-        folder = self.folder
-        try:
-            decisions = self.decide_units(folder.episodes, units or {})
-            profiles = [
-                profile_episode(raw.entry.index, raw.frames, raw.quantities, folder.fps)
-                for raw in self.read(self.sample(_CONTRACT_EPISODES))
-            ]
-        except DatasetError as error:
-            return self, f"no contract of the columns is kept: {error}"
-        contract = infer_contract(folder, self.columns, decisions, profiles)
-        kept = contract.selections(folder.features)
-        columns = map_columns(folder.features, self.sidecar, kept=kept)
-        if not columns.reads_like(self.columns):
-            return self, ""  # such as an order of components that a contract cannot express
-        try:
-            keep_contract(folder.root, contract)
-        except OSError as error:
-            return self, f"no contract of the columns is kept: {error.strerror or error}"
-        note = (
-            f"the meaning of the columns is kept in {folder.root / SIDECAR_PATH}: edit it there"
-        )
-        sidecar = replace(self.sidecar, contract=contract.content())
-        return replace(self, sidecar=sidecar, contract=contract, columns=columns), note
 
 
 def _spread(entries: Sequence[EpisodeEntry], most: int) -> list[EpisodeEntry]:
@@ -244,7 +200,7 @@ def load_demos(
     """Read the demonstrations of a LeRobot dataset (version 2.0, 2.1 or 3.0) into memory.
 
     Columns are found by name; videos are not needed. Guesses are listed in the result's
-    `notes`, and a guessed unit that changes values raises a `UnitsWarning`.
+    `notes`; a guessed unit that changes values or is doubtful raises a `UnitsWarning`.
 
     Args:
         path: Folder of the dataset, or an open `LeRobotDataset`, whose own selection of
@@ -277,7 +233,7 @@ def open_demos(
     *,
     tasks: str | Sequence[str] | None = None,
     where: EpisodeFilter | None = None,
-    keep_contract: bool = False,
+    refuse_doubt: bool = False,
 ) -> "DemonstrationSource":
     """Open a dataset whose demonstrations are read from disk when they are used.
 
@@ -293,28 +249,29 @@ def open_demos(
         joint_names: Joints wanted.
         tasks: Tasks wanted.
         where: Condition on the episodes wanted.
-        keep_contract: Keep the inferred contract with a dataset that declares nothing itself,
-            unless a mapping is given.
+        refuse_doubt: Raise an error instead of a warning if a guessed unit is doubtful.
 
     Raises:
-        DatasetError: The metadata are damaged, or an argument names what does not exist.
+        DatasetError: The metadata are damaged, an argument names what does not exist, or a
+            guessed unit is doubtful and `refuse_doubt` is given.
     """
     if isinstance(path, str | Path):
         root = path
     else:
         root, episodes = path.root, path.episodes if episodes is None else episodes
-    dataset, note = open_dataset(root, mapping), ""
+    dataset = open_dataset(root, mapping)
     entries = select_episodes(dataset.folder, episodes, tasks, where)
     if joint_names is not None:  # before any long read
         joint_columns(dataset.columns.joint_names, joint_names)
-    if keep_contract and not mapping:
-        dataset, note = dataset.keep_first_contract(units)
     decisions = dataset.decide_units(entries, units or {})
+    doubts = [decision.doubt for decision in decisions.values() if decision.doubt]
+    if doubts and refuse_doubt:
+        raise DatasetError(f"{dataset.folder.root}: {'; '.join(doubts)}")
     for decision in decisions.values():
-        if decision.converts:
-            warnings.warn(f"{dataset.folder.root}: {decision.note}", UnitsWarning, stacklevel=2)
-    notes = (note,) if note else ()
-    return DemonstrationSource(dataset, entries, decisions, joint_names, notes)
+        if decision.converts or decision.doubt:
+            text = f"{dataset.folder.root}: {decision.doubt or decision.note}"
+            warnings.warn(text, UnitsWarning, stacklevel=2)
+    return DemonstrationSource(dataset, entries, decisions, joint_names)
 
 
 class DemonstrationSource(Sequence[Demonstration]):
@@ -342,7 +299,6 @@ class DemonstrationSource(Sequence[Demonstration]):
         entries: Sequence[EpisodeEntry],
         decisions: Mapping[str, UnitDecision],
         joint_names: Sequence[str] | None = None,
-        notes: Sequence[str] = (),
     ):
         """
         Args:
@@ -350,18 +306,17 @@ class DemonstrationSource(Sequence[Demonstration]):
             entries: Episodes, in order.
             decisions: Unit of each quantity on disk, by role.
             joint_names: Joints wanted; None takes all in their order.
-            notes: Further notes for the user.
 
         Raises:
             DatasetError: A joint does not exist.
         """
         columns, root = dataset.columns, dataset.folder.root
-        self._dataset, self._entries, self._own_notes = dataset, tuple(entries), tuple(notes)
+        self._dataset, self._entries = dataset, tuple(entries)
         self._decisions = dict(decisions)
         names = columns.joint_names if joint_names is None else joint_names
         joint_columns(columns.joint_names, names)
         self.joint_names, self.source = tuple(names), str(root)
-        noted = [*notes, *columns.notes]
+        noted = [*columns.notes]
         noted += [f"{role} {note}" for role, note in columns.unmatched.items()]
         noted += [dataset.contract_note, *(d.note for d in decisions.values())]
         self._extracted = feature = None if dataset.own_feature else only_feature(root)
@@ -386,7 +341,7 @@ class DemonstrationSource(Sequence[Demonstration]):
 
     def _part(self, entries: Iterable[EpisodeEntry]) -> "DemonstrationSource":
         return DemonstrationSource(
-            self._dataset, tuple(entries), self._decisions, self.joint_names, self._own_notes
+            self._dataset, tuple(entries), self._decisions, self.joint_names
         )
 
     def __len__(self) -> int:
@@ -411,6 +366,17 @@ class DemonstrationSource(Sequence[Demonstration]):
         return self._dataset.folder
 
     @property
+    def units(self) -> Mapping[str, UnitDecision]:
+        """Unit on disk of each quantity, and its evidence."""
+        return self._decisions
+
+    @property
+    def joint_unit(self) -> str:
+        """Unit of the joint positions as read: "rad", or "1" for a fraction of a range."""
+        decision = self._decisions.get("joint_position")
+        return "rad" if decision is None else decision.si_unit
+
+    @property
     def lengths(self) -> tuple[int, ...]:
         """Number of frames of each demonstration."""
         return tuple(entry.length for entry in self._entries)
@@ -431,7 +397,9 @@ class DemonstrationSource(Sequence[Demonstration]):
         Raises:
             DatasetError: An episode cannot be read.
         """
-        return DemonstrationSet([*self], notes=self.notes, source=self.source)
+        return DemonstrationSet(
+            [*self], notes=self.notes, source=self.source, joint_unit=self.joint_unit
+        )
 
     def _convert(self, episode: RawEpisode) -> Demonstration:
         """Demonstration of a raw episode of this dataset.

@@ -293,7 +293,10 @@ def _guess_time(frame_step: float) -> UnitDecision:
     unit = min(off, key=off.__getitem__)
     if unit == "s":
         return UnitDecision(role="time", unit=unit)
-    note = _note("time", f"steps are {frame_step:.3g} times 1/fps", unit)
+    note = (
+        f"time: no unit declared, steps are {frame_step:.3g} times 1/fps: taken for {unit}; "
+        f"overrule with units={{'time': ...}}"
+    )
     return UnitDecision(role="time", unit=unit, note=note, converts=True)
 
 
