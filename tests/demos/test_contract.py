@@ -1,6 +1,5 @@
 """The contract of a dataset describes its columns, and readers obey it."""
 
-import errno
 import json
 import shutil
 from dataclasses import replace
@@ -8,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from clean_sets import SETS, write_set
-from commands import done
+from commands import done, hrc
 from lerobot_folders import joint_path, write_folder
 
 from hrc_learn.demos import (
@@ -20,7 +19,6 @@ from hrc_learn.demos import (
 )
 from hrc_learn.demos.read.contract import keep_contract
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
-from hrc_learn.demos.read.source import open_dataset
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation
@@ -54,9 +52,9 @@ def kept(root):
     return contract
 
 
-def keep_first_contract(root):
-    """The note of the reader on the contract that it keeps."""
-    return open_dataset(root).keep_first_contract()[1]
+def keep_inferred_contract(root):
+    """Output of the command that stores the inferred contract."""
+    return hrc("check", "--dataset", root, "--keep-contract").output
 
 
 def named(contract, key, name):
@@ -216,9 +214,6 @@ def test_what_is_kept_is_plain_json(root):
     assert json.loads(json.dumps(content)) == content
 
 
-# Kept when a dataset is first learned from.
-
-
 CONVENTIONS = {
     "no names": {STATE: None, "action": None},
     "leader and follower": {
@@ -260,41 +255,23 @@ def same(first, second):
 def test_a_first_contract_changes_nothing_that_is_read(tmp_path, names):
     root = of_convention(tmp_path / "set", names)
     before = load_demos(root)
-    assert "edit it there" in keep_first_contract(root)
+    assert "edit it there" in keep_inferred_contract(root)
     same(before, load_demos(root))
-    assert keep_first_contract(root) == ""  # once
 
 
 @pytest.mark.parametrize("options", SETS.values(), ids=SETS)
 def test_a_first_contract_of_sound_sets_says_their_units(tmp_path, options):
     root = write_set(tmp_path / "set", **options)
     before = load_demos(root)
-    keep_first_contract(root)
+    keep_inferred_contract(root)
     same(before, load_demos(root))
     assert not any("no unit declared" in i.message for i in check_dataset(root).warnings)
 
 
-def test_what_cannot_be_understood_or_written_is_said(root, tmp_path, monkeypatch):
-    episodes = [motion(i) for i in range(3)]
-    episodes[1] = {key: np.deg2rad(values) for key, values in episodes[1].items()}
-    names = {STATE: NAMES, "action": NAMES}
-    odd = write_folder(tmp_path / "odd", episodes, names, fps=FPS)
-    assert "episode 1" in keep_first_contract(odd)
-    assert not (odd / SIDECAR_PATH).exists()
-
-    def refuse(*_):
-        raise PermissionError(errno.EACCES, "Permission denied")
-
-    monkeypatch.setattr("hrc_learn.demos.read.source.keep_contract", refuse)
-    assert "Permission denied" in keep_first_contract(root)
-
-
-def test_fit_keeps_a_contract_and_fit_evaluate_and_repair_say_when_the_data_changed(
-    root, tmp_path
-):
+def test_fit_evaluate_and_repair_report_that_data_changed(root, tmp_path):
     model = tmp_path / "model"
-    kept = done("fit", "--dataset", root, "--out", model, "--n-basis", 10).output
-    assert "edit it there" in kept
+    keep_inferred_contract(root)
+    done("fit", "--dataset", root, "--out", model, "--n-basis", 10)
     assert "changed since" not in done("evaluate", "--model", model, "--dataset", root).output
     names = {STATE: NAMES, "action": NAMES}
     other = write_folder(tmp_path / "other", [motion(i) for i in range(5)], names, fps=FPS)
@@ -308,7 +285,6 @@ def test_fit_keeps_a_contract_and_fit_evaluate_and_repair_say_when_the_data_chan
     assert "changed since" in " ".join(report.notes)
 
 
-def test_without_keeping_the_dataset_is_not_touched(root, tmp_path):
-    fit = ("fit", "--dataset", root, "--out", tmp_path / "model", "--n-basis", 10)
-    done(*fit, "--no-keep-contract")
+def test_fit_does_not_touch_the_dataset(root, tmp_path):
+    done("fit", "--dataset", root, "--out", tmp_path / "model", "--n-basis", 10)
     assert not (root / SIDECAR_PATH).exists()

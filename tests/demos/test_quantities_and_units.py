@@ -2,15 +2,19 @@
 
 import math
 
+import numpy as np
 import pytest
 
+from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.naming import (
     ComponentMeaning,
     is_hand,
     meaning_of_component,
     role_of_key,
+    without_unit,
 )
-from hrc_learn.demos.read.units import decide_units
+from hrc_learn.demos.read.units import decide_units, units_from_episodes
 
 
 @pytest.mark.parametrize(
@@ -30,6 +34,14 @@ from hrc_learn.demos.read.units import decide_units
         ("eef_quat_w", "quaternion_wxyz", 0),
         ("TCP.qx", "quaternion_wxyz", 1),
         ("yaw", "euler_xyz", 2),
+        ("eef_pos_2", "position", 2),
+        ("eef_quat_3", "quaternion", 3),
+        ("pose.position.x", "position", 0),
+        ("tool0_pose.orientation.w", "rotation", "w"),
+        ("robot0_eef_rot_axis_angle_1", "rotation_vector", 1),
+        ("end_effector_position_x", "position", 0),
+        ("eef.rot6d_5", "rotation_6d", 5),
+        ("x_mm", "position", 0),
     ],
 )
 def test_names_that_speak(name, role, slot):
@@ -38,7 +50,18 @@ def test_names_that_speak(name, role, slot):
 
 @pytest.mark.parametrize(
     "name",
-    ["joint_1", "motor_7", "gripper.vel", "gripper.torque", "ee.vx", "left_waist", "reward"],
+    [
+        *(
+            "joint_1",
+            "motor_7",
+            "gripper.vel",
+            "gripper.torque",
+            "ee.vx",
+            "left_waist",
+            "reward",
+        ),
+        *("wrist_roll", "left_shoulder_pitch", "q_0", "pos_0", "joint_pos_0", "hand.x"),
+    ],
 )
 def test_names_that_say_nothing(name):
     assert meaning_of_component(name) is None
@@ -53,6 +76,11 @@ def test_names_that_say_nothing(name):
         ("action.joint_velocity", "joint_velocity"),
         ("observation.image_feature", "feature"),
         ("time_stamp", "time"),
+        ("observation.robot0_eef_pos", "position"),
+        ("observation.robot0_eef_quat", "quaternion_xyzw"),
+        ("obs.robot0_joint_pos", "joint_position"),
+        ("robot0_gripper_qpos", "gripper"),
+        ("observation.joint_position_deg", "joint_position"),
         ("observation.state", None),
         ("observation.position", None),  # of what?
         ("observation.environment_state", None),
@@ -75,8 +103,9 @@ def test_keys(key, role):
         # No arm reaches further than 5 m.
         ("position", 5.0, "m"),
         ("position", 5.01, "cm"),
-        ("position", 500.0, "cm"),
-        ("position", 500.1, "mm"),
+        # Arms reach 1.5 m.
+        ("position", 150.0, "cm"),
+        ("position", 150.1, "mm"),
         # A turn, or two of a vector that was unwrapped.
         ("euler_xyz", 6.38, "rad"),
         ("euler_xyz", 6.39, "deg"),
@@ -140,3 +169,105 @@ def test_the_unit_of_stamps_is_the_nearest_to_the_frame_rate(step, unit, factor)
 )
 def test_joints_of_hands_by_their_names(name, hand):
     assert is_hand(name) == hand
+
+
+@pytest.mark.parametrize(
+    ("name", "stem", "unit"),
+    [
+        ("joint0_deg", "joint0", "deg"),
+        ("elbow (deg)", "elbow", "deg"),
+        ("elbow [rad]", "elbow", "rad"),
+        ("q_deg_3", "q_3", "deg"),
+        ("lift_mm", "lift", "mm"),
+        ("x_m", "x", "m"),
+        ("joint1.vel_deg/s", "joint1.vel", "deg/s"),
+        ("motor_m", "motor_m", ""),
+        ("deg", "deg", ""),
+        ("radius", "radius", ""),
+    ],
+)
+def test_units_in_names(name, stem, unit):
+    assert without_unit(name) == (stem, unit)
+
+
+def test_side_of_an_arm_of_two():
+    assert meaning_of_component("left_eef_x") == ComponentMeaning("position", 0, "left")
+
+
+SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+
+
+def joint_decision(values, labels=SO101, robot_type="", units=()):
+    """Decision on joints from the values of one episode, (frames, joints)."""
+    columns = tuple(("observation.state", i) for i in range(len(labels)))
+    selection = ColumnSelection(
+        role="joint_position", columns=columns, labels=tuple(labels), units=tuple(units)
+    )
+    entry = EpisodeEntry(index=0, length=len(values), tasks=(), file="data", start=0)
+    decisions, _ = units_from_episodes(
+        {"joint_position": selection},
+        [(entry, {"joint_position": np.asarray(values, float)})],
+        30.0,
+        {},
+        {},
+        robot_type=robot_type,
+    )
+    return decisions["joint_position"]
+
+
+def swept(*reach):
+    """Motion of each joint between -reach and reach."""
+    return np.sin(np.linspace(0, 6.2, 200))[:, None] * np.asarray(reach)
+
+
+def test_joints_clipped_at_100_are_fractions_of_their_range():
+    values = np.clip(swept(80, 160, 70, 60, 90, 50), -100, 100)
+    decision = joint_decision(values, robot_type="so101_follower")
+    assert (decision.unit, decision.doubt) == ("%", None)
+    assert decision.si_unit == "1"
+
+
+@pytest.mark.parametrize("robot_type", ["so101_follower", ""])
+def test_a_hobby_arm_within_100_is_asked_about(robot_type):
+    decision = joint_decision(swept(80, 95, 70, 60, 90, 50), robot_type=robot_type)
+    assert "--units joint_position deg or --units joint_position %" in decision.doubt
+
+
+def test_a_hobby_arm_beyond_100_is_in_degrees_and_its_gripper_in_percent():
+    decision = joint_decision(swept(80, 140, 70, 60, 90, 50), robot_type="so100")
+    assert decision.doubt is None
+    assert decision.units == ("deg",) * 5 + ("%",)
+
+
+def test_names_decide_whatever_the_values_reach():
+    decision = joint_decision(swept(3, 2, 1), ("a", "b", "c"), units=("deg",) * 3)
+    assert (decision.unit, decision.doubt) == ("deg", None)
+
+
+def test_one_large_component_does_not_decide_the_unit_of_the_others():
+    labels = [f"joint{i}" for i in range(7)] + ["mystery"]
+    decision = joint_decision(swept(1, 2, 1, 2.5, 1, 2, 1, 640), labels)
+    assert decision.unit == "rad"
+    assert "mystery 640" in decision.doubt
+
+
+def test_a_hand_that_counts_to_255_does_not_decide_the_unit_of_the_arm():
+    values = swept(1, 2, 1, 2.5, 1, 2, 255)
+    values[:, -1] = np.rint(np.abs(values[:, -1]))
+    decision = joint_decision(values, [*(f"joint{i}" for i in range(6)), "gripper"])
+    assert decision.units == ("rad",) * 6 + ("byte",)
+    assert decision.factor[-1] == pytest.approx(1 / 255)
+
+
+def test_a_quaternion_among_numbered_joints_is_noticed():
+    angle = np.linspace(0.2, 1.4, 100)
+    turn = np.stack([np.sin(angle), 0 * angle, 0.2 + 0 * angle, np.cos(angle)], 1)
+    turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+    values = np.hstack([np.linspace(0, 0.4, 100)[:, None] * [1, 2, 1.5], turn])
+    decision = joint_decision(values, [f"joint_{i}" for i in range(1, 8)])
+    assert "joint_4 .. joint_7 always have unit length" in decision.doubt
+
+
+def test_lengths_of_a_few_ten_are_asked_about():
+    decision = decide_units({"position": 45.0}, {}, {})["position"]
+    assert "--units position cm or --units position mm" in decision.doubt

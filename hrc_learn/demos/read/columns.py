@@ -56,6 +56,8 @@ class ColumnSelection:
     """True if the dataset gives no names, so that the labels only count."""
     units: tuple[str, ...] = ()
     """Unit in the name of each column, "" for none; () if no name states one."""
+    assumed: str = ""
+    """Encoding that no name states, in words; "" if names or the caller state it."""
 
     def only(self, labels: Sequence[str]) -> "ColumnSelection":
         """The columns of these labels, in this order."""
@@ -297,9 +299,8 @@ class _Conventions:
             visible = [_select("feature_visible", feature, [2])] if feature.width == 3 else []
             return [_select("feature", feature, indices[:2]), *visible]
         if role == "quaternion_xyzw" and feature.width == 4:
-            self._notes.append(
-                f"{feature.key}: assumed to be a quaternion in the order x, y, z, w"
-            )
+            self._encoding(feature, "quaternion", dict.fromkeys(range(4), 0))
+            return [replace(_select(role, feature, indices), assumed=f"{role}, by its width")]
         if role == "gripper" and feature.width == 2:  # two fingers, as in robomimic
             self._notes.append(f"{feature.key}: its first finger is taken for the gripper")
             return [_select(role, feature, indices[:1])]
@@ -382,7 +383,8 @@ class _Conventions:
                 groups[encoding, side] = {k - 3: slots[k] for k in range(3, len(slots))}
         first: dict[str, str] = {}
         for (role, side), slots in groups.items():
-            role = self._encoding(feature, role, slots)
+            named, role = role, self._encoding(feature, role, slots)
+            assumed = "" if named == role or "w" in slots else f"{role}, by its width"
             if first.setdefault(role, side) != side:
                 self._notes.append(
                     f"{feature.key}: one pose is read, that of the {first[role]} arm; the "
@@ -404,6 +406,7 @@ class _Conventions:
             yield ColumnSelection(
                 role=role,
                 columns=tuple((feature.key, slots[slot]) for slot in order),
+                assumed=assumed if role in ORIENTATION_ROLES else "",
                 labels=tuple(map(str, order)),
                 numbered=feature.names is None,
             )

@@ -189,7 +189,13 @@ def decide_units(
             known = own if isinstance(own, Sizes) else Sizes.of_peaks(own)
             decisions[role] = _guess(role, known, selection, robot_type, named)
         else:
-            decisions[role] = UnitDecision(role=role, unit=ROLES[role].unit)
+            assumed = "" if selection is None else selection.assumed
+            decisions[role] = UnitDecision(
+                role=role,
+                unit=ROLES[role].unit,
+                confidence=0.8 if assumed else 1.0,
+                evidence=assumed,
+            )
     return decisions
 
 
