@@ -625,7 +625,9 @@ def _with_fingers(meaning: Meaning, search: _Search) -> Meaning:
             names = tuple(f"{name}.pos" for name, _ in fingers)
             kept[key] = (tuple(place for _, place in fingers), names)
     for key, feature in search.features.items():
-        if "gripper" not in selections and role_of_key(key) == "gripper" and feature.width == 2:
+        known = selections.get("gripper")
+        free = known is None or len(known.columns) == 1
+        if free and role_of_key(key) == "gripper" and feature.width == 2:
             whole = ColumnSelection(
                 role="gripper", columns=((key, 0), (key, 1)), labels=("a", "b")
             )

@@ -27,7 +27,7 @@ from hrc_learn.demos import (
     load_demos,
     repair_dataset,
 )
-from hrc_learn.demos.read.source import open_dataset
+from hrc_learn.demos.read.contract import keep_contract
 
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
@@ -376,7 +376,9 @@ def test_resampling_goes_on_where_joints_and_commands_wrap(tmp_path, turn, unit,
 
 def test_units_given_to_a_repair_overrule_an_older_contract(tmp_path):
     root = write(tmp_path / "old", [joint_path(60, seed=k) for k in range(2)])
-    open_dataset(root).keep_first_contract({"joint_position": "rad"})
+    kept = check_dataset(root, units={"joint_position": "rad"}).contract
+    assert kept is not None
+    keep_contract(root, kept)
     repair_dataset(
         root, tmp_path / "new", RepairOptions(trim=False), units={"joint_position": "deg"}
     )
