@@ -1,0 +1,194 @@
+"""Public recordings through `hrc import`: columns right, asked about and wrong, and training.
+
+The meaning of every column was found by hand, from the sources named here. The files are not
+part of the project: put each repository, or the files named, into a folder as OWNER+NAME.
+
+    python benchmarks/bench_recordings.py --folder FOLDER --train --json figures.json
+"""
+
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from hrc_learn import cli
+from hrc_learn.demos import DatasetError
+from hrc_learn.demos.recording_import import ImportPlan, plan_import, write_plan
+from hrc_learn.demos.recording_meaning import ImportOptions
+
+STATE_AND_ACTION = {"observation.state": "?", "action": "?"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Public:
+    """One public recording and what it holds."""
+
+    path: str
+    """File or folder below the folder of all."""
+    licence: str
+    expected: dict[str, str]
+    """Quantity -> unit on disk; "?" for columns that nothing documents, to be kept as recorded."""
+    options: ImportOptions = field(default_factory=ImportOptions)
+    """What its user has to know and say."""
+    columns: tuple[str, ...] = ()
+
+
+RECORDINGS = (
+    Public(
+        path="mosesnah-shared+ModularRobotControl/pour_demo1.npz",  # its text file as t and q
+        licence="MIT",
+        expected={"joint_position": "rad"},
+    ),
+    Public(
+        path="mosesnah-shared+DMP-MATLAB/iiwa_example1_pose.npz",
+        licence="MIT",
+        expected={"joint_position": "rad", "position": "m", "rotation_6d": "1"},
+    ),
+    Public(
+        path="sayantanauddy+clfd-snode/datasets/robottasks/pos_ori/pouring.npy",
+        licence="MIT",
+        expected={"position": "cm", "quaternion_wxyz": "1"},
+        options=ImportOptions(duration=5, units={"position": "cm"}),
+        columns=("px", "py", "pz", "qw", "qx", "qy", "qz"),
+    ),
+    Public(
+        path="octo-models+octo/tests/debug_dataset/bridge_dataset/1.0.0",
+        licence="MIT",
+        expected=STATE_AND_ACTION,
+        options=ImportOptions(fps=5),
+    ),
+    Public(  # xArm: millimetres and degrees, by the maker's SDK
+        path="BAEK26+lfd/data/first_attempt_pouring",
+        licence="none stated",
+        expected={
+            "position": "mm",
+            "euler_xyz": "deg",
+            "joint_position": "deg",
+            "gripper": "1",
+        },
+        options=ImportOptions(units={"position": "mm"}),
+    ),
+    Public(  # UR: RTDE guide of the maker
+        path="moelyaakoubi+GUI-RTDE/robot_data.csv",
+        licence="none stated",
+        expected={
+            "joint_position": "rad",
+            "joint_velocity": "rad/s",
+            "command_position": "rad",
+            "command_velocity": "rad/s",
+            "position": "m",
+            "rotation_vector": "rad",
+        },
+    ),
+    Public(
+        path="Himanshu12328+7DOF_Robotic_Manipulation_IL/data/demos.hdf5",
+        licence="none stated",
+        expected=STATE_AND_ACTION,
+        options=ImportOptions(fps=20),
+    ),
+    Public(
+        path="Slifer64+DMPM/data/demos.mat",
+        licence="none stated",
+        expected={"observation.state": "?"},
+        options=ImportOptions(columns={"observation.state": "demo_data"}, time="Time"),
+    ),
+    Public(
+        path="Slifer64+DMPM/data/data.mat",
+        licence="none stated",
+        expected={"observation.state": "?"},
+        options=ImportOptions(columns={"observation.state": "Y"}, time="Time"),
+    ),
+    Public(
+        path="nvidia+Isaac-GR00T/data/chunk-000/episode_000000.parquet",
+        licence="Apache-2.0",
+        expected=STATE_AND_ACTION,
+    ),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    folder: Path
+    """Folder of the recordings."""
+    train: bool = False
+    """Train LeRobot's ACT on each dataset for 20 steps."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> int:
+    """Import all recordings, print a table, write the figures; status 1 if a column is wrong."""
+    table = Table("recording", "licence", "right", "asked", "wrong", "episodes", "trained")
+    total: Counter[str] = Counter()
+    for public in RECORDINGS:
+        path = args.folder / public.path
+        if not path.exists():
+            table.add_row(public.path, public.licence, "not there")
+            continue
+        found = judged(path, public)
+        with tempfile.TemporaryDirectory() as folder:
+            plan = plan_import([path], public.options, public.columns)
+            wrong = compared(plan, public)["wrong"]
+            summary = write_plan(plan, Path(folder) / "set", "unknown", True)
+            trained = args.train and trains(Path(folder))
+        found["wrong"] += wrong
+        total += found + Counter(recordings=1, trained=int(trained))
+        counts = [str(found[name]) for name in ("right", "asked", "wrong")]
+        row = (public.path, public.licence, *counts, str(summary["episodes"]))
+        table.add_row(*row, "yes" if trained else "no")
+    Console().print(table)
+    cli.write_values(args.json, {f"{name}_columns": total[name] for name in total})
+    return int(total["wrong"] > 0)
+
+
+def judged(path: Path, public: Public) -> Counter[str]:
+    """Quantities that are right, asked about and wrong without a word from the user."""
+    silent = ImportOptions(fps=public.options.fps, duration=public.options.duration)
+    try:
+        return compared(plan_import([path], silent, public.columns), public)
+    except DatasetError:
+        return Counter(asked=len(public.expected))
+
+
+def compared(plan: ImportPlan, public: Public) -> Counter[str]:
+    """The same for a plan."""
+    meaning, counts = plan.meaning, Counter[str]()
+    found = {role: decision.unit for role, decision in meaning.decisions.items()}
+    found |= dict.fromkeys(meaning.kept, "?")
+    for role in public.expected.keys() | found.keys():
+        if role not in found:
+            counts["asked"] += 1  # listed among the fields that are left out
+        else:
+            counts["right" if found[role] == public.expected.get(role) else "wrong"] += 1
+    return counts
+
+
+def trains(folder: Path) -> bool:
+    """True if LeRobot opens the dataset and trains a small ACT on it for 20 steps."""
+    size = ("dim_model=64", "dim_feedforward=64", "n_heads=2", "latent_dim=8", "chunk_size=8")
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "lerobot.scripts.lerobot_train", "--steps=20"),
+            *("--dataset.repo_id=local/set", f"--dataset.root={folder / 'set'}"),
+            *("--dataset.video_backend=pyav", "--policy.type=act", "--policy.device=cpu"),
+            *("--policy.pretrained_backbone_weights=null", "--policy.n_action_steps=8"),
+            *("--policy.push_to_hub=false", "--wandb.enable=false", "--batch_size=2"),
+            *("--num_workers=0", "--env_eval_freq=0", "--save_checkpoint=false"),
+            *(f"--policy.{name}" for name in size),
+            f"--output_dir={folder / 'out'}",
+        ],
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        print(done.stderr[-1500:], file=sys.stderr)
+    return done.returncode == 0
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
