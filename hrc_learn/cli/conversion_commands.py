@@ -32,7 +32,7 @@ def import_recordings(args: Import) -> None:
     for warning in plan.meaning.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     if template and args.mapping is not None:
-        write_text(args.mapping, plan.meaning.template())
+        write_text(args.mapping, plan.template())
         print(f"{args.mapping}: a mapping file that says the same; edit it")
     if args.dry_run or args.out is None:
         write_values(args.json, plan.counts())

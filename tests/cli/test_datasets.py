@@ -76,7 +76,7 @@ def test_poses_are_imported_in_centimetres(tmp_path):
     again = ("import", tmp_path / "poses.npy", "--out", tmp_path / "bare", "--no-actions")
     names = ("--columns", "px,py,pz,qw,qx,qy,qz", "--duration", "5")
     # 60 may be centimetres or millimetres.
-    assert "its unit is doubtful" in hrc(*again, *names)[2]
+    assert "the unit is doubtful" in hrc(*again, *names)[2]
     assert hrc(*again, *names, "--units", "position", "cm")[0] == 0
     assert not load_demos(tmp_path / "bare")[0].extra
 

@@ -9,7 +9,7 @@ from lerobot_folders import joint_path
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError
-from hrc_learn.demos.recording_files import open_recordings
+from hrc_learn.demos.recording_formats import open_recordings
 from hrc_learn.demos.recording_import import plan_import
 from hrc_learn.demos.recording_meaning import ImportOptions
 
@@ -150,7 +150,11 @@ def saved(save, *arrays, **named):
         ("a.mp4", b"junk", "is a video"),
         ("a.npy", saved(np.savez, q=Q), "its name should end in .npz"),
         ("a.npz", saved(np.save, Q), "its name should end in .npy"),
-        ("a.npz", saved(np.savez, q=Q, o=np.array([{}])), "a.npz, o: cannot be read"),
+        (
+            "a.npz",
+            saved(np.savez, q=Q, o=np.array([{}])),
+            "a.npz, o: holds pickled Python objects",
+        ),
         ("a.csv", "0,1\n0.1,2 °\n".encode("latin-1"), "a.csv: is not encoded in UTF-8"),
         ("a.csv", b"\n \n,,\n", "a.csv: is empty"),
         ("a.csv", b"t,q\n\n0,1\n0.1\n", "line 4 does not hold 2 numbers"),
@@ -454,7 +458,7 @@ def test_six_numbers_of_a_pose_do_not_tell_their_angles(tmp_path):
     np.savez(tmp_path / "a.npz", tcp_pose=0.1 * joint_path(40, 6), t=TIME)
     made = plan(tmp_path / "a.npz")
     assert next(made.episodes()).demonstration.orientation is None
-    assert any("euler_xyz" in name for name in made.meaning.left_out)
+    assert "euler_xyz" in made.meaning.left_out["tcp_pose[3:6]"]
 
 
 def test_an_array_without_names_that_holds_quaternions_is_asked_about(tmp_path):
@@ -463,10 +467,9 @@ def test_an_array_without_names_that_holds_quaternions_is_asked_about(tmp_path):
         plan(tmp_path / "a.npy", fps=10)
 
 
-@pytest.mark.parametrize("scale", [40, 500])
-def test_lengths_in_cm_or_mm_are_asked_about(tmp_path, scale):
+def test_lengths_in_cm_or_mm_are_asked_about(tmp_path):
     poses = np.tile(np.eye(4), (40, 1, 1))
-    poses[:, :3, 3] = scale * (0.3 + 0.1 * Q)
+    poses[:, :3, 3] = 40 * (0.3 + 0.1 * Q)
     np.savez(tmp_path / "a.npz", eef_pos=poses[:, :3, 3], t=TIME)
     np.savez(tmp_path / "b.npz", tcp_pose=poses, t=TIME)
     for path, role in ((tmp_path / "a.npz", "position"), (tmp_path / "b.npz", "pose_matrix")):

@@ -1,0 +1,160 @@
+"""Clocks of recordings: stamps in seconds, and all fields on the clock of the state."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from hrc_learn.demos.read.units import unit_factor
+from hrc_learn.demos.recording_files import Recording, is_time, time_unit_in
+from hrc_learn.demos.recording_meaning import ImportOptions, Meaning
+
+_EPOCH = (1e9, 3e9)
+"""Stamps that count from 1970, in the years 2001 to 2065 [s]."""
+_STEPS = (1 / 1500, 0.5)
+"""Plausible steps between stamps [s]: 2 Hz to 1.5 kHz."""
+_STALE = 0.2
+"""Age above which a held value no longer counts as measured [s], or three of its periods."""
+_JUMP = 10.0
+"""Gap between stamps that is reported, as a multiple of the usual one."""
+
+
+class Clock(NamedTuple):
+    """Frames of a recording's state that all of its fields know."""
+
+    time: Float64[np.ndarray, " frames"]
+    """Stamps of the state [s]."""
+    frames: dict[str, Int64[np.ndarray, " frames"]]
+    """Field -> its latest frame at each stamp."""
+    notes: tuple[str, ...]
+
+
+def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOptions) -> Clock:
+    """Bring all fields that have a meaning to the clock of the state.
+
+    Slower fields hold their last value: nothing is interpolated, because a robot does not know
+    what its sensors will measure. Frames at either end that some field does not know are cut.
+
+    Raises:
+        DatasetError: Stamps are missing or do not increase, a field belongs to another time,
+            or is silent in between.
+    """
+    place = f"{recording.file.name} {recording.label}".strip()
+    time, notes = _stamps_of_state(recording, meaning, options)
+    names = [n for s in meaning.selections.values() for n, _ in s.columns]
+    names += [n for places, _ in meaning.kept.values() for n, _ in places]
+    frames = {
+        name: _latest(recording, name, time, meaning.time)
+        for name in dict.fromkeys((*names, *meaning.cameras.values()))
+    }
+    known = np.all([index >= 0 for index in frames.values()], axis=0)
+    partial = [name for name, index in frames.items() if (index < 0).any()]
+    inside = np.flatnonzero(known)
+    if len(inside) < 2:
+        text = f"the clocks of {', '.join(partial)} and of the state do not overlap"
+        raise recording.error(text)
+    start, stop = int(inside[0]), int(inside[-1]) + 1
+    for name in partial:
+        silent = np.flatnonzero(frames[name][start:stop] < 0)
+        if len(silent):
+            at = time[start + silent[0]] - time[0]
+            text = (
+                f"is silent for more than {_STALE} s at {at:.2f} s: split the recording there"
+            )
+            raise recording.error(text, name)
+    if partial:
+        cut = len(time) - (stop - start)
+        notes.append(f"{cut} frames without {', '.join(partial)} are cut at the ends")
+    cut_frames = {name: index[start:stop] for name, index in frames.items()}
+    return Clock(time[start:stop], cut_frames, tuple(f"{place}: {note}" for note in notes))
+
+
+def _stamps_of_state(
+    recording: Recording, meaning: Meaning, options: ImportOptions
+) -> tuple[Float64[np.ndarray, " frames"], list[str]]:
+    """Stamps [s], or even ones at the rate that is known, and notes."""
+    fields, frames = recording.fields, recording.fields[meaning.main].frames
+    if frames < 2:
+        raise recording.error(f"a demonstration needs at least two frames, got {frames}")
+    stamps = meaning.time or next((n for n, one in fields.items() if is_time(n, one)), "")
+    rate = options.fps or recording.fps
+    if meaning.time and fields[stamps].frames == frames:
+        time = read_stamps(recording, stamps, options.units.get("time", ""))
+        steps = np.diff(time)
+        wide = np.flatnonzero(steps > max(_JUMP * float(np.median(steps)), _STEPS[1]))
+        jumps = [f"{stamps} jumps by {steps[k]:.3g} s after frame {k}" for k in wide[:1]]
+        return time, jumps
+    if options.duration is not None:
+        return np.linspace(0.0, options.duration, frames), []
+    if rate is None:
+        videos = [fields[name] for name in meaning.cameras.values() if fields[name].rate]
+        rate = videos[0].rate if videos and videos[0].frames == frames else None
+    if rate is not None:
+        return np.arange(frames) / rate, []
+    if stamps:
+        text = f"holds {fields[stamps].frames} stamps for {frames} frames of the state"
+        raise recording.error(f"{text}: name its own (--time), or give --fps", stamps)
+    raise recording.error(
+        "there are no stamps: name the field of stamps (time), or give duration or fps"
+    )
+
+
+def read_stamps(
+    recording: Recording, name: str, unit: str = ""
+) -> Float64[np.ndarray, " _frames"]:
+    """Stamps of a field [s], in the given unit or the one that its name or size tells.
+
+    Raises:
+        DatasetError: Stamps do not increase, or their unit is in doubt.
+    """
+    time = recording.fields[name].numbers()[:, 0]
+    bad = np.flatnonzero(~np.isfinite(time))
+    if len(bad):
+        raise recording.error(f"is {time[bad[0]]} at frame {bad[0]}", name)
+    steps = np.diff(time)
+    for k in np.flatnonzero(steps <= 0)[:1]:
+        way = f"{time[k]:.9g} to {time[k + 1]:.9g} at frame {k}"
+        text = f"time must increase, but goes from {way}: remove repeated rows, or import"
+        raise recording.error(f"{text} without this field and with --fps", name)
+    unit = unit or recording.fields[name].unit or time_unit_in(name)
+    if unit:
+        return time * unit_factor("time", unit)
+    step = float(np.median(steps)) if len(steps) else 1.0
+    sizes = {unit: unit_factor("time", unit) for unit in ("s", "ms", "us", "ns")}
+    found = [u for u, size in sizes.items() if _EPOCH[0] < time[0] * size < _EPOCH[1]]
+    found = found or [u for u, size in sizes.items() if _STEPS[0] <= step * size <= _STEPS[1]]
+    counts = bool((steps == 1).all())
+    if counts or len(found) != 1:
+        kinds = "a count of frames (give --fps), ms or s" if counts else "s, ms, us or ns"
+        text = f"steps by {step:.4g}: {kinds}? Give the unit: --units time s"
+        raise recording.error(text, name)
+    return time * sizes[found[0]]
+
+
+def _latest(
+    recording: Recording, name: str, time: Float64[np.ndarray, " frames"], main: str
+) -> Int64[np.ndarray, " frames"]:
+    """Latest frame of a field at each stamp of the state; -1 where there is none or an old one."""
+    one, own = recording.fields[name], recording.clock_of(name, main)
+    length, lasts = one.frames, float(time[-1] - time[0])
+    if own not in ("", main):
+        stamps = read_stamps(recording, own)
+    elif length == len(time):
+        return np.arange(length)
+    elif one.rate:
+        stamps = time[0] + np.arange(length) / one.rate
+        if abs(length / one.rate - lasts) > 0.5 + 0.05 * lasts:
+            text = f"lasts {length / one.rate:.1f} s, the states {lasts:.1f} s: not the same"
+            raise recording.error(text, name)
+    elif abs(length - len(time)) == 1:  # a last observation without an action, or the reverse
+        return np.minimum(np.arange(len(time)), length - 1)
+    else:
+        text = (
+            f"arrays differ in their numbers of frames: it has {length}, the state {len(time)}"
+        )
+        raise recording.error(f"{text}, and no stamps are its own", name)
+    # The tolerance is for stamps that were rounded.
+    index = np.searchsorted(stamps, time + 1e-6, side="right") - 1
+    usual = float(np.median(np.diff(stamps))) if length > 1 else 0.0
+    old = time - stamps[np.maximum(index, 0)] > max(_STALE, 3 * usual)
+    return np.where(old, -1, index)

@@ -1,0 +1,474 @@
+"""Readers of recordings: numpy, text, Parquet, HDF5, zarr, MATLAB, RLDS, videos and folders.
+
+To add a format, such as bags of ROS, write a reader and list its suffix in `READERS`.
+"""
+
+import contextlib
+import json
+import re
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.recording_files import (
+    UNNAMED,
+    Field,
+    Recording,
+    array_field,
+    bytes_field,
+    is_encoded,
+    make_field,
+    natural,
+    split_episodes,
+    unit_in_words,
+)
+from hrc_learn.demos.recording_tables import read_parquet_table, read_text_table
+
+_VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
+_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
+_RATES = ("fps", "control_freq", "control_frequency", "frequency", "rate", "hz")
+"""Attributes that hold a frame rate [1/s]."""
+_TASKS = ("task", "language_instruction", "instruction", "lang", "task_description")
+_PICKLED = "holds pickled Python objects: save it again as numbers"
+_LINK = "is a link, which is not followed"
+
+
+def open_recordings(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
+    """Open the episodes of a file or folder; no frames are read before they are used.
+
+    Args:
+        path: File of one of the formats in `READERS`, a zarr store, or a folder of such files.
+        columns: Names for the columns of a .npy file, or of a text file without a header.
+
+    Raises:
+        DatasetError: The path is missing, of another kind, damaged, or leads to other files.
+    """
+    reader = _reader_of(path, columns)
+    try:
+        return reader(path)
+    except (DatasetError, ModuleNotFoundError):
+        raise
+    except Exception as error:  # of any library, about a file from anywhere
+        raise DatasetError(f"cannot be read ({error}): copy it again", file=path) from error
+
+
+def _reader_of(path: Path, columns: Sequence[str]) -> Callable[[Path], list[Recording]]:
+    name = path.name.lower()
+    if path.is_dir():
+        if (path / "meta" / "info.json").is_file():
+            text = "is a LeRobot dataset already: `hrc check`, `repair` and `merge` take it"
+            raise DatasetError(text, file=path)
+        return read_zarr if _is_zarr(path) else partial(_read_folder, columns=columns)
+    if not path.is_file():
+        raise DatasetError("not found", file=path)
+    for suffix, reader in READERS.items():
+        if name.endswith(suffix) or (suffix == ".tfrecord" and suffix in name):
+            named = reader in (_read_text, read_npy)
+            return partial(reader, columns=columns) if named else reader
+    if name.endswith(_VIDEOS):
+        raise DatasetError("is a video: name the folder that holds its states, too", file=path)
+    if name.endswith(_PICKLES):
+        text = "is a pickle, which can run any program when it is opened: save it as .npz"
+        raise DatasetError(text, file=path)
+    raise DatasetError(f"is of no kind that is read here: {', '.join(READERS)}", file=path)
+
+
+def _read_text(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
+    table = read_text_table(path, columns)
+    return split_episodes(path, {name: array_field(name, v) for name, v in table.items()})
+
+
+def read_parquet(path: Path) -> list[Recording]:
+    """Episodes of a Parquet file."""
+    table = read_parquet_table(path)
+    fields = {
+        name: bytes_field(values) if isinstance(values, list) else array_field(name, values)
+        for name, values in table.items()
+    }
+    return split_episodes(path, fields)
+
+
+def read_npy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
+    """Episodes of a .npy file, whose columns may be given names."""
+    if zipfile.is_zipfile(path):
+        raise DatasetError("holds several arrays: its name should end in .npz", file=path)
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except ValueError as error:
+        if "Python objects" in str(error):
+            raise DatasetError(_PICKLED, file=path) from error
+        raise
+    if array.dtype.names:  # a table of named columns
+        columns, array = array.dtype.names, np.stack([array[n] for n in array.dtype.names], -1)
+    if array.dtype.kind not in "fiub" or 0 in array.shape or array.ndim == 0:
+        text = f"an array of shape {array.shape} and type {array.dtype} holds no frames"
+        raise DatasetError(f"{text} of numbers", file=path)
+    if not columns:
+        return split_episodes(path, {UNNAMED: array_field(UNNAMED, array)})
+    if len(columns) != array.shape[-1]:
+        text = f"{len(columns)} column names for {array.shape[-1]} columns"
+        raise DatasetError(text, file=path)
+    fields = {}
+    for place, name in enumerate(columns):
+        one = array_field(name, array[..., place : place + 1])
+        fields[name] = replace(one, kind="other") if array.ndim == 3 else one
+    return split_episodes(path, fields)
+
+
+def read_npz(path: Path) -> list[Recording]:
+    """Episodes of a .npz file."""
+    fields: dict[str, Field] = {}
+    details: dict[str, Any] = {}
+    if not zipfile.is_zipfile(path):
+        np.load(path, allow_pickle=False)
+        raise DatasetError("holds a single array: its name should end in .npy", file=path)
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.namelist():
+            if not member.endswith(".npy"):
+                continue
+            with archive.open(member) as stream:
+                version = np.lib.format.read_magic(stream)
+                header: Any = np.lib.format.read_array_header_1_0
+                if version != (1, 0):
+                    header = np.lib.format.read_array_header_2_0
+                shape, _, dtype = header(stream)
+            name = member.removesuffix(".npy")
+            if dtype.hasobject:
+                raise DatasetError(_PICKLED, file=path, key=name)
+            if shape:
+                read = partial(_read_member, path, name)
+                fields[name] = make_field(name, shape, dtype, read)
+            else:
+                _attributes({name: _npz_member(path, name)[()]}, details)
+    return split_episodes(path, fields, **details)
+
+
+def _read_member(path: Path, name: str, start: int, stop: int) -> np.ndarray:
+    return _npz_member(path, name)[start:stop]
+
+
+@lru_cache(maxsize=8)
+def _npz_member(path: Path, name: str) -> np.ndarray:
+    with np.load(path, allow_pickle=False) as file:
+        return file[name]
+
+
+def read_hdf5(path: Path) -> list[Recording]:
+    """Episodes of an HDF5 file; links and data in other files are refused."""
+    import h5py
+
+    fields: dict[str, Field] = {}
+    details: dict[str, Any] = {}
+
+    def visit(group: h5py.Group) -> None:
+        _attributes(group.attrs, details)
+        for name, node in _nodes(path, group):
+            if isinstance(node, h5py.Group):
+                visit(node)
+            elif node.shape == ():
+                _attributes({name: node[()]}, details)
+            elif node.shape and 0 not in node.shape and not node.dtype.names:
+                _hdf5_field(path, node, fields)
+
+    with h5py.File(path, "r") as file:
+        visit(file)
+    return split_episodes(path, fields, **details)
+
+
+def _nodes(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
+    """Groups and datasets of a group.
+
+    Raises:
+        DatasetError: One is a link, or its data are in another file.
+    """
+    import h5py
+
+    for name in group:
+        place = f"{group.name}/{name}".strip("/")
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise DatasetError(_LINK, file=path, key=place)
+        node = group[name]
+        if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual):
+            raise DatasetError("is kept in another file: not opened", file=path, key=place)
+        yield name, node
+
+
+def _read_hdf5(path: Path, place: str, start: int, stop: int) -> np.ndarray:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        return file[place][start:stop]  # type: ignore[index]
+
+
+def _hdf5_field(path: Path, node: Any, fields: dict[str, Field]) -> None:
+    import h5py
+
+    place = node.name.strip("/")
+    read = partial(_read_hdf5, path, place)
+    if node.dtype.kind == "O":  # texts, or arrays of bytes of any length
+        kind = "encoded" if is_encoded(node[0]) else "text"
+        known = h5py.check_string_dtype(node.dtype) or h5py.check_vlen_dtype(node.dtype)
+        if known is not None:
+            fields[place] = Field(shape=node.shape[:1], kind=kind, read=read)
+        return
+    unit, names = (node.attrs.get(name, "") for name in ("units", "names"))
+    unit = unit.decode() if isinstance(unit, bytes) else str(unit)
+    known = len(node.shape) == 2 and np.size(names) == node.shape[1] > 1
+    words = [n.decode() if isinstance(n, bytes) else str(n) for n in names] if known else []
+    details = {"unit": unit_in_words(unit), "names": tuple(words) or None}
+    fields[place] = make_field(place, node.shape, node.dtype, read, **details)
+
+
+def _attributes(attributes: Mapping[str, Any], details: dict[str, Any]) -> None:
+    """Frame rate and task among the attributes of a group."""
+    for name, value in attributes.items():
+        text, key = value.decode() if isinstance(value, bytes) else value, name.lower()
+        with contextlib.suppress(TypeError, ValueError, AttributeError, ZeroDivisionError):
+            if name == "env_args":  # robomimic: settings of the simulator
+                _attributes(json.loads(text).get("env_kwargs", {}), details)
+            elif key in _TASKS and isinstance(text, str) and len(text) < 500:
+                details.setdefault("task", str(text))
+            elif key in (*_RATES, "dt"):
+                number = float(np.asarray(text).item())
+                details.setdefault("fps", 1 / number if key == "dt" else number)
+
+
+def _is_zarr(path: Path) -> bool:
+    return any((path / name).is_file() for name in (".zgroup", "zarr.json", ".zarray"))
+
+
+def read_zarr(path: Path) -> list[Recording]:
+    """Episodes of a zarr store, a folder or a .zip file; links and pickles are refused."""
+    import zarr
+    from zarr.storage import ZipStore
+
+    if path.is_dir():
+        for entry in path.rglob("*"):
+            if entry.is_symlink():
+                raise DatasetError(_LINK, file=entry)
+    store: Any = str(path) if path.is_dir() else ZipStore(path, mode="r")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # foreign files in the store
+        group = zarr.open_group(store, mode="r")
+        members = dict(group.members(max_depth=None))
+    fields: dict[str, Field] = {}
+    details: dict[str, Any] = {}
+    _attributes(dict(group.attrs), details)
+    for name, node in members.items():
+        if not isinstance(node, zarr.Array) or not node.shape or 0 in node.shape:
+            continue
+        if any("pickle" in str(c).lower() for c in (*node.filters, *node.compressors)):
+            raise DatasetError(_PICKLED, file=path, key=name)
+        read = partial(_read_zarr, node)
+        dtype = np.dtype(object) if node.dtype.kind == "O" else np.dtype(node.dtype)
+        fields[name] = make_field(name, node.shape, dtype, read)
+    return split_episodes(path, fields, **details)
+
+
+def _read_zarr(node: Any, start: int, stop: int) -> np.ndarray:
+    return np.asarray(node[start:stop])
+
+
+def read_mat(path: Path) -> list[Recording]:
+    """Episodes of a MATLAB file of version 5 or 7.3."""
+    from scipy.io import loadmat
+
+    try:
+        content: dict = loadmat(path, simplify_cells=True)
+    except NotImplementedError:  # version 7.3 is HDF5
+        content = _mat_of_hdf5(path)
+    fields: dict[str, Field] = {}
+    details: dict[str, Any] = {}
+    content = {k: v for k, v in content.items() if not k.startswith("__")}
+    _flatten(content, "", fields)
+    _attributes({k: v for k, v in content.items() if np.ndim(v) == 0}, details)
+    episodes = split_episodes(path, fields, **details)
+    return [replace(one, fields=_frames_first(one.fields)) for one in episodes]
+
+
+def _flatten(value: Any, place: str, fields: dict[str, Field]) -> None:
+    """Collect the arrays of nested structures and cells."""
+    if isinstance(value, np.ndarray) and value.dtype.hasobject:
+        value = list(value.ravel())
+    if isinstance(value, list):
+        value = {str(number): item for number, item in enumerate(value)}
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            _flatten(item, f"{place}/{name}".lstrip("/"), fields)
+    elif isinstance(value, np.ndarray) and value.size > 1 and value.dtype.kind in "fiub":
+        fields[place] = array_field(place, value)
+
+
+def _frames_first(fields: Mapping[str, Field]) -> dict[str, Field]:
+    """Arrays with their frames, of which most arrays have as many, along the first axis."""
+    lengths = [max(f.shape) for f in fields.values() if len(f.shape) <= 2]
+    frames = max(dict.fromkeys(lengths), key=lengths.count, default=0)
+    turned = {n: f for n, f in fields.items() if f.shape[1:] == (frames,)}
+    return {**fields, **{n: array_field(n, f.numbers().T) for n, f in turned.items()}}
+
+
+def _mat_of_hdf5(path: Path) -> dict[str, Any]:
+    """Content of a MATLAB file of version 7.3, whose arrays are kept transposed."""
+    import h5py
+
+    def value(node: Any) -> Any:
+        if isinstance(node, h5py.Group):
+            return {n: value(one) for n, one in _nodes(path, node) if not n.startswith("#")}
+        if h5py.check_ref_dtype(node.dtype) is not None:
+            return [value(node.file[ref]) for ref in np.ravel(node[()])]
+        return np.asarray(node[()]).T.squeeze() if node.dtype.kind in "fiub" else None
+
+    with h5py.File(path, "r") as file:
+        return value(file)
+
+
+def read_tfrecord(path: Path) -> list[Recording]:
+    """Episodes of an RLDS dataset, one record each, with the shapes in its `features.json`."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    description = path.parent / "features.json"
+    if description.is_file():
+        shapes = dict(_rlds_shapes(json.loads(description.read_text(encoding="utf-8")), ""))
+    episodes: list[Recording] = []
+    size, offset = path.stat().st_size, 0
+    with path.open("rb") as stream:
+        while offset < size:  # length, checksum, record, checksum
+            stream.seek(offset)
+            length = int.from_bytes(stream.read(8), "little")
+            if offset + 16 + length > size:
+                text = f"ends within record {len(episodes)}: copy it again"
+                raise DatasetError(text, file=path)
+            episodes.append(_rlds_episode(path, len(episodes), (offset + 12, length), shapes))
+            offset += 16 + length
+    return episodes
+
+
+def _rlds_episode(
+    path: Path, number: int, place: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]
+) -> Recording:
+    found, task, label = {}, "", f"record {number}"
+    steps = {n: v for n, v in _rlds_record(path, *place).items() if n.startswith("steps/")}
+    frames = min((len(values) for values in steps.values()), default=0)
+    for name, values in steps.items():
+        short = name.removeprefix("steps/")
+        if isinstance(values, list):
+            read = partial(_read_rlds, path, place, name)
+            found[short] = replace(bytes_field(values), read=read)
+            if short.split("/")[-1] in _TASKS:
+                task = task or values[0].decode(errors="replace")
+            continue
+        shape = shapes.get(name, (len(values) // max(frames, 1),))
+        if len(values) != frames * int(np.prod(shape)):
+            text = f"holds {len(values)} numbers for {frames} steps of shape {shape}"
+            raise DatasetError(text, file=path, key=f"{label}/{name}")
+        found[short] = array_field(name, values.reshape(frames, *shape))
+    return Recording(file=path, label=label, fields=found, task=task)
+
+
+def _read_rlds(
+    path: Path, place: tuple[int, int], name: str, start: int, stop: int
+) -> np.ndarray:
+    return np.array(_rlds_record(path, *place)[name][start:stop], dtype=object)
+
+
+@lru_cache(maxsize=2)
+def _rlds_record(path: Path, offset: int, length: int) -> dict[str, Any]:
+    """Values of one record: an array of numbers, or a list of bytes, for each feature."""
+    from tfrecord import example_pb2
+
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        content = stream.read(length)
+    example: Any = example_pb2.Example()  # type: ignore[attr-defined]
+    example.ParseFromString(content)
+    values: dict[str, Any] = {}
+    for name, feature in example.features.feature.items():
+        kind = feature.WhichOneof("kind")
+        items = getattr(feature, kind).value if kind else []
+        values[name] = [*items] if kind == "bytes_list" else np.array(items)
+    return values
+
+
+def _rlds_shapes(node: Any, place: str) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Shape of each feature in the description of a TensorFlow dataset."""
+    for name, inner in node.get("featuresDict", {}).get("features", {}).items():
+        yield from _rlds_shapes(inner, f"{place}/{name}".lstrip("/"))
+    if "sequence" in node:
+        yield from _rlds_shapes(node["sequence"]["feature"], place)
+    if "tensor" in node:
+        dimensions = node["tensor"].get("shape", {}).get("dimensions", [])
+        yield place, tuple(int(length) for length in dimensions)
+
+
+READERS: dict[str, Callable[..., list[Recording]]] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".log", ".dat"), _read_text),
+    ".npz": read_npz,
+    ".npy": read_npy,
+    ".parquet": read_parquet,
+    **dict.fromkeys((".hdf5", ".h5"), read_hdf5),
+    ".mat": read_mat,
+    ".zarr.zip": read_zarr,
+    ".tfrecord": read_tfrecord,
+}
+"""Reader of each suffix."""
+
+
+def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
+    """Episodes of a folder: files that count are episodes, others belong together.
+
+    A video belongs to the episode whose name it begins with.
+    """
+    entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+    entries.sort(key=lambda entry: natural(entry.name))
+    for entry in entries:
+        if entry.is_symlink():
+            raise DatasetError(_LINK, file=entry)
+    known = [
+        p for p in entries if p.name.lower().endswith((*READERS,)) or ".tfrecord" in p.name
+    ]
+    tables = [p for p in entries if p in known or (p.is_dir() and _is_zarr(p))]
+    videos = [p for p in entries if p.suffix.lower() in _VIDEOS]
+    if not tables:
+        folders = [p for p in entries if p.is_dir()]
+        if not folders:
+            raise DatasetError("holds no recording that is read here", file=path)
+        return [one for folder in folders for one in open_recordings(folder, columns)]
+    opened = [(table, open_recordings(table, columns)) for table in tables]
+    count = len({re.sub(r"\d+", "", table.name) for table in tables})
+    if count > 1 and all(len(found) == 1 for _, found in opened):
+        joined = {
+            table.stem if name == UNNAMED else f"{table.stem}/{name}": field
+            for table, (one,) in opened
+            for name, field in one.fields.items()
+        }
+        opened = [(path, [replace(opened[0][1][0], file=path, fields=joined)])]
+    episodes = []
+    for table, found in opened:
+        own = {
+            v.stem.removeprefix(table.stem).strip("_-. ") or v.stem: _video_field(v)
+            for v in videos
+            if len(opened) == 1 or re.match(rf"{re.escape(table.stem)}(?!\d)", v.stem)
+        }
+        if own and len(found) > 1:
+            raise DatasetError("holds several episodes, and the videos are of one", file=table)
+        episodes += [replace(one, fields=one.fields | own) for one in found]
+    return episodes
+
+
+def _video_field(path: Path) -> Field:
+    import av
+
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        rate = float(stream.average_rate or 0)
+        frames = stream.frames or round((container.duration or 0) / av.time_base * rate)
+        shape = (frames, stream.height, stream.width, 3)
+    # Images of videos are decoded one by one, and not through `read`.
+    empty = np.zeros(0, np.uint8)
+    return Field(shape=shape, kind="image", read=lambda a, b: empty, video=path, rate=rate)

@@ -1,0 +1,211 @@
+"""Fields of recordings presented as features of a dataset, so that its conventions apply."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from hrc_learn.demos.demonstration import JOINT_FIELDS
+from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.metadata import Feature
+from hrc_learn.demos.read.naming import (
+    is_hand,
+    joint_of,
+    meaning_of_component,
+    role_of_key,
+    without_unit,
+)
+from hrc_learn.demos.recording_files import UNNAMED, Field, Recording
+
+Place = tuple[str, int]
+"""Field and component."""
+
+_COMMAND = re.compile(
+    r"(?:^|(?<=[_./ ]))(?:actions?|qaction|cmd|command|commanded|commands|target|desired|des|"
+    r"setpoint|leader|master)(?=[_./ \d]|$)[_ ]?"
+)
+_STATE = re.compile(r"(?:low_dim_)?(?:states?|obs|observations?|proprio|agent_pos|robot_state)")
+_IGNORED = re.compile(
+    r"(?:next[_.]?)?(?:rewards?|dones?|terminals?|timeouts?|truncations?|discounts?)|success|mask|"
+    r"is_(?:first|last|terminal)|infos?|compress_len|frame(?:_?(?:index|number|id|nr))?|step|seq|"
+    r"index|task_index|episode.*|demo(?:_?id)?|traj.*|trial|run|.*_ends|next_.*"
+)
+"""Fields that count, or belong to a learner, or repeat the next frame."""
+_SYNONYMS = {
+    "qpos": "q actual_q joint_angles joint_angle joint_states robot_q arm_qpos",
+    "qvel": "dq qd qdot q_dot actual_qd",
+    "effort": "tau tau_j torques",
+    "eef_pos": "pos position positions xyz",
+    "eef_quat": "quat quaternion",
+    "tcp_pose": "pose poses o_t_ee",
+    "gripper": "gripper_state gripper_states gripper_opening",
+}
+_KEYS = {name: key for key, names in _SYNONYMS.items() for name in names.split()}
+"""Names of whole fields in recordings -> the names that datasets use."""
+_JOINT_NAME = re.compile(
+    r"(?:.*[._\- ])?(?:j|q|jnt|joint|axis|motor|servo|dof|theta|angle|a)[ _\-.]*\[?\d+\]?|"
+    r".*(?:shoulder|elbow|wrist|waist|forearm|upper_?arm|joint).*"
+)
+_MEASURED = re.compile(r"^(?:measured|meas|follower|puppet|obs|observation|state)[_. /]")
+_INDEXED = re.compile(r"(.*?)[_.\[ ]?(\d+)\]?")
+_OTHER_FRAME = re.compile(r"cam|trinsic|obj|goal|start")
+# ALOHA's `qpos`, `qvel`, `effort` and `action`: github.com/tonyzhaozh/act, record_episodes.py.
+_ALOHA_ARM = "waist shoulder elbow forearm_roll wrist_angle wrist_rotate gripper"
+_ALOHA = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in _ALOHA_ARM.split())
+
+
+def column_names(first: Recording, places: Sequence[Place]) -> tuple[str, ...]:
+    """A name for each column."""
+    names = []
+    for name, index in places:
+        one, last = first.fields[name], name.split("/")[-1]
+        counted = last if one.width == 1 else f"{last}_{index}"
+        names.append(one.names[index] if one.names else counted)
+    return tuple(names)
+
+
+class FieldSearch:
+    """Features for the numbers of an episode, and the fields that are none.
+
+    Attributes:
+        features: Features by key.
+        states: Vectors that are named as a state, but not by their content.
+        actions: The same for actions.
+        fingers: For each finger among the joints: True in a command, name, column.
+        two_fingers: Field with the positions of a gripper's two fingers, "" if there is none.
+        left_out: Field -> reason.
+    """
+
+    def __init__(self, first: Recording, hinted: bool):
+        """
+        Args:
+            first: The episode.
+            hinted: True if the caller named the columns: unknown ones are joints.
+        """
+        self._first, self._hinted = first, hinted
+        self.features: dict[str, Feature] = {}
+        self._places: dict[str, list[Place]] = {}
+        self.states: list[str] = []
+        self.actions: list[str] = []
+        self.fingers: list[tuple[bool, str, Place]] = []
+        self.two_fingers = ""
+        kinds = {"depth": "depth images are not written", "text": "text", "other": "no frames"}
+        kept = first.fields.items()
+        self.left_out = {name: kinds[one.kind] for name, one in kept if one.kind in kinds}
+
+    def add_fields(self, fields: Mapping[str, Field]) -> None:
+        """Add fields of numbers."""
+        wide = {n.split("/")[-1] for n, one in fields.items() if one.width == len(_ALOHA)}
+        table = []
+        for name, one in fields.items():
+            parts = name.lower().split("/")
+            if _IGNORED.fullmatch(parts[-1]) or any(part.startswith("next_") for part in parts):
+                self.left_out[name] = "counts, or is of a learner or the next frame"
+            elif one.width == 1 and len(parts) == 1:
+                table.append(name)
+            else:
+                aloha = {"qpos", "action"} <= wide and one.width == len(_ALOHA)
+                self._add_vector(name, one, _ALOHA if aloha else one.names)
+        self._add_table(table)
+
+    def _add(self, key: str, places: list[Place], names: tuple[str, ...] | None) -> None:
+        while key in self.features:
+            key = key.replace(".", ".other.", 1)
+        shape = (len(places),)
+        self.features[key] = Feature(key=key, dtype="float32", shape=shape, names=names)
+        self._places[key] = places
+
+    def _add_vector(self, name: str, one: Field, names: tuple[str, ...] | None) -> None:
+        *parents, last = re.split(r"[/.]", name.lower())
+        command = any(_COMMAND.search(part) for part in (*parents, last))
+        bare = _COMMAND.sub("", last).strip("_. ")
+        plain = re.sub(r"^(?:robot|arm)\d*_(?=\w)", "", bare)
+        key = self._canonical(name, _KEYS.get(plain, plain), one)
+        places = [(name, index) for index in range(one.width)]
+        if name in self.left_out:
+            return
+        if key == "tcp_pose" and one.width == 6:
+            # Angles about fixed axes, or a rotation vector?
+            self.left_out[f"{name}[3:6]"] = "name it euler_xyz or rotation_vector"
+            key, places = "eef_pos", places[:3]
+        if role_of_key(key) == "gripper" and one.width == 2 and not command:
+            self.two_fingers = name
+            return
+        of_joints = role_of_key(key) in JOINT_FIELDS
+        if names and (command or of_joints or _STATE.fullmatch(bare)):
+            hands = [i for i, label in enumerate(names) if is_hand(label)]
+            if role_of_key(key) in ("joint_position", None):
+                self.fingers += [(command, joint_of(names[i]), places[i]) for i in hands]
+            arm = [i for i in range(len(names)) if i not in hands]
+            places, names = [places[i] for i in arm], tuple(names[i] for i in arm)
+        elif not names and command and not bare:
+            self.actions.append(name)
+            return
+        elif not names and (_STATE.fullmatch(key) or key == UNNAMED):
+            self.states.append(name)
+            return
+        prefix = "action" if command else "observation"
+        group = [part for part in parents if not _COMMAND.search(part)]
+        whole = ".".join([prefix, *group, key])
+        if names and not role_of_key(key):
+            whole = "action" if command else "observation.state"
+        self._add(whole, places, names)
+
+    def _canonical(self, name: str, key: str, one: Field) -> str:
+        """Name that datasets use for a whole field."""
+        if one.shape[1:] == (4, 4) or (one.width == 16 and "pose" in key):
+            if _OTHER_FRAME.search(name.lower()):
+                self.left_out[name] = "transforms of another frame than the hand's"
+            return "tcp_pose"
+        if one.shape[1:] == (3, 3) and re.search(r"rot|orient|^r$|mat", key):
+            return "eef_rotation_matrix"
+        beside = f"{name.rpartition('/')[0]}/effort".lstrip("/")
+        if key == "eef_pos" and (one.width != 3 or beside in self._first.fields):
+            return "qpos" if one.width >= 3 else "state"  # ROS: position, velocity, effort
+        if key in ("ee", "eef", "cartesian_position", "end_effector", "end_effector_pose"):
+            return "tcp_pose"
+        return key
+
+    def _add_table(self, columns: Sequence[str]) -> None:
+        """Add the columns of a table, those that count as one vector."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for name in columns:
+            plain = _MEASURED.sub("", name.strip().lstrip("%").strip())
+            command = bool(_COMMAND.search(plain.lower()))
+            if command:
+                rest = _COMMAND.sub("", plain.lower()).strip("_. ")
+                plain = rest if rest and not rest.isdigit() else plain
+            match = _INDEXED.fullmatch(without_unit(plain)[0])
+            stem = (match[1] if match else plain).lower().strip("_. ")
+            key = _KEYS.get(re.sub(r"^(?:robot|arm)\d*_", "", stem), stem)
+            prefix = "action" if command else "observation"
+            if stem == "actual_tcp_pose" and match:  # of UR: a rotation vector
+                turn, slot = divmod(int(match[2]), 3)
+                plain = f"ee.{'w' if turn else ''}{'xyz'[slot]}"
+                groups.setdefault("observation.ee", []).append((name, plain))
+            elif role_of_key(key) in JOINT_FIELDS:
+                groups.setdefault(f"{prefix}.{key}", []).append((name, plain))
+            elif self._hinted or _names_joint(plain):
+                whole = "action" if command else "observation.state"
+                groups.setdefault(whole, []).append((name, plain))
+            else:
+                self.left_out[name] = "its name says nothing"
+        for key, members in groups.items():
+            names = tuple(plain for _, plain in members)
+            # Names that only count, as q_0 and target_q_0, say no more than their order.
+            counted = role_of_key(key) and all(map(_INDEXED.fullmatch, names))
+            self._add(key, [(n, 0) for n, _ in members], None if counted else names)
+
+    def explained(self, note: str) -> str:
+        """A note of the reader about the field instead of the feature."""
+        key, colon, text = note.partition(": ")
+        return f"{self._places[key][0][0]}{colon}{text}" if key in self._places else note
+
+    def located(self, selection: ColumnSelection) -> ColumnSelection:
+        """The selection with fields for features."""
+        columns = tuple(self._places[key][index] for key, index in selection.columns)
+        return replace(selection, columns=columns)
+
+
+def _names_joint(name: str) -> bool:
+    plain = without_unit(name)[0].lower()
+    return meaning_of_component(name) is not None or bool(_JOINT_NAME.fullmatch(plain))
