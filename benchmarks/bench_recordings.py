@@ -32,7 +32,7 @@ class Public:
     """File or folder below the folder of all."""
     licence: str
     expected: dict[str, str]
-    """Quantity -> unit on disk; "?" for columns that nothing documents, to be kept as recorded."""
+    """Quantity -> unit on disk; "?" for columns that nothing documents, kept as recorded."""
     options: ImportOptions = field(default_factory=ImportOptions)
     """What its user has to know and say."""
     columns: tuple[str, ...] = ()
@@ -122,7 +122,7 @@ class Args:
 
 
 def main(args: Args) -> int:
-    """Import all recordings, print a table, write the figures; status 1 if a column is wrong."""
+    """Import all recordings and count; status 1 if a column is wrong."""
     table = Table("recording", "licence", "right", "asked", "wrong", "episodes", "trained")
     total: Counter[str] = Counter()
     for public in RECORDINGS:

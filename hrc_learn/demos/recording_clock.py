@@ -134,7 +134,7 @@ def read_stamps(
 def _latest(
     recording: Recording, name: str, time: Float64[np.ndarray, " frames"], main: str
 ) -> Int64[np.ndarray, " frames"]:
-    """Latest frame of a field at each stamp of the state; -1 where there is none or an old one."""
+    """Latest frame of a field at each stamp of the state; -1 where there is none, or it is old."""
     one, own = recording.fields[name], recording.clock_of(name, main)
     length, lasts = one.frames, float(time[-1] - time[0])
     if own not in ("", main):
@@ -144,7 +144,7 @@ def _latest(
     elif one.rate:
         stamps = time[0] + np.arange(length) / one.rate
         if abs(length / one.rate - lasts) > 0.5 + 0.05 * lasts:
-            text = f"lasts {length / one.rate:.1f} s, the states {lasts:.1f} s: not the same"
+            text = f"lasts {length / one.rate:.1f} s, the states {lasts:.1f} s"
             raise recording.error(text, name)
     elif abs(length - len(time)) == 1:  # a last observation without an action, or the reverse
         return np.minimum(np.arange(len(time)), length - 1)
