@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import chain, islice, repeat
 from pathlib import Path
 
 import numpy as np
@@ -99,8 +100,8 @@ def write_folder(
     return root
 
 
-def one_step_of_act(root: Path) -> float:
-    """Loss of one training step of LeRobot's ACT on a dataset, by its own factory.
+def one_step_of_act(root: Path, steps: int = 1) -> float:
+    """Loss of the last training step of LeRobot's ACT on a dataset, by its own factory.
 
     ACT takes no state alone: where there are neither images nor a state of the environment, it
     sees the robot's state as that of the environment.
@@ -129,7 +130,7 @@ def one_step_of_act(root: Path) -> float:
         video_backend="pyav",
         delta_timestamps={"action": [k / fps for k in range(8)]},
     )
-    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=4)))
+    loader = torch.utils.data.DataLoader(dataset, batch_size=4, shuffle=True, drop_last=True)
     stats, state, around = (
         dataset.meta.stats,
         "observation.state",
@@ -139,14 +140,19 @@ def one_step_of_act(root: Path) -> float:
     if blind:
         shape = tuple(dataset.meta.features[state]["shape"])
         config.input_features = {around: PolicyFeature(type=FeatureType.ENV, shape=shape)}
-        batch[around], stats = batch[state], stats | {around: stats[state]}
+        stats = stats | {around: stats[state]}
     policy = make_policy(config, ds_meta=dataset.meta)
     assert any(f.type is FeatureType.ACTION for f in policy.config.output_features.values())
     preprocess, _ = make_pre_post_processors(config, dataset_stats=stats)
     optimizer = torch.optim.Adam(policy.parameters(), 1e-4)
-    loss, _ = policy.forward(preprocess(batch))
-    loss.backward()
-    optimizer.step()
+    loss = torch.zeros(())
+    for batch in islice(chain.from_iterable(repeat(loader)), steps):
+        if blind:
+            batch[around] = batch[state]
+        loss, _ = policy.forward(preprocess(batch))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
     return float(loss.detach())
 
 

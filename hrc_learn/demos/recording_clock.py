@@ -134,7 +134,7 @@ def read_stamps(
 def _latest(
     recording: Recording, name: str, time: Float64[np.ndarray, " frames"], main: str
 ) -> Int64[np.ndarray, " frames"]:
-    """Latest frame of a field at each stamp of the state; -1 where there is none, or it is old."""
+    """Latest frame of a field at each stamp of the state; -1 where it is none or old."""
     one, own = recording.fields[name], recording.clock_of(name, main)
     length, lasts = one.frames, float(time[-1] - time[0])
     if own not in ("", main):

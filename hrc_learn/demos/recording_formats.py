@@ -127,8 +127,10 @@ def read_npz(path: Path) -> list[Recording]:
     fields: dict[str, Field] = {}
     details: dict[str, Any] = {}
     if not zipfile.is_zipfile(path):
-        np.load(path, allow_pickle=False)
-        raise DatasetError("holds a single array: its name should end in .npy", file=path)
+        with path.open("rb") as stream:
+            single = stream.read(6) == b"\x93NUMPY"
+        text = "holds a single array: its name should end in .npy"
+        raise DatasetError(text if single else "cannot be read: it is damaged", file=path)
     with zipfile.ZipFile(path) as archive:
         for member in archive.namelist():
             if not member.endswith(".npy"):

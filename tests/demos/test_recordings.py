@@ -5,12 +5,13 @@ import json
 
 import numpy as np
 import pytest
-from lerobot_folders import joint_path
+from broken_copies import STATE
+from lerobot_folders import joint_path, one_step_of_act, read_info
 from scipy.spatial.transform import Rotation
 
-from hrc_learn.demos import DatasetError
+from hrc_learn.demos import DatasetError, ImageReader
 from hrc_learn.demos.recording_formats import open_recordings
-from hrc_learn.demos.recording_import import plan_import
+from hrc_learn.demos.recording_import import plan_import, write_plan
 from hrc_learn.demos.recording_meaning import ImportOptions
 
 TIME = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.004, 40))
@@ -485,3 +486,61 @@ def test_arrays_that_count_are_episodes(tmp_path):
     demos = read(tmp_path / "a.h5", fps=10)
     assert [len(demo) for demo in demos] == [30, 31]
     np.testing.assert_allclose(demos[1].joint_position, (Q + 1)[:31])
+
+
+def write_pusht(path):
+    import zarr
+
+    rng = np.random.default_rng(0)
+    group = zarr.open_group(str(path), mode="w", zarr_format=2)
+    group.create_array("data/state", data=rng.uniform(0, 500, (60, 5)).astype("f4"))
+    group.create_array("data/action", data=rng.uniform(0, 500, (60, 2)).astype("f4"))
+    group.create_array("data/img", data=rng.uniform(0, 255, (60, 32, 32, 3)).astype("f4"))
+    group.create_array("meta/episode_ends", data=np.array([25, 60]))
+
+
+def write_video_and_table(path):
+    import av
+
+    path.mkdir()
+    rows = np.column_stack([np.arange(40) / 20, Q])
+    np.savetxt(path / "run.csv", rows, delimiter=",", header="t,j1,j2,j3", comments="")
+    with av.open(str(path / "run_front.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for level in range(20):
+            image = np.full((48, 64, 3), 12 * level, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+def test_a_video_beside_a_table_is_a_camera_at_its_own_rate(tmp_path):
+    write_video_and_table(tmp_path / "run")
+    made = plan(tmp_path / "run")
+    write_plan(made, tmp_path / "set", "any", True)
+    assert made.meaning.cameras == {"front": "front"}
+    shown = ImageReader(tmp_path / "set").read(0)["observation.images.front"]
+    expected = 12.0 * np.minimum(np.arange(40) // 2, 19)
+    # The encoder rounds, twice.
+    np.testing.assert_allclose(shown.float().mean((1, 2, 3)), expected, atol=4)
+
+
+@pytest.mark.slow
+@pytest.mark.simulation
+@pytest.mark.parametrize(
+    ("name", "write", "options"),
+    [
+        ("aloha.hdf5", lambda path: write_hdf5(path, aloha()), {"fps": 50}),
+        ("lift.hdf5", robomimic, {}),
+        ("pusht.zarr", write_pusht, {"fps": 10}),
+        ("run", write_video_and_table, {}),
+        ("a.npz", lambda path: np.savez(path, q=Q, t=TIME), {}),
+    ],
+)
+def test_lerobot_trains_on_what_was_imported(tmp_path, name, write, options):
+    write(tmp_path / name)
+    write_plan(plan(tmp_path / name, **options), tmp_path / "set", "any", True)
+    features = read_info(tmp_path / "set")["features"]
+    seen = [key for key in features if key.startswith("observation.")]
+    assert all(key == STATE or key.startswith("observation.images.") for key in seen)
+    assert np.isfinite(one_step_of_act(tmp_path / "set", 20))
