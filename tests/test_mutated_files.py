@@ -19,13 +19,11 @@ from unchecked import shapes_unchecked
 from hrc_learn.demos import check_dataset, load_demos
 from hrc_learn.dmp import JointDMP
 from hrc_learn.geometry import Pose
-from hrc_learn.jacobian import RBFImageJacobian
 from hrc_learn.kinematics import arm
 from hrc_learn.kinematics.limits import read_limits
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.learning.model_choice import CHOICE, best_models
-from hrc_learn.skills.marker_sensor import MarkerAngle
-from hrc_learn.skills.visual_skill import VisualTarget
+from hrc_learn.skills.visual_skill import MarkerAngle, VisualTarget
 from hrc_learn.store import MANIFEST, changed_files, new_folder, read_made_by, write_json
 from hrc_learn.viz.report import Measurement, Report, read_report, write_report
 
@@ -82,10 +80,7 @@ def write_approach(folder: Path) -> None:
 
 
 def write_angle(folder: Path) -> None:
-    centre = torch.zeros(1, 2, dtype=torch.float64)
-    row = torch.ones(6, 1, dtype=torch.float64)
-    jacobian = RBFImageJacobian(centre, 1.0, weight=row)
-    MarkerAngle(jacobian=jacobian, offset=0.3, spread=0.01).save(folder)
+    MarkerAngle(offset=0.3, spread=0.01).save(folder / "angle.json")
 
 
 def write_results(folder: Path) -> None:
@@ -102,12 +97,10 @@ def load_dataset(folder: Path) -> None:
 TARGETS = {
     "target": Target(
         "visual_target.json",
-        lambda f: VisualTarget(offset=np.ones(3) / 9, error=0.5, focal=600.0).save(
-            f / "visual_target.json"
-        ),
+        lambda f: VisualTarget(offset=np.ones(3) / 9, error=0.5).save(f / "visual_target.json"),
         lambda f: VisualTarget.load(f / "visual_target.json"),
     ),
-    "angle": Target("angle.json", write_angle, MarkerAngle.load),
+    "angle": Target("angle.json", write_angle, lambda f: MarkerAngle.load(f / "angle.json")),
     "approach": Target(
         "approach.json", write_approach, lambda f: Approach.load(f / "approach.json")
     ),

@@ -312,7 +312,7 @@ class AdaptiveController(nn.Module):
         task_level = next_task_level(
             state.task_level, goals.posture, q, state.blending.active, dt, blend_time
         )
-        usable = observation.feature_visible & goals.vision_enabled & known
+        usable = visible = observation.feature_visible & goals.vision_enabled & known
         if goals.posture is not None:
             usable = usable & (task_level > 0)  # no vision during a joint-space approach
         blending, seen, stop = self.blending.step(
@@ -341,6 +341,13 @@ class AdaptiveController(nn.Module):
             potential_rate=potential_rate(feedback.s, J, v),
             safety=report,
         )
+        if goals.posture is not None:
+            # The approach, which vision does not guide, shows how the marker moves, too.
+            seen = visible & (self.blending.inside(observation.feature) >= 0)
+            if observation.feature_age is not None:
+                seen = seen & ~self.blending.late(observation.feature_age)
+            taught = torch.where(seen.unsqueeze(-1), observation.feature, blending.feature)
+            blending = replace(blending, feature=taught)
         seen = seen & ~stale & sound
         estimator = self._adapted(state, observation, pose, dt, seen, blending, feedback, sound)
         return command, ControllerState(

@@ -403,6 +403,17 @@ class VisionBlending(nn.Module):
             feature=torch.where(known.unsqueeze(-1), state.feature, fresh.feature),
         )
 
+    def late(self, age: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
+        """True where a measurement of an age [s] is too old."""
+        # NaN is an unknown age; an age far below zero means that the clocks differ.
+        return ~(age.abs() <= self.config.max_feature_age)
+
+    def inside(self, feature: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*batch"]:
+        """Distance to the nearest edge of the image [px]; NaN compares as not seen."""
+        points = feature.shape[-1] // 2
+        centre = self.centre if points == 1 else self.centre.repeat(points)
+        return (centre - (feature - centre).abs()).amin(-1)
+
     def step(
         self,
         state: BlendingState,
@@ -427,14 +438,9 @@ class VisionBlending(nn.Module):
         """
         stop = None
         if age is not None:
-            # NaN is an unknown age; an age far below zero means that the clocks differ.
-            late = ~(age.abs() <= self.config.max_feature_age)
-            stop = usable & late & state.active
-            usable = usable & ~late
-        # Distance to the nearest edge of the image; NaN compares as not seen.
-        points = feature.shape[-1] // 2
-        centre = self.centre if points == 1 else self.centre.repeat(points)
-        inside = (centre - (feature - centre).abs()).amin(-1)
+            stop = usable & self.late(age) & state.active
+            usable = usable & ~self.late(age)
+        inside = self.inside(feature)
         seen = usable & (inside >= 0)
         active = seen & (state.active | (inside >= self.config.hysteresis))
         level = fade(state.level, active, dt, self.config.blend_time)

@@ -2,6 +2,7 @@
 
 from hrc_learn.jacobian.camera_estimator import CameraConfig as CameraConfig
 from hrc_learn.jacobian.camera_estimator import CameraEstimator as CameraEstimator
+from hrc_learn.jacobian.camera_estimator import CameraSpread as CameraSpread
 from hrc_learn.jacobian.camera_estimator import CameraState as CameraState
 from hrc_learn.jacobian.camera_motion import CameraCorrection as CameraCorrection
 from hrc_learn.jacobian.camera_motion import CameraMotion as CameraMotion
@@ -38,6 +39,5 @@ from hrc_learn.jacobian.model_selection import maximize_evidence as maximize_evi
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian
 from hrc_learn.jacobian.perspective import CameraFit as CameraFit
 from hrc_learn.jacobian.perspective import MarkerCamera as MarkerCamera
-from hrc_learn.jacobian.perspective import depth_gradient as depth_gradient
 from hrc_learn.jacobian.perspective import fit_camera as fit_camera
 from hrc_learn.jacobian.perspective import unexplained as unexplained

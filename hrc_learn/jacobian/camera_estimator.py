@@ -136,10 +136,32 @@ class CameraState:
         """Posterior probability of each hypothesis."""
         return torch.softmax(-self.cost, dim=-1)
 
-    @property
-    def camera(self) -> Float[Tensor, "*batch 13"]:
-        """Most probable camera, in the name of a network's."""
-        return self.best
+    def spread(self) -> CameraSpread:
+        """Uncertainty of the estimate: all hypotheses, and steps of one deviation."""
+        best = self.best
+        covariance = self.covariance / 2 + self.covariance.mT / 2
+        values, vectors = torch.linalg.eigh(covariance)
+        steps = (vectors * values.clamp_min(0).sqrt().unsqueeze(-2)).mT
+        around = stepped(best.unsqueeze(-2).expand(steps.shape), steps)
+        samples = torch.cat([best.unsqueeze(-2), around, self.cameras], dim=-2)
+        weights = torch.cat([torch.ones_like(values), self.probability], dim=-1)
+        return CameraSpread(samples=samples, weights=weights)
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class CameraSpread:
+    """Cameras whose differences are the uncertainty of an estimate.
+
+    The variance of any function is the weighted sum of the squared differences of its values
+    from that for the first camera: linearised about the most probable camera, plus what other
+    hypotheses say.
+    """
+
+    samples: Float[Tensor, "*batch samples 13"]
+    """The most probable camera, then the others."""
+    weights: Float[Tensor, "*batch others"]
+    """Weight of each of the others."""
 
 
 class _Fit(NamedTuple):

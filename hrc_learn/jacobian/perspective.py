@@ -159,7 +159,7 @@ def rays(
 def on_plane(
     camera: Float[Tensor, "*batch 13"],
     pixel: Float[Tensor, "*batch 2"],
-    height: float | Float[Tensor, "*batch"],
+    height: float | Float[Tensor, ""],
 ) -> Float[Tensor, "*batch 3"]:
     """Points of a horizontal plane seen at pixels, in the base frame [m].
 
@@ -420,31 +420,6 @@ def _pinhole(
     u, _, vt = torch.linalg.svd(torch.stack([*(rows + xi[:, None] * axis), axis]))
     flip = torch.ones_like(depth) * torch.linalg.det(u @ vt)
     return u @ torch.diag(torch.stack([*u.new_ones(2), flip])) @ vt, depth
-
-
-def depth_gradient(
-    jacobian: Float[np.ndarray, "*batch 2 3"],
-    pixel: Float[np.ndarray, "*batch 2"],
-    focal: float,
-    center: Float[np.ndarray, "2"],
-) -> Float[np.ndarray, "*batch 3"]:
-    """Relative change of a point's depth with its position, g = r_3 / z [1/m].
-
-    Args:
-        jacobian: Derivative of the point's pixel by its position [px/m].
-        pixel: Pixel of the point [px].
-        focal: Focal length [px].
-        center: Centre of the image [px].
-    """
-    xi = (pixel - center) / focal
-    square = 1 + (xi**2).sum(-1)
-    size = np.maximum((jacobian**2).sum((-2, -1)) / focal**2, _TINY)
-    depth = np.asarray(np.sqrt((1 + square) / size))
-    rows = depth[..., None, None] * jacobian / focal
-    ray = np.cross(rows[..., 0, :], rows[..., 1, :])
-    axis = (ray - (xi[..., None, :] @ rows)[..., 0, :]) / square[..., None]
-    axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), _TINY)
-    return axis / depth[..., None]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,5 @@
 """Visual servoing skills of demonstrations: image Jacobian, target in the image, approach."""
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,10 +27,10 @@ from hrc_learn.jacobian import (
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.learning.large_datasets import LazyMap
-from hrc_learn.skills.marker_sensor import AngleDemonstration, MarkerAngle
 from hrc_learn.skills.visual_skill import (
     ANGLE_FEATURE,
     OBJECT_FEATURE,
+    MarkerAngle,
     VisualServoSkill,
     VisualTarget,
 )
@@ -81,16 +80,15 @@ def fit_visual_servo(
         motion=float(held_out.motion.square().sum(-1).mean().sqrt()),
         held_out_error=float(held_out.error.square().sum(-1).mean().sqrt()),
     )
-    cells = held_out.by_cell()
-    ends = _ends(demos, network)
-    focal = float(camera.camera[0].exp())
+    ends = _ends(demos)
+    target = _visual_target(ends, camera.camera) if ends else None
     return VisualServoSkill(
         jacobian=network,
-        target=_visual_target(ends, focal) if ends else None,
+        target=target,
         approach=Approach.fit([end.path for end in ends]) if ends else None,
-        angle=_marker_angle([end.angle for end in ends if end.angle is not None]),
+        angle=None if target is None else _marker_angle(ends, camera.camera, target),
         learned=learned,
-        cells=cells,
+        cells=held_out.by_cell(),
     )
 
 
@@ -129,20 +127,17 @@ class _End(NamedTuple):
     """Final state of a demonstration, at rest above the object."""
 
     object_pixel: Float[np.ndarray, "2"]
-    tool_pixel: Float[np.ndarray, "2"]
-    jacobian: Float[np.ndarray, "2 6"]
+    pose: Pose
     path: Pose
-    orientation: Tensor
-    angle: AngleDemonstration | None
+    angle: float | None
 
 
-def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
+def _ends(demos: Demonstrations) -> list[_End]:
     """Final states of all demonstrations, or none if no object was observed."""
     ends, without = [], []
-    network = copy.deepcopy(network).double()
     for demo in demos:
         if OBJECT_FEATURE in demo.extra:
-            ends.append(_end(demo, demos.source, network))
+            ends.append(_end(demo, demos.source))
         else:
             without.append(demo.episode)
     if ends and without:
@@ -152,7 +147,7 @@ def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
     return ends
 
 
-def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
+def _end(demo: Demonstration, source: str) -> _End:
     """Final state of a demonstration, averaged over the rest at its end."""
     watched = _watched(demo, source)
     at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
@@ -162,42 +157,35 @@ def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
             f"{source}, episode {demo.episode}: the end effector's marker is not visible in "
             f"the last {_REST} s, at rest above the object. Leave this episode out."
         )
-    with torch.no_grad():
-        jacobian = network(watched.pose[last]).mean(dim=0)
+    angles = demo.extra.get(ANGLE_FEATURE)
+    place = watched.pose.position[last].mean(dim=0)
     return _End(
         object_pixel=demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0),
-        tool_pixel=watched.feature[last].mean(dim=0).numpy(),
-        jacobian=jacobian.numpy(),
+        pose=Pose(place, watched.pose.orientation[last[-1]]),
         path=watched.pose,
-        orientation=watched.pose.orientation[last[-1]],
-        angle=_angles(demo, watched, int(last[-1])),
+        angle=None if angles is None else float(angles[int(last[-1]), 1]),
     )
 
 
-def _angles(
-    demo: Demonstration, watched: ImageDemonstration, last: int
-) -> AngleDemonstration | None:
-    """Directions of the markers along a demonstration; None if they were not recorded."""
-    if ANGLE_FEATURE not in demo.extra:
+def _poses(ends: Sequence[_End]) -> Pose:
+    return Pose(
+        torch.stack([end.pose.position for end in ends]),
+        torch.stack([end.pose.orientation for end in ends]),
+    )
+
+
+def _visual_target(ends: Sequence[_End], camera: Float[Tensor, "13"]) -> VisualTarget:
+    objects = np.array([end.object_pixel for end in ends], dtype=np.float64)
+    return VisualTarget.fit(camera, objects, _poses(ends))
+
+
+def _marker_angle(
+    ends: Sequence[_End], camera: Float[Tensor, "13"], target: VisualTarget
+) -> MarkerAngle | None:
+    """Learned direction of the object's marker; None if it was not recorded."""
+    known = [end for end in ends if end.angle is not None and np.isfinite(end.angle)]
+    if not known:
         return None
-    tool, item = torch.from_numpy(demo.extra[ANGLE_FEATURE]).double().T
-    return AngleDemonstration(
-        pose=watched.pose,
-        tool=torch.where(watched.visible, tool, torch.nan),
-        item=float(item[last]),
-        final=float(tool[last]),
-    )
-
-
-def _marker_angle(demonstrations: Sequence[AngleDemonstration]) -> MarkerAngle | None:
-    return MarkerAngle.fit(demonstrations) if demonstrations else None
-
-
-def _visual_target(ends: Sequence[_End], focal: float) -> VisualTarget:
-    return VisualTarget.fit(
-        np.array([end.object_pixel for end in ends]),
-        np.array([end.tool_pixel for end in ends]),
-        np.array([end.jacobian for end in ends]),
-        torch.stack([end.orientation for end in ends]),
-        focal,
-    )
+    objects = np.array([end.object_pixel for end in known], dtype=np.float64)
+    angles = [end.angle for end in known if end.angle is not None]
+    return MarkerAngle.fit(camera, objects, angles, _poses(known), target)

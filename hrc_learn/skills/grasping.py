@@ -22,7 +22,7 @@ from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
-from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill, from_learned
+from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill, camera_estimator
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
     MissedGraspError,
@@ -151,7 +151,7 @@ class Grasping:
         self._table = _TableHeight()
         controller = AdaptiveController(
             cell.chain,
-            from_learned(skill.jacobian),
+            camera_estimator(skill.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=replace(config.controller, safety=cell.watchful(cell.config.safety)),
         )

@@ -17,9 +17,10 @@ from torch import Tensor
 
 from hrc_learn.controller import Goals
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import CameraSpread
 from hrc_learn.protocols import DrawnRegion, HumanInput
 from hrc_learn.regions import OrientationRegion, PositionRegion
-from hrc_learn.skills.visual_skill import VisualTarget
+from hrc_learn.skills.visual_skill import VisualTarget, object_heading
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 
@@ -271,7 +272,7 @@ class DrawnGoals:
 class VisualServoConfig:
     """Tolerances, time limits and regions of visual servoing."""
 
-    tolerance: float = 2.0
+    tolerance: float = 1.5
     """Distance of the feature from the target that counts as reached [px]."""
     dwell: float = 0.4
     """Time at the target until it counts as reached [s]."""
@@ -283,24 +284,16 @@ class VisualServoConfig:
     """Give up after this long [s]."""
     occlusion_timeout: float = 10.0
     """Give up after the end effector's marker is undetected for this long [s]."""
+    object_error: float = 0.0025
+    """Predicted error above the object below which the gripper may descend [m], one standard
+    deviation in the plane; until then the end effector probes."""
     probe: float = 0.06
-    """Height above the box from which the end effector descends into it, along the line from
-    the object's marker to its own [m]; 0: no descent. The motion shows the controller how that
-    line appears to a camera that may have been moved, and so the target on it. The remaining
-    way to the object is four times as long, and multiplies the error of the descent."""
-    probe_speed: float = 0.05
-    """Speed of that descent [m/s]: the highest at which the camera can guide it along the
-    line."""
+    """Height of a probe: the end effector rises and comes back, which shows the camera how its
+    marker moves in height [m]."""
     probe_tolerance: float = 10.0
-    """Distance of the feature from the target at which the descent begins [px]."""
-    probe_correction: float = 0.003
-    """Correction of the end effector after a descent above which the descent is repeated [m]:
-    half the required accuracy above an object."""
-    probe_deviation: float = 0.012
-    """Sideways deviation of the first descent above which it is repeated [m]: a motion in
-    another direction is less informative about the line."""
+    """Distance of the feature from the target at which a probe turns round [px]."""
     max_probes: int = 5
-    """Largest number of descents."""
+    """Largest number of probes."""
     border: float = 80.0
     """Distance of the target from the border of the image [px]; within 50 px, a marker is cut
     off."""
@@ -385,7 +378,7 @@ class ServoTarget:
     """Joint positions there, approached in joint space [rad]; None: approached by the
     Cartesian regions."""
     visual: VisualTarget
-    """Offset from the object's marker to the end effector's."""
+    """Place of the object's marker in the tool frame."""
     item: Float[np.ndarray, "2"]
     """Pixel of the object's marker [px]."""
     angle: float | None = None
@@ -397,52 +390,57 @@ class ServoTarget:
     rest: Float[Tensor, " joints"] | None = None
     """Posture to which the null space returns [rad]; None: it stays where it is."""
     raised: float = 0.0
-    """Present height above the box, along the line [m]."""
-    kept_jacobian: Float[np.ndarray, "2 6"] | None = None
-    """Image Jacobian of a target that stays where it is while an estimate learns; None: it
-    follows the estimate."""
+    """Present height above the box [m]."""
+    kept_camera: Float[Tensor, "13"] | None = None
+    """Camera of a target that stays where it is while an estimate learns; None: it follows the
+    estimate."""
 
-    def goals(
-        self, image_jacobian: Float[np.ndarray, "2 6"], pose: Pose, *, detected: bool = True
-    ) -> Goals:
-        """Goals from an estimate of the image Jacobian at a pose of the end effector."""
+    def goals(self, camera: Float[Tensor, "13"], pose: Pose, *, detected: bool = True) -> Goals:
+        """Goals from an estimate of the camera, for the present pose of the end effector."""
         # A camera that was moved may not see above the box until the marker is detected.
-        offset = torch.from_numpy(self._offset(self.raised if detected else 0.0))
+        offset = torch.tensor([0.0, 0.0, self.raised if detected else 0.0], dtype=torch.float64)
         above = Pose(self.above.position + offset, self.tool_orientation)
-        goals = self.config.goals(above, self.pixel(image_jacobian, pose), detected=detected)
+        goals = self.config.goals(above, self.pixel(camera, pose), detected=detected)
         return goals.approached_by(self.posture)
 
-    def pixel(
-        self, image_jacobian: Float[np.ndarray, "2 6"], pose: Pose
-    ) -> Float[np.ndarray, "2"]:
-        """Target of the marker with the end effector on the line at its present height [px]."""
-        # Within the box the gripper moves straight down, not along the line: millimetres of
-        # remaining height must not move it sideways.
-        height = float(pose.position[2] - self.above.position[2]) - self.config.half_size[2]
-        pixel = self.raised_pixel(image_jacobian, min(max(height, 0.0), self.config.probe))
-        return self.config.within(pixel) if self.raised else pixel
+    def pixel(self, camera: Float[Tensor, "13"], pose: Pose) -> Float[np.ndarray, "2"]:
+        """Target of the marker with the end effector at its present height [px].
 
-    def raised_pixel(
-        self, image_jacobian: Float[np.ndarray, "2 6"], height: float
-    ) -> Float[np.ndarray, "2"]:
-        """Target pixel of the marker with the end effector on the line at a height [m]."""
-        if self.kept_jacobian is not None:
-            return self.visual(self.item, self.kept_jacobian, self.tool_orientation)
+        Right above the object at any height, so that millimetres of remaining height do not
+        move the gripper sideways.
+        """
+        camera = camera if self.kept_camera is None else self.kept_camera
+        height = pose.position[2].clamp(min=self.lowest)
         return self.visual(
-            self.item, image_jacobian, self.tool_orientation, self._offset(height)
-        )
+            camera, torch.from_numpy(self.item), self.demonstrated, height
+        ).numpy()
 
-    def deviation(self, pose: Pose, before: Pose) -> float:
-        """Sideways distance of a pose from the line through an earlier one [m]."""
-        moved = (pose.position - before.position).numpy()
-        return float(np.linalg.norm((moved - self._offset(moved[2]))[:2]))
+    def uncertainty(
+        self, cameras: CameraSpread, image_jacobian: Float[np.ndarray, "2 6"]
+    ) -> float:
+        """Predicted error above the object, standard deviation in the plane [m]."""
+        item = torch.from_numpy(self.item)
+        return self.visual.uncertainty(cameras, image_jacobian, item, self.demonstrated)
+
+    def heading(self, camera: Float[Tensor, "13"]) -> float | None:
+        """Heading of the object's marker in the base frame [rad]; None without a direction."""
+        if self.angle is None:
+            return None
+        offset = quaternion.rotate(self.tool_orientation, torch.from_numpy(self.visual.offset))
+        height = float(self.above.position[2] + offset[2])
+        return object_heading(camera, torch.from_numpy(self.item), self.angle, height)
+
+    @property
+    def lowest(self) -> float:
+        """Lower wall of the box [m]."""
+        return float(self.above.position[2]) - self.config.half_size[2]
+
+    @property
+    def demonstrated(self) -> Pose:
+        """Height where demonstrations end, and the orientation of the end effector."""
+        return Pose(self.above.position, self.tool_orientation)
 
     @property
     def tool_orientation(self) -> Float[Tensor, "4"]:
         """Orientation of the end effector."""
         return self.above.orientation if self.orientation is None else self.orientation
-
-    def _offset(self, height: float) -> Float[np.ndarray, "3"]:
-        """Offset along the line at a height above its start [m]."""
-        line = self.visual.line(self.tool_orientation)
-        return height / line[2] * line

@@ -4,8 +4,7 @@
 controller; `VisualServo` runs it in a work cell until the marker is at its target.
 """
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -25,25 +24,25 @@ from hrc_learn.controller import (
 )
 from hrc_learn.controller.joint_path import changed_rate
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import Measurement
+from hrc_learn.jacobian import CameraEstimator, CameraSpread
+from hrc_learn.kinematics.tool_orientation import turn_about_vertical
 from hrc_learn.protocols import HumanInput
-from hrc_learn.skills.marker_sensor import (
-    AngleState,
-    MarkerAngle,
-    MarkerConsistency,
-    MarkerObservation,
-)
+from hrc_learn.skills.marker_sensor import MarkerConsistency, MarkerObservation
 from hrc_learn.skills.servo_target import (
     DrawnGoals,
     DrawnGoalsState,
     ServoTarget,
     VisualServoConfig,
 )
+from hrc_learn.skills.visual_skill import MarkerAngle
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 # Fractions of the probe's height, tried until its upper end is well within the image.
 _PROBE_FRACTIONS = np.array([1.0, 0.75, 0.5])
+# Predicted error above the object beyond which the gripper does not turn for it yet [m]: the
+# camera may be turned in a wholly different way.
+_LOST = 0.03
 _NOT_SEEN = np.full(2, np.nan)
 
 
@@ -87,10 +86,12 @@ class ServoState:
     """State of the controller, with its estimate of the image Jacobian."""
     drawn: DrawnGoalsState
     """A person's drawing and turn."""
-    angle: AngleState | None
-    """Estimate of the marker's direction; None: the gripper does not turn."""
+    camera: Float[Tensor, "13"]
+    """Estimate of the camera and its marker (see `jacobian.perspective`)."""
     image_jacobian: Float[np.ndarray, "2 6"]
     """Estimate at the pose of the newest image [px/m, px/rad]."""
+    chosen_turn: float | None = None
+    """Chosen turn of the present motion [rad]; None: none so far."""
     image_jacobian_time: float = np.nan
     """Time of the image of that estimate [s]."""
     wanted_orientation: Float[Tensor, "4"] | None = None
@@ -162,11 +163,17 @@ class ServoStep:
             controller: The adaptive controller.
             marker: ArUco number of the end effector's marker.
             config: Tolerances and regions.
-            angle: Learned direction of the marker in the image; None: the gripper does not
-                turn.
+            angle: Demonstrated turn relative to the object; None: the gripper does not turn.
             refusal: Reason why the arm cannot go to a pose requested by a person, in words for
                 them; empty if it can.
+
+        Raises:
+            ValueError: The controller estimates no camera.
         """
+        if not isinstance(controller.estimator, CameraEstimator):
+            raise ValueError(
+                "servoing to an object needs the camera: give the controller a CameraEstimator."
+            )
         self.controller, self.chain = controller, controller.chain
         self.marker, self.config = marker, config or VisualServoConfig()
         self._angle = angle
@@ -174,10 +181,11 @@ class ServoStep:
 
     def initial_state(self, joints: Float[Tensor, " joints"]) -> ServoState:
         """State of an arm at rest at joint positions [rad]."""
+        controller = self.controller.initial_state(joints)
         return ServoState(
-            controller=self.controller.initial_state(joints),
+            controller=controller,
             drawn=self._drawn.initial_state(),
-            angle=None if self._angle is None else self._angle.initial_state(),
+            camera=controller.estimator.best,
             image_jacobian=np.zeros((2, 6)),
             last_pixel=_NOT_SEEN,
         )
@@ -196,14 +204,11 @@ class ServoStep:
             controller = replace(controller, estimator=resumed)
         counts = controller.safety.counts
         controller = replace(controller, safety=replace(motion, counts=counts))
-        angle = state.angle
-        if self._angle is not None and angle is not None:
-            angle = self._angle.restarted(angle)
         return replace(
             state,
             controller=controller,
-            angle=angle,
             drawn=self._drawn.restarted(state.drawn),
+            chosen_turn=None,
             wanted_orientation=None,
             goal_orientation=None,
             detected=False,
@@ -211,28 +216,16 @@ class ServoStep:
         )
 
     def observed(self, state: ServoState, reading: ServoReading) -> ServoState:
-        """State with the image Jacobian at the newest image, estimated once an image."""
+        """State with the camera and the image Jacobian at the newest image."""
         if reading.markers.time == state.image_jacobian_time:
             return state
-        pose = self.chain.forward(reading.image_joints)
-        estimate = self.controller.estimator.jacobian(state.controller.estimator, pose)
+        pose, estimate = self.chain.forward(reading.image_joints), state.controller.estimator
         return replace(
-            state, image_jacobian=estimate.numpy(), image_jacobian_time=reading.markers.time
+            state,
+            camera=estimate.best,
+            image_jacobian=self.controller.estimator.jacobian(estimate, pose).numpy(),
+            image_jacobian_time=reading.markers.time,
         )
-
-    def learned(
-        self, state: ServoState, target: ServoTarget, high: Measurement, low: Measurement
-    ) -> ServoState:
-        """State that has learned the appearance of the line from both ends of a descent."""
-        descent = (high.pose.position - low.pose.position).numpy()
-        gradient = target.visual.depth_gradient(state.image_jacobian, low.feature.numpy())
-        # Distance of both ends in an image without perspective.
-        apart = (1 + float(gradient @ descent)) * (high.feature - low.feature)
-        high = replace(high, feature=low.feature + apart)
-        estimator = self.controller.estimator
-        compared = estimator.compared(state.controller.estimator, high, low)
-        controller = replace(state.controller, estimator=compared)
-        return replace(state, controller=controller, image_jacobian_time=np.nan)
 
     def step(
         self, state: ServoState, reading: ServoReading, target: ServoTarget
@@ -289,8 +282,13 @@ class ServoStep:
         self, state: ServoState, reading: ServoReading, target: ServoTarget
     ) -> float:
         """Distance of the feature from its target [px]; NaN if it is not detected."""
-        pixel = self.tool_target(state, target).pixel(state.image_jacobian, reading.pose)
+        pixel = self.tool_target(state, target).pixel(state.camera, reading.pose)
         return float(np.linalg.norm(self.feature(reading) - pixel))
+
+    def uncertainty(self, state: ServoState, target: ServoTarget) -> float:
+        """Predicted error above the object, standard deviation in the plane [m]."""
+        spread: CameraSpread = state.controller.estimator.spread()
+        return self.tool_target(state, target).uncertainty(spread, state.image_jacobian)
 
     def turn_error(self, state: ServoState, pose: Pose, target: ServoTarget) -> float:
         """Angle between the end effector's orientation and the wanted one [rad]."""
@@ -301,7 +299,9 @@ class ServoStep:
         """Largest height of a probe with its marker well within the image [m]."""
         turned = self.tool_target(state, target)
         for height in self.config.probe * _PROBE_FRACTIONS:
-            pixel = turned.raised_pixel(state.image_jacobian, float(height))
+            up = torch.tensor([0.0, 0.0, float(height)], dtype=torch.float64)
+            raised = Pose(turned.above.position + up, turned.tool_orientation)
+            pixel = turned.pixel(state.camera, raised)
             if np.array_equal(self.config.within(pixel), pixel):
                 return float(height)
         return float(self.config.probe * _PROBE_FRACTIONS[-1])
@@ -337,20 +337,17 @@ class ServoStep:
         self, state: ServoState, reading: ServoReading, target: ServoTarget
     ) -> ServoState:
         """State with the orientation for the object, from a new image."""
-        markers = reading.markers
-        angle = markers.angles.get(self.marker)
-        if self._angle is None or target.angle is None or angle is None:
+        if self._angle is None or target.angle is None or not state.detected:
             return state
-        assert state.angle is not None
-        pose = self.chain.forward(reading.image_joints)
-        elapsed = markers.time - state.last_image
-        learned = self._angle.updated(
-            state.angle, pose, angle, elapsed if math.isfinite(elapsed) else 0.0
-        )
-        wanted, learned = self._angle.turned(
-            learned, pose, angle, target.angle, target.above.orientation, target.turn_range
-        )
-        return replace(state, angle=learned, wanted_orientation=wanted)
+        if self.uncertainty(state, target) > _LOST:
+            return state
+        heading, reference = target.heading(state.camera), target.above.orientation
+        assert heading is not None
+        now = turn_about_vertical(reading.pose.orientation, reference)
+        chosen = self._angle.turn(heading, reference, now, target.turn_range, state.chosen_turn)
+        about = quaternion.exp(reference.new_tensor([0.0, 0.0, chosen]))
+        wanted = quaternion.multiply(about, reference)
+        return replace(state, chosen_turn=chosen, wanted_orientation=wanted)
 
     def _turned_further(
         self, state: ServoState, target: ServoTarget, feature: Float[np.ndarray, "2"], dt: float
@@ -380,7 +377,7 @@ class ServoStep:
             # A person's pull, or a turn for the object, moves the joints far from the posture:
             # that must not restart the approach, not even while the marker is out of view.
             target = replace(target, posture=None)
-        planned = target.goals(state.image_jacobian, reading.pose, detected=state.detected)
+        planned = target.goals(state.camera, reading.pose, detected=state.detected)
         pushed = reading.effort.any()
         scale = float(changed_rate(state.posture_gain_scale, float(not pushed), reading.dt))
         if scale > 0:
@@ -426,37 +423,30 @@ class VisualServo:
         self.state = law.initial_state(cell.joints)
 
     def servo_to(self, target: ServoTarget) -> float:
-        """Bring the marker to the target, first from higher up, along a line.
+        """Bring the marker to the target, and probe until the target is certain.
 
         Returns:
             Duration [s].
 
         Raises:
-            MissedGraspError: It takes too long, or the marker stays undetected.
+            MissedGraspError: It takes too long, the marker stays undetected, or the error above
+                the object stays too uncertain.
         """
         begun, start, config = self._cell.time, self._clock, self._config
         self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
-        if config.probe == 0:
-            return self._converge(target, config.tolerance, start)[0] - begun
-        reached = begun
-        for probe in range(config.max_probes):
-            self._read()
-            raised = replace(target, raised=self._law.probe_height(self.state, target))
-            _, high = self._converge(raised, config.probe_tolerance, start)
-            above = self._cell.pose
-            self._descend(raised)
-            _, low = self._converge(target, config.tolerance, start)
-            before = self._cell.pose
-            if high is not None and low is not None:
-                self.state = self._law.learned(self.state, target, high, low)
-            reached, _ = self._converge(target, config.tolerance, start)
-            # Along the line of the turned tool, which differs from that of the unturned one.
-            turned = self._law.tool_target(self.state, target)
-            moved = self._cell.pose.position - before.position
-            along = probe > 0 or turned.deviation(before, above) < config.probe_deviation
-            if along and float(moved[:2].norm()) < config.probe_correction:
-                break
-        return reached - begun
+        for probe in range(config.max_probes + 1):
+            reached = self._converge(target, config.tolerance, start, config.dwell)
+            error = self._law.uncertainty(self.state, target)
+            if error <= config.object_error:
+                return reached - begun
+            if probe < config.max_probes:
+                raised = replace(target, raised=self._law.probe_height(self.state, target))
+                self._converge(raised, config.probe_tolerance, start, 0.0)
+        raise MissedGraspError(
+            f"visual servoing: after {config.max_probes} probes the end effector may still be "
+            f"{1e3 * error:.1f} mm off the object, more than {1e3 * config.object_error:.1f}: "
+            "see that the camera stands still and the marker is in view."
+        )
 
     def hold(self, target: ServoTarget, duration: float) -> None:
         """Keep the end effector at its place in the image while a person moves the null space.
@@ -468,7 +458,7 @@ class VisualServo:
         end = self._cell.time + duration
         # Learning during the hold must not move the target; a turn by the person must.
         self._read()
-        held = replace(target, kept_jacobian=self.state.image_jacobian)
+        held = replace(target, kept_camera=self.state.camera)
         self.state = replace(
             self.state,
             wanted_orientation=self.state.goal_orientation,
@@ -494,40 +484,28 @@ class VisualServo:
         )
 
     def _converge(
-        self, target: ServoTarget, tolerance: float, start: float
-    ) -> tuple[float, Measurement | None]:
-        """Step until marker and height have stayed at the target.
-
-        Returns:
-            Time of arrival [s], and the mean measurement at rest; None without one.
-        """
+        self, target: ServoTarget, tolerance: float, start: float, dwell: float
+    ) -> float:
+        """Step until marker and height have stayed at the target; returns the time [s]."""
         cell, config, law = self._cell, self._config, self._law
-        reached = cell.time
+        reached, on_target = cell.time, False
         self.state = replace(self.state, last_detection=reached)
-        seen: dict[float, tuple[Pose, Tensor]] = {}
-        while cell.time - reached < config.dwell:
+        while not on_target or cell.time - reached < dwell:
             if law.out_of_view(self.state, cell.time):
                 self.state = replace(self.state, detected=False)
             self._step(target)
             reading = self._read()
             height = float(reading.pose.position[2] - target.above.position[2])
-            at_height = abs(height - target.raised) < config.height_tolerance
-            turned = law.turn_error(self.state, reading.pose, target) < config.turn_tolerance
-            on_target = law.pixel_error(self.state, reading, target) < tolerance
-            if not (on_target and not self.state.drawn.away and at_height and turned):
+            on_target = abs(height - target.raised) < config.height_tolerance
+            on_target &= (
+                law.turn_error(self.state, reading.pose, target) < config.turn_tolerance
+            )
+            on_target &= law.pixel_error(self.state, reading, target) < tolerance
+            on_target &= not self.state.drawn.away
+            if not on_target:
                 reached = cell.time
-                seen.clear()
-            elif reading.markers.joints is not None:
-                pose = cell.chain.forward(reading.markers.joints)
-                seen[reading.markers.time] = pose, torch.from_numpy(law.feature(reading))
             self._check_timeouts(target, self._clock - start)
-        return reached, _mean(list(seen.values()))
-
-    def _descend(self, target: ServoTarget) -> None:
-        """Descend along the line from the height of the target."""
-        begun, speed = self._clock, self._config.probe_speed
-        while (height := target.raised - speed * (self._clock - begun)) > 0:
-            self._step(replace(target, raised=height))
+        return reached
 
     def _step(self, target: ServoTarget) -> None:
         """Take one step and execute its command."""
@@ -580,14 +558,3 @@ class VisualServo:
                 f"visual servoing: after {spent:.0f} s the marker is still "
                 f"{self.error(target):.1f} px from its target (NaN: not detected)."
             )
-
-
-def _mean(seen: Sequence[tuple[Pose, Float[Tensor, "2"]]]) -> Measurement | None:
-    """Mean of frames at rest; None if no frame shows the feature."""
-    known = [(pose, feature) for pose, feature in seen if bool(feature.isfinite().all())]
-    if not known:
-        return None
-    poses, features = zip(*known, strict=True)
-    # At rest the orientations differ only by noise, too small to matter.
-    pose = Pose(torch.stack([p.position for p in poses]).mean(0), poses[-1].orientation)
-    return Measurement.seen(pose, torch.stack(features).mean(0))

@@ -1,18 +1,16 @@
 """Learned model of visual servoing: image Jacobian, approach direction, and visual target.
 
-The visual target is the pixel of the end effector's marker when the end effector is right above
-an object. The markers of end effector and object are at different heights and positions, so the
-target is not the object's pixel. With an uncalibrated camera the offset has to be learned: each
-demonstration ends with the end effector right above an object, and gives one pair of pixels.
-
-The offset is a vector in space, fixed to the tool, which turns with the object. The image
-Jacobian, which adapts to a camera that has been moved, projects it into the image, with the
-perspective of a camera whose focal length was learned. Without perspective the offset appears a
-few percent too long or too short once the camera has been turned by 10 degrees.
+Demonstrations end with the end effector right above an object. The target is the place of the
+object's marker in the tool frame there, learned from the pixels of both markers. In a new scene
+the camera, as estimated then, turns the object's pixel into a ray; the ray meets the height
+at which the demonstrations found objects; and the end effector belongs where the object has the
+learned place. The target in the image is the pixel of the end effector's marker there, so
+errors of calibration that move both markers alike cancel.
 """
 
 import copy
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,20 +20,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
+    CameraEstimator,
+    CameraSpread,
     CellErrors,
     EvidenceResult,
-    KalmanConfig,
-    KalmanEstimator,
     RBFImageJacobian,
-    depth_gradient,
 )
-from hrc_learn.jacobian.perspective import FOCAL, SHIFT
+from hrc_learn.jacobian.perspective import (
+    FOCAL,
+    MARKER,
+    SHIFT,
+    SIZE,
+    marker_pixels,
+    on_plane,
+)
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.skills.marker_sensor import MarkerAngle
-from hrc_learn.store import Metres, Pixels, read_json, write_json
-from hrc_learn.vision.camera_model import IMAGE_SIZE
+from hrc_learn.store import Metres, Pixels, Radians, read_json, write_json
 
 OBJECT_FEATURE = "observation.object_feature"
 """Dataset column with the object's marker in the image."""
@@ -43,64 +45,52 @@ OBJECT_FEATURE_NAMES = ("u", "v", "visible")
 ANGLE_FEATURE = "observation.marker_angle"
 """Dataset column with the directions of both markers in the image [rad]."""
 ANGLE_FEATURE_NAMES = ("tool", "object")
-UP = np.array([0.0, 0.0, 1.0])
-LONGEST_OFFSET = 0.3
-"""Longest offset of the end effector's marker from the object's [m]. A few demonstrations in a
-flat box teach the image Jacobian little about height: without this bound the least-squares
-offset can be metres long."""
+LONGEST_OFFSET = 0.4
+"""Longest offset of the object's marker from the tool centre point [m]. Demonstrations at one
+place hardly show the height of the object: without this bound it could be metres."""
+HALF_TURN = math.pi
+"""Period of the turn of a parallel grasp [rad]."""
 
-# Largest ratio of the depths of both markers: a bound while the image Jacobian is uncertain.
-_MAX_DEPTH_RATIO = 1.5
-
-POSE_NOISE = 1.5e-4
-"""Standard deviation of a pose from encoders with noise of 1e-4 rad on levers of up to 0.8 m,
-for the estimator of the image Jacobian [m]."""
-PIXEL_NOISE = 0.15
-"""Standard deviation of a marker's centre [px]: 0.08 px for the detector, more in noisy and
-blurred images."""
+# Steps of the fit of the offset, each from a closed form: perspective changes it slightly.
+_STEPS = 8
+# Offset from which the fit starts: below the end effector [m].
+_BELOW = (0.0, 0.0, 0.1)
+# Distance in the image along a marker's direction whose ends are followed to the table [px].
+_ALONG = 20.0
+# Distance from the range within which a chosen turn is kept [rad]: the error of its estimate
+# while the camera is uncertain.
+_KEPT = 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
 class _TargetFile:
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     offset_m: tuple[Metres, Metres, Metres]
     error_px: Pixels | None
-    focal_px: Pixels | None = None
-
-    def __post_init__(self) -> None:
-        if self.focal_px is not None and self.focal_px <= 0:
-            raise ValueError(f"focal_px must be positive, got {self.focal_px}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class VisualTarget:
-    """Offset from the object's marker to the end effector's marker right above it."""
+    """Place of the object's marker in the frame of a tool right above it."""
 
     offset: Float[np.ndarray, "3"]
-    """Offset in the tool frame [m]. Without a focal length, it is that of an image without
-    perspective."""
+    """Place in the tool frame [m]."""
     error: float
     """Leave-one-out error, root mean square [px]; NaN with fewer than five demonstrations."""
-    focal: float | None = None
-    """Focal length of the camera [px]; None: no perspective."""
 
     @classmethod
     def fit(
         cls,
+        camera: Float[Tensor, "13"],
         objects: Float[np.ndarray, "demos 2"],
-        tools: Float[np.ndarray, "demos 2"],
-        jacobians: Float[np.ndarray, "demos 2 6"],
-        orientations: Float[Tensor, "demos 4"],
-        focal: float | None = None,
+        poses: Pose,
     ) -> "VisualTarget":
         """Fit to the ends of demonstrations.
 
         Args:
+            camera: Camera of the demonstrations (see `jacobian.perspective`).
             objects: Pixels of the object's marker [px].
-            tools: Pixels of the end effector's marker right above it [px].
-            jacobians: Image Jacobians of that marker there [px/m, px/rad].
-            orientations: Orientations of the end effector there.
-            focal: Focal length of the camera [px]; None: no perspective.
+            poses: Poses of the end effector right above it, (demos,).
 
         Raises:
             ValueError: There are fewer than three demonstrations.
@@ -109,72 +99,82 @@ class VisualTarget:
             raise ValueError(
                 f"the visual target needs three or more demonstrations, got {len(objects)}."
             )
-        apart, rows = tools - objects, jacobians[..., :3]
-        if focal is not None:
-            # apart = J o / (1 - g o) is also linear in the offset o.
-            rows = rows + apart[..., :, None] * _gradient(rows, tools, focal)[..., None, :]
-        design = rows @ quaternion.to_matrix(orientations).numpy()
-        offset, error = _solved(design.reshape(-1, 3), apart)
-        return cls(offset=offset, error=error, focal=focal)
+        offset, error = np.array(_BELOW), math.nan
+        for _ in range(_STEPS):
+            # The camera sees the object as a marker on the tool.
+            carrying = torch.cat([camera[: MARKER.start], torch.from_numpy(offset)])
+            seen, slope = marker_pixels(carrying, poses)
+            design = slope[..., MARKER].numpy()
+            towards = objects - seen.numpy() + design @ offset
+            offset, error = _solved(design.reshape(-1, 3), towards)
+        return cls(offset=offset, error=error)
+
+    def tool_position(
+        self,
+        camera: Float[Tensor, "*batch 13"],
+        pixel: Float[Tensor, "2"],
+        above: Pose,
+    ) -> Float[Tensor, "*batch 3"]:
+        """Place of a tool right above an object [m].
+
+        Args:
+            camera: Cameras.
+            pixel: Pixel of the object's marker [px].
+            above: Orientation of the tool, and its height where demonstrations end.
+        """
+        offset = quaternion.rotate(above.orientation, torch.from_numpy(self.offset))
+        height = above.position[2] + offset[2]
+        return on_plane(camera, pixel.expand(*camera.shape[:-1], 2), height) - offset
 
     def __call__(
         self,
-        pixel: Float[np.ndarray, "2"],
-        jacobian: Float[np.ndarray, "2 6"],
-        orientation: Float[Tensor, "4"],
-        further: Float[np.ndarray, "3"] | None = None,
-    ) -> Float[np.ndarray, "2"]:
+        camera: Float[Tensor, "*batch 13"],
+        pixel: Float[Tensor, "2"],
+        above: Pose,
+        height: float | Float[Tensor, ""] | None = None,
+    ) -> Float[Tensor, "*batch 2"]:
         """Target pixel of the end effector's marker for an object's marker at `pixel` [px].
 
         Args:
+            camera: Cameras.
             pixel: Pixel of the object's marker [px].
-            jacobian: Estimated image Jacobian of the end effector's marker [px/m, px/rad].
-            orientation: Orientation of the end effector at the target.
-            further: Offset of the target from right above the object, base frame [m]; None:
-                none.
+            above: Orientation of the tool, and its height where demonstrations end.
+            height: Height of the tool now [m]; None: that of `above`.
         """
-        offset = self._in_base(orientation)
-        if further is not None:
-            offset = offset + further
-        apart = jacobian[:, :3] @ offset
-        seen = pixel + apart
-        # Depth depends slightly on the pixel: two iterations are within a tenth of a pixel.
-        for _ in range(2):
-            nearer = 1 - float(self.depth_gradient(jacobian, seen) @ offset)
-            seen = pixel + apart / min(max(nearer, 1 / _MAX_DEPTH_RATIO), _MAX_DEPTH_RATIO)
-        return seen
+        place = self.tool_position(camera, pixel, above)
+        if height is not None:
+            level = torch.as_tensor(height).to(place).expand(place.shape[:-1])
+            place = torch.cat([place[..., :2], level[..., None]], dim=-1)
+        orientation = above.orientation.expand(*place.shape[:-1], 4)
+        one = Pose(place.unsqueeze(-2), orientation.unsqueeze(-2))
+        return marker_pixels(camera, one)[0].squeeze(-2)
 
-    def depth_gradient(
-        self, jacobian: Float[np.ndarray, "2 6"], pixel: Float[np.ndarray, "2"]
-    ) -> Float[np.ndarray, "3"]:
-        """Relative change of the marker's depth with its position [1/m]; 0 without perspective.
+    def uncertainty(
+        self,
+        cameras: CameraSpread,
+        image_jacobian: Float[np.ndarray, "2 6"],
+        pixel: Float[Tensor, "2"],
+        above: Pose,
+    ) -> float:
+        """Standard deviation of the tool's place above the object, root of both axes [m].
+
+        The image closes the loop, so what counts is the error of the target pixel.
 
         Args:
-            jacobian: Image Jacobian of the end effector's marker [px/m, px/rad].
-            pixel: Pixel of that marker [px].
+            cameras: Estimate of the camera.
+            image_jacobian: Image Jacobian of the end effector's marker [px/m, px/rad].
+            pixel: Pixel of the object's marker [px].
+            above: Orientation of the tool, and its height where demonstrations end.
         """
-        if self.focal is None:
-            return np.zeros(3)
-        return _gradient(jacobian[:, :3], pixel, self.focal)
-
-    def line(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
-        """Direction from the object's marker to the end effector's above it, base frame.
-
-        Straight up for no offset, and for one flatter than 30 degrees, which a few
-        demonstrations do not distinguish from noise.
-        """
-        offset = self._in_base(orientation)
-        length = np.linalg.norm(offset)
-        return UP if offset[2] <= 0.5 * length else offset / length
-
-    def _in_base(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
-        return quaternion.rotate(orientation, torch.from_numpy(self.offset)).numpy()
+        best, *others = self(cameras.samples, pixel, above)
+        apart = (torch.stack(others) - best).numpy()
+        metres = np.linalg.lstsq(image_jacobian[:, :2], apart.T, rcond=None)[0]
+        return float(np.sqrt(cameras.weights.numpy() @ (metres**2).sum(0)))
 
     def save(self, path: Path) -> None:
         """Write a JSON file, atomically."""
         x, y, z = self.offset.tolist()
-        content = _TargetFile(offset_m=(x, y, z), error_px=self.error, focal_px=self.focal)
-        write_json(path, content)
+        write_json(path, _TargetFile(offset_m=(x, y, z), error_px=self.error))
 
     @classmethod
     def load(cls, path: Path) -> "VisualTarget":
@@ -186,16 +186,7 @@ class VisualTarget:
         """
         content = read_json(path, _TargetFile, "fit the visual target again")
         error = math.nan if content.error_px is None else content.error_px
-        return cls(offset=np.array(content.offset_m), error=error, focal=content.focal_px)
-
-
-def _gradient(
-    jacobian: Float[np.ndarray, "*batch 2 3"],
-    pixel: Float[np.ndarray, "*batch 2"],
-    focal: float,
-) -> Float[np.ndarray, "*batch 3"]:
-    """Relative change of depth with position [1/m], principal point in the image's middle."""
-    return depth_gradient(jacobian, pixel, focal, np.array(IMAGE_SIZE) / 2)
+        return cls(offset=np.array(content.offset_m), error=error)
 
 
 def _solved(
@@ -235,6 +226,139 @@ def _solved(
 
 
 @dataclass(frozen=True, kw_only=True)
+class _AngleFile:
+    version: Literal[2] = 2
+    offset_rad: Radians
+    spread_rad: Radians
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerAngle:
+    """Demonstrated turn of the end effector relative to the object's marker."""
+
+    offset: float
+    """Heading of the tool's x axis less that of the marker's, modulo half turns [rad]."""
+    spread: float
+    """Root mean square deviation of the offset among the demonstrations [rad]."""
+
+    @classmethod
+    def fit(
+        cls,
+        camera: Float[Tensor, "13"],
+        objects: Float[np.ndarray, "demos 2"],
+        angles: Sequence[float],
+        poses: Pose,
+        target: VisualTarget,
+    ) -> "MarkerAngle":
+        """Learn the offset from the ends of demonstrations.
+
+        Args:
+            camera: Camera of the demonstrations.
+            objects: Pixels of the object's marker [px].
+            angles: Directions of that marker in the image [rad].
+            poses: Poses of the end effector right above it, (demos,).
+            target: Place of the object in the tool frame.
+
+        Raises:
+            ValueError: There is no demonstration.
+        """
+        if not len(angles):
+            raise ValueError("the direction of a marker needs one demonstration or more.")
+        differences = []
+        for pixel, direction, k in zip(objects, angles, range(len(angles)), strict=True):
+            place = poses[k].apply(torch.from_numpy(target.offset))
+            seen = object_heading(camera, torch.from_numpy(pixel), direction, float(place[2]))
+            differences.append(_heading(poses[k].orientation) - seen)
+        # The mean of angles modulo half turns is half the mean of their doubles.
+        offset = float(np.angle(np.exp(2j * np.array(differences)).mean())) / 2
+        off = np.array([_wrapped(d - offset) for d in differences])
+        return cls(offset=offset, spread=float(np.sqrt((off**2).mean())))
+
+    def turn(
+        self,
+        heading: float,
+        reference: Float[Tensor, "4"],
+        now: float,
+        turn_range: tuple[float, float],
+        chosen: float | None,
+    ) -> float:
+        """Turn about the vertical that aligns a tool with an object [rad].
+
+        Args:
+            heading: Heading of the object's marker (see `object_heading`) [rad].
+            reference: Orientation of a tool that is not turned.
+            now: Present turn of the tool [rad].
+            turn_range: Smallest and largest turn [rad]. Of turns that differ by half turns, the
+                nearest one in the range is chosen, and kept while it is not far out of the
+                range: near an end of the range, noise would otherwise turn the tool back and
+                forth.
+            chosen: Turn chosen before; None: none.
+        """
+        return _within(heading + self.offset - _heading(reference), now, turn_range, chosen)
+
+    def save(self, path: Path) -> None:
+        """Write a JSON file, atomically."""
+        write_json(path, _AngleFile(offset_rad=self.offset, spread_rad=self.spread))
+
+    @classmethod
+    def load(cls, path: Path) -> "MarkerAngle":
+        """Read a saved direction.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged, or has an unknown version.
+        """
+        content = read_json(path, _AngleFile, "fit it again")
+        return cls(offset=content.offset_rad, spread=content.spread_rad)
+
+
+def object_heading(
+    camera: Float[Tensor, "13"], pixel: Float[Tensor, "2"], angle: float, height: float
+) -> float:
+    """Heading in the base frame of a marker that lies flat [rad].
+
+    Args:
+        camera: Camera.
+        pixel: Pixel of the marker [px].
+        angle: Its direction in the image [rad].
+        height: Its height [m].
+    """
+    along = _ALONG * pixel.new_tensor([math.cos(angle), math.sin(angle)])
+    ends = torch.stack([pixel - along, pixel + along])
+    start, end = on_plane(camera.expand(2, SIZE), ends, height)
+    x, y, _ = (end - start).tolist()
+    return math.atan2(y, x)
+
+
+def _heading(orientation: Float[Tensor, "4"]) -> float:
+    """Heading of a tool's x axis in the horizontal plane [rad]."""
+    x, y, _ = quaternion.to_matrix(orientation)[:, 0].tolist()
+    return math.atan2(y, x)
+
+
+def _within(
+    turn: float, now: float, turn_range: tuple[float, float], chosen: float | None
+) -> float:
+    """Turn in the range that equals `turn` modulo half turns.
+
+    The one nearest to the present turn; the one chosen before, if it is nearly in the range.
+    """
+    low, high = turn_range
+    candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
+    if chosen is not None:
+        same = min(candidates, key=lambda c: abs(c - chosen))
+        if low - _KEPT <= same <= high + _KEPT:
+            return same
+    inside = [c for c in candidates if low <= c <= high]
+    return min(inside or [min(max(turn, low), high)], key=lambda c: abs(c - now))
+
+
+def _wrapped(angle: float) -> float:
+    """An angle modulo half turns, within a quarter turn of zero [rad]."""
+    return float((angle + HALF_TURN / 2) % HALF_TURN - HALF_TURN / 2)
+
+
+@dataclass(frozen=True, kw_only=True)
 class VisualServoSkill:
     """Skill learned from demonstrations of visual servoing."""
 
@@ -252,14 +376,14 @@ class VisualServoSkill:
     """Held-out errors by cell of a grid; None for a loaded skill."""
 
     def save(self, folder: Path) -> None:
-        """Write `jacobian`, `visual_target.json`, `approach.json` and `angle` in a folder."""
+        """Write `jacobian`, `visual_target.json`, `approach.json` and `angle.json`."""
         self.jacobian.save(folder / "jacobian")
         if self.target is not None:
             self.target.save(folder / "visual_target.json")
         if self.approach is not None:
             self.approach.save(folder / "approach.json")
         if self.angle is not None:
-            self.angle.save(folder)
+            self.angle.save(folder / "angle.json")
 
     @classmethod
     def load(cls, folder: Path) -> "VisualServoSkill":
@@ -270,11 +394,12 @@ class VisualServoSkill:
             ValueError: A file has an unknown version or kind.
         """
         target, approach = folder / "visual_target.json", folder / "approach.json"
+        angle = folder / "angle.json"
         return cls(
             jacobian=RBFImageJacobian.load(folder / "jacobian"),
             target=VisualTarget.load(target) if target.exists() else None,
             approach=Approach.load(approach) if approach.exists() else None,
-            angle=MarkerAngle.load(folder) if (folder / "angle").exists() else None,
+            angle=MarkerAngle.load(angle) if angle.exists() else None,
         )
 
     def metrics(self) -> dict[str, float]:
@@ -322,15 +447,10 @@ class VisualServoSkill:
         return values
 
 
-def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
-    """Kalman filter that starts from the learned Jacobian with the wide prior of a guess.
+def camera_estimator(learned: RBFImageJacobian) -> CameraEstimator:
+    """Online estimate of a camera that may have been moved since the demonstrations.
 
-    The camera may have been moved since the fit, which the covariance of the fit does not
-    cover.
+    Raises:
+        ValueError: The model has no camera.
     """
-    network = copy.deepcopy(learned).double()
-    network.covariance = None
-    config = KalmanConfig(
-        pose_noise=POSE_NOISE, pixel_noise=PIXEL_NOISE, watched_drift=10.0, max_step=0.1
-    )
-    return KalmanEstimator(network, config)
+    return CameraEstimator(copy.deepcopy(learned).double())

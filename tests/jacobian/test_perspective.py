@@ -1,4 +1,4 @@
-"""A camera found from motion, and depth from image Jacobians, against OpenCV's camera."""
+"""A camera found from motion, against OpenCV's."""
 
 from dataclasses import replace
 
@@ -18,7 +18,6 @@ from hrc_learn.jacobian import (
     Measurement,
     RBFCenters,
     RBFImageJacobian,
-    depth_gradient,
     fit_camera,
 )
 from hrc_learn.jacobian.perspective import (
@@ -48,26 +47,6 @@ def seen(points, rotation, shift, focal):
     # A point that moves by d moves the camera's frame by R d.
     by_shift = jacobian[:, 3:6].reshape(-1, 2, 3)
     return pixels[:, 0], by_shift @ cv2.Rodrigues(rotation)[0]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_depth_gradient_predicts_points_far_away(seed):
-    rng = np.random.default_rng(seed)
-    rotation, shift = camera(rng)
-    points, offset = rng.uniform(-0.2, 0.2, (20, 3)), np.array([0.1, -0.15, -0.2])
-    pixels, jacobians = seen(points, rotation, shift, 1700.0)
-    gradient = depth_gradient(jacobians, pixels, 1700.0, CENTER)
-    depth_ratio = 1 + gradient @ offset
-    far = pixels + (jacobians @ offset) / depth_ratio[:, None]
-    expected, _ = seen(points + offset, rotation, shift, 1700.0)
-    np.testing.assert_allclose(far, expected, atol=1e-8)
-    # Without perspective the prediction is off by far more than a detector's noise.
-    assert np.abs(pixels + jacobians @ offset - expected).max() > 5
-
-
-def test_of_an_unknown_camera_depth_is_the_same_everywhere():
-    gradient = depth_gradient(np.zeros((2, 3)), CENTER, 1700.0, CENTER)
-    np.testing.assert_array_equal(gradient, np.zeros(3))
 
 
 def demonstration(rng, rotation, shift, focal, marker, frames=200, noise=0.1):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from seen_cameras import camera_network, camera_vector
 from unchecked import shapes_unchecked
 
 from hrc_learn.experiments.grasping_experiment import (
@@ -31,7 +32,6 @@ from hrc_learn.experiments.grasping_trial import (
 from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.protocols import DrawnRegion
@@ -41,7 +41,6 @@ from hrc_learn.skills import MissedGraspError, grasping
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig
 from hrc_learn.skills.placing import check_plan
-from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
@@ -53,28 +52,17 @@ WORKPLACE = Workplace()
 
 @pytest.fixture(scope="module")
 def skill():
-    """What the camera as it stood would teach, without noise: its Jacobian in the middle."""
+    """What the camera as it stood would teach, without noise."""
     camera, item = WORKPLACE.scene.camera, WORKPLACE.scene.objects[0]
     world, hover = World(WORKPLACE.scene), WORKPLACE.hover()
     world.reset(WORKPLACE.home_joints().numpy())
-    offset = torch.from_numpy(world.hand_marker_offset())
+    vector = camera_vector(camera, world.hand_marker_offset())
     steps = torch.tensor([[0.0, 0, 0], [0.08, 0, 0], [0, 0.06, 0], [-0.06, -0.05, 0]]).double()
     hand = Pose(hover.position + steps, hover.orientation.expand(4, 4))
-    marker = hand.apply(offset).numpy()
     on_top = hand.position.numpy().copy()
     on_top[:, 2] = 2 * item.half_size[2]
-    jacobians = camera.image_jacobian(marker, hand.position.numpy())
-    network = RBFImageJacobian.from_jacobian(
-        torch.from_numpy(jacobians[0]), paper_grid().double(), 0.1
-    )
-    target = VisualTarget.fit(
-        camera.project(on_top),
-        camera.project(marker),
-        jacobians,
-        hand.orientation,
-        focal=camera.focal[0],
-    )
-    return VisualServoSkill(jacobian=network, target=target)
+    target = VisualTarget.fit(vector, camera.project(on_top), hand)
+    return VisualServoSkill(jacobian=camera_network(vector), target=target)
 
 
 def turned(degrees, seed=0):
@@ -116,9 +104,11 @@ def succeeded(run):
 
 
 def test_the_image_jacobian_is_wrong_at_first_and_right_at_the_descent(grasp):
-    first, last = jacobian_errors(grasp)
-    assert first > 0.5
-    assert last < 0.2
+    _, last = jacobian_errors(grasp)
+    assert last < 0.02
+    known = grasp.cell.log["image_jacobian"][..., :3]
+    known = known[np.isfinite(known).all(axis=(1, 2))]
+    assert np.linalg.norm(known[0] - known[-1]) > 0.5 * np.linalg.norm(known[-1])
 
 
 def test_feedback_goes_from_joint_space_to_the_image(grasp):
@@ -179,15 +169,15 @@ def test_a_missed_grasp_is_begun_anew(skill):
     class Astray(VisualTarget):
         """Misses the object by a hand's breadth until it has looked twice."""
 
-        def __call__(self, pixel, jacobian, orientation, further=None):
-            seen = super().__call__(pixel, jacobian, orientation, further)
+        def __call__(self, camera, pixel, above, height=None):
+            seen = super().__call__(camera, pixel, above, height)
             if not tries or np.allclose(pixel, tries[0], atol=1e-12):
                 tries[:] = [pixel]
-                return seen + np.array([0.0, 150.0])
+                return seen + torch.tensor([0.0, 150.0]).double()
             return seen
 
     known = skill.target
-    target = Astray(error=known.error, offset=known.offset, focal=known.focal)
+    target = Astray(error=known.error, offset=known.offset)
     with shapes_unchecked():
         run = grasped(replace(skill, target=target), turned(0.0))
     assert run.result is not None
@@ -268,53 +258,16 @@ def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
 
 
 @pytest.mark.slow
-def test_coming_down_along_the_line_finds_the_object_by_any_camera(skill):
+def test_the_gripper_comes_down_right_above_the_object_by_any_camera(skill):
     """Cameras moved, tilted and turned by any angle."""
-
-    def runs(**servo):
-        grasping = GraspingConfig(servo=VisualServoConfig(**servo))
-        for seed in (1, 12, 19, 27):
-            rng = np.random.default_rng(seed)
-            trial = simulate_grasp(
-                skill,
-                GraspingScene.draw(WORKPLACE, config, rng),
-                camera="synthetic",
-                config=grasping,
-                rng=np.random.default_rng([seed, 1]),
-            )
-            yield trial
-
     config = GraspingSceneConfig(random_camera=True)
     with shapes_unchecked():
-        descended, straight = list(runs()), list(runs(probe=0.0))
-    assert all(succeeded(run) for run in descended)
-    error = max(descent(run)[0] for run in descended)
-    assert error < 5
-    assert error < 0.5 * max(descent(run)[0] for run in straight)
-
-
-def test_a_hand_that_comes_down_along_the_line_stays_on_it():
-    line = np.array([0.3, -0.2, 1.0])
-    line /= np.linalg.norm(line)
-    hover = WORKPLACE.hover()
-    back = quaternion.conjugate(hover.orientation)
-    offset = quaternion.rotate(back, torch.from_numpy(line)).numpy()
-    target = ServoTarget(
-        config=VisualServoConfig(),
-        above=hover,
-        posture=None,
-        visual=VisualTarget(offset=offset, error=math.nan),
-        item=np.zeros(2),
-    )
-
-    def hand(along, aside=(0.0, 0.0, 0.0)):
-        moved = along * line + np.array(aside)
-        return Pose(hover.position + torch.from_numpy(moved), hover.orientation)
-
-    assert target.deviation(hand(0.0), hand(0.03)) == pytest.approx(0.0, abs=1e-12)
-    assert target.deviation(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
-    there = hand(0.0, (0.012, 0.005, 0.0))
-    assert target.deviation(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)
+        for seed in (1, 12, 19, 27):
+            drawn = GraspingScene.draw(WORKPLACE, config, np.random.default_rng(seed))
+            run = grasped(skill, drawn)
+            assert succeeded(run)
+            assert descent(run)[0] < 3
+            assert run.result.servo_time < 15
 
 
 def unled_cell(world: World, **settings: Any) -> WorkCell:

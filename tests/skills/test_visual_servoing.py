@@ -6,15 +6,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from seen_cameras import camera_network, camera_vector
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import AdaptiveController, Goals
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import FixedEstimator, Measurement, RBFImageJacobian, paper_grid
+from hrc_learn.jacobian import CameraEstimator, FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import HumanInput
+from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills import MarkerObservation, ServoTarget, VisualServo, VisualServoConfig
+from hrc_learn.skills import (
+    MarkerObservation,
+    MissedGraspError,
+    ServoTarget,
+    VisualServo,
+    VisualServoConfig,
+)
 from hrc_learn.skills.visual_servoing import ServoReading, ServoStep
 from hrc_learn.skills.visual_skill import VisualTarget
 from hrc_learn.vision.camera_model import IMAGE_SIZE
@@ -26,29 +34,25 @@ MIDDLE = np.array([700.0, 500.0])
 NO_OFFSET = VisualTarget(offset=np.zeros(3), error=np.nan)
 
 
-class Estimator(FixedEstimator):
-    """Notes the poses at which the image Jacobian is evaluated, and compared frames."""
+CAMERA = camera_vector(overhead_camera())
 
-    def __init__(self, jacobian):
-        centers = paper_grid().double()
-        network = RBFImageJacobian.from_jacobian(torch.as_tensor(jacobian), centers, 0.1)
-        super().__init__(network)
-        self.poses, self.pairs = [], []
+
+class Estimator(CameraEstimator):
+    """Notes the poses at which the image Jacobian is evaluated."""
+
+    def __init__(self):
+        super().__init__(camera_network(CAMERA))
+        self.poses = []
 
     def jacobian(self, state, r):
         self.poses.append(r)
         return super().jacobian(state, r).detach()
 
-    def compared(self, state, before, now):
-        self.pairs.append((before, now))
-        return state
-
 
 @pytest.fixture
 def law():
-    estimator = Estimator(np.zeros((2, 6)))
     goals = Goals.at(ABOVE.position, ABOVE.orientation)
-    return ServoStep(AdaptiveController(panda, estimator, goals), MARKER)
+    return ServoStep(AdaptiveController(panda, Estimator(), goals), MARKER)
 
 
 def reading(pixel=None, *, time=1.0, image_joints=None, push=0.0):
@@ -76,13 +80,6 @@ def target_above(**changes):
         item=np.zeros(2),
     )
     return replace(target, **changes)
-
-
-def offset_along(orientation, line):
-    """Visual target whose offset is a direction in the base frame, at an orientation."""
-    back = quaternion.conjugate(orientation)
-    offset = quaternion.rotate(back, torch.tensor(line, dtype=torch.float64))
-    return VisualTarget(offset=offset.numpy(), error=np.nan)
 
 
 def about_vertical(angle):
@@ -114,75 +111,50 @@ def test_the_image_jacobian_is_estimated_once_an_image_at_the_pose_of_that_image
     torch.testing.assert_close(pose.position, there.position)
 
 
+class Rising(VisualTarget):
+    """Target whose pixel comes down in the image by 200 px while the tool rises by `top`."""
+
+    top: float
+
+    def __call__(self, camera, pixel, above, height=None):
+        raised = 0.0 if height is None else float(height - above.position[2])
+        edge = IMAGE_SIZE[1] - 1 - CONFIG.border
+        lower = 200.0 * (raised / self.top * (1 - 1e-9) - 1)
+        return torch.tensor([700.0, edge + lower], dtype=torch.float64)
+
+
 @pytest.mark.parametrize(
     ("top", "fraction"), [(1.0, 1.0), (0.75, 0.75), (0.5, 0.5), (0.3, 0.5)]
 )
 def test_a_probe_starts_no_higher_than_the_marker_stays_in_the_image(law, top, fraction):
     """The marker leaves the image of this camera at a fraction of the probe's height."""
-    edge = IMAGE_SIZE[1] - 1 - CONFIG.border
-    rise = 200.0 / (top * CONFIG.probe)  # pixels a metre
-    jacobian = np.zeros((2, 6))
-    jacobian[1, 2] = rise * (1 - 1e-9)
-    target = target_above(item=np.array([700.0, edge - 200.0]))
-    state = replace(law.initial_state(panda.ready), image_jacobian=jacobian)
-    height = law.probe_height(state, target)
+    visual = Rising(offset=np.zeros(3), error=np.nan)
+    object.__setattr__(visual, "top", top * CONFIG.probe)
+    height = law.probe_height(law.initial_state(panda.ready), target_above(visual=visual))
     assert height == pytest.approx(fraction * CONFIG.probe)
 
 
 @pytest.mark.parametrize(("detected", "raised"), [(True, 0.05), (False, 0.0)])
 def test_the_end_effector_is_raised_only_after_its_marker_was_detected(detected, raised):
     """A camera that was moved is sure to see the box, not the space above it."""
-    target = target_above(raised=0.05)
-    goals = target.goals(np.zeros((2, 6)), ABOVE, detected=detected)
+    goals = target_above(raised=0.05).goals(CAMERA, ABOVE, detected=detected)
     expected = ABOVE.position + torch.tensor([0.0, 0.0, raised], dtype=torch.float64)
     torch.testing.assert_close(goals.position.centre, expected)
 
 
-def pinhole(height):
-    """Image Jacobian and pixel of a point below a camera of 1000 px that looks down."""
-    xi = np.array([0.2, 0.1]) / height
-    jacobian = np.zeros((2, 6))
-    jacobian[:, :3] = 1000 / height * np.column_stack([np.diag([1.0, -1.0]), xi])
-    return jacobian, 1000 * xi + np.array(IMAGE_SIZE) / 2
+def test_a_target_that_is_kept_does_not_follow_the_estimate():
+    elsewhere = CAMERA + 0.01
+    kept, free = target_above(kept_camera=CAMERA), target_above()
+    np.testing.assert_array_equal(kept.pixel(elsewhere, ABOVE), free.pixel(CAMERA, ABOVE))
+    assert np.linalg.norm(free.pixel(elsewhere, ABOVE) - free.pixel(CAMERA, ABOVE)) > 5
 
 
-def test_a_descent_teaches_the_image_jacobian_at_its_lower_end(law):
-    """A camera right above sees both ends; its depth changes by 1 / z a metre."""
-    low, high = 1.2, 1.12
-    jacobian, pixel = pinhole(low)
-
-    def at(depth):
-        none = torch.zeros(6, dtype=torch.float64)
-        return Measurement(
-            pose=Pose(torch.tensor([0.2, -0.1, -depth]).double(), ABOVE.orientation),
-            feature=torch.from_numpy(pinhole(depth)[1]),
-            valid=torch.tensor(True),
-            dt=0.0,
-            xi_x=none[:2],
-            xi_r=none,
-        )
-
-    target = target_above(visual=replace(NO_OFFSET, focal=1000.0))
-    state = replace(law.initial_state(panda.ready), image_jacobian=jacobian)
-    law.learned(state, target, at(high), at(low))
-    ((above, below),) = law.controller.estimator.pairs
-    descent = above.pose.position - below.pose.position
-    expected = torch.from_numpy(jacobian[:, :3]) @ descent
-    torch.testing.assert_close(above.feature - below.feature, expected, rtol=1e-5, atol=0)
-    torch.testing.assert_close(below.feature, torch.from_numpy(pixel))
-
-
-@pytest.mark.parametrize("height", [-0.004, 0.0, 0.002, 0.013])
-def test_within_the_box_the_target_is_straight_below(height):
-    """Above the box it is on the line, which leans."""
-    jacobian = np.zeros((2, 6))
-    jacobian[:, :2] = 1000.0 * np.eye(2)
-    leaning = offset_along(ABOVE.orientation, [0.6, 0.0, 0.8])
-    target = target_above(visual=leaning, item=np.array([-600.0, 0.0]))
-    up = torch.tensor([0.0, 0.0, height], dtype=torch.float64)
-    pixel = target.pixel(jacobian, Pose(ABOVE.position + up, ABOVE.orientation))
-    aside = 0.75 * max(height - CONFIG.half_size[2], 0.0)
-    np.testing.assert_allclose(pixel, [1000.0 * aside, 0.0], atol=1e-9)
+def test_a_controller_that_estimates_no_camera_is_refused():
+    network = RBFImageJacobian.from_jacobian(torch.zeros(2, 6).double(), paper_grid(), 0.1)
+    goals = Goals.at(ABOVE.position, ABOVE.orientation)
+    controller = AdaptiveController(panda, FixedEstimator(network), goals)
+    with pytest.raises(ValueError, match="give the controller a CameraEstimator"):
+        ServoStep(controller, MARKER)
 
 
 def test_the_goal_turns_no_faster_than_the_camera_can_guide_the_marker(law):
@@ -296,13 +268,12 @@ class Cell:
 
 
 class IdealStep:
-    """A step without errors; `arrive` sets the pose of the arm for a target."""
+    """A step without errors whose predicted error falls with every probe."""
 
     marker, config = MARKER, CONFIG
 
-    def __init__(self, cell, arrive, tool_target=lambda target: target):
-        self.cell, self.arrive, self.turned = cell, arrive, tool_target
-        self.heights, self.descents = [], 0
+    def __init__(self, cell, errors):
+        self.cell, self.errors, self.heights = cell, list(errors), []
 
     def initial_state(self, joints):
         return State()
@@ -311,18 +282,13 @@ class IdealStep:
     probe_height = staticmethod(lambda state, target: CONFIG.probe)
     pixel_error = turn_error = staticmethod(lambda state, now, target: 0.0)
     out_of_view = staticmethod(lambda state, time: False)
-    feature = staticmethod(lambda now: MIDDLE)
 
-    def tool_target(self, state, target):
-        return self.turned(target)
-
-    def learned(self, state, target, high, low):
-        self.descents += 1
-        return state
+    def uncertainty(self, state, target):
+        return self.errors.pop(0)
 
     def step(self, state, now, target):
         self.heights.append(target.raised)
-        self.cell.pose = self.arrive(target, self.descents)
+        self.cell.pose = raised_by(target.raised)
         goals = SimpleNamespace(position=None)
         result = SimpleNamespace(
             command=None, goals=goals, approach=0.0, remark="", columns=lambda drawn: {}
@@ -335,48 +301,24 @@ def raised_by(height):
     return Pose(ABOVE.position + up, ABOVE.orientation)
 
 
-def test_a_probe_descends_at_its_speed_and_waits_with_the_task():
-    cell = Cell(waits=2)
-    step = IdealStep(cell, lambda target, _: raised_by(target.raised))
-    with shapes_unchecked():
-        VisualServo(cell, step).servo_to(target_above())
-    heights = np.array(step.heights)
-    descent = heights[(heights > 0) & (heights < CONFIG.probe)]
-    lowered = np.diff(descent)
-    np.testing.assert_allclose(lowered[::2], lowered[0], atol=1e-12)
-    assert sorted({round(float(x), 9) for x in lowered}) == [-CONFIG.probe_speed * 0.02, 0.0]
-    assert descent[-1] <= CONFIG.probe_speed * 0.02 * (1 + 1e-9)
-
-
-@pytest.mark.parametrize(
-    ("astray", "moves", "probes"),
-    [
-        (0.0, [0.0], 1),
-        (0.03, [0.0, 0.0], 2),  # the first descent deviated: another one from there
-        (0.0, [0.01, 0.01, 0.001], 3),  # until learning changes nothing
-        (0.0, [0.01] * 9, CONFIG.max_probes),
-    ],
-)
-def test_a_descent_is_repeated_until_it_teaches_nothing_new(astray, moves, probes):
-    """The line of a turned tool leads elsewhere; only deviations from that line count."""
-    wanted = about_vertical(1.2)
-
-    # Leans by 45 degrees to the side on which the tool carries its marker.
-    side = quaternion.to_matrix(wanted)[:, 1].numpy()
-    visual = offset_along(wanted, side + np.array([0.0, 0.0, 1.0]))
-    along = torch.from_numpy(visual.line(wanted) / visual.line(wanted)[2])
-
-    def arrive(target, learned):
-        """On the line above; below it astray, and moved by what has been learned so far."""
-        if target.raised:
-            return Pose(ABOVE.position + target.raised * along, wanted)
-        moved = float(np.sum(moves[:learned]))
-        low = torch.tensor([astray, moved, 0.0], dtype=torch.float64)
-        return Pose(ABOVE.position + low, wanted)
-
+@pytest.mark.parametrize("errors", [[0.001], [0.01, 0.002], [0.02, 0.004, 0.0024]])
+def test_the_arm_probes_until_the_target_is_certain(errors):
     cell = Cell()
-    turn = lambda target: replace(target, orientation=wanted)  # noqa: E731
-    step = IdealStep(cell, arrive, turn)
+    step = IdealStep(cell, errors)
     with shapes_unchecked():
-        VisualServo(cell, step).servo_to(target_above(visual=visual))
-    assert step.descents == probes
+        duration = VisualServo(cell, step).servo_to(target_above())
+    probes = int((np.diff((np.array(step.heights) > 0).astype(int)) == 1).sum())
+    assert probes == len(errors) - 1
+    assert step.heights[-1] == 0
+    # It has rested at the target each time.
+    assert duration + CONFIG.dwell >= len(errors) * CONFIG.dwell
+
+
+def test_an_arm_whose_target_stays_uncertain_does_not_descend():
+    cell = Cell()
+    step = IdealStep(cell, [0.01] * (CONFIG.max_probes + 1))
+    with (
+        shapes_unchecked(),
+        pytest.raises(MissedGraspError, match=r"may still be 10\.0 mm off"),
+    ):
+        VisualServo(cell, step).servo_to(target_above())
