@@ -131,35 +131,18 @@ def read_npz(path: Path) -> list[Recording]:
             single = stream.read(6) == b"\x93NUMPY"
         text = "holds a single array: its name should end in .npy"
         raise DatasetError(text if single else "cannot be read: it is damaged", file=path)
-    with zipfile.ZipFile(path) as archive:
-        for member in archive.namelist():
-            if not member.endswith(".npy"):
-                continue
-            with archive.open(member) as stream:
-                version = np.lib.format.read_magic(stream)
-                header: Any = np.lib.format.read_array_header_1_0
-                if version != (1, 0):
-                    header = np.lib.format.read_array_header_2_0
-                shape, _, dtype = header(stream)
-            name = member.removesuffix(".npy")
-            if dtype.hasobject:
-                raise DatasetError(_PICKLED, file=path, key=name)
-            if shape:
-                read = partial(_read_member, path, name)
-                fields[name] = make_field(name, shape, dtype, read)
-            else:
-                _attributes({name: _npz_member(path, name)[()]}, details)
-    return split_episodes(path, fields, **details)
-
-
-def _read_member(path: Path, name: str, start: int, stop: int) -> np.ndarray:
-    return _npz_member(path, name)[start:stop]
-
-
-@lru_cache(maxsize=8)
-def _npz_member(path: Path, name: str) -> np.ndarray:
     with np.load(path, allow_pickle=False) as file:
-        return file[name]
+        for name in file.files:
+            try:
+                array = file[name]
+            except ValueError as error:
+                text = _PICKLED if "allow_pickle" in str(error) else f"cannot be read: {error}"
+                raise DatasetError(text, file=path, key=name) from error
+            if isinstance(array, np.ndarray) and array.shape:
+                fields[name] = array_field(name, array)
+            elif isinstance(array, np.ndarray):
+                _attributes({name: array[()]}, details)
+    return split_episodes(path, fields, **details)
 
 
 def read_hdf5(path: Path) -> list[Recording]:

@@ -231,7 +231,6 @@ def _with_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str]
     for name in states:
         places = [(name, index) for index in range(first.fields[name].width)]
         if name == UNNAMED and not selections:
-            _require_no_quaternions(first)
             notes.append("nothing names the columns: taken for joints (--columns names them)")
             joints = _selection(first, "joint_position", places)
             selections["joint_position"] = replace(joints, numbered=True)
@@ -243,15 +242,6 @@ def _with_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str]
     return replace(
         meaning, kept=kept, left_out=left_out, selections=selections, notes=tuple(notes)
     )
-
-
-def _require_no_quaternions(first: Recording) -> None:
-    values = first.fields[UNNAMED].numbers()
-    for start in range(values.shape[1] - 3 if len(values) > 1 else 0):
-        norms = np.linalg.norm(values[:, start : start + 4], axis=1)
-        if np.abs(norms - 1).max() < 1e-3:
-            text = f"columns {start} to {start + 3} are unit quaternions: name the columns, as"
-            raise first.error(f"{text} in --columns px py pz qw qx qy qz", UNNAMED)
 
 
 def _with_fingers(meaning: Meaning, search: FieldSearch) -> Meaning:

@@ -1,27 +1,27 @@
 """Tables of numbers: text files as spreadsheets, loggers and numpy write them, and Parquet."""
 
 import csv
+import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Shaped
 
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.recording_files import UNNAMED
 
 Table = dict[str, Shaped[np.ndarray, "_frames ..."]]
 """Column -> its values."""
 
-UNNAMED = "array"
-"""Name of an array that has none."""
 _COMMENTS = ("#", "%", "//")
-_MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
-_FLAGS = {"true": "1", "false": "0"}
-_DECIMAL_COMMA = re.compile(r"[-+]?\d+(?:,\d+)?(?:[eE][-+]?\d+)?")
-_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?Z?")
+_MISSING = ["", "nan", "NaN", "NAN", "na", "NA", "N/A", "null", "NULL", "None", "-"]
+_DECIMAL_COMMAS = re.compile(r"[-+]?\d+(?:,\d+)?(?:[eE][-+]?\d+)?")
 _INDEX = ("", "index", "unnamed: 0", "__index_level_0__")
 """Names under which pandas writes the index of its rows."""
+_WRONG_ROW = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
 def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
@@ -45,60 +45,34 @@ def read_text_table(path: Path, columns: Sequence[str] = ()) -> Table:
     except UnicodeDecodeError as error:
         reason = f"is not encoded in UTF-8 ({error.reason} at byte {error.start})"
         raise DatasetError(f"{reason}: save it as UTF-8", file=path) from error
-    header, rows, delimiter = _rows(path, lines)
-    if not rows:
-        if header:
-            raise DatasetError("holds a header and no numbers", file=path)
+    rows = [(k, line) for k, line in enumerate(lines, start=1) if line.strip(" ,;\t|")]
+    plain = [not line.lstrip().startswith(_COMMENTS) for _, line in rows]
+    if not any(plain):
         raise DatasetError("is empty", file=path)
-    width = len(rows[0][1])
-    for number, row in rows:
-        if len(row) != width:
-            text = f"line {number} does not hold {width} numbers separated by {delimiter!r}"
-            raise DatasetError(f"{text}, but {len(row)} fields", file=path)
-    if header and len(header) == width - 1 and _counts([row[0] for _, row in rows]):
+    remarks = [line.lstrip().lstrip("#%/ ") for _, line in rows[: plain.index(True)]]
+    rows = [row for row, is_row in zip(rows, plain, strict=True) if is_row]
+    delimiter = _delimiter(rows[min(1, len(rows) - 1)][1])
+    header = _split(rows[0][1], delimiter)
+    if any(map(_is_number, header)):
+        named = _split(remarks[-1], delimiter) if remarks else []
+        header = named if len(named) == len(header) else []
+    else:
+        rows = rows[1:]
+    if not rows:
+        raise DatasetError("holds a header and no numbers", file=path)
+    width = len(_split(rows[0][1], delimiter))
+    if len(header) == width - 1:
         header = ["", *header]  # R and pandas name no column of row numbers
-    if header and len(header) != width:
-        text = f"names {len(header)} columns, but its rows hold {width}"
-        raise DatasetError(text, file=path)
-    values = _columns(path, header, rows, delimiter)
-    names = header or list(columns)
-    if not names:
-        return {UNNAMED: np.stack([*values.values()], axis=1)}
-    if not header and len(columns) != width:
-        text = f"{len(columns)} column names for {width} columns"
-        raise DatasetError(text, file=path)
-    table: Table = {}
-    for place, column in values.items():
-        name, count = names[place], names[:place].count(names[place])
-        table[f"{name} ({count + 1})" if count else name] = column
+    names = header or list(columns) or [str(place) for place in range(width)]
+    if len(names) != width:
+        raise DatasetError(f"{len(names)} column names for {width} columns", file=path)
+    names = [
+        f"{n} ({names[:k].count(n) + 1})" if n in names[:k] else n for k, n in enumerate(names)
+    ]
+    table = _parsed(path, rows, names, delimiter)
+    if not header and not columns:
+        return {UNNAMED: np.stack([*table.values()], axis=1)}
     return _without_index(path, table)
-
-
-def _rows(
-    path: Path, lines: Sequence[str]
-) -> tuple[list[str], list[tuple[int, list[str]]], str]:
-    """Header, rows with their line numbers, and the delimiter."""
-    kept = [(k, line) for k, line in enumerate(lines, start=1) if line.strip(" ,;\t|")]
-    plain = [not line.lstrip().startswith(_COMMENTS) for _, line in kept]
-    comments = [line for _, line in kept[: plain.index(True) if any(plain) else 0]]
-    kept = [(k, line) for k, line in kept if not line.lstrip().startswith(_COMMENTS)]
-    if not kept:
-        return [], [], ","
-    probe = kept[min(1, len(kept) - 1)][1]
-    delimiter = _delimiter(probe)
-    try:
-        rows = [(k, _split(line, delimiter)) for k, line in kept]
-    except csv.Error as error:
-        raise DatasetError(f"cannot be split into fields: {error}", file=path) from error
-    while len(rows[0][1]) > 1 and all(not row[-1] for _, row in rows if len(row) > 1):
-        rows = [(k, row[:-1]) for k, row in rows]  # every line ends with a delimiter
-    if not any(_is_number(field) for field in rows[0][1]):
-        return rows[0][1], rows[1:], delimiter
-    if comments:
-        named = _split(comments[-1].lstrip().lstrip("#%/ "), delimiter)
-        if len(named) == len(rows[0][1]) and not any(map(_is_number, named)):
-            return named, rows, delimiter
-    return [], rows, delimiter
 
 
 def _delimiter(line: str) -> str:
@@ -106,79 +80,71 @@ def _delimiter(line: str) -> str:
         if delimiter in line:
             return delimiter
     words = line.split()
-    if "," in line and not (len(words) > 1 and all(map(_DECIMAL_COMMA.fullmatch, words))):
-        return ","
-    return " "
+    decimals = len(words) > 1 and all(map(_DECIMAL_COMMAS.fullmatch, words))
+    return "," if "," in line and not decimals else " "
 
 
 def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == " " and '"' not in line:
         return line.split()
-    (row,) = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
-    return [field.strip() for field in row]
-
-
-def _number(field: str) -> float | None:
-    """Value of a field; None if it is no number, NaN if it is empty."""
-    plain = field.strip().lower()
-    if plain in _MISSING:
-        return np.nan
-    plain = _FLAGS.get(plain, plain)
-    if plain.count(",") == 1 and "." not in plain:
-        plain = plain.replace(",", ".")
-    try:
-        return float(plain)
-    except ValueError:
-        return None
+    fields = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+    fields = [field.strip() for field in fields]
+    return fields[:-1] if len(fields) > 1 and not fields[-1] else fields  # it ends the line
 
 
 def _is_number(field: str) -> bool:
-    return field.strip().lower() not in _MISSING and _number(field) is not None
-
-
-def _columns(
-    path: Path, header: Sequence[str], rows: Sequence[tuple[int, list[str]]], delimiter: str
-) -> dict[int, np.ndarray]:
-    """Numbers of each column; columns of text are left out."""
-    kept: dict[int, np.ndarray] = {}
-    for place, first in enumerate(rows[0][1]):
-        fields = [row[place] for _, row in rows]
-        if _DATE.fullmatch(first):
-            dates = [field.replace(",", ".").rstrip("Z") for field in fields]
-            try:
-                moments = np.array(dates, dtype="datetime64[ns]")
-            except ValueError as error:
-                raise DatasetError(f"holds a damaged date: {error}", file=path) from error
-            kept[place] = moments.astype(np.int64) * 1e-9
-            continue
-        if _number(first) is None and header:
-            continue
-        numbers = [_number(field) for field in fields]
-        if None in numbers:
-            line = rows[numbers.index(None)][0]
-            text = f"line {line} does not hold {len(rows[0][1])} numbers separated by"
-            raise DatasetError(
-                f"{text} {delimiter!r}: {fields[numbers.index(None)]!r}", file=path
-            )
-        kept[place] = np.array(numbers, dtype=float)
-    if not kept:
-        raise DatasetError("holds no column of numbers", file=path)
-    return kept
-
-
-def _counts(values: Sequence[object]) -> bool:
-    """True if the values count rows from 0 or 1."""
     try:
-        numbers = np.asarray([float(str(value)) for value in values])
+        float(field.replace(",", "."))
     except ValueError:
         return False
-    return bool(np.isin(numbers[0], (0, 1)) and (np.diff(numbers) == 1).all())
+    return True
+
+
+def _parsed(
+    path: Path, rows: Sequence[tuple[int, str]], names: Sequence[str], delimiter: str
+) -> Table:
+    """Columns of numbers, parsed by Arrow."""
+    from pyarrow.csv import ConvertOptions, ParseOptions, ReadOptions, read_csv
+
+    text = io.StringIO()
+    writer = csv.writer(text, delimiter="\t")
+    writer.writerows(_split(line, delimiter) for _, line in rows)
+    comma = delimiter != "," and bool(re.search(r"\d,\d", rows[0][1]))
+    options = {
+        "read_options": ReadOptions(column_names=names, use_threads=False),
+        "parse_options": ParseOptions(delimiter="\t"),
+        "convert_options": ConvertOptions(
+            null_values=_MISSING, decimal_point="," if comma else "."
+        ),
+    }
+    try:
+        table = read_csv(io.BytesIO(text.getvalue().encode()), **options)
+    except pa.ArrowInvalid as error:
+        wrong = _WRONG_ROW.search(str(error))
+        place = f"line {rows[int(wrong[1]) - 1][0]}" if wrong else "a line"
+        text = f"{place} does not hold {len(names)} numbers separated by {delimiter!r}"
+        raise DatasetError(text, file=path) from error
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        # A column of text begins with text; a word among numbers is damage.
+        words = column.to_pylist() if pa.types.is_string(column.type) else ["text"]
+        wrong = [k for k, word in enumerate(words) if word is None or not _is_number(word)]
+        if wrong[:1] != [0]:
+            text = f"line {rows[wrong[0]][0]} does not hold {len(names)} numbers separated by"
+            raise DatasetError(
+                f"{text} {delimiter!r}: {words[wrong[0]]!r}", file=path, key=name
+            )
+    found = _arrow_columns(path, table)
+    numbers = {name: v for name, v in found.items() if isinstance(v, np.ndarray)}
+    if not numbers:
+        raise DatasetError("holds no column of numbers", file=path)
+    return numbers
 
 
 def _without_index(path: Path, table: Table) -> Table:
     """The table without the column that numbers its rows."""
     for name in [name for name in table if name.strip().lower() in _INDEX]:
-        if _counts(table[name].tolist()) and len(table) > 1:
+        counts = table[name][0] in (0, 1) and (np.diff(table[name]) == 1).all()
+        if counts and len(table) > 1:
             del table[name]
         elif not name.strip():
             raise DatasetError(
@@ -193,45 +159,43 @@ def read_parquet_table(path: Path) -> dict[str, np.ndarray | list[bytes]]:
     Raises:
         DatasetError: The file is damaged, or the vectors of a column differ in length.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         table = pq.read_table(path).flatten()  # {bytes, path} of images become columns
     except (pa.ArrowException, OSError) as error:
         raise DatasetError(f"cannot be read as Parquet: {error}", file=path) from error
-    found: dict[str, np.ndarray | list[bytes]] = {}
-    for name, values in _arrow_columns(path, table):
-        found[name.removesuffix(".bytes")] = values
+    found = _arrow_columns(path, table)
     numbers = {name: v for name, v in found.items() if isinstance(v, np.ndarray)}
-    kept = _without_index(path, numbers)
-    return {name: v for name, v in found.items() if name in kept or isinstance(v, list)}
+    return (
+        {**found, **numbers}
+        if not numbers
+        else {
+            **{name: v for name, v in found.items() if isinstance(v, list)},
+            **_without_index(path, numbers),
+        }
+    )
 
 
-def _arrow_columns(path: Path, table) -> Iterator[tuple[str, np.ndarray | list[bytes]]]:
-    import pyarrow as pa
-
+def _arrow_columns(path: Path, table: pa.Table) -> dict[str, np.ndarray | list[bytes]]:
+    """Columns of numbers, of vectors and of bytes; all others are left out."""
+    found: dict[str, np.ndarray | list[bytes]] = {}
     for name in table.column_names:
         column = table[name].combine_chunks()
-        kind = column.type
-        if pa.types.is_binary(kind) or pa.types.is_large_binary(kind):
-            yield name, column.to_pylist()
-        elif pa.types.is_timestamp(kind):
-            yield name, column.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy() * 1e-9
-        elif pa.types.is_primitive(kind):
-            yield name, column.to_numpy(zero_copy_only=False).astype(float)
-        elif pa.types.is_list(kind) or pa.types.is_large_list(kind) or _is_fixed(kind):
+        if pa.types.is_binary(column.type) or pa.types.is_large_binary(column.type):
+            found[name.removesuffix(".bytes")] = column.to_pylist()
+        elif pa.types.is_timestamp(column.type):
+            stamps = column.cast(pa.timestamp("ns")).cast(pa.int64())
+            found[name] = stamps.to_numpy() * 1e-9
+        elif pa.types.is_primitive(column.type):
+            found[name] = column.to_numpy(zero_copy_only=False).astype(float)
+        elif pa.types.is_nested(column.type):
             rows = column.to_numpy(zero_copy_only=False)
             widths = {0 if row is None else len(row) for row in rows}
             if len(widths) > 1:
                 text = f"holds vectors of {min(widths)} to {max(widths)} components"
                 raise DatasetError(f"{text}: all frames need as many", file=path, key=name)
-            stacked = np.stack([*rows])
-            if stacked.dtype != object:
-                yield name, stacked
-
-
-def _is_fixed(kind) -> bool:
-    import pyarrow as pa
-
-    return pa.types.is_fixed_size_list(kind)
+            vectors = np.stack([*rows])
+            if vectors.dtype != object:
+                found[name] = vectors
+    return found

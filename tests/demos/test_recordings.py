@@ -464,7 +464,7 @@ def test_six_numbers_of_a_pose_do_not_tell_their_angles(tmp_path):
 
 def test_an_array_without_names_that_holds_quaternions_is_asked_about(tmp_path):
     np.save(tmp_path / "a.npy", np.hstack([Q, TURN.as_quat()]))
-    with pytest.raises(DatasetError, match="columns 3 to 6 are unit quaternions"):
+    with pytest.raises(DatasetError, match="unit length, as a quaternion has"):
         plan(tmp_path / "a.npy", fps=10)
 
 
