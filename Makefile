@@ -20,6 +20,8 @@ help:
 demo: .venv/.installed
 	$(PYTHON) -m hrc_learn.cli demo --out $(OUT) --shelf $(SHELF) --robot $(ROBOT)
 
+# Rewritten assertions and checked shapes are compiled once, not by each worker and program.
+test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.installed
 	$(PYTHON) -m pytest -n auto --dist loadfile -m "not slow and not realtime"
 	@# A machine that does something else meanwhile may stall for longer than a protocol allows.

@@ -33,10 +33,11 @@ def ordinary_priority():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    """Simulations, with their fixtures, cost half as much again while shapes are checked."""
+    """Simulations, with their fixtures, cost twice as much with shape checks and autograd."""
     if item.get_closest_marker("simulation") is None:
         return (yield)
-    with shapes_unchecked():
+    differentiates = item.get_closest_marker("gradients") is not None
+    with shapes_unchecked(), torch.inference_mode(not differentiates):
         return (yield)
 
 

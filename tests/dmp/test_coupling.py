@@ -79,6 +79,7 @@ def test_steering_is_finite_at_rest_and_straight_ahead():
         assert (steering(torch.zeros(3), velocity, obstacle) == 0).all()
 
 
+@pytest.mark.gradients
 def test_repulsion_is_the_gradient_of_its_potential():
     rng = torch.Generator().manual_seed(0)
     position = torch.rand(100, 3, generator=rng, dtype=torch.float64).requires_grad_()

@@ -194,6 +194,7 @@ def test_arms_keep_their_offset_when_one_goal_moves():
 OFFSET3 = torch.tensor([0.3, 0.4, 0.5], dtype=torch.float64)
 
 
+@pytest.mark.gradients
 def test_terms_take_batches_and_pass_gradients():
     dmp = two_arms()
 

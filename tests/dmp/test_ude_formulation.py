@@ -142,6 +142,7 @@ def test_drift_agrees_with_the_derivative_of_the_exponential():
     torch.testing.assert_close(v + axis_drift(e, v), rate, rtol=0, atol=1e-11)
 
 
+@pytest.mark.gradients
 def test_angular_acceleration_is_that_of_the_error(dmp):
     t = torch.linspace(0, 3, 1501, dtype=torch.float64)
     got = dmp.rollout(t, goal=GOAL)

@@ -67,6 +67,7 @@ def test_plans_without_an_error_are_plans_all_the_same(error):
     torch.testing.assert_close(made, still[0]["action"], rtol=0, atol=1e-3)
 
 
+@pytest.mark.gradients
 @pytest.mark.simulation
 def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
     shown = passing()

@@ -168,6 +168,7 @@ def there_and_back(count=12, frames=60):
     return [{STATE: x, "action": x} for x in (p.expand(-1, 2).clone() for p in paths)]
 
 
+@pytest.mark.gradients
 @pytest.mark.simulation
 def test_velocities_tell_the_way_there_from_the_way_back():
     shown = there_and_back()
