@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +50,10 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
     said = ImportOptions()
     if mapping is not None:
         read = read_toml if mapping.suffix == ".toml" else read_json
+        known = {one.name for one in fields(ImportOptions)} - {"hinted"}
+        if unknown := read(mapping).keys() - known:
+            text = f"{mapping}: there is no field {min(unknown)!r} in a mapping file"
+            raise ValueError(f"{text}; known are {', '.join(sorted(known))}")
         said = read(mapping, ImportOptions)
     turn = _words(args.orientation)
     columns = {

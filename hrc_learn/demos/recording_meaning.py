@@ -187,7 +187,8 @@ def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSe
         notes=tuple(search.explained(n) for n in found.notes if "left among" not in n),
     )
     meaning = _with_fingers(_with_bare_vectors(meaning, first, search.states), search)
-    if not meaning.selections and "observation.state" not in meaning.kept:
+    states = {"joint_position", "position", *ORIENTATION_ROLES}
+    if not meaning.selections.keys() & states and "observation.state" not in meaning.kept:
         there = ", ".join(name for name, one in first.fields.items() if one.kind == "number")
         text = "name the arrays of joints or poses (joints, position); it holds"
         raise first.error(f"{text} {there}")
@@ -345,12 +346,30 @@ def _with_units(
             warned.append(f"{text} and converted; overrule with --units {role} ...")
         elif given.get(role) == "rad" and largest > 4 * np.pi:
             warned.append(f"{role}: rad are given, but values reach {largest:.4g}: degrees?")
+    if "joint_position" in selections and "gripper" not in selections:
+        warned += _gripper_among(first, selections["joint_position"])
     return replace(meaning, decisions=decisions, warnings=tuple(warned))
+
+
+def _gripper_among(first: Recording, joints: ColumnSelection) -> list[str]:
+    """A question about last columns without names that behave as those of a gripper."""
+    values = read_columns(first, joints.columns)
+    inside = np.all((values >= -0.01) & (values <= 1.05), axis=0)
+    # A gripper rests at its ends; two fingers move alike.
+    rests = np.mean(np.diff(values, axis=0) == 0, axis=0) > 0.5
+    alike = values.shape[1] > 7 and np.allclose(values[:, -1], values[:, -2])
+    count = 2 if alike and inside[-2:].all() else int(inside[-1] and rests[-1])
+    if not joints.numbered or not count or rests[: -count or None].any():
+        return []
+    (name, index), width = joints.columns[-count], len(joints.columns)
+    text = f"the last {count} of {width} columns of {name} behave as a gripper: if they are no"
+    return [f"{text} joints, give --joints {name}[0:{index}] --gripper {name}[{index}:{width}]"]
 
 
 def _largest(first: Recording, selection: ColumnSelection, columns: Sequence[int]) -> float:
     places = [selection.columns[i] for i in columns] or selection.columns
-    return float(np.nanmax(np.abs(read_columns(first, places))))
+    values = np.abs(read_columns(first, places))
+    return float(np.max(values, where=np.isfinite(values), initial=0.0))
 
 
 def _with_commands(

@@ -45,7 +45,12 @@ _JOINT_NAME = re.compile(
     r"(?:.*[._\- ])?(?:j|q|jnt|joint|axis|motor|servo|dof|theta|angle|a)[ _\-.]*\[?\d+\]?|"
     r".*(?:shoulder|elbow|wrist|waist|forearm|upper_?arm|joint).*"
 )
-_MEASURED = re.compile(r"^(?:measured|meas|follower|puppet|obs|observation|state)[_. /]")
+_TURNS = {
+    6: "name it euler_xyz or rotation_vector",
+    7: "name it quaternion_wxyz or quaternion_xyzw",
+}
+"""Width of a pose without names -> the question about its orientation."""
+_MEASURED = re.compile(r"^(?:(?:measured|meas|follower|puppet|obs|observation|state)[_. /])+")
 _INDEXED = re.compile(r"(.*?)[_.\[ ]?(\d+)\]?")
 _OTHER_FRAME = re.compile(r"cam|trinsic|obj|goal|start")
 # ALOHA's `qpos`, `qvel`, `effort` and `action`: github.com/tonyzhaozh/act, record_episodes.py.
@@ -123,12 +128,16 @@ class FieldSearch:
         places = [(name, index) for index in range(one.width)]
         if name in self.left_out:
             return
-        if key == "tcp_pose" and one.width == 6:
-            # Angles about fixed axes, or a rotation vector?
-            self.left_out[f"{name}[3:6]"] = "name it euler_xyz or rotation_vector"
+        if key == "tcp_pose" and one.width in _TURNS:
+            # Which encoding, and in which order? Nothing tells.
+            self.left_out[f"{name}[3:{one.width}]"] = _TURNS[one.width]
             key, places = "eef_pos", places[:3]
-        if role_of_key(key) == "gripper" and one.width == 2 and not command:
-            self.two_fingers = name
+        if key == "eef_quat" and not re.match(r"robot\d_", bare):  # robosuite: x, y, z, w
+            self.left_out[name] = _TURNS[7]
+            return
+        if role_of_key(key) == "gripper" and one.width < 3 and (command or one.width == 2):
+            self.two_fingers = self.two_fingers if command else name
+            self.fingers += [(True, "gripper", places[0])] if command else []
             return
         of_joints = role_of_key(key) in JOINT_FIELDS
         if names and (command or of_joints or _STATE.fullmatch(bare)):
@@ -175,13 +184,16 @@ class FieldSearch:
                 rest = _COMMAND.sub("", plain.lower()).strip("_. ")
                 plain = rest if rest and not rest.isdigit() else plain
             match = _INDEXED.fullmatch(without_unit(plain)[0])
-            stem = (match[1] if match else plain).lower().strip("_. ")
+            stem = (match[1] if match else plain).lower().strip("_. ").rpartition(".")[2]
+            stem = "qpos" if match and stem in ("pos", "position", "positions") else stem
             key = _KEYS.get(re.sub(r"^(?:robot|arm)\d*_", "", stem), stem)
             prefix = "action" if command else "observation"
             if stem == "actual_tcp_pose" and match:  # of UR: a rotation vector
                 turn, slot = divmod(int(match[2]), 3)
                 plain = f"ee.{'w' if turn else ''}{'xyz'[slot]}"
                 groups.setdefault("observation.ee", []).append((name, plain))
+            elif command and is_hand(plain):
+                self.fingers.append((True, joint_of(plain), (name, 0)))
             elif role_of_key(key) in JOINT_FIELDS:
                 groups.setdefault(f"{prefix}.{key}", []).append((name, plain))
             elif self._hinted or _names_joint(plain):

@@ -109,7 +109,7 @@ def _parsed(
     text = io.StringIO()
     writer = csv.writer(text, delimiter="\t")
     writer.writerows(_split(line, delimiter) for _, line in rows)
-    comma = delimiter != "," and bool(re.search(r"\d,\d", rows[0][1]))
+    comma = bool(re.search(r"\d,\d", text.getvalue()))
     options = {
         "read_options": ReadOptions(column_names=names, use_threads=False),
         "parse_options": ParseOptions(delimiter="\t"),
@@ -128,7 +128,10 @@ def _parsed(
         # A column of text begins with text; a word among numbers is damage.
         words = column.to_pylist() if pa.types.is_string(column.type) else ["text"]
         wrong = [k for k, word in enumerate(words) if word is None or not _is_number(word)]
-        if wrong[:1] != [0]:
+        if not wrong:
+            text = "mixes decimal points and decimal commas"
+            raise DatasetError(text, file=path, key=name)
+        if wrong[0] != 0:
             text = f"line {rows[wrong[0]][0]} does not hold {len(names)} numbers separated by"
             raise DatasetError(
                 f"{text} {delimiter!r}: {words[wrong[0]]!r}", file=path, key=name

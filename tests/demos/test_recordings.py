@@ -480,6 +480,59 @@ def test_lengths_in_cm_or_mm_are_asked_about(tmp_path):
         np.testing.assert_allclose(demo.position, 1e-3 * poses[:, :3, 3])
 
 
+@pytest.mark.parametrize("scale", [0.04, 1.0])
+def test_a_gripper_at_the_end_of_the_joints_is_asked_about(tmp_path, scale):
+    opening = scale * (np.arange(40) > 20)
+    two = np.column_stack([joint_path(40, 7), *[0.02 + 0.02 * Q[:, 0] ** 2] * 2])
+    one = np.column_stack([joint_path(40, 6), opening])
+    for name, values, columns in (("two", two, "[7:9]"), ("one", one, "[6:7]")):
+        np.savez(tmp_path / f"{name}.npz", qpos=values, t=TIME)
+        (warning,) = plan(tmp_path / f"{name}.npz").meaning.warnings
+        assert f"--gripper qpos{columns}" in warning
+    np.savez(tmp_path / "arm.npz", qpos=joint_path(40, 7), t=TIME)
+    assert not plan(tmp_path / "arm.npz").meaning.warnings
+
+
+def test_the_order_of_a_quaternion_without_names_is_asked_about(tmp_path):
+    pose = np.hstack([Q, TURN.as_quat()])
+    np.savez(tmp_path / "a.npz", tcp_pose=pose, t=TIME)
+    made = plan(tmp_path / "a.npz")
+    assert next(made.episodes()).demonstration.orientation is None
+    assert "quaternion_wxyz or" in made.meaning.left_out["tcp_pose[3:7]"]
+    columns = {"position": "tcp_pose[0:3]", "quaternion_xyzw": "tcp_pose[3:7]"}
+    (demo,) = read(tmp_path / "a.npz", columns=columns)
+    expected = TURN.as_quat(scalar_first=True)
+    np.testing.assert_allclose(np.abs((demo.orientation * expected).sum(1)), 1)
+
+
+def test_a_table_of_lerobot_has_joints_commands_and_grippers(tmp_path):
+    names = ("shoulder", "elbow", "gripper")
+    head = [f"{kind}.{n}.pos" for kind in ("observation.state", "action") for n in names]
+    rows = np.column_stack([TIME, joint_path(40, 2), TIME, joint_path(40, 2) + 0.01, 2 * TIME])
+    np.savetxt(
+        tmp_path / "a.csv", rows, delimiter=",", header="t," + ",".join(head), comments=""
+    )
+    made = plan(tmp_path / "a.csv")
+    (one,) = made.episodes()
+    assert one.demonstration.joint_names == names[:2]
+    np.testing.assert_allclose(one.demonstration.gripper, TIME)
+    np.testing.assert_allclose(one.demonstration.command_position, joint_path(40, 2) + 0.01)
+    assert made.meaning.kept["action"][1] == ("gripper.pos",)
+
+
+def test_a_topic_of_ros_as_a_table(tmp_path):
+    head = "%time," + ",".join(
+        f"field.{n}{k}" for n in ("position", "velocity") for k in range(3)
+    )
+    rows = [[int(1.7e18 + 1e7 * k), *q, *q] for k, q in enumerate(Q.tolist())]
+    lines = [head, *(",".join(map(repr, row)) for row in rows)]
+    (tmp_path / "joint_states.csv").write_text("\n".join(lines))
+    (demo,) = read(tmp_path / "joint_states.csv")
+    np.testing.assert_allclose(demo.joint_position, Q)
+    np.testing.assert_allclose(demo.joint_velocity, Q)
+    np.testing.assert_allclose(np.diff(demo.time), 0.01, atol=1e-6)
+
+
 def test_arrays_that_count_are_episodes(tmp_path):
     arrays = {f"{name}_{k}": (Q + k)[: 30 + k] for name in ("qpos", "actions") for k in (0, 1)}
     write_hdf5(tmp_path / "a.h5", arrays)
