@@ -112,21 +112,6 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """
         return state
 
-    def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
-        """State after learning from two frames chosen by the caller.
-
-        Neighbouring pairs of a motion share the noise of the frame between them, which a filter
-        does not model. One pair of means over many images, at rest at both ends, is more
-        informative than all pairs of the motion.
-
-        Args:
-            state: State before.
-            before: First frame, its feature corrected for perspective.
-            now: Second frame, at which the Jacobian is learned; its `dt` should be 0 if that
-                time has already passed in `update`.
-        """
-        return state
-
     def jacobian(
         self, state: Any, r: Pose | Float[Tensor, "*batch 6"]
     ) -> Float[Tensor, "*batch rows 6"]:
@@ -327,17 +312,6 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         """The same weights, and no key frame."""
         batch = state.weight.shape[:-2]
         return replace(state, key=KeyFrame.absent(self.network, *batch))
-
-    def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
-        """State after one more pair; the key frame stays."""
-        first = KeyFrame(
-            pose=before.pose,
-            feature=before.feature,
-            theta=self.network.basis(now.pose),
-            present=before.valid,
-        )
-        learned = self.update(replace(state, key=first), now)
-        return replace(learned, key=state.key)
 
     def advance(
         self, key: KeyFrame, measurement: Measurement, theta: Float[Tensor, "*batch K"]

