@@ -184,7 +184,7 @@ def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSe
         kept=kept,
         cameras=_cameras(first, options.images),
         left_out=search.left_out,
-        notes=tuple(search.explained(n) for n in found.notes if "left among" not in n),
+        notes=tuple(map(search.explained, filter(_is_news, found.notes))),
     )
     meaning = _with_fingers(_with_bare_vectors(meaning, first, search.states), search)
     states = {"joint_position", "position", *ORIENTATION_ROLES}
@@ -196,6 +196,11 @@ def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSe
     if not time and options.duration is None:
         time = first.clock_of(meaning.main)
     return _with_joints(replace(meaning, time=time), options.joint_names, first), search
+
+
+def _is_news(note: str) -> bool:
+    """True for notes of the reader that the preview does not show already."""
+    return "left among" not in note and "assumed" not in note
 
 
 def _selection(first: Recording, role: str, places: Sequence[Place]) -> ColumnSelection:

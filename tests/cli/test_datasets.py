@@ -102,6 +102,45 @@ def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, arguments
     assert sorted(p.name for p in tmp_path.iterdir()) == ["pour.npz"]
 
 
+def test_a_preview_writes_a_mapping_that_can_be_corrected(tmp_path):
+    q, path, map_file = joint_path(200, 7), tmp_path / "run.npz", tmp_path / "map.json"
+    np.savez(path, t=0.01 * np.arange(200), qpos=q, action=q + 0.01, tactile=q[:, :2])
+    status, text, _ = hrc("import", path, "--dry-run", "--mapping", map_file)
+    assert status == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["map.json", "run.npz"]
+    assert "left out: tactile" in text
+    said = json.loads(map_file.read_text())
+    assert said["columns"] == {"joint_position": ["qpos"], "command_position": ["action"]}
+    said["columns"] |= {
+        "joint_position": ["qpos[0:6]"],
+        "command_position": ["action[0:6]"],
+        "gripper": "qpos[6]",
+        "observation.tactile": "tactile",
+    }
+    said |= {"joint_names": list("abcdef"), "units": {"gripper": "m"}}
+    map_file.write_text(json.dumps(said))
+    assert hrc("import", path, "--out", tmp_path / "set", "--mapping", map_file)[0] == 0
+    (demo,) = load_demos(tmp_path / "set")
+    assert demo.joint_names == tuple("abcdef")
+    np.testing.assert_allclose(demo.gripper, q[:, 6], atol=1e-6)
+    np.testing.assert_allclose(demo.command_position, q[:, :6] + 0.01, atol=1e-6)
+    np.testing.assert_allclose(demo.extra["observation.tactile"], q[:, :2], atol=1e-6)
+    map_file.write_text(json.dumps({"colums": {}}))
+    status, _, error = hrc("import", path, "--dry-run", "--mapping", map_file)
+    assert status == 2
+    assert "map.json: there is no field 'colums' in a mapping file" in error
+
+
+def test_commands_and_gripper_are_named_on_the_command_line(tmp_path):
+    q, path = joint_path(200, 7), tmp_path / "run.npz"
+    np.savez(path, t=0.01 * np.arange(200), q=q, u=q + 0.01, g=0.08 * (q[:, 0] > 0))
+    named = ("--joints", "q", "--command", "u", "--gripper", "g")
+    assert hrc("import", path, "--out", tmp_path / "set", *named)[0] == 0
+    (demo,) = load_demos(tmp_path / "set")
+    np.testing.assert_allclose(demo.command_position, q + 0.01, atol=1e-6)
+    np.testing.assert_allclose(demo.gripper, 0.08 * (q[:, 0] > 0), atol=1e-6)
+
+
 def test_an_existing_dataset_is_not_touched(recording, tmp_path):
     (tmp_path / "set").mkdir()
     arguments = ("import", recording, "--out", tmp_path / "set", "--joints", "q")
