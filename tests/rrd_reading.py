@@ -23,12 +23,15 @@ class Rrd:
         """Paths that hold anything."""
         return {path for path, _, _ in self._batches}
 
-    def column(self, path: str, component: str, *, static: bool = False) -> list:
+    def column(
+        self, path: str, component: str, *, static: bool = False, timeline: str | None = None
+    ) -> list:
         """All rows of a component of an entity, in the order they were sent."""
         return [
             row
             for entity, is_static, batch in self._batches
             if entity == path and is_static == static and component in batch.schema.names
+            if timeline is None or timeline in batch.schema.names
             for row in batch.column(component).to_pylist()
         ]
 
@@ -36,16 +39,16 @@ class Rrd:
         """How often anything was sent to an entity."""
         return sum(entity == path and still == static for entity, still, _ in self._batches)
 
-    def time(self, path: str) -> np.ndarray:
+    def time(self, path: str, timeline: str = "time") -> np.ndarray:
         """Times of an entity's rows [s]."""
         return np.concatenate(
             [
-                batch.column("time").to_numpy().astype(np.int64) / 1e9
+                batch.column(timeline).to_numpy().astype(np.int64) / 1e9
                 for entity, is_static, batch in self._batches
-                if entity == path and not is_static
+                if entity == path and not is_static and timeline in batch.schema.names
             ]
         )
 
-    def scalars(self, path: str) -> np.ndarray:
+    def scalars(self, path: str, timeline: str | None = None) -> np.ndarray:
         """Curves of an entity, (T, D)."""
-        return np.array(self.column(path, "Scalars:scalars"))
+        return np.array(self.column(path, "Scalars:scalars", timeline=timeline))

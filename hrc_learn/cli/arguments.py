@@ -231,8 +231,9 @@ class Import(Measured):
 class Show(Measured):
     """Open a run, a fit or the demonstrations of a dataset in Rerun.
 
-    A dataset is recorded first: paths in 3D with the arm, the joints of all demonstrations,
-    and for each one image feature, human effort, gripper and camera images.
+    A dataset is shown with its arm in 3D, cameras, gripper, and commands next to measured
+    joints. Each episode has a timeline of its own; choose it in the time panel. The arm follows
+    from the dataset's robot type, or from --robot.
     """
 
     dataset: Path
@@ -243,6 +244,10 @@ class Show(Measured):
     """Open it in the browser, as on machines without a screen. Ctrl-C ends it."""
     episodes: tuple[int, ...] = ()
     """Episodes to show. Default: all, or 200 of a larger dataset."""
+    robot: str = ""
+    """Arm to draw, by name, or its URDF or MJCF file. Default: by the dataset's robot type."""
+    tip: str = ""
+    """Flange link in such a file, or BASE:TIP. Default: from the root to the only end."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,15 +7,19 @@ import threading
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hrc_learn.cli._run import has_screen, write_values
 from hrc_learn.cli.arguments import Report, Show
 from hrc_learn.store import write_text
 from hrc_learn.viz.report import read_report, reports_page
 
+if TYPE_CHECKING:
+    from hrc_learn.learning.demonstration_dashboard import ShownDataset
+
 
 def show(args: Show) -> int:
-    """Open the recordings of a folder, or record the demonstrations of a dataset."""
+    """Open the recordings of a folder, or show the demonstrations of a dataset."""
     if not args.dataset.exists():
         raise FileNotFoundError(f"there is nothing at {args.dataset}")
     if recordings := recordings_in(args.dataset):
@@ -26,14 +30,12 @@ def show(args: Show) -> int:
             )
         return _open(recordings, args.web)
     if args.out is not None:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        _record_demonstrations(args, args.out)
-        print(args.out)
-        return 0
+        return _record(args, args.out)
+    if args.web or not has_screen():
+        return _stream(args)
     with tempfile.TemporaryDirectory(prefix="hrc_show_") as folder:
         recording = Path(folder) / "demonstrations.rrd"
-        _record_demonstrations(args, recording)
-        return _open([recording], args.web)
+        return _record(args, recording) or _open([recording], args.web)
 
 
 def recordings_in(path: Path) -> list[Path]:
@@ -72,32 +74,97 @@ def _serve(recordings: Sequence[Path]) -> int:
 
 _SHOWN, _SHOWN_FRAMES = 200, 1_000_000
 """Largest number of demonstrations and frames shown by default, limited by the viewer."""
-_WITH_TAB = 8
-"""Largest number of demonstrations that get their own tab and images."""
+_VIDEO_BYTES = 300_000_000
+"""Size of all images shown: those of further episodes are left out."""
 
 
-def _record_demonstrations(args: Show, out: Path) -> None:
+def _record(args: Show, out: Path) -> int:
+    """Write the recording of a dataset."""
     # Imported here: `report` needs neither Rerun nor PyTorch.
-    from hrc_learn.demos import open_demos, thumbnails
     from hrc_learn.learning.demonstration_dashboard import record_demonstrations
 
+    out.parent.mkdir(parents=True, exist_ok=True)
+    shown = _shown(args)
+    seconds = record_demonstrations(out, shown)
+    print(out)
+    write_values(args.json, {"episodes": len(shown.demos), "seconds": seconds})
+    return 0
+
+
+def _stream(args: Show) -> int:
+    """Serve a dataset to the browser, from its first episode on, until Ctrl-C."""
+    from hrc_learn.learning.demonstration_dashboard import (
+        demonstration_layout,
+        send_demonstrations,
+    )
+    from hrc_learn.teleoperation.dashboard_page import serve_stream
+
+    shown = _shown(args)
+    try:
+        with serve_stream(None) as (stream, url):
+            stream.send_blueprint(demonstration_layout(shown))
+            print(f"Dashboard at {url} (Ctrl-C ends it)", flush=True)
+            if has_screen():
+                webbrowser.open(url)
+            seconds = sum(demo.duration for demo in send_demonstrations(stream, shown))
+            write_values(args.json, {"episodes": len(shown.demos), "seconds": seconds})
+            threading.Event().wait()
+    except KeyboardInterrupt:
+        pass
+    return 0
+
+
+def _shown(args: Show) -> "ShownDataset":
+    """Demonstrations of a dataset, as they are shown."""
+    from hrc_learn.demos import DatasetError, Demonstration, open_demos
+    from hrc_learn.demos.dataset_arm import arm_of_dataset
+    from hrc_learn.demos.images import CameraImages, ImageReader, camera_images
+    from hrc_learn.learning.demonstration_dashboard import ShownDataset
+
     source = open_demos(args.dataset, episodes=args.episodes or None)
-    shown = source
+    demos = source
     if not args.episodes:
         usual = sorted(source.lengths)[len(source) // 2]
-        shown = source.spread(min(_SHOWN, max(1, _SHOWN_FRAMES // usual)))
-    demos = shown.load()
-    title = f"Demonstrations in {args.dataset.resolve().name}"
-    images, missing = thumbnails(source.folder, demos[:_WITH_TAB])
-    record_demonstrations(out, demos, title, images, most=_WITH_TAB)
-    for image in missing:
-        print(f"left out: {image}")
-    if len(demos) < len(source):
-        print(f"{len(demos)} of {len(source)} demonstrations (--episodes selects others)")
-    else:
-        print(f"{len(demos)} demonstrations")
-    seconds = sum(demo.duration for demo in demos)
-    write_values(args.json, {"episodes": len(demos), "seconds": seconds})
+        demos = source.spread(min(_SHOWN, max(1, _SHOWN_FRAMES // usual)))
+    try:
+        arm = arm_of_dataset(source, args.robot, args.tip)
+    except DatasetError as error:
+        if args.robot:
+            raise
+        arm = None
+        print(f"no arm is drawn: {error}")
+    reader = ImageReader(source.folder)
+    left = _VIDEO_BYTES
+
+    def images(demo: Demonstration) -> dict[str, CameraImages]:
+        nonlocal left
+        found: dict[str, CameraImages] = {}
+        for name, camera in camera_images(reader, demo) if left > 0 else ():
+            if isinstance(camera, DatasetError):
+                print(f"left out: {camera}")
+            else:
+                found[name] = camera
+                left -= sum(map(len, camera.samples))
+        if left <= 0 and found:
+            print(
+                f"left out: images after episode {demo.episode}, which would need more than "
+                f"{_VIDEO_BYTES // 1_000_000} MB (--episodes selects others)"
+            )
+        return found
+
+    chosen = f"{len(demos)} of {len(source)}" if len(demos) < len(source) else len(source)
+    print(
+        f"{chosen} demonstrations" + " (--episodes selects others)" * (len(demos) < len(source))
+    )
+    return ShownDataset(
+        title=f"Demonstrations in {args.dataset.resolve().name}",
+        demos=demos,
+        arm=arm,
+        units=source.units,
+        images=images,
+        cameras=[key.removeprefix("observation.images.") for key in reader.cameras],
+        notes=source.notes,
+    )
 
 
 def report(args: Report) -> None:

@@ -12,7 +12,6 @@ from hrc_learn.demos.image_features import attach_features as attach_features
 from hrc_learn.demos.image_features import extract_features as extract_features
 from hrc_learn.demos.images import ImageReader as ImageReader
 from hrc_learn.demos.images import load_images as load_images
-from hrc_learn.demos.images import thumbnails as thumbnails
 from hrc_learn.demos.issues import DatasetError as DatasetError
 from hrc_learn.demos.issues import Issue as Issue
 from hrc_learn.demos.issues import UnitsWarning as UnitsWarning

@@ -1,8 +1,8 @@
 """Images of a dataset, decoded into tensors, one for each frame of an episode."""
 
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,18 @@ from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import INFO_PATH, open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
-from hrc_learn.demos.videos import Image, Segments, decode, decode_image, read_segments
+from hrc_learn.demos.videos import (
+    Image,
+    Segments,
+    decode,
+    decode_image,
+    encoded_samples,
+    read_segments,
+)
 
 Images = Mapping[str, UInt8[Tensor, "frames 3 height width"]]
 """Camera -> RGB images, 0 to 255. In memory, the colours of a pixel are adjacent
 (`torch.channels_last`)."""
-StampedImages = tuple[Float[np.ndarray, " images"], tuple[bytes, ...]]
-"""Times [s], and a JPEG file for each."""
 
 _THUMBNAIL_RATE = 5.0
 """Thumbnails per second: a hand-guided arm moves by a few centimetres between two."""
@@ -67,6 +72,15 @@ class ImageReader:
             if self._folder.features[key].dtype == "image"
             or (key in segments and segments[key].file.is_file())
         )
+
+    def encoded(self, episode: int, camera: str) -> tuple[str, list[float], list[bytes]] | None:
+        """Encoded images of an episode, see `encoded_samples`; None for images in columns.
+
+        Raises:
+            DatasetError: The video cannot be read.
+        """
+        segment = self._segments.get(episode, {}).get(camera)
+        return None if segment is None else encoded_samples(segment)
 
     def size(self, camera: str) -> tuple[int, int]:
         """Declared height and width of a camera's images [px].
@@ -214,53 +228,61 @@ def load_images(
     return ImageReader(path).read(episode, cameras, frames, size)
 
 
+@dataclass(frozen=True)
+class CameraImages:
+    """Images of a camera during an episode."""
+
+    codec: str
+    """jpeg, av1, h264, hevc or vp9."""
+    time: Float[np.ndarray, " images"]
+    """[s]"""
+    samples: tuple[bytes, ...]
+    """Files, or samples of a video in the order of decoding."""
+
+
+def camera_images(
+    reader: ImageReader, demo: Demonstration
+) -> Iterator[tuple[str, CameraImages | DatasetError]]:
+    """Each camera of an episode with its images, or with the error of its video.
+
+    Videos are not decoded where a viewer does that on demand; other images are thumbnails.
+    """
+    for camera in reader.available(demo.episode):
+        # The whole rest of the key: left.rgb and right.rgb are two cameras.
+        name = camera.removeprefix("observation.images.")
+        try:
+            encoded = reader.encoded(demo.episode, camera)
+            if encoded is None:
+                yield name, thumbnails(reader, demo, camera)
+            else:
+                codec, time, samples = encoded
+                yield name, CameraImages(codec, np.array(time), tuple(samples))
+        except DatasetError as error:
+            yield name, error
+
+
 def thumbnails(
-    path: str | Path | DatasetFolder, demos: Iterable[Demonstration], most: int = 200
-) -> tuple[dict[int, dict[str, StampedImages]], list[str]]:
-    """Small images of episodes: enough to see the motion.
+    reader: ImageReader, demo: Demonstration, camera: str, most: int = 200
+) -> CameraImages:
+    """Small images of an episode: enough to see the motion.
 
     Args:
-        path: Folder of the dataset, or its metadata (`DemonstrationSource.folder`).
-        demos: Demonstrations of it, with all their frames or some spread evenly over them.
-        most: Largest number of images per camera and episode: 200 take about 2 MB.
-
-    Returns:
-        Images by episode index and camera, without LeRobot's prefix, and one line for each
-        video that cannot be read.
+        reader: Reader of the dataset.
+        demo: Demonstration with all its frames or some spread evenly over them.
+        camera: Feature that holds the images.
+        most: Largest number of images: 200 take about 2 MB.
 
     Raises:
-        DatasetError: The metadata cannot be read.
+        DatasetError: The images cannot be read.
     """
-    reader, found, missing = ImageReader(path), {}, []
-    wanted = [(demo, camera) for demo in demos for camera in reader.available(demo.episode)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # PyAV releases the interpreter lock
-        read = pool.map(lambda pair: _thumbnails(reader, pair[0], pair[1], most), wanted)
-        for (demo, camera), images in zip(wanted, read, strict=True):
-            if isinstance(images, DatasetError):
-                missing.append(str(images))
-            else:
-                # The whole rest of the key: left.rgb and right.rgb are two cameras.
-                name = camera.removeprefix("observation.images.")
-                found.setdefault(demo.episode, {})[name] = images
-    return found, missing
-
-
-def _thumbnails(
-    reader: ImageReader, demo: Demonstration, camera: str, most: int
-) -> StampedImages | DatasetError:
-    """Thumbnails of one camera, or the error of its video."""
     last = reader.entry(demo.episode).length - 1
     # Evenly spread, and never more than the frames there are.
     count = min(last + 1, most, 1 + int(demo.duration * _THUMBNAIL_RATE))
     frames = sorted({*np.linspace(0, last, count).astype(int).tolist()})
-    try:
-        size = thumbnail_size(*reader.size(camera))
-        files = tuple(
-            jpeg(image) for _, image in reader.stream(demo.episode, camera, frames, size)
-        )
-    except DatasetError as error:
-        return error
-    return np.interp(frames, np.linspace(0, last, len(demo)), demo.time), files
+    size = thumbnail_size(*reader.size(camera))
+    found = reader.stream(demo.episode, camera, frames, size)
+    time = np.interp(frames, np.linspace(0, last, len(demo)), demo.time)
+    return CameraImages("jpeg", time, tuple(jpeg(image) for _, image in found))
 
 
 def thumbnail_size(height: int, width: int) -> tuple[int, int]:

@@ -123,6 +123,54 @@ def _segment(
     return VideoSegment(file=folder.root / file, start=float(times[0]), stop=float(times[1]))
 
 
+_CODECS = {"av1": "av1", "h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb", "vp9": "vp9"}
+"""Codec -> filter that makes each sample complete by itself, or the codec itself for none."""
+
+
+def encoded_samples(
+    segment: VideoSegment,
+) -> tuple[str, list[float], list[bytes]] | None:
+    """The images of a segment as they are encoded, for players that decode on demand.
+
+    Returns:
+        The codec, the time of each sample since the first image [s] in the order of decoding,
+        and the samples; None if the codec, or an order of images that differs from it, needs
+        decoding.
+
+    Raises:
+        DatasetError: The video cannot be read.
+    """
+    import av
+
+    times: list[float] = []
+    samples: list[bytes] = []
+    try:
+        with av.open(str(segment.file)) as container:
+            stream = container.streams.video[0]
+            codec = stream.codec_context.name.replace("libdav1d", "av1")
+            if codec not in _CODECS or stream.time_base is None:
+                return None
+            whole = None
+            if _CODECS[codec] != codec:
+                whole = av.BitStreamFilterContext(_CODECS[codec], stream)
+            # Half an image before, as times are rounded; a key frame begins each episode.
+            container.seek(int((segment.start + 1e-3) / stream.time_base), stream=stream)
+            for packet in container.demux(stream):
+                if packet.pts is None:
+                    continue
+                time = float(packet.pts * stream.time_base)
+                if time > segment.stop - 1e-3:
+                    break
+                if times and time - segment.start < times[-1]:
+                    return None
+                times.append(time - segment.start)
+                for part in whole.filter(packet) if whole else (packet,):
+                    samples.append(bytes(part))
+    except (av.FFmpegError, OSError, IndexError) as error:
+        raise DatasetError(f"cannot be read as a video: {error}", file=segment.file) from error
+    return (codec, times, samples) if len(times) == len(samples) else None
+
+
 def decode(
     segment: VideoSegment,
     fps: float,

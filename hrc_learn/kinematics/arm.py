@@ -66,7 +66,7 @@ type ClosedForm = Callable[[SerialChain, Pose, Tensor | float], Tensor]
 position of joint 7 [rad], then rows of NaN."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FingerJoint:
     """A joint of a gripper."""
 
@@ -79,6 +79,14 @@ class FingerJoint:
     """[rad] or [m]; the end of its range that is further from zero."""
     follows: tuple[str, float, float] | None = None
     """Joint whose position, times the factor and plus the offset, it takes."""
+    carrier: str | None = None
+    """Joint of the gripper that carries it; None: the hand."""
+    mount: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """Frame of the joint at zero in the frame of its carrier, or of the tool."""
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    """Unit vector in that frame."""
+    meshes: tuple[MeshFile, ...] = ()
+    """Meshes that it moves."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,7 +96,10 @@ class ArmShape:
     meshes: Mapping[str, tuple[MeshFile, ...]] = field(default_factory=dict)
     """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
     gripper: tuple[FingerJoint, ...] = ()
-    """Joints of the gripper in the description; empty if it ends at the flange."""
+    """Joints of the gripper in the description, carriers first; empty if it ends at the
+    flange."""
+    hand: tuple[MeshFile, ...] = ()
+    """Meshes of the hand that carries the fingers, in the frame of the tool."""
     shapes: tuple[tuple[int, Shape], ...] = ()
     """Number of a link's frame, and a collision shape there; the capsules contain them."""
     masses: tuple[float | None, ...] = ()

@@ -217,15 +217,22 @@ def _shape(
     ]
     owners = {link: number for link, (number, _) in places.items()}
     gripper = []
-    ahead = [
-        (joint, pose if number > last else to_tool @ pose)
+    # A joint, its parent's pose in the frame of the tool with the gripper open, the joint that
+    # carries the parent, and the parent's pose there.
+    ahead: list[tuple[Joint, Transform, str | None, Transform]] = [
+        (joint, at, None, at)
         for joint in roots
         for number, pose in [places[joint.parent]]
+        for at in [pose if number > last else to_tool @ pose]
     ]
-    for joint, parent in ahead:
+    for joint, parent, carrier, place in ahead:
         finger, postures = _finger(joint, parent)
-        gripper.append(finger)
-        for link, within in description.rigid_subtree(joint.child).items():
+        child = description.rigid_subtree(joint.child)
+        drawn = {link: (0, pose) for link, pose in child.items()}
+        meshes = _meshes(description, drawn, 0).get("link0", ())
+        mount = place @ joint.origin
+        gripper.append(replace(finger, carrier=carrier, mount=mount, meshes=meshes))
+        for link, within in child.items():
             owners[link] = last + 2
             shapes += [
                 (last + 2, replace(shape, pose=at @ within @ shape.pose))
@@ -233,10 +240,13 @@ def _shape(
                 for at in postures
             ]
             further = [below for below in description.below(link) if below.kind in MOVING]
-            ahead += [(below, postures[-1] @ within) for below in further]
+            opened = postures[-1] @ within
+            ahead += [(below, opened, joint.name, within) for below in further]
+    hand = {link: (0, pose) for link, (number, pose) in places.items() if number > last}
     return ArmShape(
         meshes=_meshes(description, places, last),
         gripper=tuple(gripper),
+        hand=_meshes(description, hand, 0).get("link0", ()),
         shapes=tuple(shapes),
         masses=_masses(description, owners, last),
     )
@@ -257,7 +267,10 @@ def _finger(joint: Joint, parent: Transform) -> tuple[FingerJoint, list[Transfor
     ]
     kind = "prismatic" if joint.kind == "prismatic" else "revolute"
     follows = joint.follows
-    finger = FingerJoint(joint.name, kind, closed=closed, opened=opened, follows=follows)
+    x, y, z = joint.axis.tolist()
+    finger = FingerJoint(
+        joint.name, kind, closed=closed, opened=opened, follows=follows, axis=(x, y, z)
+    )
     return finger, poses
 
 

@@ -18,18 +18,15 @@ Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at mo
 
 from __future__ import annotations
 
-from functools import cache, partial
-from importlib.metadata import PackageNotFoundError, distribution
+from functools import partial
 from math import cos, pi, sin
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry import Body, MeshFile, Pose
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics.arm import TCP_OFFSET, Arm, ArmShape, hand_capsules
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import LinkCapsule
@@ -223,76 +220,3 @@ panda = _franka("panda", PANDA_LIMITS, (False,))
 
 fr3 = _franka("fr3", FR3_LIMITS, (False, True))
 """The Research 3 with its hand; the Cartesian limits are 3 m/s and 2.5 rad/s."""
-
-
-# Drawing
-
-_MESHES = "cmeel.prefix/share/example-robot-data/robots/panda_description/meshes/visual"
-_PARTS = {
-    **{f"link{i}": {"file": f"link{i}"} for i in range(8)},
-    "hand": {"file": "hand"},
-    "tool": {"file": "hand", "position": (0.0, 0.0, -TCP_OFFSET)},
-    "finger_left": {"file": "finger"},
-    "finger_right": {"file": "finger", "orientation": (0.0, 0.0, 0.0, 1.0)},
-}
-
-
-def panda_meshes(body: str) -> tuple[MeshFile, ...]:
-    """Meshes of a link, the hand or a finger of the Panda; empty without the extra `meshes`.
-
-    Args:
-        body: link0 to link7, hand, finger_left or finger_right; tool is the hand in the frame
-            of the tool centre point. There are none of any other body.
-    """
-    folder = _mesh_folder()
-    if folder is None or body not in _PARTS:
-        return ()
-    place: dict[str, Any] = dict(_PARTS[body])
-    return (MeshFile(path=folder / f"{place.pop('file')}.dae", **place),)
-
-
-@cache
-def _mesh_folder() -> Path | None:
-    try:
-        folder = Path(str(distribution("example-robot-data").locate_file(_MESHES)))
-    except PackageNotFoundError:
-        return None
-    return folder if folder.is_dir() else None
-
-
-def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
-    """Meshes of a link, the gripper or a finger of an arm; empty if unknown.
-
-    Franka's arms share their meshes, and all arms of the work cell carry the same gripper.
-
-    Args:
-        robot: The arm.
-        body: link0, link1, ..., hand, finger_left or finger_right.
-    """
-    if robot.is_franka or body in ("hand", "finger_left", "finger_right"):
-        return panda_meshes(body)
-    return tuple(robot.meshes.get(body, ()))
-
-
-def panda_bodies(joint_position: Float[np.ndarray, "time 7"]) -> tuple[Body, ...]:
-    """Base, links and hand as the capsules that stand for them in planning.
-
-    Args:
-        joint_position: [rad].
-    """
-    moving = panda.link_poses(joint_position)
-    upright = moving.orientation.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(len(joint_position), 4)
-    bodies = []
-    for link in dict.fromkeys(panda.whole.links):
-        # The base moves with no joint.
-        pose = moving[:, link - 1] if link else Pose(torch.zeros_like(upright[:, :3]), upright)
-        name = "tool" if link == TOOL_LINK else f"link{link}"
-        body = Body(
-            name=name,
-            position=pose.position.numpy(),
-            orientation=pose.orientation.numpy(),
-            capsules=tuple(c for c in panda.whole.capsules if c.link == link),
-            meshes=panda_meshes(name),
-        )
-        bodies.append(body)
-    return tuple(bodies)

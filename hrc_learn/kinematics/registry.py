@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
@@ -36,6 +39,25 @@ _INSTALL = {
     "gym-aloha": "--no-deps gym-aloha==0.1.5",
 }
 _OWN = {"panda": panda, "fr3": fr3}
+# Other names of robots in LeRobot datasets, without "follower" and the like. A SO-100 has the
+# joints of a SO-101, and LeRobot calibrates both to the same zero.
+_OTHER_NAMES = {
+    "so100": "so101",
+    "so": "so101",
+    "franka": "panda",
+    "frankaemikapanda": "panda",
+    "fer": "panda",
+    "frankaresearch3": "fr3",
+    "droid": "panda",
+    "kinova": "gen3",
+    "kinovagen3": "gen3",
+    "iiwa": "iiwa7",
+    "kukaiiwa": "iiwa7",
+    "vx300s": "viperx",
+    "xarm": "xarm7",
+    "unitreez1": "z1",
+}
+_ROLES = re.compile("follower|leader|robot$|arm$|description$")
 
 CAPSULES = Path(__file__).with_name("capsules.json")
 """Capsules of registered arms, fitted by tools/fit_capsules.py."""
@@ -57,6 +79,25 @@ def maker_of(name: str) -> str:
     return "Franka Robotics" if name in _OWN else _sources()[name]["maker"]
 
 
+def arm_of_robot(robot_type: str | None) -> Arm | None:
+    """Registered arm of a LeRobot `robot_type`, such as so101_follower; None if unknown.
+
+    None as well if the package with its description is not installed.
+    """
+    name = _plain(_ROLES.sub("", (robot_type or "").lower().replace("_", "").replace("-", "")))
+    known = {_plain(registered): registered for registered in registered_arms()}
+    found = known.get(name) or _OTHER_NAMES.get(name)
+    try:
+        return _registered(found) if found else None
+    except MissingModelError:
+        return None
+
+
+def _plain(name: str) -> str:
+    """A name in small letters and digits."""
+    return re.sub("[^a-z0-9]", "", name.lower())
+
+
 def arm(
     name_or_file: str | Path,
     *,
@@ -69,7 +110,9 @@ def arm(
     """A robot arm by its name, or from a URDF or MJCF file.
 
     Args:
-        name_or_file: One of `registered_arms()`, or a path that ends in .urdf, .xml or .mjcf.
+        name_or_file: One of `registered_arms()`, the name of a description in an installed
+            package ("ur10e", "iiwa14"; see `installed_descriptions`), or a path that ends in
+            .urdf, .xml or .mjcf.
         base: Link or body to be the base, of files; None: the root.
         tip: Link, body or site to be the flange, of files; None: the only end besides a
             gripper's.
@@ -90,10 +133,84 @@ def arm(
         return _registered(name) if not choice else _described(name, choice)
     if path.suffix.lower() in (".urdf", ".xml", ".mjcf"):
         return arm_from_file(path, **choice)
+    if found := installed_descriptions(name):
+        if len(found) > 1:
+            raise ValueError(
+                f"several installed descriptions are named {name!r}: give one of the files "
+                f"{', '.join(map(str, found))}"
+            )
+        return arm_from_file(found[0], name=name, **choice)
     raise ValueError(
-        f"no arm {name!r}: there are {', '.join(registered_arms())}, and files in URDF (.urdf) "
-        "and MJCF (.xml, .mjcf)"
+        f"no arm {name!r}: there are {', '.join(registered_arms())}, descriptions in installed "
+        f"packages, and files in URDF (.urdf) and MJCF (.xml, .mjcf){_fetched_with(name)}"
     )
+
+
+def installed_descriptions(name: str) -> list[Path]:
+    """Descriptions of a robot in installed packages, by the name of their file or folder.
+
+    Looked through are example-robot-data, robosuite, and what mujoco-menagerie and
+    robot_descriptions have already fetched; nothing is downloaded. Of several kinds of packages
+    the first that has the robot counts, of files in one folder the one named most simply.
+    """
+    wanted = _plain(name)
+    for root in _description_folders():
+        found: dict[Path, Path] = {}
+        for file in sorted(root.rglob("*"), key=lambda path: (len(path.name), path.name)):
+            if file.suffix in (".urdf", ".xml") and wanted in _names_of(file):
+                found.setdefault(file.parent, file)
+        if found:
+            return [*found.values()]
+    return []
+
+
+def _names_of(file: Path) -> set[str]:
+    """Names under which a description is looked up."""
+    stem = _plain(file.stem)
+    names = {stem, stem.removesuffix("robot"), stem.removesuffix("description")}
+    # robosuite names folders, and each file robot.xml.
+    return {_plain(file.parent.name)} if stem == "robot" else names
+
+
+def _description_folders() -> Iterator[Path]:
+    """Folders of descriptions on this machine."""
+    for package, place in (
+        ("example-robot-data", "cmeel.prefix/share/example-robot-data/robots"),
+        ("robosuite", "robosuite/models/assets/robots"),
+    ):
+        try:
+            yield Path(str(distribution(package).locate_file(place)))
+        except PackageNotFoundError:
+            continue
+    cache_home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    menagerie = os.environ.get("MENAGERIE_CACHE_DIR") or cache_home / "mujoco_menagerie"
+    yield Path(os.environ.get("MENAGERIE_ROOT") or Path(menagerie) / "models")
+    fetched = os.environ.get("ROBOT_DESCRIPTIONS_CACHE") or "~/.cache/robot_descriptions"
+    yield Path(fetched).expanduser()
+
+
+def _fetched_with(name: str) -> str:
+    """Command that fetches a description, if an installed package knows the robot."""
+    wanted = _plain(name)
+    with suppress(ModuleNotFoundError):
+        from mujoco_menagerie import names  # pyright: ignore[reportMissingImports]
+
+        for robot in names():
+            if _plain(robot).endswith(wanted):
+                return f"; mujoco_menagerie.prefetch([{robot!r}]) fetches {robot}"
+    with suppress(ModuleNotFoundError):
+        # Its list alone: importing a description downloads it.
+        from robot_descriptions._descriptions import (  # pyright: ignore
+            DESCRIPTIONS,
+        )
+
+        for module in DESCRIPTIONS:
+            if wanted in (_plain(module.removesuffix(end)) for end in _ENDS):
+                return f"; `import robot_descriptions.{module}` fetches it"
+    return ""
+
+
+_ENDS = ("_description", "_mj_description")
 
 
 @cache

@@ -1,9 +1,12 @@
-"""Rerun recording of demonstrations, drawn together and one by one."""
+"""Rerun recording of a dataset: the arm, its cameras and curves, episode by episode.
+
+Each episode has a timeline of its own, named after it, so that one layout shows them all. The
+timeline "time" holds the first episode, and the joints of all episodes laid over one another.
+"""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from itertools import chain
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import rerun as rr
@@ -11,14 +14,19 @@ import rerun.blueprint as rrb
 import torch
 from jaxtyping import Float
 
-from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.demos import Demonstration
+from hrc_learn.demos.dataset_arm import DatasetArm
+from hrc_learn.demos.images import CameraImages
+from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.kinematics import panda
-from hrc_learn.kinematics.franka import panda_bodies
+from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.log import JointRanges
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Curves, Plot, Tab, limit_curves, several, single, slug
 from hrc_learn.viz.rerun_stream import (
     POSE_RATE,
+    TIMELINE,
+    begin,
     dashboard,
     frame_view,
     markdown_table,
@@ -34,10 +42,12 @@ from hrc_learn.viz.rerun_stream import (
     tab_view,
 )
 
-Images = Mapping[str, tuple[np.ndarray, tuple[bytes, ...]]]
-"""Times [s] and JPEG files of the images of a demonstration, by camera."""
-Timed = list[tuple[Float[np.ndarray, "_"], Curves]]
-"""Curves, each with the times of its samples [s]."""
+_CODECS = {
+    "av1": rr.VideoCodec.AV1,
+    "h264": rr.VideoCodec.H264,
+    "hevc": rr.VideoCodec.H265,
+    "vp9": rr.VideoCodec.VP9,
+}
 
 
 def panda_ranges(joint_names: Sequence[str]) -> JointRanges | None:
@@ -47,148 +57,263 @@ def panda_ranges(joint_names: Sequence[str]) -> JointRanges | None:
     return JointRanges(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
 
 
-def record_demonstrations(
-    path: str | os.PathLike[str],
-    demos: DemonstrationSet,
-    title: str,
-    images: Mapping[int, Images] | None = None,
-    *,
-    most: int = 8,
-) -> None:
-    """Write demonstrations as an .rrd file with its layout; `rerun FILE` shows it.
+@dataclass(frozen=True, kw_only=True)
+class ShownDataset:
+    """Demonstrations of a dataset with what it takes to show them."""
 
-    A Panda is drawn as well, with the path of its end effector.
+    title: str
+    demos: Sequence[Demonstration]
+    """Demonstrations of one robot, read one by one."""
+    arm: DatasetArm | None = None
+    """Arm to draw; None draws the path of the end effector alone."""
+    units: Mapping[str, UnitDecision] = field(default_factory=dict)
+    """Units on disk by role, in which joints are plotted; rad if not given."""
+    images: Callable[[Demonstration], Mapping[str, CameraImages]] = lambda demo: {}
+    """Images of a demonstration by camera."""
+    cameras: Sequence[str] = ()
+    """All cameras."""
+    notes: Sequence[str] = ()
+    """Remarks of the reader."""
+
+
+def record_demonstrations(path: str | os.PathLike[str], shown: ShownDataset) -> float:
+    """Write demonstrations as an .rrd file with its layout; `rerun FILE` shows it.
 
     Args:
         path: File to write; it appears only when complete.
-        demos: Demonstrations of one robot.
-        title: Title of the recording.
-        images: Camera images by episode.
-        most: Number of demonstrations with a tab of their own; all are drawn together.
+        shown: The demonstrations.
+
+    Returns:
+        Duration of all demonstrations together [s].
     """
-    limits, images = panda_ranges(demos[0].joint_names), images or {}
-    shown = [_completed(demo) for demo in demos]
-    first, alone = shown[0], shown[:most]
-    arm = (
-        panda_bodies(first.joint_position)
-        if limits and first.joint_position is not None
-        else ()
+    with rrd_file(path, shown.title, demonstration_layout(shown)) as stream:
+        return sum(demo.duration for demo in send_demonstrations(stream, shown))
+
+
+def demonstration_layout(shown: ShownDataset) -> rrb.Blueprint:
+    """Layout with arm and cameras on the left and curves on the right."""
+    first = shown.demos[0]
+    left: list[rrb.View | rrb.Container] = []
+    path = tool_path(shown, first)
+    if path is not None:
+        name, points = "Paths of the end effector, dots: now", path
+        if (arm := shown.arm) is not None and first.joint_position is not None:
+            name = f"{arm.arm.name}, and the paths of its tool (dots: now)"
+            q = torch.from_numpy(arm.positions(first.joint_position))
+            points = np.concatenate([path, arm.arm.joint_origins(q).flatten(0, 1).numpy()])
+        eye = frame_view(points, direction=(0.85, 0.5, 0.4), nearest=0.3)
+        left.append(rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
+    if shown.cameras:
+        views = [
+            rrb.Spatial2DView(origin=f"/cameras/{slug(name)}", name=name)
+            for name in shown.cameras
+        ]
+        left.append(rrb.Grid(contents=views, grid_columns=min(3, len(views))))
+    task = rrb.TextDocumentView(origin="/task", name="Task")
+    episodes = rrb.TextDocumentView(origin="/summary", name="Episodes")
+    tabs = [tab_view(tab) for tab in (_episode_tab(shown, first), _together_tab(shown, first))]
+    right = rrb.Vertical(
+        rrb.Tabs(contents=[*tabs, episodes], active_tab=0), task, row_shares=(9, 1)
     )
-    tabs = [_together(shown, limits), *(_alone(demo) for demo in alone)]
-    pages: list[rrb.Container] = [tab_view(tab) for tab, _ in tabs]
-    for k, demo in enumerate(alone, start=1):
-        pages[k] = _below_images(pages[k], demo, images.get(demo.episode, {}))
-    left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Demonstrations")]
-    if paths := [demo.position for demo in shown if demo.position is not None]:
-        name = "Paths of the end effector, dots: now"
-        name += f"; the arm in episode {first.episode}" * bool(arm)
-        eye = frame_view(np.concatenate(paths))
-        left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
-    right = rrb.Tabs(contents=pages, active_tab=0)
-    layout = dashboard(left, [right], row_shares=(2, 1), column_shares=(2, 3))
-    with rrd_file(path, title, layout) as stream:
-        for k, demo in enumerate(shown):
-            if demo.position is not None:
-                name, colour = str(demo.episode), _colour(k)
-                send_strips(stream, f"world/paths/{name}", [demo.position], colour, 0.003)
-                send_dot(stream, name, demo.time, demo.position, colour)
-        for body in arm:
+    # Without arm, path and cameras the curves have the whole screen.
+    return dashboard(left, [right], row_shares=(3, 2), column_shares=(1, 1))
+
+
+def send_demonstrations(
+    stream: rr.RecordingStream, shown: ShownDataset
+) -> Iterator[Demonstration]:
+    """Send the demonstrations one by one, and yield each one that was sent.
+
+    Args:
+        stream: Into a file or to a viewer that has the layout of `demonstration_layout`.
+        shown: The demonstrations.
+    """
+    begin(stream, shown.title)
+    rows = []
+    for k, demo in enumerate(shown.demos):
+        timelines = [f"episode {demo.episode}", *[TIMELINE] * (k == 0)]
+        _send_arm(stream, shown, demo, timelines, first=k == 0)
+        _send_images(stream, shown.images(demo), timelines)
+        for curves in _episode_curves(shown, demo):
+            send_curves(stream, demo.time, curves, timelines)
+        task = rr.TextDocument.columns(text=[f"Episode {demo.episode}: {demo.task}"])
+        stream.send_columns("task", seconds(demo.time[:1], timelines), task)
+        path = _send_together(stream, shown, demo, k)
+        rows.append((demo.episode, demo.task, f"{demo.duration:.2f}", len(demo), path))
+        yield demo
+    send_summary(stream, _summary(shown, rows))
+
+
+def tool_path(shown: ShownDataset, demo: Demonstration) -> Float[np.ndarray, "time 3"] | None:
+    """Recorded path of the end effector, or that of the arm [m]; None if neither is known."""
+    if demo.position is not None or shown.arm is None or demo.joint_position is None:
+        return demo.position
+    q = torch.from_numpy(shown.arm.positions(demo.joint_position))
+    return shown.arm.arm.forward(q).position.numpy()
+
+
+def _send_arm(
+    stream: rr.RecordingStream,
+    shown: ShownDataset,
+    demo: Demonstration,
+    timelines: Sequence[str],
+    first: bool,
+) -> None:
+    if shown.arm is None or demo.joint_position is None:
+        return
+    q, at = shown.arm.positions(demo.joint_position), samples(demo.time, POSE_RATE)
+    opening = shown.arm.opening(demo)
+    opened = None if opening is None else opening[at]
+    for body in arm_bodies(shown.arm.arm, q[at], opened):
+        if first:
             send_shapes(stream, body)
-            send_poses(stream, first.time, body, samples(first.time, POSE_RATE))
-        for demo in alone:
-            _send_images(stream, demo, images.get(demo.episode, {}))
-        send_summary(stream, _summary(title, shown, map(str, demos.notes)))
-        for time, curves in chain.from_iterable(timed for _, timed in tabs):
-            send_curves(stream, time, curves)
+        send_poses(stream, demo.time[at], body, np.arange(len(at)), timelines)
 
 
-def _completed(demo: Demonstration) -> Demonstration:
-    """Demonstration with a Panda's path, and NaN for features that were not seen."""
-    position, feature = demo.position, demo.feature
-    if position is None and demo.joint_position is not None and panda_ranges(demo.joint_names):
-        position = panda.forward(torch.from_numpy(demo.joint_position)).position.numpy()
-    if feature is not None and demo.feature_visible is not None:
-        feature = np.where(demo.feature_visible[:, None], feature, np.nan)
-    return replace(demo, position=position, feature=feature)
+def _send_images(
+    stream: rr.RecordingStream, images: Mapping[str, CameraImages], timelines: Sequence[str]
+) -> None:
+    for name, camera in images.items():
+        path, index = f"cameras/{slug(name)}", seconds(camera.time, timelines)
+        if camera.codec in _CODECS:
+            stream.log(path, rr.VideoStream(codec=_CODECS[camera.codec]), static=True)
+            columns = rr.VideoStream.columns(sample=camera.samples)
+        else:
+            kinds = ["image/jpeg"] * len(camera.samples)
+            columns = rr.EncodedImage.columns(blob=camera.samples, media_type=kinds)
+        stream.send_columns(path, index, columns)
 
 
-def _camera(demo: Demonstration, name: str) -> str:
-    """Entity of the images of a camera."""
-    return f"episode_{demo.episode}/cameras/{slug(name)}"
+def _own_unit(shown: ShownDataset, role: str, column: int) -> tuple[str, float]:
+    """Unit of a joint in the dataset, and the factor from it to the unit of the reader."""
+    decision = shown.units.get(role)
+    if decision is None:
+        return "rad", 1.0
+    unit = decision.unit_of(column)
+    return unit, unit_factor(role, unit)
 
 
-def _below_images(page: rrb.Container, demo: Demonstration, images: Images) -> rrb.Container:
-    """Layout of a tab below the camera images, if there are any."""
-    if not images:
-        return page
-    views = [rrb.Spatial2DView(origin=f"/{_camera(demo, name)}", name=name) for name in images]
-    row, title = rrb.Horizontal(*views), f"Episode {demo.episode}"
-    return rrb.Vertical(row, page, row_shares=(1, 3), name=title)
+def _episode_tab(shown: ShownDataset, demo: Demonstration) -> Tab:
+    """All that was recorded in an episode, commands next to what was measured."""
+    plots: dict[str, list[Curves]] = {}
+    for curves in _episode_curves(shown, demo):
+        plots.setdefault(curves.path.removesuffix("/limits"), []).append(curves)
+    drawn = [
+        Plot(
+            title=_title(shown, demo, path),
+            curves=tuple(curves),
+            legend=path in ("episode/position", "episode/feature", "episode/effort"),
+        )
+        for path, curves in plots.items()
+    ]
+    title = "Episode: measured blue, commanded orange, limits red"
+    return Tab(title=title, plots=tuple(drawn), columns=1 + (len(drawn) > 3))
 
 
-def _send_images(stream: rr.RecordingStream, demo: Demonstration, images: Images) -> None:
-    for name, (time, files) in images.items():
-        kinds = ["image/jpeg"] * len(files)
-        columns = rr.EncodedImage.columns(blob=files, media_type=kinds)
-        stream.send_columns(_camera(demo, name), seconds(time), columns)
+def _title(shown: ShownDataset, demo: Demonstration, path: str) -> str:
+    words = {
+        "episode/position": "Tool centre point [m]",
+        "episode/feature": "Feature in the image [px]",
+        "episode/effort": "Effort of the person [N m]",
+    }
+    if path in words:
+        return words[path]
+    if path == "episode/gripper":
+        decision = shown.units.get("gripper")
+        return f"Gripper [{'m' if decision is None else decision.unit}]"
+    joint = int(path.rpartition("_")[2])
+    unit, _ = _own_unit(shown, "joint_position", joint)
+    return f"{demo.joint_names[joint]} [{unit}]"
 
 
-def _together(demos: Sequence[Demonstration], limits: JointRanges | None) -> tuple[Tab, Timed]:
-    """Tab with every joint and the feature of all demonstrations, and its curves."""
-    joints = demos[0].joint_names
-    titles = [("joint_position", j, f"{name} [rad]") for j, name in enumerate(joints)]
-    titles += [("feature", i, f"Feature {pixel} [px]") for i, pixel in enumerate("uv")]
-    longest = max((demo.time for demo in demos), key=lambda time: time[-1])
-    plots, every = [], []
-    for quantity, column, title in titles:
-        timed: Timed = []
-        if limits is not None and quantity == "joint_position":
-            bounds = limit_curves(f"together/limits_{column}", limits, column, len(longest))
-            timed.append((longest, bounds))
-        for k, demo in enumerate(demos):
-            if (values := getattr(demo, quantity)) is not None:
-                path = f"together/{quantity}_{column}/{demo.episode}"
-                name = f"episode {demo.episode}"
-                timed.append((demo.time, single(path, name, values[:, column], _colour(k))))
-        if timed:
-            plots.append(Plot(title=title, curves=tuple(curves for _, curves in timed)))
-            every += timed
-    title = "All: joints" + ", limits red" * (limits is not None)
-    return Tab(title=title, plots=tuple(plots), columns=2), every
-
-
-def _colour(k: int) -> str:
-    """Colour of demonstration k."""
-    return palette.SERIES_ON_DARK[k % len(palette.SERIES_ON_DARK)]
-
-
-def _alone(demo: Demonstration) -> tuple[Tab, Timed]:
-    """Tab with all recorded quantities of one demonstration, and its curves."""
-    plots, every = [], []
-    for title, name, names, values in (
-        ("Joints [rad]", "joints", demo.joint_names, demo.joint_position),
-        ("Tool centre point [m]", "position", ("x", "y", "z"), demo.position),
-        ("Feature in the image [px]", "feature", ("u (right)", "v (down)"), demo.feature),
-        ("Effort of the person [N m]", "effort", demo.joint_names, demo.human_effort),
-        ("Gripper [m]", "gripper", ("opening",), demo.gripper),
+def _episode_curves(shown: ShownDataset, demo: Demonstration) -> Iterator[Curves]:
+    """Curves of an episode; joints and gripper in the units of the dataset."""
+    for joint, _ in enumerate(demo.joint_names):
+        names, columns = [], []
+        for role, name in (("joint_position", "measured"), ("command_position", "commanded")):
+            if (values := getattr(demo, role)) is not None:
+                _, factor = _own_unit(shown, role, joint)
+                names.append(name)
+                columns.append(values[:, joint] / factor)
+        if names:
+            path = f"episode/joint_{joint}"
+            yield several(path, names, np.stack(columns, axis=1))
+            if (limits := _limits(shown)) is not None:
+                yield limit_curves(f"{path}/limits", limits, joint, len(demo))
+    for name, names, values, role in (
+        ("gripper", ("opening",), demo.gripper, "gripper"),
+        ("position", ("x", "y", "z"), demo.position, ""),
+        ("feature", ("u (right)", "v (down)"), _seen(demo), ""),
+        ("effort", demo.joint_names, demo.human_effort, ""),
     ):
         if values is not None:
-            columns = values.reshape(len(values), -1)
-            curves = several(f"episode_{demo.episode}/{name}", names, columns)
-            plots.append(Plot(title=title, curves=(curves,), legend=True))
-            every.append((demo.time, curves))
-    return Tab(title=f"Episode {demo.episode}", plots=tuple(plots)), every
+            factor = _own_unit(shown, role, 0)[1] if role in shown.units else 1.0
+            columns = values.reshape(len(values), -1) / factor
+            yield several(f"episode/{name}", names, columns)
 
 
-def _summary(title: str, demos: Sequence[Demonstration], notes: Iterable[str]) -> str:
+def _limits(shown: ShownDataset) -> JointRanges | None:
+    """Joint limits of the arm in the units of the dataset, by the dataset's joints."""
+    if shown.arm is None:
+        return None
+    count = len(shown.demos[0].joint_names)
+    lower, upper = np.full(count, np.nan), np.full(count, np.nan)
+    for joint, column in enumerate(shown.arm.columns):
+        unit, factor = _own_unit(shown, "joint_position", column)
+        if unit in ("rad", "deg"):  # shares of a range have theirs in their name
+            lower[column] = float(shown.arm.arm.limits.lower[joint]) / factor
+            upper[column] = float(shown.arm.arm.limits.upper[joint]) / factor
+    return JointRanges(lower=lower, upper=upper)
+
+
+def _seen(demo: Demonstration) -> Float[np.ndarray, "frames 2"] | None:
+    """Image feature, NaN where it was not seen."""
+    if demo.feature is None or demo.feature_visible is None:
+        return demo.feature
+    return np.where(demo.feature_visible[:, None], demo.feature, np.nan)
+
+
+def _together_tab(shown: ShownDataset, demo: Demonstration) -> Tab:
+    """Every joint and the feature of all episodes, on the timeline "time"."""
+    every = [*demo.joint_names] if demo.joint_position is not None else []
+    titles = {
+        f"joint_{k}": _title(shown, demo, f"episode/joint_{k}") for k in range(len(every))
+    }
+    if demo.feature is not None:
+        titles |= {f"feature_{k}": f"Feature {axis} [px]" for k, axis in enumerate("uv")}
+    glob = {name: several(f"together/{name}/**", (), np.empty((0, 0))) for name in titles}
+    plots = [Plot(title=titles[name], curves=(curves,)) for name, curves in glob.items()]
+    return Tab(title=f"All episodes (timeline {TIMELINE})", plots=tuple(plots), columns=2)
+
+
+def _send_together(
+    stream: rr.RecordingStream, shown: ShownDataset, demo: Demonstration, k: int
+) -> str:
+    """Send an episode's part of what shows all of them; returns the length of its path."""
+    colour = palette.SERIES_ON_DARK[k % len(palette.SERIES_ON_DARK)]
+    columns = {}
+    if demo.joint_position is not None:
+        for joint, values in enumerate(demo.joint_position.T):
+            columns[f"joint_{joint}"] = values / _own_unit(shown, "joint_position", joint)[1]
+    if (feature := _seen(demo)) is not None:
+        columns |= {f"feature_{i}": values for i, values in enumerate(feature.T)}
+    name = f"episode {demo.episode}"
+    for quantity, values in columns.items():
+        path = f"together/{quantity}/{demo.episode}"
+        send_curves(stream, demo.time, single(path, name, values, colour))
+    way = tool_path(shown, demo)
+    if way is None:
+        return ""
+    send_strips(stream, f"world/paths/{demo.episode}", [way], colour, 0.003)
+    send_dot(stream, str(demo.episode), demo.time, way, colour)
+    return f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.2f}"
+
+
+def _summary(shown: ShownDataset, rows: Iterable[Sequence[object]]) -> str:
     """List of the demonstrations, as Markdown."""
-    rows = []
-    for demo in demos:
-        length = ""
-        if demo.position is not None:
-            steps = np.linalg.norm(np.diff(demo.position, axis=0), axis=1)
-            length = f"{steps.sum():.2f}"
-        rows.append((demo.episode, demo.task, f"{demo.duration:.2f}", len(demo), length))
     heads = ("episode", "task", "duration [s]", "frames", "path [m]")
-    notes = [f"- {note}" for note in notes]
-    return "\n".join([f"# {title}", "", *markdown_table(heads, rows), "", *notes])
+    choose = "Choose the timeline of an episode in the time panel, at the bottom."
+    notes = [f"- {note}" for note in shown.notes]
+    return "\n".join(
+        [f"# {shown.title}", "", choose, "", *markdown_table(heads, rows), "", *notes]
+    )

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile, read_mesh
-from hrc_learn.kinematics.franka import arm_meshes
+from hrc_learn.kinematics.drawing import arm_meshes
 from hrc_learn.log import RunRecording
 from hrc_learn.sim.arm_model import add_box, add_capsule
 from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM, add_surroundings

@@ -46,13 +46,13 @@ class DashboardServer(NamedTuple):
 
 
 @contextmanager
-def serve_stream(port: int = 9090) -> Iterator[DashboardServer]:
+def serve_stream(port: int | None = 9090) -> Iterator[DashboardServer]:
     """Serve a recording stream and its viewer until the `with` block ends.
 
     A page that is opened later shows all earlier data.
 
     Args:
-        port: Port of the page.
+        port: Port of the page; None: the first free one from 8080 on.
 
     Raises:
         ValueError: The port is taken.

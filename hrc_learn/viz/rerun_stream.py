@@ -43,7 +43,8 @@ def rrd_file(
         content = stream.binary_stream()
         try:
             if blueprint is not None:
-                stream.send_blueprint(blueprint, make_active=False)
+                # Active: a viewer in the browser does not show a layout that is only a default.
+                stream.send_blueprint(blueprint)
                 begin(stream, title)
             yield stream
             part.write_bytes(content.read() or b"")
@@ -72,9 +73,12 @@ class StaticShapes:
             self._stream.log(path, *shapes, static=True)
 
 
-def seconds(time: Float[np.ndarray, " time"]) -> list[rr.TimeColumn]:
-    """The index of columns sampled at these times."""
-    return [rr.TimeColumn(TIMELINE, duration=np.rint(1e9 * time).astype("timedelta64[ns]"))]
+def seconds(
+    time: Float[np.ndarray, " time"], timelines: Sequence[str] = (TIMELINE,)
+) -> list[rr.TimeColumn]:
+    """The index of columns sampled at these times, on one timeline or several."""
+    durations = np.rint(1e9 * time).astype("timedelta64[ns]")
+    return [rr.TimeColumn(timeline, duration=durations) for timeline in timelines]
 
 
 def send_tab(stream: rr.RecordingStream, time: Float[np.ndarray, " time"], tab: Tab) -> None:
@@ -85,11 +89,14 @@ def send_tab(stream: rr.RecordingStream, time: Float[np.ndarray, " time"], tab: 
 
 
 def send_curves(
-    stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
+    stream: rr.RecordingStream,
+    time: Float[np.ndarray, " time"],
+    curves: Curves,
+    timelines: Sequence[str] = (TIMELINE,),
 ) -> None:
     """Send curves with their names and colours; NaN interrupts them."""
     stream.log(curves.path, style(curves), static=True)
-    send_rows(stream, seconds(time), curves)
+    send_rows(stream, seconds(time, timelines), curves)
 
 
 def style(curves: Curves) -> rr.SeriesLines | rr.SeriesPoints:
@@ -147,11 +154,12 @@ def send_poses(
     time: Float[np.ndarray, " time"],
     body: Body,
     at: Int[np.ndarray, " chosen"],
+    timelines: Sequence[str] = (TIMELINE,),
 ) -> None:
     """Send the pose of a body at the chosen samples."""
     stream.send_columns(
         body_path(body),
-        seconds(time[at]),
+        seconds(time[at], timelines),
         rr.Transform3D.columns(
             translation=body.position[at],
             quaternion=np.roll(body.orientation[at], -1, axis=-1),  # rerun: x, y, z, w
@@ -251,7 +259,7 @@ def plot_view(plot: Plot, span: tuple[float, float] | None = None) -> rrb.TimeSe
 
 
 def dashboard(
-    left: Sequence[rrb.View],
+    left: Sequence[rrb.Container | rrb.View],
     right: Sequence[rrb.Container | rrb.View],
     *,
     row_shares: tuple[int, ...] = (1,),
@@ -261,15 +269,17 @@ def dashboard(
     """Layout of a dashboard: views above one another, with further columns to their right.
 
     Args:
-        left: The views.
+        left: The views; without any, the columns have the whole width.
         right: The columns.
         row_shares: Heights of the views, in proportion.
         column_shares: Widths of all columns, in proportion.
         timeline: Timeline of the views.
     """
-    columns = [rrb.Vertical(contents=left, row_shares=row_shares[: len(left)]), *right]
+    columns = [*right]
+    if left:
+        columns.insert(0, rrb.Vertical(contents=left, row_shares=row_shares[: len(left)]))
     return rrb.Blueprint(
-        rrb.Horizontal(contents=columns, column_shares=column_shares[: len(columns)]),
+        rrb.Horizontal(contents=columns, column_shares=column_shares[-len(columns) :]),
         rrb.TimePanel(state="collapsed", timeline=timeline),
         collapse_panels=True,
     )

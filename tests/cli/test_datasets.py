@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from commands import hrc
@@ -14,7 +15,6 @@ from rrd_reading import Rrd
 
 from hrc_learn.cli import dashboard_commands, dataset_commands
 from hrc_learn.demos import DatasetWriter, load_demos
-from hrc_learn.demos.videos import decode_image
 from hrc_learn.teleoperation import dashboard_page
 
 ROOT = Path(__file__).parents[2]
@@ -314,16 +314,18 @@ def test_images_are_shown_and_a_bad_video_is_listed(tmp_path):
     assert shown.status == 0
     assert "left out: " in shown.output
     assert second.name in shown.output
-    recording = Rrd(out)
-    assert not [path for path in recording.entities if path.startswith("episode_1/cameras")]
-    place = "episode_0/cameras/front"
-    # Every other of ten a second, and the last.
-    frames = np.linspace(0, 9, 5).astype(int)
-    np.testing.assert_allclose(recording.time(place), 0.1 * frames, atol=1e-6)
-    blobs = recording.column(place, "EncodedImage:blob")
-    images = [decode_image(np.asarray(blob[0], np.uint8).tobytes()) for blob in blobs]
-    assert [image.shape for image in images] == [(240, 320, 3)] * 5
-    np.testing.assert_allclose([i.mean() for i in images], shades[frames], atol=4)
+    assert "no arm is drawn: robot type 'any'" in shown.output
+    recording, place = Rrd(out), "cameras/front"
+    assert len(recording.column(place, "VideoStream:sample", timeline="episode 1")) == 0
+    # Every image, as it is encoded: the viewer decodes.
+    np.testing.assert_allclose(recording.time(place), 0.1 * np.arange(10), atol=1e-6)
+    samples = recording.column(place, "VideoStream:sample", timeline="episode 0")
+    ((codec,),) = recording.column(place, "VideoStream:codec", static=True)[:1]
+    decoder = av.CodecContext.create({0x61763031: "libdav1d", 0x61766331: "h264"}[codec], "r")
+    packets = [av.Packet(np.asarray(sample[0], np.uint8).tobytes()) for sample in samples]
+    images = [image for packet in [*packets, None] for image in decoder.decode(packet)]
+    shown_shades = [image.to_ndarray(format="rgb24").mean() for image in images]
+    np.testing.assert_allclose(shown_shades, shades, atol=4)
 
 
 def test_a_sample_of_many_demonstrations_is_shown(tmp_path, monkeypatch):
@@ -362,6 +364,7 @@ def viewer(monkeypatch):
     monkeypatch.setattr(dashboard_commands.subprocess, "run", start)
     monkeypatch.setattr(dashboard_commands.threading.Event, "wait", lambda event: None)
     monkeypatch.setattr(dashboard_page, "serve_recordings", serve)
+    monkeypatch.setattr(dashboard_page, "_viewer_contents", dict)
     return opened
 
 
@@ -387,11 +390,30 @@ def test_without_a_screen_a_recording_is_served_through_the_gate(viewer, tmp_pat
 
 
 def test_demonstrations_are_opened_from_a_recording_that_does_not_stay(
-    viewer, recording, tmp_path
+    viewer, recording, tmp_path, monkeypatch
 ):
     hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")
-    assert hrc("show", tmp_path / "set", "--web").status == 0
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert hrc("show", tmp_path / "set").status == 0
     assert not Path(viewer[0][-1]).exists()
+
+
+def test_demonstrations_are_streamed_to_the_browser(viewer, recording, tmp_path):
+    hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")
+    shown = hrc("show", tmp_path / "set", "--web")
+    assert shown.status == 0
+    assert "/#token=" in shown.output
+    assert not viewer
+
+
+def test_a_dataset_is_shown_with_the_arm_that_is_named(recording, tmp_path):
+    hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")
+    out = tmp_path / "demos.rrd"
+    refused = hrc("show", tmp_path / "set", "--out", out, "--robot", "so101")
+    assert (refused.status, "are not those of so101" in refused.error) == (2, True)
+    assert not out.exists()
+    assert hrc("show", tmp_path / "set", "--out", out, "--robot", "panda").status == 0
+    assert "world/bodies/link7" in Rrd(out).entities
 
 
 def test_paths_that_cannot_be_shown_are_refused(viewer, tmp_path):

@@ -7,8 +7,8 @@ import pytest
 import torch
 from clean_sets import CAMERA, SIZE, bar, write_set
 
-from hrc_learn.demos import load_demos, load_images, thumbnails
-from hrc_learn.demos.images import thumbnail_size
+from hrc_learn.demos import load_demos, load_images
+from hrc_learn.demos.images import ImageReader, thumbnail_size, thumbnails
 from hrc_learn.demos.videos import decode_image
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
@@ -29,10 +29,8 @@ def test_thumbnails_are_few_and_small_and_at_the_times_of_their_frames(version, 
     )
     every = load_images(root, 1)[CAMERA]
     for read in (demo, thinned):
-        found, missing = thumbnails(root, [read])
-        assert not missing
-        ((name, (time, files)),) = found[1].items()
-        assert CAMERA.endswith(name)
+        shown = thumbnails(ImageReader(root), read, CAMERA)
+        time, files = shown.time, shown.samples
         assert len(files) == len(time) == 1 + int(5 * demo.duration)
         assert (time[0], time[-1]) == (0, pytest.approx(demo.duration))
         for at, file in zip(time, files, strict=True):
@@ -45,9 +43,9 @@ def test_thumbnails_are_few_and_small_and_at_the_times_of_their_frames(version, 
 def test_of_long_episodes_only_so_many_are_taken(tmp_path):
     root = write_set(tmp_path / "set", "v2.1", camera=True)
     demo = load_demos(root)[0]
-    ((time, files),) = thumbnails(root, [demo], 4)[0][0].values()
-    assert len(files) == 4
-    np.testing.assert_allclose(np.diff(time), demo.duration / 3, atol=1 / demo.fps)
+    shown = thumbnails(ImageReader(root), demo, CAMERA, 4)
+    assert len(shown.samples) == 4
+    np.testing.assert_allclose(np.diff(shown.time), demo.duration / 3, atol=1 / demo.fps)
 
 
 def test_tall_images_are_scaled_to_even_sides():

@@ -4,7 +4,7 @@ import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda
-from hrc_learn.kinematics.franka import panda_bodies
+from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.learning.primitive_fitting import Motions
 
 
@@ -20,7 +20,7 @@ def demonstration(joints, **changes) -> Demonstration:
 
 
 def test_the_arm_is_drawn_where_planning_takes_it_to_be(joints):
-    bodies = panda_bodies(joints)
+    bodies = arm_bodies(panda, joints)
     drawn = [
         body.position + rotated(body.orientation, np.array(end))
         for body in bodies

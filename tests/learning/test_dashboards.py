@@ -9,6 +9,9 @@ from rrd_reading import Rrd
 from sample_runs import LIMITS, NAMES
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.demos.dataset_arm import DatasetArm
+from hrc_learn.demos.images import CameraImages
+from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     EvidenceResult,
@@ -19,9 +22,12 @@ from hrc_learn.jacobian import (
     cross_validate,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.kinematics.franka import panda_bodies
+from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.learning import fit_primitives
-from hrc_learn.learning.demonstration_dashboard import record_demonstrations
+from hrc_learn.learning.demonstration_dashboard import (
+    ShownDataset,
+    record_demonstrations,
+)
 from hrc_learn.learning.fit_dashboards import (
     ShownFit,
     fit_report,
@@ -55,10 +61,15 @@ def demos() -> DemonstrationSet:
     return DemonstrationSet([demonstration(2, 100), second, demonstration(7, 80)])
 
 
+def panda_of(columns=range(7), unit="rad") -> DatasetArm:
+    decision = UnitDecision(role="joint_position", unit=unit)
+    return DatasetArm(arm=panda, columns=tuple(columns), joints=decision)
+
+
 @pytest.fixture(scope="module")
 def rrd(demos, tmp_path_factory) -> Rrd:
     path = tmp_path_factory.mktemp("rrd") / "demos.rrd"
-    record_demonstrations(path, demos, "Placing", most=2)
+    record_demonstrations(path, ShownDataset(title="Placing", demos=demos, arm=panda_of()))
     return Rrd(path)
 
 
@@ -68,7 +79,7 @@ def tool_path(demo: Demonstration) -> np.ndarray:
 
 def test_joints_and_features_of_all_lie_over_one_another(demos, rrd):
     for demo in demos:
-        path = f"together/joint_position_4/{demo.episode}"
+        path = f"together/joint_4/{demo.episode}"
         np.testing.assert_array_equal(rrd.scalars(path)[:, 0], demo.joint_position[:, 4])
         np.testing.assert_allclose(rrd.time(path), demo.time, atol=1e-9)
     v = rrd.scalars("together/feature_1/7")[:, 0]
@@ -76,16 +87,26 @@ def test_joints_and_features_of_all_lie_over_one_another(demos, rrd):
     assert 0 < (~seen).sum() < len(seen)
     np.testing.assert_array_equal(v, np.where(seen, demos[2].feature[:, 1], np.nan))
     assert "together/feature_1/5" not in rrd.entities
-    bounds = [float(panda.limits.lower[0]), float(panda.limits.upper[0])]
-    np.testing.assert_array_equal(rrd.scalars("together/limits_0")[0], bounds)
 
 
-def test_the_first_have_tabs_with_what_was_recorded(demos, rrd):
-    np.testing.assert_array_equal(rrd.scalars("episode_2/effort"), demos[0].human_effort)
-    np.testing.assert_array_equal(rrd.scalars("episode_2/gripper")[:, 0], demos[0].gripper)
-    alone = {entity for entity in rrd.entities if entity.startswith("episode_")}
-    both = {f"episode_{k}/{name}" for k in (2, 5) for name in ("joints", "position", "gripper")}
-    assert alone == both | {"episode_2/feature", "episode_2/effort"}
+def test_each_episode_has_a_timeline_with_all_that_was_recorded(demos, rrd):
+    for demo in demos:
+        timeline = f"episode {demo.episode}"
+        joints = rrd.scalars("episode/joint_4", timeline)
+        np.testing.assert_array_equal(joints[:, 0], demo.joint_position[:, 4])
+        np.testing.assert_array_equal(rrd.scalars("episode/gripper", timeline)[:, 0], 0.04)
+        bounds = rrd.scalars("episode/joint_0/limits", timeline)
+        assert bounds[0].tolist() == [
+            float(panda.limits.lower[0]),
+            float(panda.limits.upper[0]),
+        ]
+        assert rrd.column("task", "TextDocument:text", timeline=timeline) == [
+            [f"Episode {demo.episode}: place"]
+        ]
+    assert len(rrd.scalars("episode/effort", "episode 5")) == 0
+    np.testing.assert_array_equal(
+        rrd.scalars("episode/effort", "episode 2"), demos[0].human_effort
+    )
 
 
 def test_recorded_or_computed_paths_are_drawn_and_the_arm_moves(demos, rrd):
@@ -96,9 +117,15 @@ def test_recorded_or_computed_paths_are_drawn_and_the_arm_moves(demos, rrd):
         np.testing.assert_allclose(strip, path, atol=1e-6)
         last = rrd.column(f"world/now/{demo.episode}", "Points3D:positions")[-1]
         np.testing.assert_allclose(last[0], path[-1], atol=1e-6)
-    for body in panda_bodies(demos[0].joint_position):
-        moved = np.array(rrd.column(f"world/bodies/{body.name}", "Transform3D:translation"))
-        np.testing.assert_allclose(moved[-1, 0], body.position[-1], atol=1e-6)
+        for body in arm_bodies(panda, demo.joint_position):
+            moved = np.array(
+                rrd.column(
+                    f"world/bodies/{body.name}",
+                    "Transform3D:translation",
+                    timeline=f"episode {demo.episode}",
+                )
+            )
+            np.testing.assert_allclose(moved[-1, 0], body.position[-1], atol=1e-6)
 
 
 def test_the_summary_lists_demonstrations_and_notes(rrd):
@@ -107,22 +134,57 @@ def test_the_summary_lists_demonstrations_and_notes(rrd):
     assert "| 5 | place | 1.78 | 90 | 1.00 |" in text
 
 
-def test_images_stand_in_the_tab_of_their_episode(demos, tmp_path):
-    images = {2: {"front": (np.array([0.0, 0.5]), (b"one", b"two"))}}
-    record_demonstrations(tmp_path / "demos.rrd", demos, "Placing", images)
+def test_images_are_those_of_the_episode_of_the_timeline(demos, tmp_path):
+    def images(demo):
+        blobs = (b"one", f"of {demo.episode}".encode())
+        return {"front": CameraImages("jpeg", np.array([0.0, 0.5]), blobs)}
+
+    shown = ShownDataset(title="Placing", demos=demos, images=images, cameras=["front"])
+    record_demonstrations(tmp_path / "demos.rrd", shown)
     rrd = Rrd(tmp_path / "demos.rrd")
-    blobs = rrd.column("episode_2/cameras/front", "EncodedImage:blob")
-    assert [bytes(blob) for (blob,) in blobs] == [b"one", b"two"]
-    np.testing.assert_allclose(rrd.time("episode_2/cameras/front"), [0.0, 0.5], atol=1e-9)
+    for demo in demos:
+        timeline = f"episode {demo.episode}"
+        blobs = rrd.column("cameras/front", "EncodedImage:blob", timeline=timeline)
+        assert bytes(blobs[1][0]) == f"of {demo.episode}".encode()
+        np.testing.assert_allclose(rrd.time("cameras/front", timeline), [0.0, 0.5], atol=1e-9)
 
 
-def test_other_robots_with_few_columns_are_recorded_without_limits(tmp_path):
+def test_joints_are_plotted_in_the_units_of_the_dataset(demos, tmp_path):
+    """Degrees as degrees, with the limits; shares of a range as percents, without."""
+    share = replace(demos[0], joint_position=np.full((len(demos[0]), 7), 0.5))
+    for unit, demo, seen in (
+        ("deg", demos[0], np.rad2deg(demos[0].joint_position[:, 3])),
+        ("%", share, np.full(len(share), 50.0)),
+    ):
+        decision = UnitDecision(role="joint_position", unit=unit)
+        shown = ShownDataset(
+            title="",
+            demos=DemonstrationSet([demo]),
+            arm=panda_of(unit=unit),
+            units={"joint_position": decision},
+        )
+        record_demonstrations(tmp_path / f"{unit}.rrd", shown)
+        rrd = Rrd(tmp_path / f"{unit}.rrd")
+        np.testing.assert_allclose(rrd.scalars("episode/joint_3", "time")[:, 0], seen)
+        lower = rrd.scalars("episode/joint_3/limits", "time")[0, 0]
+        if unit == "deg":
+            assert lower == pytest.approx(np.rad2deg(-3.0718))
+        else:
+            assert np.isnan(lower)
+        place = arm_bodies(panda, shown.arm.positions(demo.joint_position))[3].position[0]
+        moved = rrd.column("world/bodies/link3", "Transform3D:translation")[0]
+        np.testing.assert_allclose(moved[0], place, atol=1e-6)
+
+
+def test_without_an_arm_there_is_no_scene(tmp_path):
     bare = dict.fromkeys(("feature", "human_effort", "gripper"))
     one = demonstration(0, 20, joint_names=tuple(f"arm_{i}" for i in range(7)), **bare)
-    record_demonstrations(tmp_path / "bare.rrd", DemonstrationSet([one]), "")
+    shown = ShownDataset(title="", demos=DemonstrationSet([one]))
+    record_demonstrations(tmp_path / "bare.rrd", shown)
     rrd = Rrd(tmp_path / "bare.rrd")
-    assert not {e for e in rrd.entities if e.startswith(("world/", "together/limits"))}
-    assert "episode_0/joints" in rrd.entities
+    assert {e for e in rrd.entities if e.startswith("world")} == {"world"}
+    assert "episode/joint_0" in rrd.entities
+    assert "episode/joint_0/limits" not in rrd.entities
 
 
 def sample_fit(**changes) -> ShownFit:

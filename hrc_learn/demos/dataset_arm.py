@@ -1,0 +1,117 @@
+"""The arm that recorded a dataset: which registered arm or file, and where its joints are."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from hrc_learn.demos.demonstration import Demonstration
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.quantities import is_hand
+from hrc_learn.demos.read.source import DemonstrationSource
+from hrc_learn.demos.read.units import UnitDecision
+from hrc_learn.kinematics import Arm, ArmChoice
+from hrc_learn.kinematics.registry import arm_of_robot
+
+# Opening of the Franka hand [m].
+_FRANKA_WIDTH = 0.08
+
+
+@dataclass(frozen=True)
+class DatasetArm:
+    """An arm, and how a dataset's joints and gripper give its configuration."""
+
+    arm: Arm
+    columns: tuple[int, ...]
+    """Column of each of the arm's joints among the dataset's joints."""
+    joints: UnitDecision
+    """Unit of the dataset's joints."""
+    gripper: UnitDecision | None = None
+    """Unit of its gripper."""
+
+    def positions(
+        self, values: Float64[np.ndarray, "frames _columns"]
+    ) -> Float64[np.ndarray, "frames joints"]:
+        """Joint positions of the arm [rad], from those of a demonstration.
+
+        Shares of a joint's range, as LeRobot's -100..100, become angles by the range of the
+        arm; ticks of an encoder count from the middle of a turn.
+        """
+        lower, upper = self.arm.limits.lower.numpy(), self.arm.limits.upper.numpy()
+        chosen = values[:, self.columns].copy()
+        for joint, column in enumerate(self.columns):
+            unit = self.joints.unit_of(column)
+            if unit in ("%", "1"):
+                middle, half = (lower + upper) / 2, (upper - lower) / 2
+                chosen[:, joint] = middle[joint] + half[joint] * chosen[:, joint]
+            elif unit == "tick":
+                chosen[:, joint] -= math.pi
+        return chosen
+
+    def opening(self, demo: Demonstration) -> Float64[np.ndarray, " frames"] | None:
+        """Opening of the gripper, 0 (closed) to 1; None if it was not recorded."""
+        if demo.gripper is None or self.gripper is None:
+            return None
+        if self.gripper.unit in ("%", "1"):
+            return np.clip(demo.gripper, 0.0, 1.0)
+        travel = sum(
+            abs(f.opened - f.closed) for f in self.arm.gripper if f.kind == "prismatic"
+        )
+        width = _FRANKA_WIDTH if self.arm.is_franka else travel
+        return np.clip(demo.gripper / (width or max(demo.gripper.max(), 1e-9)), 0.0, 1.0)
+
+
+def arm_of_dataset(source: DemonstrationSource, robot: str = "", tip: str = "") -> DatasetArm:
+    """The arm of a dataset's demonstrations.
+
+    Joints are found by their names, else by their order if there are as many as the arm has.
+
+    Args:
+        source: The opened dataset.
+        robot: Name or file of the arm; empty: by the dataset's `robot_type`.
+        tip: Flange link of a file, or BASE:TIP.
+
+    Raises:
+        DatasetError: The robot type is no registered arm, the dataset has no joint positions,
+            or its joints are not the arm's.
+        ValueError: There is no such arm.
+    """
+    kind = source.folder.robot_type
+    arm = ArmChoice(robot, tip=tip).arm() if robot else arm_of_robot(kind)
+    if "joint_position" not in source.units:
+        raise DatasetError("the dataset has no joint positions")
+    if arm is None:
+        raise DatasetError(
+            f"robot type {kind!r} is no registered and installed arm; --robot NAME|FILE names "
+            "one"
+        )
+    return DatasetArm(
+        arm=arm,
+        columns=_columns(source.joint_names, arm),
+        joints=source.units["joint_position"],
+        gripper=source.units.get("gripper"),
+    )
+
+
+def _columns(names: Sequence[str], arm: Arm) -> tuple[int, ...]:
+    plain = [_plain(name) for name in names]
+    wanted = [_plain(name) for name in arm.joint_names]
+    if set(wanted) <= set(plain):
+        return tuple(plain.index(name) for name in wanted)
+    joints = [i for i, name in enumerate(names) if not is_hand(name)]
+    if len(joints) != arm.joints:
+        raise DatasetError(
+            f"the dataset's joints ({', '.join(names) or 'none'}) are not those of {arm.name} "
+            f"({', '.join(arm.joint_names)}): --robot NAME|FILE names another arm"
+        )
+    return tuple(joints)
+
+
+def _plain(name: str) -> str:
+    """A joint's name without case, separators and the word for its position."""
+    return re.sub("[^a-z0-9]", "", re.sub(r"[._ ](pos|position|q)$", "", name.lower()))

@@ -1,0 +1,114 @@
+"""Where arms and their fingers are drawn, compared with Pinocchio and MuJoCo."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.geometry import quaternion
+from hrc_learn.kinematics import arm, panda
+from hrc_learn.kinematics.drawing import arm_bodies, panda_meshes
+from hrc_learn.kinematics.registry import arm_of_robot
+
+SHAPES = '<visual><geometry><mesh filename="part.stl"/></geometry></visual>'
+LINKS = "".join(
+    f'<link name="{name}">{SHAPES}</link>'
+    for name in ("base", "l1", "hand", "left", "right", "tip")
+)
+HAND = f"""<robot name="r">
+{LINKS}<link name="tcp"/>
+<joint name="j1" type="revolute"><parent link="base"/><child link="l1"/>
+  <origin xyz="0.1 0.2 0.3" rpy="0.1 0.2 0.3"/><axis xyz="0 1 0"/>
+  <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+<joint name="h" type="fixed"><parent link="l1"/><child link="hand"/>
+  <origin xyz="0 0 0.2" rpy="0 0 0.7"/></joint>
+<joint name="t" type="fixed"><parent link="hand"/><child link="tcp"/>
+  <origin xyz="0 0 0.1"/></joint>
+<joint name="left_finger" type="revolute"><parent link="hand"/><child link="left"/>
+  <origin xyz="0 0.03 0.02" rpy="0.4 0 0"/><axis xyz="1 0 0"/>
+  <limit lower="0" upper="0.9" velocity="1" effort="1"/></joint>
+<joint name="right_finger" type="prismatic"><parent link="hand"/><child link="right"/>
+  <origin xyz="0 -0.03 0.02"/><axis xyz="0 -1 0"/><mimic joint="left_finger" multiplier="0.05"/>
+  <limit lower="0" upper="0.05" velocity="1" effort="1"/></joint>
+<joint name="finger_tip" type="revolute"><parent link="left"/><child link="tip"/>
+  <origin xyz="0 0 0.03" rpy="0 0.5 0"/><axis xyz="0 0 1"/>
+  <mimic joint="left_finger" multiplier="-2" offset="0.1"/>
+  <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
+</robot>"""
+TRIANGLE = "solid t\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 0.1 0 0\n" + (
+    "vertex 0 0.1 0\nendloop\nendfacet\nendsolid t\n"
+)
+
+
+@pytest.mark.filterwarnings("ignore:.*the arm ends at.*:UserWarning")
+def test_fingers_move_as_pinocchio_says(tmp_path):
+    pinocchio = pytest.importorskip("pinocchio")
+    path = tmp_path / "robot.urdf"
+    path.write_text(HAND)
+    (tmp_path / "part.stl").write_text(TRIANGLE)
+    described = arm(path, tip="tcp")
+    q, opening = np.array([[0.7], [-1.1]]), np.array([0.3, 1.0])
+    bodies = {body.name: body for body in arm_bodies(described, q, opening)}
+    names = {
+        "finger_left_finger": "left",
+        "finger_right_finger": "right",
+        "finger_finger_tip": "tip",
+    }
+    assert bodies.keys() == {"link0", "link1", "tool", *names}
+    model = pinocchio.buildModelFromUrdf(str(path))
+    data = model.createData()
+    for row in range(2):
+        posture = pinocchio.neutral(model)
+        left = 0.9 * opening[row]
+        for name, value in (
+            ("j1", q[row, 0]),
+            ("left_finger", left),
+            ("right_finger", 0.05 * left),
+            ("finger_tip", 0.1 - 2 * left),
+        ):
+            posture[model.joints[model.getJointId(name)].idx_q] = value
+        pinocchio.framesForwardKinematics(model, data, posture)
+        for body, link in names.items():
+            placed = data.oMf[model.getFrameId(link)]
+            np.testing.assert_allclose(
+                bodies[body].position[row], placed.translation, atol=1e-12
+            )
+            turn = quaternion.to_matrix(torch.from_numpy(bodies[body].orientation[row]))
+            np.testing.assert_allclose(turn, placed.rotation, atol=1e-12)
+
+
+def test_the_jaw_of_an_so101_opens(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    so101 = arm_of_robot("so101")
+    if so101 is None:
+        pytest.skip("example-robot-data is not installed")
+    q = so101.ready.numpy()[None].repeat(2, axis=0) + 0.2
+    jaw = arm_bodies(so101, q, np.array([0.0, 1.0]))[-1]
+    assert jaw.name == "finger_gripper"
+    bare = re.sub(
+        r"<(visual|collision)>.*?</\1>",
+        "",
+        Path(so101.description).read_text(),
+        flags=re.DOTALL,
+    )
+    (tmp_path / "robot.urdf").write_text(bare)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.urdf"))
+    data = mujoco.MjData(model)
+    for row, value in ((0, so101.gripper[0].closed), (1, so101.gripper[0].opened)):
+        for name, position in zip(
+            [*so101.joint_names, "gripper"], [*q[row], value], strict=True
+        ):
+            data.joint(name).qpos[0] = position
+        mujoco.mj_kinematics(model, data)
+        body = model.body(model.joint("gripper").bodyid[0]).name
+        np.testing.assert_allclose(jaw.position[row], data.body(body).xpos, atol=1e-6)
+
+
+def test_the_fingers_of_a_panda_part_by_the_width_of_the_gripper():
+    if not panda_meshes("hand"):
+        pytest.skip("example-robot-data is not installed")
+    left, right = arm_bodies(panda, panda.ready.numpy()[None], np.array([0.5]))[-2:]
+    assert (left.name, right.name) == ("finger_left", "finger_right")
+    assert np.linalg.norm(left.position - right.position) == pytest.approx(0.04)
