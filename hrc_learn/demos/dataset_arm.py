@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.read.quantities import is_hand
+from hrc_learn.demos.read.naming import is_hand
 from hrc_learn.demos.read.source import DemonstrationSource
 from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.kinematics import Arm, ArmChoice

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
@@ -189,28 +190,22 @@ def _description_folders() -> Iterator[Path]:
     yield Path(fetched).expanduser()
 
 
+_ENDS = ("_description", "_mj_description")
+
+
 def _fetched_with(name: str) -> str:
     """Command that fetches a description, if an installed package knows the robot."""
     wanted = _plain(name)
     with suppress(ModuleNotFoundError):
-        from mujoco_menagerie import names  # pyright: ignore[reportMissingImports]
-
-        for robot in names():
+        for robot in import_module("mujoco_menagerie").names():
             if _plain(robot).endswith(wanted):
                 return f"; mujoco_menagerie.prefetch([{robot!r}]) fetches {robot}"
     with suppress(ModuleNotFoundError):
-        # Its list alone: importing a description downloads it.
-        from robot_descriptions._descriptions import (  # pyright: ignore
-            DESCRIPTIONS,
-        )
-
-        for module in DESCRIPTIONS:
+        # The list alone: the import of a description downloads it.
+        for module in import_module("robot_descriptions._descriptions").DESCRIPTIONS:
             if wanted in (_plain(module.removesuffix(end)) for end in _ENDS):
                 return f"; `import robot_descriptions.{module}` fetches it"
     return ""
-
-
-_ENDS = ("_description", "_mj_description")
 
 
 @cache
