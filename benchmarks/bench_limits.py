@@ -5,7 +5,8 @@ first at random, then drawn by the cross-entropy method, which keeps the sequenc
 point fastest and draws the next ones from their distribution. Tool, elbow and the end of a load
 0.2 m past the tool are capped. An independent monitor counts the steps beyond any limit.
 
-The filter runs as a batch, arm by arm, with the constraint layer, and exported; with float32
+The filter runs as a batch, arm by arm, with the constraint layer, and exported, arm by arm
+and as one loop over a batch; with float32
 and float64; with readings that are late or wrong, and with a wrong model of the arm, for which
 the filter is given a delay and a lower cap.
 """
@@ -50,9 +51,9 @@ class Search:
     """One configuration of a search."""
 
     arm: str = "panda"
-    path: Literal["batch", "layer", "single", "exported"] = "batch"
-    """The filter for all arms at once, with the constraint layer, arm by arm, or exported and
-    arm by arm."""
+    path: Literal["batch", "layer", "single", "exported", "exported batch"] = "batch"
+    """The filter for all arms at once, with the constraint layer, arm by arm, or exported, arm
+    by arm or for all at once."""
     dt: float = 0.0
     """Step [s]; 0: any from 1 to 20 ms, drawn anew in each step."""
     dtype: torch.dtype = torch.float64
@@ -212,6 +213,8 @@ def _opened(config: Search, robot: SerialChain, q: Tensor) -> _Filter:
     )
     if config.path in ("batch", "layer"):
         return _Eager(step, observation)
+    if config.path == "exported batch":
+        return _exported(export_step(step, observation), observation)
     alone = [
         _pytree.tree_map(lambda x, k=k: x[k] if x.ndim else x, observation)
         for k in range(len(q))
@@ -243,7 +246,7 @@ class _Eager:
 
 
 def _exported(package: Path, observation: WantedVelocity) -> _Filter:
-    """The compiled filter of one arm."""
+    """The compiled filter of one arm, or of a batch."""
     runner = PackageRunner(package)
     runner.observe(observation)
     runner.start(runner.observation["joint_position"])
@@ -253,7 +256,7 @@ def _exported(package: Path, observation: WantedVelocity) -> _Filter:
         runner.observation["joint_position"][:] = q.numpy()
         runner.observation["joint_velocity"][:] = u.numpy()
         runner.observation["dt"][...] = dt
-        return torch.from_numpy(runner.step()).double(), int(excess > 0)
+        return torch.from_numpy(runner.step()).double(), int((excess > 0).sum())
 
     return send
 
@@ -288,6 +291,7 @@ def searches(args: Args) -> Iterator[Search]:
         exported = Search(arm=name, path="exported", batch=128)
         yield sized(exported, args.steps)
         yield sized(replace(exported, dtype=single), args.steps)
+        yield sized(replace(exported, path="exported batch"), args.steps)
     for name in args.arms:
         one = Search(arm=name)
         yield sized(replace(one, path="layer"), args.steps)

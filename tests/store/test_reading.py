@@ -20,6 +20,7 @@ from hrc_learn.store import (
     Metres,
     Radians,
     changed_files,
+    json_text,
     new_file,
     new_folder,
     parse_json,
@@ -214,6 +215,19 @@ def test_a_full_disk_is_named_and_nothing_is_left(tmp_path, small_files):
         assert error.value.errno == errno.EFBIG
         assert error.value.filename == str(tmp_path / "log")
         assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("other", ["", "elsewhere.txt"])
+def test_an_error_of_the_disk_names_the_file_and_not_its_temporary_place(tmp_path, other):
+    path = tmp_path / "log"
+    with pytest.raises(OSError, match="No space") as error, new_file(path) as part:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), other or str(part))
+    assert error.value.filename == (other or str(path))
+
+
+def test_json_has_many_lines_or_one():
+    assert json_text({"a": [1]}) == '{\n  "a": [\n    1\n  ]\n}\n'
+    assert json_text({"a": [1]}, indent=False) == '{"a":[1]}\n'
 
 
 def test_a_full_device_is_named():

@@ -115,6 +115,17 @@ def test_who_reads_finds_the_old_or_the_new(tmp_path):
     assert missing
 
 
+def test_recovery_reports_the_unfinished_content_that_it_removed(tmp_path):
+    out, unfinished = tmp_path / "out", 0
+    fill(out, "old")
+    for _ in cut_off(lambda: fill(out, "new", overwrite=True)):
+        half = out.exists() and (tmp_path / ".out.writing" / "new").exists()
+        unfinished += half
+        assert (f"{out}: removed unfinished content" in recover(out)) == half
+        fill(out, "old", overwrite=True)
+    assert unfinished > 3
+
+
 def test_nothing_else_is_deleted_when_something_takes_the_name_in_between(tmp_path):
     out = tmp_path / "out"
     fill(out, "old")
