@@ -17,14 +17,14 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import numpy as np
-from lerobot_folders import one_step_of_act
+from lerobot_folders import one_step_of_act  # pyright: ignore[reportMissingImports]
 from rich.console import Console
 from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.demos import DatasetError
 from hrc_learn.demos.recording_import import ImportPlan, plan_import, write_plan
-from hrc_learn.demos.recording_meaning import ImportOptions
+from hrc_learn.demos.recording_names import ImportOptions
 
 STATE_AND_ACTION = {"observation.state": "?", "action": "?"}
 

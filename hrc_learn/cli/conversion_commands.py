@@ -13,7 +13,7 @@ from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments import Extract, Import
 from hrc_learn.demos import Detector, extract_features
 from hrc_learn.demos.recording_import import plan_import, write_plan
-from hrc_learn.demos.recording_meaning import ImportOptions
+from hrc_learn.demos.recording_names import ImportOptions
 from hrc_learn.store import read_json, read_toml, write_text
 from hrc_learn.vision import MarkerDetector, centre
 

@@ -7,7 +7,8 @@ from jaxtyping import Float64, Int64
 
 from hrc_learn.demos.read.units import unit_factor
 from hrc_learn.demos.recording_files import Recording, is_time, time_unit_in
-from hrc_learn.demos.recording_meaning import ImportOptions, Meaning
+from hrc_learn.demos.recording_meaning import Meaning
+from hrc_learn.demos.recording_names import ImportOptions
 
 _EPOCH = (1e9, 3e9)
 """Stamps that count from 1970, in the years 2001 to 2065 [s]."""

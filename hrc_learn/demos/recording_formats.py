@@ -315,11 +315,7 @@ def _mat_of_hdf5(path: Path) -> dict[str, Any]:
 
 
 def read_tfrecord(path: Path) -> list[Recording]:
-    """Episodes of an RLDS dataset, one record each, with the shapes in its `features.json`."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    description = path.parent / "features.json"
-    if description.is_file():
-        shapes = dict(_rlds_shapes(json.loads(description.read_text(encoding="utf-8")), ""))
+    """Episodes of an RLDS dataset, one record each; arrays have their components in a row."""
     episodes: list[Recording] = []
     size, offset = path.stat().st_size, 0
     with path.open("rb") as stream:
@@ -329,17 +325,15 @@ def read_tfrecord(path: Path) -> list[Recording]:
             if offset + 16 + length > size:
                 text = f"ends within record {len(episodes)}: copy it again"
                 raise DatasetError(text, file=path)
-            episodes.append(_rlds_episode(path, len(episodes), (offset + 12, length), shapes))
+            episodes.append(_rlds_episode(path, len(episodes), (offset + 12, length)))
             offset += 16 + length
     return episodes
 
 
-def _rlds_episode(
-    path: Path, number: int, place: tuple[int, int], shapes: Mapping[str, tuple[int, ...]]
-) -> Recording:
+def _rlds_episode(path: Path, number: int, place: tuple[int, int]) -> Recording:
     found, task, label = {}, "", f"record {number}"
     steps = {n: v for n, v in _rlds_record(path, *place).items() if n.startswith("steps/")}
-    frames = min((len(values) for values in steps.values()), default=0)
+    frames = max(1, min((len(values) for values in steps.values()), default=1))
     for name, values in steps.items():
         short = name.removeprefix("steps/")
         if isinstance(values, list):
@@ -347,12 +341,11 @@ def _rlds_episode(
             found[short] = replace(bytes_field(values), read=read)
             if short.split("/")[-1] in _TASKS:
                 task = task or values[0].decode(errors="replace")
-            continue
-        shape = shapes.get(name, (len(values) // max(frames, 1),))
-        if len(values) != frames * int(np.prod(shape)):
-            text = f"holds {len(values)} numbers for {frames} steps of shape {shape}"
+        elif len(values) % frames:
+            text = f"holds {len(values)} numbers for {frames} steps"
             raise DatasetError(text, file=path, key=f"{label}/{name}")
-        found[short] = array_field(name, values.reshape(frames, *shape))
+        else:
+            found[short] = array_field(name, values.reshape(frames, -1))
     return Recording(file=path, label=label, fields=found, task=task)
 
 
@@ -378,17 +371,6 @@ def _rlds_record(path: Path, offset: int, length: int) -> dict[str, Any]:
         items = getattr(feature, kind).value if kind else []
         values[name] = [*items] if kind == "bytes_list" else np.array(items)
     return values
-
-
-def _rlds_shapes(node: Any, place: str) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Shape of each feature in the description of a TensorFlow dataset."""
-    for name, inner in node.get("featuresDict", {}).get("features", {}).items():
-        yield from _rlds_shapes(inner, f"{place}/{name}".lstrip("/"))
-    if "sequence" in node:
-        yield from _rlds_shapes(node["sequence"]["feature"], place)
-    if "tensor" in node:
-        dimensions = node["tensor"].get("shape", {}).get("dimensions", [])
-        yield place, tuple(int(length) for length in dimensions)
 
 
 READERS: dict[str, Callable[..., list[Recording]]] = {

@@ -17,8 +17,8 @@ from hrc_learn.demos.recorded_episode import rotation_vectors
 from hrc_learn.demos.recording_clock import Clock, clock_of_state
 from hrc_learn.demos.recording_files import Field, Recording
 from hrc_learn.demos.recording_formats import open_recordings
-from hrc_learn.demos.recording_meaning import ImportOptions, Meaning, read_columns, understand
-from hrc_learn.demos.recording_names import Place
+from hrc_learn.demos.recording_meaning import Meaning, read_columns, understand
+from hrc_learn.demos.recording_names import ImportOptions, Place
 from hrc_learn.demos.videos import Image, VideoSegment, decode, decode_image
 
 _BATCH = 32

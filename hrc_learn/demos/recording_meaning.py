@@ -4,8 +4,7 @@ Names and units are judged as for datasets (`read.columns`, `read.units`). What 
 understood is left out and listed, or kept as recorded where it is the state or the action.
 """
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,7 +19,13 @@ from hrc_learn.demos.read.profiles import track
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.units import UnitDecision, unit_factor, units_from_episodes
 from hrc_learn.demos.recording_files import UNNAMED, Recording, is_time
-from hrc_learn.demos.recording_names import FieldSearch, Place, column_names
+from hrc_learn.demos.recording_names import (
+    FieldSearch,
+    ImportOptions,
+    Place,
+    column_names,
+    find_cameras,
+)
 
 _REACH = 5.0
 """Beyond the reach of any arm on a fixed base [m]."""
@@ -28,41 +33,6 @@ _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 """Episodes and frame rate [1/s] with which a command is compared: 30 frames of delay."""
 _SLOPES = (0.5, 2.0)
 """Change of the joints per change of the command, if both are in the same unit."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportOptions:
-    """The caller's word about recordings; also the content of a mapping file."""
-
-    columns: dict[str, str | list[str]] = field(default_factory=dict)
-    """Quantity of `demos.ROLES`, "action" or "observation.NAME" -> fields, ranges of fields
-    ("qpos[0:6]") or columns."""
-    images: dict[str, str] | None = None
-    """Camera -> field; None for all images."""
-    units: dict[str, str] = field(default_factory=dict)
-    """Units by quantity."""
-    time: str = ""
-    """Field of the stamps."""
-    joint_names: tuple[str, ...] = ()
-    """Joint names."""
-    fps: float | int | None = None
-    """Frame rate [1/s] where there are no stamps; with stamps, it is only recorded."""
-    duration: float | int | None = None
-    """Duration of each episode [s] where there are no stamps."""
-    task: str | None = None
-    """Task in words."""
-    hinted: bool = False
-    """True if the caller named the columns of a file: unknown ones are then joints."""
-
-    def __post_init__(self) -> None:
-        for name, value in (("duration", self.duration), ("fps", self.fps)):
-            if value is not None and not 0 < value < np.inf:
-                raise ValueError(f"{name} must be positive, got {value}")
-        for name in self.columns:
-            if name not in ROLES and name != "action" and not name.startswith("observation."):
-                known = ", ".join([*ROLES, "action"])
-                text = f"columns name the unknown quantity {name!r}; known are {known}"
-                raise ValueError(f"{text} and observation.NAME")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +152,7 @@ def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSe
     meaning = Meaning(
         selections=selections,
         kept=kept,
-        cameras=_cameras(first, options.images),
+        cameras=find_cameras(first, options.images),
         left_out=search.left_out,
         notes=tuple(map(search.explained, filter(_is_news, found.notes))),
     )
@@ -211,23 +181,6 @@ def _selection(first: Recording, role: str, places: Sequence[Place]) -> ColumnSe
     numbered = any(first.fields[n].width > 1 and not first.fields[n].names for n, _ in places)
     labels = tuple(map(joint_of, column_names(first, places)))
     return ColumnSelection(role=role, columns=tuple(places), labels=labels, numbered=numbered)
-
-
-def _cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str, str]:
-    """Cameras and the fields of their images."""
-    found: dict[str, str] = {}
-    if named is not None:
-        found = {camera: first.known(name, camera) for camera, name in named.items()}
-        for camera, name in found.items():
-            if first.fields[name].kind not in ("image", "encoded"):
-                raise first.error(f"{name} holds no images", camera)
-        return found
-    for name, one in first.fields.items():
-        if one.kind in ("image", "encoded") and not re.search(r"(?:^|/)next_", name):
-            last = re.sub(r"_(?:image|rgb|img|color)$", "", name.split("/")[-1])
-            plain = re.sub(r"\W+", "_", last).strip("_")
-            found[plain if plain not in found else re.sub(r"\W+", "_", name)] = name
-    return found
 
 
 def _with_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str]) -> Meaning:

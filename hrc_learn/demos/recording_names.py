@@ -1,8 +1,13 @@
-"""Fields of recordings presented as features of a dataset, so that its conventions apply."""
+"""Names of the fields of recordings, and the caller's word about them.
+
+Fields are presented as features of a dataset, so that its conventions apply.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.read.columns import ColumnSelection
@@ -14,6 +19,7 @@ from hrc_learn.demos.read.naming import (
     role_of_key,
     without_unit,
 )
+from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.recording_files import UNNAMED, Field, Recording
 
 Place = tuple[str, int]
@@ -58,6 +64,41 @@ _ALOHA_ARM = "waist shoulder elbow forearm_roll wrist_angle wrist_rotate gripper
 _ALOHA = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in _ALOHA_ARM.split())
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """The caller's word about recordings; also the content of a mapping file."""
+
+    columns: dict[str, str | list[str]] = field(default_factory=dict)
+    """Quantity of `demos.ROLES`, "action" or "observation.NAME" -> fields, ranges of fields
+    ("qpos[0:6]") or columns."""
+    images: dict[str, str] | None = None
+    """Camera -> field; None for all images."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units by quantity."""
+    time: str = ""
+    """Field of the stamps."""
+    joint_names: tuple[str, ...] = ()
+    """Joint names."""
+    fps: float | int | None = None
+    """Frame rate [1/s] where there are no stamps; with stamps, it is only recorded."""
+    duration: float | int | None = None
+    """Duration of each episode [s] where there are no stamps."""
+    task: str | None = None
+    """Task in words."""
+    hinted: bool = False
+    """True if the caller named the columns of a file: unknown ones are then joints."""
+
+    def __post_init__(self) -> None:
+        for name, value in (("duration", self.duration), ("fps", self.fps)):
+            if value is not None and not 0 < value < np.inf:
+                raise ValueError(f"{name} must be positive, got {value}")
+        for name in self.columns:
+            if name not in ROLES and name != "action" and not name.startswith("observation."):
+                known = ", ".join([*ROLES, "action"])
+                text = f"columns name the unknown quantity {name!r}; known are {known}"
+                raise ValueError(f"{text} and observation.NAME")
+
+
 def column_names(first: Recording, places: Sequence[Place]) -> tuple[str, ...]:
     """A name for each column."""
     names = []
@@ -66,6 +107,27 @@ def column_names(first: Recording, places: Sequence[Place]) -> tuple[str, ...]:
         counted = last if one.width == 1 else f"{last}_{index}"
         names.append(one.names[index] if one.names else counted)
     return tuple(names)
+
+
+def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str, str]:
+    """Cameras and the fields of their images, as the caller names them or by their names.
+
+    Raises:
+        DatasetError: A named field does not exist, or holds no images.
+    """
+    found: dict[str, str] = {}
+    if named is not None:
+        found = {camera: first.known(name, camera) for camera, name in named.items()}
+        for camera, name in found.items():
+            if first.fields[name].kind not in ("image", "encoded"):
+                raise first.error(f"{name} holds no images", camera)
+        return found
+    for name, one in first.fields.items():
+        if one.kind in ("image", "encoded") and not re.search(r"(?:^|/)next_", name):
+            last = re.sub(r"_(?:image|rgb|img|color)$", "", name.split("/")[-1])
+            plain = re.sub(r"\W+", "_", last).strip("_")
+            found[plain if plain not in found else re.sub(r"\W+", "_", name)] = name
+    return found
 
 
 class FieldSearch:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hrc_learn.demos import DatasetError, ImageReader
 from hrc_learn.demos.recording_formats import open_recordings
 from hrc_learn.demos.recording_import import plan_import, write_plan
-from hrc_learn.demos.recording_meaning import ImportOptions
+from hrc_learn.demos.recording_names import ImportOptions
 
 TIME = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.004, 40))
 Q = joint_path(40)
