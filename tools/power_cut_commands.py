@@ -79,6 +79,7 @@ CASES = {
     "fit": Case("--dataset {inputs}/placing_demos --out out --json j.json"),
     "fit image-jacobian": Case("--dataset {inputs}/aiming_demos --out out --json j.json"),
     "evaluate": Case("{inputs}/placing {inputs}/placing_demos --out out --json j.json"),
+    "play": Case("{inputs}/placing --goal 0.5 0 0.4 --robot panda --out out --json j.json"),
     "smooth": Case(
         "--checkpoint checkpoint --dataset {inputs}/placing_demos --json j.json",
         copies=("checkpoint",),

@@ -384,6 +384,39 @@ class Evaluate(OnDataset, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Play(Written):
+    """Carry out a fitted model to a goal: path, joints, film, table and LeRobot episode.
+
+    With --robot the path becomes joint positions within the limits of that arm, and takes
+    longer where they demand it; without, it stays in the model's coordinates. Exit status 1 if
+    the arm cannot do it.
+
+        hrc play pour_model --goal 0.4 0.1 0.3 --robot panda
+        hrc play pour_model --goal pose 0.4 0.1 0.3 0 1 0 0 --start episode 2 --robot panda
+    """
+
+    model: Path
+    """Folder of `hrc fit`."""
+    goal: tuple[str, ...]
+    """Joints, position [m], or pose with quaternion (w, x, y, z), by the count of numbers or
+    with the word joints, position or pose before them; or the end of a demonstration: episode
+    2."""
+    start: tuple[str, ...] = ()
+    """The same for the start, or the start of a demonstration. Default: the model's."""
+    robot: str = ""
+    """Arm by name, or its URDF or MJCF file. Default: none."""
+    duration: float | None = None
+    """Duration [s]. Default: the model's."""
+    out: Path | None = None
+    """Folder for the motion. Default: MODEL_played."""
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the motion."""
+        return self.out or sibling(self.model, "played")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Smooth(Measured):
     """Limit velocity, acceleration and jerk of a trained LeRobot policy's actions.
 

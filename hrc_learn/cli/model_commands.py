@@ -1,5 +1,6 @@
 """`hrc evaluate` and `hrc smooth`: errors of models, and limits on the actions of policies."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -120,14 +121,9 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
 
 def _demonstrations(args: Evaluate, model: Path, console: Console) -> DemonstrationSet:
     """Demonstrations to evaluate on, read in the way they were read for the fit."""
-    made_by = _made_by(model)
+    made_by = fitted_from(model)
     learned = {int(i) for i in made_by.get("episodes") or ()}
-    names = tuple(made_by.get("joint_names") or ())
-    wanted: dict[str, Any] = {
-        "joint_names": names or None,
-        "mapping": columns(made_by.get("mapping") or {}),
-        "units": made_by.get("units") or {},
-    }
+    wanted = as_fitted(made_by)
     episodes = list(args.episodes)
     if Path(made_by["dataset"]).resolve() == args.dataset.resolve():
         if not episodes and learned:
@@ -142,7 +138,16 @@ def _demonstrations(args: Evaluate, model: Path, console: Console) -> Demonstrat
     return sampled(open_demos(args.dataset, episodes=episodes or None, **wanted))
 
 
-def _made_by(model: Path) -> dict[str, Any]:
+def as_fitted(made_by: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `open_demos` with which a model's dataset was read."""
+    return {
+        "joint_names": tuple(made_by.get("joint_names") or ()) or None,
+        "mapping": columns(made_by.get("mapping") or {}),
+        "units": made_by.get("units") or {},
+    }
+
+
+def fitted_from(model: Path) -> dict[str, Any]:
     """Dataset and options that a model was made from.
 
     Raises:

@@ -117,7 +117,8 @@ class MeshPart:
         normals = turned(self.normals / scale)
         return MeshPart(
             vertices=turned(self.vertices * scale) + mesh.position,
-            normals=normals / np.linalg.norm(normals, axis=-1, keepdims=True),
+            # A degenerate triangle has no normal.
+            normals=normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(1e-30),
             # A mirrored part would be seen from inside.
             faces=self.faces[:, ::-1] if scale.prod() < 0 else self.faces,
             colour=self.colour or mesh.colour or PLAIN,

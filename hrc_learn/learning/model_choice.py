@@ -277,17 +277,37 @@ def predict(
         ValueError: The model is damaged, or a demonstration lacks a column of the context.
     """
     choice = _choice(folder)
-    model = choice.models.get(channel, "mean")
-    if model == "mean":
+    if choice.models.get(channel, "mean") == "mean":
         return motions.adapted(channel, load_primitive(folder / channel, channel))
     context = contexts(demos, choice.context, motions, channel)
-    if model == "contextual":
-        primitives = ContextualDMP.load(folder / CONTEXTUAL / channel).at(context)
-        return motions.adapted(channel, primitives)
+    return motions.adapted(channel, _at_context(folder, channel, choice, context))
+
+
+def predicted_primitive(
+    folder: Path, channel: str, start: Float[Tensor, " D"], goal: Float[Tensor, " D"]
+) -> JointDMP:
+    """Primitive of the best model for one start and goal; the mean where it is best, and where
+    the best one needs other columns than start and goal.
+
+    Raises:
+        FileNotFoundError: The folder holds no model.
+        ValueError: The model is damaged.
+    """
+    choice = _choice(folder)
+    if choice.models.get(channel, "mean") == "mean" or choice.context:
+        return cast(JointDMP, load_primitive(folder / channel, channel))
+    return _at_context(folder, channel, choice, torch.cat([start, goal])[None])[0]
+
+
+def _at_context(
+    folder: Path, channel: str, choice: _Choice, context: Float[Tensor, "motions C"]
+) -> JointDMP:
+    """Primitives of a model that is not the mean."""
+    if choice.models[channel] == "contextual":
+        return ContextualDMP.load(folder / CONTEXTUAL / channel).at(context)
     each = cast(JointDMP, load_primitive(folder / EACH / channel, channel))
     x = each.coordinates().detach()
     known = torch.cat([x[..., -2], x[..., -1]], dim=-1)  # start and goal
     chosen = _nearest(context.to(known), known)
     like = cast(JointDMP, load_primitive(folder / channel, channel))
-    nearest = like.with_coordinates(x[chosen], each.duration[chosen])
-    return motions.adapted(channel, nearest)
+    return like.with_coordinates(x[chosen], each.duration[chosen])

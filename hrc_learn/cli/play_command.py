@@ -1,0 +1,202 @@
+"""`hrc play`: a fitted model carried out to a goal."""
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from hrc_learn.cli._run import refuse_existing, write_values
+from hrc_learn.cli.arguments import Play
+from hrc_learn.cli.model_commands import as_fitted, fitted_from
+from hrc_learn.demos import DatasetWriter, open_demos
+from hrc_learn.experiments.run_recorder import film
+from hrc_learn.kinematics import Arm, UnreachableError
+from hrc_learn.kinematics.drawing import arm_bodies
+from hrc_learn.learning.motion_playing import (
+    DT,
+    BeyondLimitsError,
+    FittedModel,
+    PlayedMotion,
+    Target,
+    arm_for,
+    play_on_arm,
+    play_path,
+)
+from hrc_learn.log import JointRanges, RunRecording
+from hrc_learn.store import new_folder, write_json, write_text
+from hrc_learn.viz.report import show_command
+from hrc_learn.viz.run_dashboard import record_run
+
+_POSE = ("x [m]", "y [m]", "z [m]", "qw", "qx", "qy", "qz")
+
+
+def play(args: Play) -> int:
+    """Carry out a model to a goal; exit status 1 if the arm cannot do it.
+
+    Raises:
+        FileNotFoundError: There is no model.
+        ValueError: The goal does not fit the model, or the model not the arm.
+    """
+    if not args.model.is_dir():
+        raise FileNotFoundError(f"there is no model at {args.model}")
+    refuse_existing(args.folder, args.overwrite)
+    model = FittedModel.load(args.model)
+    goal = _target(model, args.goal, "--goal")
+    start = _target(model, args.start, "--start") if args.start else None
+    robot = arm_for(model, args.robot) if args.robot else None
+    try:
+        with Console().status("Playing"):
+            if robot is None:
+                motion = play_path(model, start, goal, args.duration)
+            else:
+                motion = play_on_arm(model, robot, start, goal, args.duration)
+    except (BeyondLimitsError, UnreachableError) as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    figures = _figures(motion)
+    with new_folder(args.folder, asdict(args), args.overwrite) as folder:
+        write_text(folder / "motion.csv", _table(model, robot, motion))
+        write_json(folder / "metrics.json", figures)
+        if robot is not None:
+            _write_episode(folder / "episode", args, robot, motion)
+            run = _recording(args, robot, motion)
+            record_run(folder / "run.rrd", run)
+            (folder / "film.mp4").write_bytes(film(run).mp4)
+    _report(args, robot, motion)
+    write_values(args.json, figures)
+    return 0
+
+
+def _target(model: FittedModel, words: Sequence[str], option: str) -> Target:
+    """Start or goal, of numbers or of a demonstration."""
+    if words[0] != "episode":
+        return model.target(words, option)
+    try:
+        (episode,) = map(int, words[1:])
+    except ValueError:
+        raise ValueError(f"{option} episode needs the number of one: episode 2") from None
+    made_by = fitted_from(model.folder)
+    demos = open_demos(made_by["dataset"], episodes=[episode], **as_fitted(made_by))
+    (demo,) = demos
+    row = 0 if option == "--start" else -1
+    columns = {
+        "joints": demo.joint_position if model.joint is not None else None,
+        "position": demo.position,
+        "orientation": demo.orientation,
+    }
+    values = {k: torch.from_numpy(x[row].copy()) for k, x in columns.items() if x is not None}
+    if model.joint is not None and "joints" in values:
+        names = [name.removesuffix(".pos") for name in demo.joint_names]
+        values = {"joints": values["joints"][[names.index(n) for n in model.joint_names]]}
+    if not values or not ("joints" in values or "position" in values):
+        raise ValueError(f"{option}: episode {episode} has neither joints nor positions.")
+    return Target(**values)
+
+
+def _figures(motion: PlayedMotion) -> dict[str, float]:
+    figures = {
+        "duration_s": float(motion.time[-1]),
+        "planned_duration_s": motion.planned_duration,
+        "samples": float(len(motion.time)),
+        "beyond_limits": 0.0,
+        "path_deviation_rad": motion.deviation,
+    }
+    for name, value, factor in (
+        ("goal_position_error_mm", motion.goal_position_error, 1e3),
+        ("goal_turn_error_deg", motion.goal_turn_error, 180 / math.pi),
+        ("goal_joint_error", motion.goal_joint_error, 1.0),
+    ):
+        if value is not None:
+            figures[name] = factor * value
+    return figures
+
+
+def _table(model: FittedModel, robot: Arm | None, motion: PlayedMotion) -> str:
+    """Motion as comma-separated values with a line of names and units."""
+    names, columns = ["time [s]"], [motion.time[:, None]]
+    if motion.joints is not None:
+        joint = model.joint
+        unit = "rad" if robot is not None or joint is None else joint.units
+        joints = model.joint_names if robot is None else robot.chain.joint_names
+        names += [f"{name} [{unit}]" for name in joints]
+        columns.append(motion.joints)
+    for values, labels in ((motion.position, _POSE[:3]), (motion.orientation, _POSE[3:])):
+        if values is not None:
+            names += labels
+            columns.append(values)
+    rows = np.concatenate(columns, axis=1)
+    lines = [",".join(names), *(",".join(f"{x:.9g}" for x in row) for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _write_episode(folder: Path, args: Play, robot: Arm, motion: PlayedMotion) -> None:
+    """Write the motion as a LeRobot dataset of one episode; actions are the next positions."""
+    assert motion.joints is not None
+    assert motion.position is not None
+    assert motion.orientation is not None
+    following = np.concatenate([motion.joints[1:], motion.joints[-1:]])
+    with DatasetWriter(
+        folder,
+        fps=round(1 / DT),
+        robot_type=robot.name,
+        joint_names=robot.chain.joint_names,
+        frames={"base": f"{robot.name} base", "ee": f"{robot.name} tool centre point"},
+        details={"played by": "hrc play", "model": str(args.model.resolve())},
+    ) as writer:
+        writer.start_episode(f"played {args.model.name}")
+        for k in range(len(motion.time)):
+            writer.add_frame(
+                joint_position=motion.joints[k],
+                position=motion.position[k],
+                orientation=motion.orientation[k],
+                command_position=following[k],
+            )
+        writer.save_episode()
+
+
+def _recording(args: Play, robot: Arm, motion: PlayedMotion) -> RunRecording:
+    assert motion.joints is not None
+    assert motion.position is not None
+    limits = robot.limits
+    return RunRecording(
+        title=f"{args.model.name} played by {robot.name}",
+        time=motion.time,
+        joint_names=robot.chain.joint_names,
+        joint_position=motion.joints,
+        joint_velocity=np.gradient(motion.joints, DT, axis=0),
+        joint_limits=JointRanges(
+            lower=limits.lower.numpy(),
+            upper=limits.upper.numpy(),
+            velocity=limits.velocity.numpy(),
+        ),
+        position=motion.position,
+        plan_path=motion.position,
+        bodies=arm_bodies(robot, motion.joints),
+    )
+
+
+def _report(args: Play, robot: Arm | None, motion: PlayedMotion) -> None:
+    lasts = float(motion.time[-1])
+    said = []
+    if motion.goal_position_error is not None:
+        said.append(f"{1e3 * motion.goal_position_error:.1f} mm from the goal")
+    if motion.goal_turn_error is not None:
+        said.append(f"{180 / math.pi * motion.goal_turn_error:.1f} deg from it")
+    if motion.goal_joint_error is not None:
+        said.append(f"joints {motion.goal_joint_error:.2g} from the goal")
+    print(f"{lasts:.2f} s, {', '.join(said)}")
+    if robot is None:
+        print("note: no --robot, so no limits were checked: motion.csv has the model's path")
+    elif motion.slowed_by:
+        print(
+            f"note: {lasts:.2f} s instead of {motion.planned_duration:.2f} s, because the "
+            f"{motion.slowed_by} would be beyond its limit"
+        )
+    print(f"Motion in {args.folder}")
+    if robot is not None:
+        print(f"Dashboard: {show_command(args.folder)}")

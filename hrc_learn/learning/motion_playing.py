@@ -1,0 +1,637 @@
+"""A fitted model carried out to a goal: its path, the joints of an arm, and their limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.controller.motion_filter import MotionFilter, MotionState
+from hrc_learn.dmp import JointDMP, PoseDMP
+from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.kinematics import Arm, ArmChoice, UnreachableError, arm_angle
+from hrc_learn.learning.model_choice import predicted_primitive
+from hrc_learn.learning.primitive_fitting import Primitive, load_primitive
+from hrc_learn.skills.placing import follow_pose
+
+DT = 0.02
+"""Time between samples [s]."""
+CHANNELS = ("joint", "pose", "position")
+"""Channels that can be played; an orientation alone moves no arm."""
+_RAD = {"rad": 1.0, "deg": math.pi / 180}
+"""Units of joints with a fixed size, in radians."""
+_DEVIATION = 2e-3
+"""Largest distance of the motion from the planned path [rad]: 1 mm at 0.5 m."""
+_SLOWER, _ATTEMPTS = 1.1, 30
+_SETTLING = 1.0
+"""Longest time after the path in which the motion reaches its end [s]."""
+_ITERATIONS, _DAMPING, _MISSED = 8, 1e-8, 1e-3
+"""Steps of Newton's method from one pose to the next, their damping, and the error that counts
+as out of reach [m, rad]."""
+_TURNS, _TURN_DAMPING, _LARGEST_TURN, _ROOM = 30, 1e-2, 0.1, 0.1
+"""Steps towards an orientation that an arm may have no joints for, their largest size, and the
+distance from the ends of the joints at which they stop [rad]."""
+_SAME_TOOL = 0.02
+"""Largest distance between the model's poses and those of its joints [m]."""
+
+Kind = Literal["joints", "position", "pose"]
+
+
+class BeyondLimitsError(RuntimeError):
+    """The motion leaves a limit that no longer duration can keep."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """Start or goal of a motion."""
+
+    joints: Float[Tensor, " joints"] | None = None
+    """In the model's unit."""
+    position: Float[Tensor, "3"] | None = None
+    """[m]"""
+    orientation: Float[Tensor, "4"] | None = None
+    """Unit quaternion (w, x, y, z); None leaves the model's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedModel:
+    """Primitives of a folder of `hrc fit`."""
+
+    folder: Path
+    primitives: Mapping[str, Primitive]
+    """Common primitives by channel."""
+
+    @classmethod
+    def load(cls, folder: Path) -> FittedModel:
+        """Read the primitives that can be played.
+
+        Raises:
+            FileNotFoundError: The folder holds none.
+        """
+        found = [channel for channel in CHANNELS if (folder / channel).is_dir()]
+        if not found:
+            raise FileNotFoundError(
+                f"{folder} holds no primitive of joints, poses or positions: give a folder of "
+                "hrc fit"
+            )
+        loaded = {c: cast(Any, load_primitive(folder / c, c)).double() for c in found}
+        return cls(folder=folder, primitives=loaded)
+
+    @property
+    def joint(self) -> JointDMP | None:
+        """Primitive of the joints."""
+        return cast("JointDMP | None", self.primitives.get("joint"))
+
+    @property
+    def pose(self) -> PoseDMP | None:
+        """Primitive of the end effector."""
+        return cast("PoseDMP | None", self.primitives.get("pose"))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, empty without their primitive."""
+        joint = self.joint
+        if joint is None:
+            return ()
+        names = joint.joint_names or [f"joint{i + 1}" for i in range(len(joint.start))]
+        return tuple(name.removesuffix(".pos") for name in names)
+
+    def target(self, words: Sequence[str], option: str) -> Target:
+        """Start or goal from the words of an option.
+
+        Args:
+            words: Numbers, or "joints", "position" or "pose" before them.
+            option: Name of the option, for errors.
+
+        Raises:
+            ValueError: The words name no target of this model.
+        """
+        counts: dict[Kind, int] = {"position": 3, "pose": 7}
+        if self.joint is not None:
+            counts = {"joints": len(self.joint_names), **counts}
+        given, numbers = "", list(words)
+        if numbers and numbers[0] in (*counts, "joints"):
+            given, numbers = numbers[0], numbers[1:]
+        forms = ", ".join(f"{n} numbers ({kind})" for kind, n in counts.items())
+        if given and given not in counts:
+            raise ValueError(f"{option} joints: {self.folder} moves no joints; give {forms}.")
+        try:
+            values = torch.tensor([float(word) for word in numbers], dtype=torch.float64)
+        except ValueError:
+            raise ValueError(
+                f"{option} {' '.join(words)}: give {forms}, or episode and its number."
+            ) from None
+        fits = [kind for kind, n in counts.items() if n == len(values) and given in ("", kind)]
+        if not fits or not bool(values.isfinite().all()):
+            raise ValueError(
+                f"{option} has {len(values)} numbers{f' for {given}' if given else ''}, but "
+                f"{self.folder} takes {forms}; all finite."
+            )
+        if len(fits) > 1:
+            raise ValueError(
+                f"{option}: {len(values)} numbers may be {' or '.join(fits)}: write "
+                f"{option} {fits[0]} before them, or {fits[1]}."
+            )
+        if fits[0] == "joints":
+            return Target(joints=values)
+        if fits[0] == "position":
+            return Target(position=values)
+        if abs(float(values[3:].norm()) - 1) > 0.02:
+            raise ValueError(
+                f"{option} pose: w x y z have the norm {float(values[3:].norm()):.3f}, but a "
+                "quaternion has 1."
+            )
+        return Target(
+            position=values[:3], orientation=values[3:] / torch.linalg.vector_norm(values[3:])
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayedMotion:
+    """Motion of a model to a goal."""
+
+    time: Float[np.ndarray, " samples"]
+    """[s]"""
+    joints: Float[np.ndarray, "samples joints"] | None = None
+    """Joint positions, in rad with an arm, else in the model's unit."""
+    position: Float[np.ndarray, "samples 3"] | None = None
+    """Position of the end effector [m]."""
+    orientation: Float[np.ndarray, "samples 4"] | None = None
+    """Unit quaternions (w, x, y, z)."""
+    planned_duration: float
+    """Duration that was asked for [s]; the motion is longer where the limits demand it."""
+    slowed_by: str = ""
+    """Limit that made the motion slower."""
+    goal_position_error: float | None = None
+    """Distance of the end from the goal [m]."""
+    goal_turn_error: float | None = None
+    """Angle between the end and the goal [rad]."""
+    goal_joint_error: float | None = None
+    """Largest distance of a joint from its goal, in the unit of `joints`."""
+    deviation: float = 0.0
+    """Largest distance of a joint from the planned path [rad]."""
+
+
+def play_path(
+    model: FittedModel, start: Target | None, goal: Target, duration: float | None
+) -> PlayedMotion:
+    """Motion in the model's own coordinates.
+
+    Args:
+        model: The model.
+        start: Start; None: the model's.
+        goal: Goal.
+        duration: [s]; None: the model's.
+
+    Raises:
+        ValueError: The model has no primitive of such a goal.
+    """
+    kind = "joint" if goal.joints is not None else "pose"
+    if kind == "pose" and model.pose is None:
+        kind = "position"
+    if kind not in model.primitives:
+        raise ValueError(
+            f"{model.folder} holds no primitive for a goal of "
+            f"{'joints' if kind == 'joint' else 'the end effector'}: it has "
+            f"{' and '.join(model.primitives)}. With --robot one becomes the other."
+        )
+    if start is not None and (start.joints is None) != (goal.joints is None):
+        raise ValueError("--start and --goal must be of one kind, or give --robot.")
+    lasting = _duration(model, kind, duration)
+    if kind == "joint":
+        assert goal.joints is not None
+        joints = _joint_path(
+            model, None if start is None else start.joints, goal.joints, lasting
+        )
+        error = float((joints[-1] - goal.joints).abs().max())
+        return PlayedMotion(
+            time=_times(lasting).numpy(),
+            joints=joints.numpy(),
+            planned_duration=lasting,
+            goal_joint_error=error,
+        )
+    pose, _, _ = _pose_path(model, start, goal, lasting)
+    return replace(
+        PlayedMotion(time=_times(lasting).numpy(), planned_duration=lasting),
+        position=pose.position.numpy(),
+        orientation=None if kind == "position" else pose.orientation.numpy(),
+        **_pose_errors(pose, goal),
+    )
+
+
+def play_on_arm(
+    model: FittedModel,
+    robot: Arm,
+    start: Target | None,
+    goal: Target,
+    duration: float | None,
+) -> PlayedMotion:
+    """Motion of an arm within its limits, from rest to rest.
+
+    The path keeps its shape; where the limits of velocity, acceleration or jerk demand it, the
+    motion takes longer.
+
+    Args:
+        model: The model.
+        robot: The arm, from `arm_for`.
+        start: Start; None: the model's.
+        goal: Goal.
+        duration: [s]; None: the model's.
+
+    Raises:
+        ValueError: The joints have a unit without a fixed size.
+        UnreachableError: The arm does not reach the path or the goal.
+        BeyondLimitsError: The path leaves the range of a joint.
+    """
+    plan = _Plan.of(model, robot, start, goal, duration)
+    path, note, stretch = plan.path(plan.duration), "", 1.0
+    for _ in range(_ATTEMPTS):
+        _require_range(robot, path)
+        factor, limit = _too_fast(robot, path)
+        note = note or limit
+        if factor <= 1.0:
+            joints = _within_limits(robot, path)
+            off = _distance(joints, path)
+            if off <= _DEVIATION:
+                break
+            factor, note = _SLOWER, note or "jerk"
+        stretch *= max(factor, 1 + 1e-3) * (1 + 1e-6)
+        path = plan.path(plan.duration * stretch)
+    else:
+        raise BeyondLimitsError(f"no duration keeps the limits of {robot.name} on this path.")
+    reached = robot.forward(torch.from_numpy(joints))
+    errors = _pose_errors(reached, plan.goal_pose)
+    if goal.joints is not None:
+        errors = {"goal_joint_error": float(np.abs(joints[-1] - plan.goal_joints).max())}
+    return PlayedMotion(
+        time=DT * np.arange(len(joints)),
+        joints=joints,
+        position=reached.position.numpy(),
+        orientation=reached.orientation.numpy(),
+        planned_duration=plan.duration,
+        slowed_by=note if stretch > 1 else "",
+        deviation=off,
+        **errors,
+    )
+
+
+def arm_for(model: FittedModel, name: str) -> Arm:
+    """Arm whose tool the model's poses are of: that of its description, or with our hand.
+
+    Args:
+        model: The model.
+        name: Registered arm, or its file.
+
+    Raises:
+        ValueError: The model moves other joints, or poses of another tool or base.
+    """
+    robot = ArmChoice(name).arm()
+    names = robot.chain.joint_names
+    if model.joint is not None and {*model.joint_names} != {*names}:
+        raise ValueError(
+            f"{model.folder} moves the joints {', '.join(model.joint_names)}, but {name} has "
+            f"{', '.join(names)}: choose the arm it was taught with, or fit --joint-names."
+        )
+    if model.joint is None or model.pose is None:
+        return robot
+    arms = [robot]
+    if robot.joints >= 6 and not robot.is_franka:
+        arms.append(robot.with_hand())
+    q = _in_rad(model, robot, model.joint.start)
+    apart = [
+        float((arm.forward(q).position - model.pose.start.position).norm()) for arm in arms
+    ]
+    best = int(np.argmin(apart))
+    if apart[best] > _SAME_TOOL:
+        raise ValueError(
+            f"the poses of {model.folder} begin {1e3 * apart[best]:.0f} mm from where its "
+            f"joints put the tool of {name}: they are of another tool or base frame. Fit with "
+            "--channels joint, or choose the arm's description with that tool."
+        )
+    return arms[best]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    """Path of an arm as a function of the duration."""
+
+    duration: float
+    path: Callable[[float], Float[Tensor, "samples joints"]]
+    """Joint positions [rad] for a duration [s]."""
+    goal_pose: Target
+    goal_joints: np.ndarray | None = None
+
+    @classmethod
+    def of(
+        cls,
+        model: FittedModel,
+        robot: Arm,
+        start: Target | None,
+        goal: Target,
+        duration: float | None,
+    ) -> _Plan:
+        """Path by the primitive of joints, or by inverse kinematics of that of poses."""
+        has_path = model.pose is not None or "position" in model.primitives
+        if goal.joints is None and has_path:
+            channel = "pose" if model.pose is not None else "position"
+            lasting = _duration(model, channel, duration)
+            first = _first_joints(model, robot, start)
+
+            def along(time: float) -> Tensor:
+                return _joints_along(model, robot, first, goal, time)
+
+            return cls(duration=lasting, path=along, goal_pose=goal)
+        if model.joint is None:
+            raise ValueError(
+                f"{model.folder} holds no primitive of joints: give --goal position or pose."
+            )
+        lasting = _duration(model, "joint", duration)
+        _in_rad(model, robot, model.joint.start)  # refuses shares before any search
+        if goal.joints is None:
+            ending = _reached(model, robot, goal)
+        else:
+            ending = _in_rad(model, robot, goal.joints)
+        first = _in_model(model, robot, _first_joints(model, robot, start))
+        asked = _in_model(model, robot, ending)
+
+        def path(time: float) -> Tensor:
+            return _in_rad(model, robot, _joint_path(model, first, asked, time))
+
+        return cls(duration=lasting, path=path, goal_pose=goal, goal_joints=ending.numpy())
+
+
+def _duration(model: FittedModel, channel: str, given: float | None) -> float:
+    if given is not None and not (math.isfinite(given) and given > DT):
+        raise ValueError(f"--duration must be more than {DT} s, but is {given}.")
+    return float(model.primitives[channel].duration) if given is None else given
+
+
+def _times(duration: float) -> Float[Tensor, " samples"]:
+    return DT * torch.arange(math.ceil(duration / DT - 1e-9) + 1, dtype=torch.float64)
+
+
+@torch.no_grad()
+def _joint_path(
+    model: FittedModel, start: Tensor | None, goal: Tensor, duration: float
+) -> Float[Tensor, "samples joints"]:
+    """Positions in the model's unit, by the model that predicts best, from rest."""
+    joint = model.joint
+    assert joint is not None
+    start = joint.start if start is None else start
+    best = predicted_primitive(model.folder, "joint", start, goal).double()
+    still = torch.zeros_like(start)
+    return best.rollout(_times(duration), start, goal, duration, still).position
+
+
+@torch.no_grad()
+def _pose_path(
+    model: FittedModel,
+    start: Target | None,
+    goal: Target,
+    duration: float,
+    body: Tensor | None = None,
+) -> tuple[Pose, Tensor | None, Tensor | None]:
+    """Poses of the end effector, their twists and the learned body.
+
+    Positions alone keep the orientation of the goal.
+    """
+    time, pose = _times(duration), model.pose
+    assert goal.position is not None
+    if pose is None:
+        linear = cast("JointDMP", model.primitives["position"])
+        first = linear.start if start is None or start.position is None else start.position
+        best = predicted_primitive(model.folder, "position", first, goal.position).double()
+        moved = best.rollout(time, first, goal.position, duration, torch.zeros_like(first))
+        still = torch.tensor((1.0, 0.0, 0.0, 0.0), dtype=time.dtype)
+        turned = still if goal.orientation is None else goal.orientation
+        return Pose(moved.position, turned.expand(len(time), 4)), None, None
+    begin = _completed(start, pose.start)
+    end = _completed(goal, pose.goal)
+    rest = torch.zeros(6, dtype=time.dtype)
+    motion = pose.rollout(time, begin, end, duration, rest, start_body=body)
+    return motion.pose, motion.twist, motion.body
+
+
+def _completed(target: Target | None, usual: Pose) -> Pose:
+    if target is None or target.position is None:
+        return usual
+    turned = usual.orientation if target.orientation is None else target.orientation
+    return Pose(target.position, turned)
+
+
+def _joints_along(
+    model: FittedModel, robot: Arm, first: Tensor, goal: Target, duration: float
+) -> Float[Tensor, "samples joints"]:
+    """Joint positions [rad] along the model's poses, from the joints at the start."""
+    begin = robot.forward(first)
+    start = Target(position=begin.position, orientation=begin.orientation)
+    has_angle = robot.null_space == "arm angle"
+    angle = arm_angle(robot.chain, first)[None] if has_angle else None
+    learned = model.pose is not None and model.pose.motion.start.shape[-1] > 6
+    poses, twist, body = _pose_path(model, start, goal, duration, angle if learned else None)
+    if has_angle and learned and twist is not None and body is not None:
+        path = follow_pose(robot.chain, first, poses, twist, body[:, 0], DT)
+        # The law follows with a lag that vanishes in time, and some of it is left at the end.
+        path[-1] = _followed(robot, path[-1], poses[-1:])[-1]
+        return path
+    turns = model.pose is not None or goal.orientation is not None
+    if robot.joints >= 6 and turns:
+        return _followed(robot, first, poses)
+    end = _nearest_posture(robot, poses[-1], first, turns)
+    progress = [
+        minimum_jerk(k / max(len(poses.position) - 1, 1))[0] for k in range(len(poses.position))
+    ]
+    reference = torch.lerp(first, end, torch.tensor(progress, dtype=first.dtype)[:, None])
+    return _followed(robot, first, poses, reference)
+
+
+@torch.no_grad()
+def _followed(
+    robot: Arm,
+    first: Tensor,
+    poses: Pose,
+    reference: Float[Tensor, "samples joints"] | None = None,
+) -> Float[Tensor, "samples joints"]:
+    """Joint positions along poses, each by Newton's method from the one before.
+
+    Args:
+        robot: The arm.
+        first: Joint positions at the first pose [rad].
+        poses: Poses of the end effector.
+        reference: Joint positions to be near to, where only the positions count [rad].
+    """
+    rows, q, path = 6 if reference is None else 3, first, []
+    for k in range(len(poses.position)):
+        for _ in range(_ITERATIONS):
+            pose, J = robot.chain.forward_and_jacobian(q)
+            back = _damped(J[:rows])
+            q = q + back @ pose.twist_to(poses[k])[:rows]
+            if reference is not None:
+                away = reference[k] - q
+                q = q + away - back @ (J[:rows] @ away)
+        if not bool((robot.forward(q).twist_to(poses[k])[:rows].abs() < _MISSED).all()):
+            where = ", ".join(f"{x:.3f}" for x in poses.position[k].tolist())
+            raise UnreachableError(
+                f"{robot.name} does not reach the path at position ({where}) m"
+                f"{' with this orientation' if rows == 6 else ''}: choose another goal or "
+                "start."
+            )
+        path.append(q)
+    return torch.stack(path)
+
+
+def _nearest_posture(
+    robot: Arm, pose: Pose, near: Tensor, turns: bool
+) -> Float[Tensor, " joints"]:
+    """Joint positions at a position [rad], turned towards an orientation as far as they can."""
+    q = robot.inverse(pose, near=near, task="position")
+    lower, upper = robot.limits.lower + _ROOM, robot.limits.upper - _ROOM
+    for _ in range(_TURNS if turns else 0):
+        now, J = robot.chain.forward_and_jacobian(q)
+        error, back = now.twist_to(pose), _damped(J[:3])
+        rest = torch.eye(len(q), dtype=q.dtype) - back @ J[:3]
+        turn = rest @ _damped(J[3:] @ rest, _TURN_DAMPING) @ error[3:]
+        turn = turn * (_LARGEST_TURN / turn.norm().clamp(min=_LARGEST_TURN))
+        moved = q + turn + back @ error[:3]
+        # The joints of the path on the way to it need some room.
+        if bool(((moved < lower) | (moved > upper)).any()):
+            break
+        q = moved
+    for _ in range(_ITERATIONS):
+        now, J = robot.chain.forward_and_jacobian(q)
+        q = q + _damped(J[:3]) @ now.twist_to(pose)[:3]
+    return q
+
+
+def _damped(
+    J: Float[Tensor, "rows joints"], damping: float = _DAMPING
+) -> Float[Tensor, "joints rows"]:
+    """Damped pseudo-inverse of a Jacobian."""
+    return J.mT @ torch.linalg.inv(J @ J.mT + damping * torch.eye(len(J), dtype=J.dtype))
+
+
+def _first_joints(model: FittedModel, robot: Arm, start: Target | None) -> Tensor:
+    """Joint positions at the start [rad]."""
+    if start is not None and start.joints is not None:
+        return _in_rad(model, robot, start.joints)
+    if start is None and model.joint is not None:
+        return _in_rad(model, robot, model.joint.start)
+    return _reached(model, robot, start)
+
+
+def _reached(model: FittedModel, robot: Arm, target: Target | None) -> Tensor:
+    """Joint positions [rad] of a pose, near those that the model has there."""
+    near, usual = robot.ready, None
+    if model.joint is not None:
+        near = _in_rad(model, robot, model.joint.start if target is None else model.joint.goal)
+        usual = robot.forward(near)
+    if model.pose is not None:
+        usual = model.pose.start if target is None else model.pose.goal
+    if usual is None:
+        linear = cast("JointDMP", model.primitives["position"])
+        usual = Pose(linear.start, robot.forward(near).orientation)
+    pose = _completed(target, usual)
+    free = target is not None and target.orientation is None and model.pose is None
+    if robot.joints >= 6 and not free:
+        return robot.inverse(pose, near=near)
+    return _nearest_posture(robot, pose, near, not free)
+
+
+def _columns(model: FittedModel, robot: Arm) -> tuple[float, list[int]]:
+    """Radians in the model's unit, and the model's column of each joint of the arm."""
+    assert model.joint is not None
+    unit = model.joint.units
+    if unit not in _RAD:
+        shown = "shares of their ranges" if unit in ("1", "%") else repr(unit)
+        raise ValueError(
+            f"{model.folder} holds joints in {shown}, of which no angle is known: fit "
+            "with the unit of the dataset (--units joint_position deg) or convert it with the "
+            "robot's calibration; without --robot the model is played as it is."
+        )
+    names = model.joint_names
+    return _RAD[unit], [names.index(name) for name in robot.chain.joint_names]
+
+
+def _in_rad(model: FittedModel, robot: Arm, values: Tensor) -> Tensor:
+    """Joint positions of the arm [rad] from the model's."""
+    factor, columns = _columns(model, robot)
+    return factor * values[..., columns]
+
+
+def _in_model(model: FittedModel, robot: Arm, joints: Tensor) -> Tensor:
+    """Inverse of `_in_rad`."""
+    factor, columns = _columns(model, robot)
+    return joints[..., np.argsort(columns).tolist()] / factor
+
+
+def _require_range(robot: Arm, path: Float[Tensor, "samples joints"]) -> None:
+    """Refuse a path that leaves the range of a joint."""
+    beyond = torch.maximum(robot.limits.lower - path, path - robot.limits.upper)
+    if float(beyond.max()) > 1e-9:
+        k, i = divmod(int(beyond.argmax()), path.shape[1])
+        raise BeyondLimitsError(
+            f"{robot.chain.joint_names[i]} would be {float(beyond[k, i]):.3f} rad beyond its "
+            f"range at {k / max(len(path) - 1, 1):.0%} of the motion: choose another goal or "
+            "start."
+        )
+
+
+def _too_fast(robot: Arm, path: Float[Tensor, "samples joints"]) -> tuple[float, str]:
+    """Factor by which the path is too fast, and the limit that it breaks most."""
+    worst, said = 1.0, ""
+    for order, kind in enumerate(("velocity", "acceleration"), 1):
+        rate = torch.diff(path, n=order, dim=0) / DT**order
+        # The path begins and ends at rest: its first step is a change of velocity, too.
+        ratio = (rate.abs() / getattr(robot.limits, kind)).amax(0)
+        factor = float(ratio.max()) ** (1 / order)
+        if factor > worst:
+            name = robot.chain.joint_names[int(ratio.argmax())]
+            worst, said = factor, f"{kind} of {name}"
+    return worst, said
+
+
+def _within_limits(
+    robot: Arm, path: Float[Tensor, "samples joints"]
+) -> Float[np.ndarray, "moments joints"]:
+    """Motion along a path within all limits, from rest to rest."""
+    names = ("velocity", "acceleration", "jerk", "lower", "upper")
+    limits = {name: getattr(robot.limits, name).double().numpy() for name in names}
+    smoother, state = MotionFilter(DT, **limits), MotionState.moving(path[0].numpy())
+    made, end = [state.position], path[-1].numpy()
+    for asked in path[1:].numpy():
+        state = smoother.step(state, asked)
+        made.append(state.position)
+    for _ in range(round(_SETTLING / DT)):
+        if np.abs(state.position - end).max() < 1e-5 and np.abs(state.velocity).max() < 1e-4:
+            break
+        state = smoother.step(state, end)
+        made.append(state.position)
+    return np.stack(made)
+
+
+def _distance(
+    joints: Float[np.ndarray, "moments joints"], path: Float[Tensor, "samples joints"]
+) -> float:
+    """Largest distance of a motion from a path, whenever it passes there [rad]."""
+    between = torch.linspace(0, 1, 5, dtype=path.dtype)[:-1, None, None]
+    fine = torch.cat([torch.lerp(path[:-1], path[1:], between).flatten(0, 1), path[-1:]])
+    return float(torch.cdist(torch.from_numpy(joints), fine, p=torch.inf).amin(1).max())
+
+
+def _pose_errors(pose: Pose, goal: Target) -> dict[str, float]:
+    """Distance and angle of the last pose from the goal."""
+    errors = {}
+    if goal.position is not None:
+        apart = pose.position[-1] - goal.position
+        errors["goal_position_error"] = float(torch.linalg.vector_norm(apart))
+    if goal.orientation is not None:
+        turn = quaternion.multiply(quaternion.conjugate(goal.orientation), pose.orientation[-1])
+        errors["goal_turn_error"] = float(torch.linalg.vector_norm(quaternion.log(turn)))
+    return errors
