@@ -93,8 +93,10 @@ class ImportPlan:
             fields = ", ".join(self._tokens(places))
             rows.append((fields, f"{key}, as recorded", "?", "", "no unit is known"))
         for camera, name in meaning.cameras.items():
-            size = "x".join(map(str, self.recordings[0].fields[name].shape[1:3]))
-            rows.append((name, f"camera {camera}", "", "", size or "image files"))
+            one = self.recordings[0].fields[name]
+            shape = "x".join(map(str, one.shape[1:]))
+            size = "image files" if one.kind == "encoded" else shape
+            rows.append((name, f"camera {camera}", "", "", size))
         if meaning.time:
             rows.append((meaning.time, "time", "s", "", "by its name"))
         yield from aligned(rows)

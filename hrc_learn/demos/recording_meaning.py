@@ -312,12 +312,14 @@ def _with_units(
 def _gripper_among(first: Recording, joints: ColumnSelection) -> list[str]:
     """A question about last columns without names that behave as those of a gripper."""
     values = read_columns(first, joints.columns)
+    if len(values) < 2:
+        return []
     inside = np.all((values >= -0.01) & (values <= 1.05), axis=0)
     # A gripper rests at its ends; two fingers move alike.
     rests = np.mean(np.diff(values, axis=0) == 0, axis=0) > 0.5
     alike = values.shape[1] > 7 and np.allclose(values[:, -1], values[:, -2])
     count = 2 if alike and inside[-2:].all() else int(inside[-1] and rests[-1])
-    if not joints.numbered or not count or rests[: -count or None].any():
+    if not joints.numbered or not count or rests[:-count].any():
         return []
     (name, index), width = joints.columns[-count], len(joints.columns)
     text = f"the last {count} of {width} columns of {name} behave as a gripper: if they are no"
