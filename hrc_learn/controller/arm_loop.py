@@ -2,11 +2,12 @@
 
 A step is a pure function `(state, reading, request) -> (command, state, report)`:
 
-1. *Observe* a reading: the null-space push is smoothed, and the joint path goes on, waits or
-   goes back, as the arm follows and people allow.
+1. *Observe* a reading: the null-space push is smoothed, and the joint path advances, waits or
+   is retraced, depending on how the arm tracks it and on people.
 2. *Act* on a request: a joint path, a pose of the end effector, a joint velocity, or a command
    of the adaptive controller becomes a joint velocity; the null space yields to the push; the
-   safety filter has the last word; and the pace of the task drops by what people took from it.
+   safety filter has the last word; and the pace of the task drops by the fraction of the motion
+   that people prevented.
 
 States, readings and requests have any number of leading batch dimensions. Drivers, clocks, logs
 and messages to people belong to the caller.
@@ -188,7 +189,7 @@ class ArmLoop:
     def _eased_push(
         self, state: ArmLoopState, reading: ArmReading
     ) -> tuple[Tensor, tuple[Limitation, ...]]:
-        """Null-space velocity that the push amounts to now, and what limits it."""
+        """Null-space velocity requested by the push now, and the limitations of it."""
         requested = self._requested_null_velocity(reading)
         asked = (requested != 0).any(-1)
         acts = asked | state.pushed
@@ -317,7 +318,7 @@ class ArmLoop:
     def _explained(
         self, reading: ArmReading, report: ArmReport, velocity: Tensor, sent: Tensor
     ) -> ArmReport:
-        """The report with what the safety filter takes from a push."""
+        """The report with the part of a push that the safety filter removes."""
         J, scale = reading.jacobian, reading.person_speed_scale
         slowed = torch.zeros_like(sent[..., 0], dtype=torch.bool)
         if scale is not None:

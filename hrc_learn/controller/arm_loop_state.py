@@ -102,13 +102,13 @@ class PathState:
     twist: Float[Tensor, "*batch 6"]
     """Velocity of that pose along the path (linear [m/s], angular [rad/s])."""
     blocked: Bool[Tensor, "*batch"]
-    """True if the arm, off its path, would have met something had the path gone on."""
+    """True if the arm, off its path, would have hit something if the path had advanced."""
     narrow_ahead: Bool[Tensor, "*batch"]
-    """True if the joints could not leave the path somewhere before it stops."""
+    """True if the path becomes narrow before it can stop: there the joints cannot leave it."""
     waited: Float[Tensor, "*batch"]
-    """Time for which it has waited for joints that come no nearer [s]."""
+    """Waiting time in which the joints came no nearer to the path [s]."""
     nearest: Float[Tensor, "*batch"]
-    """Distance of the joints from the path when they last had come nearer [rad]."""
+    """Distance of the joints from the path when they last came nearer [rad]."""
     held: Float[Tensor, "*batch"]
     """Time for which it has waited while the arm was pushed [s]."""
     direct_return: DirectReturn
@@ -153,13 +153,13 @@ class ArmLoopState:
     safety: SafetyState
     pace: TaskPace
     null_velocity: Float[Tensor, "*batch n"]
-    """Null-space velocity that a push amounts to, without jumps [rad/s]."""
+    """Null-space velocity requested by a push, smoothed [rad/s]."""
     return_velocity: Float[Tensor, "*batch n"]
-    """Null-space velocity back to the path, without jumps [rad/s]."""
+    """Null-space velocity back to the path, smoothed [rad/s]."""
     aside: Bool[Tensor, "*batch"]
     """True while the joints are off their path."""
     lost: Bool[Tensor, "*batch"]
-    """True while the null space might lead them to another posture than that of the path."""
+    """True while null-space motion might take the joints to a posture other than the path's."""
     path: PathState
 
     @property
@@ -207,17 +207,17 @@ type ArmRequest = FollowPath | TrackPose | MoveJoints | SendCommand
 
 
 class Limitation(NamedTuple):
-    """Part of a push that one cause takes away."""
+    """Reduction of a push by one cause."""
 
     cause: Hindrance
     kept: Float[Tensor, "*batch"]
-    """Fraction of the motion that is left, 0 to 1."""
+    """Fraction of the motion that remains, 0 to 1."""
     joint: Int[Tensor, "*batch"] | None = None
     """Joint at its limit, from 0."""
     distance: Float[Tensor, "*batch"] | None = None
     """Distance from an obstacle [m]."""
     mentioned: Bool[Tensor, "*batch"] | None = None
-    """True where the cause is reported although it takes nothing away."""
+    """True where the cause is reported although it reduces nothing."""
 
 
 class ArmReport(NamedTuple):

@@ -1,4 +1,4 @@
-"""Joint paths that the null space may leave: when they slow down, wait, and are gone back.
+"""Joint paths that the null space may leave: slowing down, waiting and retracing.
 
 While a person pushes the joints off their path, the end effector keeps to the poses of the
 path. The rules here decide whether the joints are off the path, how far a push may take them,
@@ -26,8 +26,8 @@ from hrc_learn.pytree import pytree
 CHANGE_OF_RATE = 0.2
 """Time in which a path comes to rest, or to its full speed [s]."""
 FAR_ASIDE = 1.8
-"""Distance of the joints from a path that still goes on [rad]. From 1.4 rad, an elbow aside by
-some 0.2 m, all joints found back to their path; from 2 rad some did not."""
+"""Largest distance of the joints from a path that still advances [rad]. From 1.4 rad, with the
+elbow about 0.2 m off, all joints returned to their path; from 2 rad some did not."""
 WELL_ALIGNED, POORLY_ALIGNED = 0.8, 0.65
 """Alignment (`return_alignment`) from which on a push counts in full, and below which the null
 space may lead to another posture than that of the path. An elbow that has gone a quarter of its
@@ -114,7 +114,7 @@ class JointPaths:
 
 
 def begins_aside(error: Float[Tensor, "*batch n"]) -> Bool[Tensor, "*batch"]:
-    """True where joints are so far from the start of a path [rad] that a push moved them."""
+    """True where joints [rad] are so far from the start of a path that a push moved them."""
     return error.norm(dim=-1) > _ASIDE
 
 
@@ -125,7 +125,7 @@ def stays_aside(
 ) -> Bool[Tensor, "*batch"]:
     """True where the joints are off their path because they are, or were, pushed.
 
-    Joints that lag behind without a push have met something: they go on along the path.
+    Joints that lag without a push are in contact with something: they continue along the path.
 
     Args:
         pushed: True while the null space is pushed.
@@ -154,7 +154,7 @@ def may_not_return(
     alignment: Float[Tensor, "*batch"],
     waited: Bool[Tensor, "*batch"] | bool = False,
 ) -> Bool[Tensor, "*batch"]:
-    """True where the null space might lead to another posture than that of a path that goes on.
+    """True where null-space motion might end in a posture other than that of an advancing path.
 
     Args:
         error: Path minus joint positions [rad].
@@ -173,7 +173,7 @@ def push_fraction(
     null_error: Float[Tensor, "*batch n"],
     alignment: Float[Tensor, "*batch"],
 ) -> Float[Tensor, "*batch"]:
-    """Fraction of a push that is followed, 0 to 1: it fades where joints might not find back.
+    """Fraction of a push that is followed, 0 to 1; it fades where joints might not return.
 
     Args:
         push: Null-space velocity that is asked for [rad/s]. One towards the path counts fully.
@@ -190,7 +190,7 @@ def eased_return(
     dt: float,
     config: YieldingConfig,
 ) -> Float[Tensor, "*batch n"]:
-    """Null-space velocity back to a path [rad/s], without jumps.
+    """Null-space velocity back to a path, smoothed [rad/s].
 
     Args:
         previous: That of the last step [rad/s].
@@ -212,9 +212,9 @@ def waiting_time(
     stuck_after: float,
     dt: float,
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-    """Time for which a path has waited for joints that come no nearer, one step later.
+    """Waiting time of a path without progress of the joints, one step later [s].
 
-    Time in which the path goes on is subtracted: a path that stops and starts under repeated
+    Time in which the path advances is subtracted: a path that stops and starts under repeated
     pushes is stuck only if it rests for more than half of the time.
 
     Args:
@@ -260,7 +260,7 @@ def changed_rate(
     dt: float,
     direction: int | Int[Tensor, "*batch"] = 1,
 ) -> Float[Tensor, "*batch"]:
-    """Rate of a path one step later, without jumps.
+    """Rate of a path one step later, changed smoothly.
 
     Args:
         rate: Fraction of the path's own speed, -1 to 1.
@@ -296,9 +296,8 @@ _RETURN_GOALS, _CHECKED = 20, 50
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class DirectReturn:
-    """A straight motion of the joints back to a path, where no null-space motion leads there.
-
-    Another posture for the same pose may lie in between, so the end effector leaves its path.
+    """A straight joint motion back to a path that null-space motion cannot reach. The joints
+    pass between two postures of one pose, so the end effector leaves its path.
     """
 
     start: Float[Tensor, "*batch n"]
@@ -314,7 +313,7 @@ class DirectReturn:
     active: Bool[Tensor, "*batch"]
     """True while the joints return directly."""
     blocked: Bool[Tensor, "*batch"]
-    """True where the arm would meet something on the way to each sample."""
+    """True where the arm would hit something on the way to each sample."""
 
     @classmethod
     def none(cls, joint_position: Float[Tensor, "*batch n"]) -> DirectReturn:
@@ -393,7 +392,7 @@ def _return_goals(
     progress: Float[Tensor, "*batch"],
     joint_position: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "goals *batch n"], Float[Tensor, "goals *batch"]]:
-    """Goals of a direct return and their samples: the one that waits, others by distance."""
+    """Candidate goals of a direct return and their samples: the waiting one, then others."""
     last = paths.last[path]
     stride = ((last + 1) // _RETURN_GOALS).clamp(min=1)
     k = torch.arange(2 * _RETURN_GOALS).reshape(-1, *(1 for _ in last.shape)) * stride

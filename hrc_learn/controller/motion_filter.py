@@ -29,13 +29,13 @@ class MotionState:
     """State of the motion, carried from one position to the next."""
 
     position: Float[np.ndarray, "*batch D"]
-    """Handed out last."""
+    """Last position returned."""
     velocity: Float[np.ndarray, "*batch D"]
     """Difference quotient of the last step [1/s]."""
     acceleration: Float[np.ndarray, "*batch D"]
     """Difference quotient of the velocity at the last step [1/s^2]."""
     reference: Float[np.ndarray, "*batch D"]
-    """Asked for last."""
+    """Last position requested."""
     reference_velocity: Float[np.ndarray, "*batch D"]
     """Velocity of the motion, zero after a jump [1/s]."""
     reference_acceleration: Float[np.ndarray, "*batch D"]
@@ -71,9 +71,9 @@ class MotionState:
 class MotionFilter:
     """Follows positions within limits of position, velocity, acceleration and jerk.
 
-    Positions that keep the limits and go on where the last ones ended come out as they went
-    in. Otherwise the motion leaves them and comes back: with e the distance to what is asked
-    for, e' its rate and a_r the acceleration of what is asked for,
+    Positions that keep the limits and continue the last ones are returned unchanged. Otherwise
+    the motion departs from them and returns: with e the distance to the requested position, e'
+    its rate and a_r the requested acceleration,
 
         a = a_r - h'(e; A, lambda) e' - h(e' + h(e; A, lambda); j, mu)
         h(x; b, k) = sign(x) (sqrt((b/k)^2 + 2 b |x|) - b/k)
@@ -81,16 +81,16 @@ class MotionFilter:
     so that e' follows -h(e), along which e brakes with A while it is large and decays at the
     rate lambda once it is small. A step counts as error, not as motion.
 
-    The limits hold for *any* input, as they are for differences of what is handed out:
-    v_k = (p_k - p_{k-1})/dt, a_k = (v_k - v_{k-1})/dt, j_k = (a_k - a_{k-1})/dt. With d the
-    distance to a limit of position and v the speed towards it, the next acceleration is clamped
-    so that
+    The limits hold for *any* input, because they apply to differences of the returned
+    positions: v_k = (p_k - p_{k-1})/dt, a_k = (v_k - v_{k-1})/dt, j_k = (a_k - a_{k-1})/dt.
+    With d the distance to a limit of position and v the speed towards it, the next acceleration
+    is clamped so that
 
         v + (a + A)^2/(2 j) <= min(h(d; A, 1/dt), v_max + A^2/(2 j))
 
-    remains true, which is a set that braking with A, reached with j, never leaves. It takes a
-    start in it: at rest, A^3/(8 j^2) + A^2 dt/(2 j) away from the limits of position. A is
-    lowered where that would be more than a tenth of their range.
+    remains true, a set that braking with A, ramped up with j, never leaves. The start must lie
+    in it: at rest, A^3/(8 j^2) + A^2 dt/(2 j) away from the limits of position. A is lowered
+    where that would be more than a tenth of their range.
     """
 
     def __init__(
@@ -161,11 +161,9 @@ class MotionFilter:
     def _reference_motion(
         self, state: MotionState, asked: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Velocity and acceleration of what is asked for, as far as it is a motion.
-
-        Where it breaks a limit, the velocity goes after it with the limit of acceleration,
-        which passes steps by and still learns a new slope, and there is no acceleration to be
-        followed.
+        """Velocity and acceleration of the requested motion, without its jumps. Where the
+        request breaks a limit, the velocity approaches its slope within the acceleration limit,
+        which ignores single steps but follows a new slope; the acceleration is then zero.
         """
         dt, A = self.dt, self.acceleration
         change = ((asked - state.reference) / dt - state.reference_velocity) / dt
@@ -196,7 +194,7 @@ class MotionFilter:
 def _braking_rate(
     x: np.ndarray, strength: np.ndarray, rate: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The function h and its slope: how fast x may change if it is to come to rest at zero.
+    """The function h and its slope: the fastest rate at which x can still come to rest at zero.
 
     Square root far from zero (constant deceleration), a line of slope `rate` close to it.
     """

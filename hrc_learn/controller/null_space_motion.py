@@ -1,8 +1,8 @@
 """Null-space motions that an arm can follow without moving its end effector.
 
-A person, or a repulsion from what is near, asks for a motion of the null space. The functions
-here reduce it to what the arm can do: slow enough for the end effector to be kept in place,
-away from singularities, within the joint limits, clear of obstacles, and without jumps.
+A person, or the repulsion from nearby bodies, requests a motion of the null space. The
+functions here reduce it to what the arm can do: slow enough for the end effector to be kept in
+place, away from singularities, within the joint limits, clear of obstacles, and without jumps.
 """
 
 from __future__ import annotations

@@ -67,7 +67,8 @@ class TaskPace:
         return (self.people_scale == 1) & (self.speed_override == self.full_speed)
 
     def limited(self, people_scale: Float[Tensor, "*batch"], dt: float) -> TaskPace:
-        """Pace one step later, after people have left a fraction of the requested motion.
+        """Pace one step later, if people near the arm permit a fraction of the requested
+        motion.
 
         Args:
             people_scale: That fraction. The scale may drop at once; it rises as paths do.
@@ -111,7 +112,7 @@ def people_bind(
 ) -> Bool[Tensor, "*batch"]:
     """True where the arm is slowed down by people, or because their distance is not known.
 
-    Limits of the arm itself do not count: a path that waited for them would wait for ever.
+    Limits of the arm itself do not count: a path would wait for them for ever.
 
     Args:
         distances: Distances from people.
@@ -141,18 +142,18 @@ def closes_in(
 
 @dataclass(frozen=True, kw_only=True)
 class WayMakingConfig:
-    """Source of null-space motion, and the repulsion from what is near."""
+    """Source of null-space motion, and the repulsion from nearby bodies."""
 
     mode: Literal["none", "expert", "automatic", "both"] = "both"
     """Source of null-space motion: none, the null-space input of a person, the repulsion from
-    what is near, or the sum of both."""
+    nearby bodies, or the sum of both."""
     far: float = 0.3
     """Distance at which the repulsion begins [m]: well before the 0.13 m at which
     `ConstraintConfig` begins to slow down an approach at 0.5 m/s."""
     near: float = 0.08
     """Distance at which the repulsion is largest [m], before the constraints bind."""
     speed: float = 0.5
-    """Joint velocity at the largest repulsion, of which the null-space part acts [rad/s]."""
+    """Joint velocity at the largest repulsion [rad/s]; only its null-space part acts."""
     smoothing: float = 0.02
     """Difference of distances below which pairs count alike [m]. Without it the direction
     would jump where another pair becomes the nearest."""
@@ -182,14 +183,14 @@ class WayMakingConfig:
 def way_making_velocity(
     distances: Distances, config: WayMakingConfig | None = None
 ) -> Float[Tensor, "*batch n"]:
-    """Joint velocity away from what is near, whose null-space part acts [rad/s].
+    """Joint velocity away from nearby bodies [rad/s]; only its null-space part acts.
 
     It follows the gradient of the smoothed least distance d = -k log sum exp(-d_i/k), as down
     the potential of a repulsion (Khatib 1986). Its speed rises smoothly from zero at `far` to
     `speed` at `near`. Zero where a distance is not a number: the arm brakes there.
 
     Args:
-        distances: Distances from what the arm should keep away from.
+        distances: Distances from the bodies to keep away from.
         config: Default: the recommended settings.
     """
     config = config or WayMakingConfig()
