@@ -3,7 +3,11 @@
 from pathlib import Path
 
 import numpy as np
-from rerun.experimental import RrdReader
+
+try:
+    from rerun.chunk import RrdReader  # pyright: ignore[reportMissingImports]
+except ModuleNotFoundError:  # before Rerun 0.41
+    from rerun.experimental import RrdReader
 
 
 class Rrd:
