@@ -14,8 +14,10 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import torch
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
+from hrc_learn.demos.dataset_arm import arm_of_dataset
 from hrc_learn.demos.images import ImageReader, jpeg
 from hrc_learn.demos.issues import plain_text
 from hrc_learn.demos.quality.ranking import MEASURES, Ranking
@@ -29,6 +31,8 @@ from hrc_learn.demos.quality.repair import (
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.read.metadata import Feature
+from hrc_learn.demos.read.source import DemonstrationSource
+from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.gate import Visitor, incoming
@@ -161,10 +165,12 @@ class CurationPage:
 
     def curves(self, episode: int) -> dict[str, Any]:
         """All that moves in an episode, over time."""
-        (demo,) = open_demos(self.ranking.path, [episode], **self._options)
+        source = open_demos(self.ranking.path, [episode], **self._options)
+        (demo,) = source
         frames = _stretches(demo)
         return {
             "time": demo.time,
+            "arm": _arm(source, demo),
             "charts": [
                 {
                     "name": plain_text(name),
@@ -174,7 +180,7 @@ class CurationPage:
                         for label, values in lines.items()
                     ],
                 }
-                for name, unit, lines in _charts(demo, self._features)
+                for name, unit, lines in _charts(demo, self._features, source.units)
             ],
         }
 
@@ -249,22 +255,48 @@ def _json(content: Any) -> Content:
     return Content(body=_encode(content), kind="application/json")
 
 
+def _arm(source: DemonstrationSource, demo: Demonstration) -> dict[str, Any] | None:
+    """Points along the arm at every few frames; None if the dataset's arm is not known."""
+    try:
+        found = arm_of_dataset(source)
+    except DatasetError:
+        return None
+    if demo.joint_position is None:
+        return None
+    every = 1 + len(demo) // _MOST_POINTS
+    frames = found.arm.link_frames(found.positions(demo.joint_position[::every]))
+    base = frames.new_zeros(len(frames), 1, 3)
+    points = torch.cat([base, frames[..., 3]], dim=1)
+    opening = found.opening(demo)
+    return {
+        "name": found.arm.name,
+        "every": every,
+        "points": np.round(points.numpy(), 4),  # tenths of a millimetre
+        "opening": None if opening is None else np.round(opening[::every], 3),
+    }
+
+
 def _charts(
-    demo: Demonstration, features: Mapping[str, Feature]
+    demo: Demonstration, features: Mapping[str, Feature], units: Mapping[str, UnitDecision]
 ) -> list[tuple[str, str, dict[str, np.ndarray]]]:
     """Name, unit and lines of each chart; columns without a meaning go by their own names."""
     charts = []
     moved = {"state": demo.joint_position, "command": demo.command_position}
+    decision = units.get("joint_position")
     for k, joint in enumerate(demo.joint_names):
-        lines = {name: values[:, k] for name, values in moved.items() if values is not None}
+        unit = "rad" if decision is None else decision.unit_of(k)
+        factor = unit_factor("joint_position", unit)
+        lines = {n: values[:, k] / factor for n, values in moved.items() if values is not None}
         if lines:
-            charts.append((joint, "rad", lines))
+            charts.append((joint, unit, lines))
     others = (("position", "m", "xyz"), ("feature", "px", "uv"))
     for name, unit, letters in others:
         if (values := getattr(demo, name)) is not None:
             charts.append((name, unit, dict(zip(letters, values.T, strict=False))))
     if demo.gripper is not None:
-        charts.append(("gripper", "", {"state": demo.gripper}))
+        unit = units["gripper"].unit if "gripper" in units else "1"
+        values = demo.gripper / unit_factor("gripper", unit)
+        charts.append(("gripper", unit.replace("1", ""), {"state": values}))
     for key, values in demo.extra.items():
         if 0 < values.shape[1] <= 12:
             names = [features[key].component(i) for i in range(values.shape[1])]

@@ -14,7 +14,7 @@ from lerobot_folders import write_folder
 from hrc_learn.cli import dataset_commands
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.images import load_images
-from hrc_learn.demos.quality.ranking import log_dimensionless_jerk, rank_episodes
+from hrc_learn.demos.quality.ranking import gripper_moves, log_dimensionless_jerk, rank_episodes
 from hrc_learn.demos.quality.repair import (
     Decision,
     decide,
@@ -231,3 +231,11 @@ def test_all_rejected_and_unknown_episodes_are_refused(odd, tmp_path):
     with pytest.raises(DatasetError, match="no such episode"):
         write_curated(odd, tmp_path / "out", {14: Decision(verdict="reject")})
     assert not (tmp_path / "out").exists()
+
+
+def test_moves_of_a_gripper_are_counted_without_its_trembling():
+    held = np.r_[np.ones(20), np.linspace(1, 0.1, 10), 0.1 + 0.02 * np.sin(np.arange(30))]
+    assert gripper_moves(held) == 1
+    assert gripper_moves(np.r_[held, np.ones(5), held]) == 3
+    assert gripper_moves(np.full(10, 0.3)) == gripper_moves(np.full(10, np.nan)) == 0
+    assert gripper_moves(100 * held) == 1

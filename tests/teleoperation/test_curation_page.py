@@ -8,6 +8,7 @@ import struct
 
 import numpy as np
 import pytest
+import torch
 from clean_sets import CAMERA, write_set
 from lerobot_folders import write_folder
 from page_in_browser import chromium, wait_until
@@ -19,6 +20,7 @@ from hrc_learn.demos.images import load_images
 from hrc_learn.demos.quality.ranking import rank_episodes
 from hrc_learn.demos.quality.repair import read_decisions
 from hrc_learn.demos.videos import decode_image
+from hrc_learn.kinematics import panda
 from hrc_learn.teleoperation import curation_page
 from hrc_learn.teleoperation.curation_page import CurationPage
 from hrc_learn.teleoperation.gate import AddressConfig
@@ -182,6 +184,29 @@ def test_curves_of_columns_without_a_meaning_go_by_their_own_names(tmp_path):
     assert lines["extra"] == ["component 0", "component 1", "component 2"]
 
 
+def test_an_arm_that_is_known_moves_as_recorded(tmp_path):
+    """In degrees; the points are the joints' origins and the tool's."""
+    degrees = np.rad2deg(panda.ready.numpy()) + np.linspace(0, 20, 50)[:, None]
+    names = [f"{name}_deg.pos" for name in panda.joint_names]
+    columns = {"observation.state": names}
+    root = write_folder(tmp_path / "set", [{"observation.state": degrees}], columns)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps(info | {"robot_type": "panda"}))
+    units = {"joint_position": "deg"}
+    with CurationPage(
+        rank_episodes(root), tmp_path / "out", AddressConfig(port=0), units=units
+    ) as page:
+        curves = json.loads(Client(page).ask("/data/curves/0")[1])
+    assert curves["charts"][0]["unit"] == "deg"
+    np.testing.assert_allclose(
+        curves["charts"][0]["lines"][0]["points"][1], degrees[:, 0], atol=1e-4
+    )
+    tool = panda.forward(torch.from_numpy(np.deg2rad(degrees))).position
+    points = np.array(curves["arm"]["points"])
+    np.testing.assert_allclose(points[:, -1], tool, atol=2e-4)
+    np.testing.assert_array_equal(points[:, 0], 0)
+
+
 def test_curves_of_long_episodes_lose_no_spike():
     from hrc_learn.teleoperation.curation_page import _points
 
@@ -223,6 +248,10 @@ def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tmp_path):
         rows = [line.split()[0] for line in page.ranking.lines()][1 : 1 + len(listed)]
         assert listed == [f"Episode {row}" for row in rows]
         wait_until(lambda: tab.locator("#videos canvas[data-frame='0']").count(), "an image")
+        tab.locator("#sort").select_option("duration")
+        longest = max(page.ranking.episodes, key=lambda q: q.measures.get("duration", -1))
+        assert tab.locator("#episodes b").first.inner_text() == f"Episode {longest.episode}"
+        tab.locator("#sort").select_option("score")
         tab.get_by_role("button", name="Play").click()
         moved = tab.locator("#videos canvas").first
         wait_until(lambda: int(moved.get_attribute("data-frame")) > 20, "playing")
@@ -254,6 +283,10 @@ def test_a_phone_shows_image_and_buttons_at_once(page, tmp_path):
     with chromium(tmp_path / "chromium", (390, 844)) as tab:
         tab.goto(page.url)
         wait_until(lambda: tab.locator("#videos canvas[data-frame='0']").count(), "an image")
+        tab.locator("#sort").select_option("duration")
+        longest = max(page.ranking.episodes, key=lambda q: q.measures.get("duration", -1))
+        assert tab.locator("#episodes b").first.inner_text() == f"Episode {longest.episode}"
+        tab.locator("#sort").select_option("score")
         for name in ("Accept", "Reject", "Start here"):
             box = tab.get_by_role("button", name=name).bounding_box()
             assert box["y"] + box["height"] <= 844

@@ -23,6 +23,7 @@ from hrc_learn.demos.read.source import open_demos
 MEASURES = {
     "distance": "distance from the most similar episodes, relative to the usual one",
     "duration": "s",
+    "gripper": "number of times the gripper opens or closes",
     "idle": "fraction of the time at rest",
     "jerk": "logarithm of the dimensionless jerk",
     "late": "fraction of late frames",
@@ -207,6 +208,8 @@ def _measure(
         "duration": demo.duration,
         "late": float((steps > 1.5 / demo.fps).mean()) if len(steps) else 0.0,
     }
+    if demo.gripper is not None:
+        quality.measures["gripper"] = float(gripper_moves(demo.gripper))
     motion = demo.joint_position if demo.joint_position is not None else demo.position
     gripper = None if demo.gripper is None else demo.gripper[:, None]
     known = [part for part in (motion, gripper) if part is not None]
@@ -223,6 +226,25 @@ def _measure(
         quality.start = max(0, int(moving[0]) - margin)
         quality.stop = min(len(demo), int(moving[-1]) + 1 + margin)
     return shape
+
+
+def gripper_moves(gripper: Float64[np.ndarray, " frames"]) -> int:
+    """Number of times that a gripper opens or closes by more than half of its travel.
+
+    A grasp that was tried twice, or an object that was dropped, adds two. Small changes of the
+    opening, as while it holds an object, count as rest.
+
+    Args:
+        gripper: Opening in any unit.
+    """
+    known = gripper[np.isfinite(gripper)]
+    low, high = (known.min(), known.max()) if len(known) else (0.0, 0.0)
+    if high <= low:
+        return 0
+    third = (high - low) / 3
+    # Between the outer thirds of the travel the gripper counts as before.
+    ends = np.where(known < low + third, -1, np.where(known > high - third, 1, 0))
+    return int(np.count_nonzero(np.diff(ends[ends != 0])))
 
 
 def log_dimensionless_jerk(
@@ -305,6 +327,7 @@ def _principal_components(
 _TESTS = {
     "distance": (1.0, 0.25, "moves unlike all others: {own:.1f} times as far from the nearest"),
     "duration": (0.0, 0.05, "takes {own:.1f} s, {usual:.1f} s are usual"),
+    "gripper": (1.0, 0.25, "its gripper moves {own:.0f} times, {usual:.0f} are usual"),
     "idle": (0.1, 0.025, "rests for {own:.0%} of the time, {usual:.0%} are usual"),
     "jerk": (1.0, 0.25, "moves jerkily: e^{above:.1f} times the usual jerk"),
     "late": (0.02, 0.005, "{own:.0%} of its frames came late, {usual:.0%} are usual"),
