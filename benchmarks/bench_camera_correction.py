@@ -2,7 +2,7 @@
 
 The policy `dmp` learns in closed form from a dataset of
 
-    hrc record expert --task grasping --config robot.marker=true --episodes 30 --out DATA
+    hrc record expert --scenario grasping --config robot.marker=true --episodes 30 --out DATA
 
 to grasp by the pixel of the object, and does so in MuJoCo from beginnings that were not shown:
 with the camera where it was; moved by 10 cm and 10 degrees in random directions in which it
@@ -41,7 +41,7 @@ FIRST_SEED = 50_000
 @dataclass(frozen=True, kw_only=True)
 class Args:
     data: Path
-    """Dataset of `hrc record expert --task grasping --config robot.marker=true`."""
+    """Dataset of `hrc record expert --scenario grasping --config robot.marker=true`."""
     policy: Path | None = None
     """Checkpoint of a policy that was trained on it; `dmp` is fitted to it without."""
     moves: int = 10

@@ -42,7 +42,7 @@ class Command:
 COMMANDS: dict[str, Command] = {
     "demo": Command("experiment_commands.demo", arguments.Demo),
     "run": Command("experiment_commands.run", arguments.Run, ("experiment",)),
-    "record": Command("record_command.record", arguments.Record, ("scenario",)),
+    "record": Command("record_command.record", arguments.Record, ("demonstration",)),
     "import": Command("conversion_commands.import_recordings", arguments.Import, ("files",)),
     "show": Command("dashboard_commands.show", arguments.Show, ("dataset",)),
     "check": Command("dataset_commands.check", arguments.Check, ("dataset",)),

@@ -604,7 +604,7 @@ class Record(WithRobot, Written):
     records the columns of LeRobot's robots, for its policies.
     """
 
-    scenario: Literal["placing", "servoing", "expert"]
+    demonstration: Literal["placing", "servoing", "expert"]
     """Demonstrations to record."""
     out: Path
     """Folder of the new dataset."""
@@ -616,8 +616,8 @@ class Record(WithRobot, Written):
     """Shelf to place on."""
     camera: Literal["auto", "egl", "synthetic"] = "synthetic"
     """Camera for servoing: "egl" renders, "synthetic" only draws markers."""
-    task: Literal["placing", "grasping"] = "placing"
-    """Task of the expert."""
+    scenario: Literal["placing", "grasping"] = "placing"
+    """Scenario of the expert, as `--robot.scenario` of LeRobot's commands."""
     config: tuple[str, ...] = ()
     """Further settings as NAME=VALUE or TOML files, such as demonstration.duration=5 or
     robot.fps=10. `--config help` lists them."""

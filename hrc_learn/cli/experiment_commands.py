@@ -324,7 +324,7 @@ def _learning_steps(
 
     def demonstrate(scenario: Any, folder: Path) -> None:
         chosen = {"robot": robot.robot, "tip": robot.tip, "overwrite": True}
-        if record(Record(scenario=scenario, out=folder, **chosen)):
+        if record(Record(demonstration=scenario, out=folder, **chosen)):
             raise RuntimeError(f"the scripted expert failed to demonstrate {scenario}")
 
     shown, watched = out / "placing_demos", out / "aiming_demos"

@@ -31,7 +31,7 @@ from hrc_learn.teleoperation.scripted_demonstrations import (
 )
 
 _DEFAULTS = {"placing": (3, 0), "servoing": (8, 1), "expert": (10, 0)}
-"""Number of episodes and seed by scenario."""
+"""Number of episodes and seed by kind of demonstration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class _Settings[Config]:
 
 def record(args: Record) -> int:
     """Record the demonstrations of a scenario; exit status 1 if the expert fails."""
-    usual_episodes, usual_seed = _DEFAULTS[args.scenario]
+    usual_episodes, usual_seed = _DEFAULTS[args.demonstration]
     episodes = usual_episodes if args.episodes is None else args.episodes
     seed = usual_seed if args.seed is None else args.seed
     if episodes < 1:
@@ -55,7 +55,7 @@ def record(args: Record) -> int:
         "expert": _record_expert,
     }
     try:
-        recorders[args.scenario](args, episodes, seed)
+        recorders[args.demonstration](args, episodes, seed)
     except (TaskFailedError, PhysicsError, RuntimeError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
@@ -120,7 +120,7 @@ def _write(
 ) -> None:
     """Record the demonstrations into the dataset, one after another."""
     assert args.episodes is not None
-    title = f"Demonstrations of {args.scenario}"
+    title = f"Demonstrations of {args.demonstration}"
     write_demonstrations(
         args.out,
         (demonstrate() for _ in track(range(args.episodes), description=title)),
@@ -148,10 +148,10 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
     default = MujocoArmRobotConfig(
         arm=args.robot,
         tip=args.tip,
-        scenario=args.task,
+        scenario=args.scenario,
         shelf=args.shelf,
         fps=20.0,
-        pixels=args.task == "grasping",
+        pixels=args.scenario == "grasping",
         seed=seed,
     )
     config = with_settings(args.config, Settings(robot=default)).robot
@@ -159,7 +159,7 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
     config = replace(config, hand=config.hand or config.marker)
     failed = 0
     with Progress(transient=True) as progress:
-        task = progress.add_task(f"Demonstrations of {args.task}", total=episodes)
+        task = progress.add_task(f"Demonstrations of {args.scenario}", total=episodes)
         for written, succeeded in record_expert(args.out, config, episodes):
             failed += not succeeded
             progress.update(task, completed=written)

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.columns import ColumnSelection, map_columns
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
+from hrc_learn.demos.read.metadata import Feature, Sidecar
 from hrc_learn.demos.read.naming import (
     ComponentMeaning,
     is_hand,
@@ -271,3 +272,32 @@ def test_a_quaternion_among_numbered_joints_is_noticed():
 def test_lengths_of_a_few_ten_are_asked_about():
     decision = decide_units({"position": 45.0}, {}, {})["position"]
     assert "--units position cm or --units position mm" in decision.doubt
+
+
+def mapped(state, action):
+    """Joints and notes of a dataset whose state and action have these component names."""
+    features = {
+        key: Feature(key=key, dtype="float32", shape=(len(names),), names=tuple(names))
+        for key, names in (("observation.state", state), ("action", action))
+    }
+    columns = map_columns(features, Sidecar())
+    return columns.joint_names, " ".join(columns.notes)
+
+
+@pytest.mark.parametrize("suffix", ["", ".pos"])
+def test_what_no_action_has_is_no_joint_of_the_arm(suffix):
+    joints, notes = mapped([f"{n}{suffix}" for n in ("a", "b", "mystery")], ["a", "b"])
+    assert joints == ("a", "b")
+    assert f"mystery{suffix}): no joint of the arm, no action has it" in notes
+
+
+@pytest.mark.parametrize("name", ["object.u", "object_v.pos", "lift_mm", "pixel_3", "base_x"])
+def test_names_of_no_joint(name):
+    joints, _ = mapped(["a.pos" if "pos" in name else "a", name], ["ee.x", "ee.y", "ee.z"])
+    assert joints == ("a",)
+
+
+def test_poses_of_two_arms_are_one_pose_and_a_note():
+    names = [f"{side}_eef_{part}" for side in ("left", "right") for part in "xyz"]
+    _, notes = mapped(names, ["a", "b"])
+    assert "one pose is read, that of the left arm" in notes

@@ -69,7 +69,7 @@ def shown(recorded):
         recorded,
         program,
         *("--out", recorded / "shown"),
-        *("--task", "grasping"),
+        *("--scenario", "grasping"),
         *("--episodes", 2),
         *("--config", "robot.fps=10"),
         *("--json", recorded / "shown.json"),

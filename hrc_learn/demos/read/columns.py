@@ -340,28 +340,33 @@ class _Conventions:
                 meaning if names_joint_quantity(name) or name.lower().startswith("ee") else None
                 for name, meaning in zip(names, meanings, strict=True)
             ]
-        elif not any(map(names_joint_quantity, names)):
+        else:
+            suffixed = any(map(names_joint_quantity, names))
+            usual = None if suffixed else "joint_position"
             meanings = [
-                meaning or self._joint(feature, name)
+                self._joint(feature, name, meaning)
+                if (meaning.role if meaning else usual) == "joint_position"
+                else meaning
                 for name, meaning in zip(names, meanings, strict=True)
             ]
         yield from self._grouped(feature, meanings)
 
-    def _joint(self, feature: Feature, name: str) -> ComponentMeaning | None:
-        """Meaning of a component whose name says nothing: a joint, unless names tell otherwise.
+    def _joint(
+        self, feature: Feature, name: str, meaning: ComponentMeaning | None
+    ) -> ComponentMeaning | None:
+        """A joint by its meaning or without one; None if other names tell that it is none.
 
         An action names the joints that move: what only the state has is no joint of the arm.
         """
         joint = joint_of(name)
+        named = {joint_of(other) for other in feature.names or ()}
+        compared = not _is_command(feature) and bool(named & self._commanded)
         if names_no_joint(name):
             reason = "its name is not that of a joint"
-        elif self._commanded and not _is_command(feature) and joint not in self._commanded:
-            named = {joint_of(other) for other in feature.names or ()}
-            if not named & self._commanded:
-                return ComponentMeaning("joint_position", joint)
+        elif compared and joint not in self._commanded:
             reason = "no action has it"
         else:
-            return ComponentMeaning("joint_position", joint)
+            return meaning or ComponentMeaning("joint_position", joint)
         self._notes.append(f"{feature.key} ({name}): no joint of the arm, {reason}")
         return None
 
