@@ -4,7 +4,8 @@ Names and units are judged as for datasets (`read.columns`, `read.units`). What 
 understood is left out and listed, or kept as recorded where it is the state or the action.
 """
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from hrc_learn.demos.recording_names import (
 
 _REACH = 5.0
 """Beyond the reach of any arm on a fixed base [m]."""
+_ANGLES = re.compile(r"(?:^|[._])r_?x$", re.IGNORECASE)
 _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 """Episodes and frame rate [1/s] with which a command is compared: 30 frames of delay."""
 _SLOPES = (0.5, 2.0)
@@ -154,7 +156,10 @@ def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSe
         kept=kept,
         cameras=find_cameras(first, options.images),
         left_out=search.left_out,
-        notes=tuple(map(search.explained, filter(_is_news, found.notes))),
+        notes=(
+            *map(search.explained, filter(_is_news, found.notes)),
+            *_question_of_angles(selections, explicit),
+        ),
     )
     meaning = _with_fingers(_with_bare_vectors(meaning, first, search.states), search)
     states = {"joint_position", "position", *ORIENTATION_ROLES}
@@ -166,6 +171,17 @@ def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSe
     if not time and options.duration is None:
         time = first.clock_of(meaning.main)
     return _with_joints(replace(meaning, time=time), options.joint_names, first), search
+
+
+def _question_of_angles(
+    selections: Mapping[str, ColumnSelection], explicit: Mapping[str, object]
+) -> list[str]:
+    """A note on columns rx, ry, rz, which may also be angles."""
+    turn = selections.get("rotation_vector")
+    if not turn or "rotation_vector" in explicit or not _ANGLES.search(turn.columns[0][0]):
+        return []
+    text = "rx, ry, rz are taken for a rotation vector; if they are angles about x, y, z,"
+    return [f"{text} name them euler_xyz"]
 
 
 def _is_news(note: str) -> bool:
@@ -295,6 +311,7 @@ def _with_units(
         if role == "pose_matrix" and not stated and largest > _REACH:
             doubt = f"{role} in m or mm? It moves to {largest:.4g}: say --units {role} mm, or m"
         if doubt is not None:
+            doubt = doubt.partition(", or leave columns")[0]  # an option of other commands
             fields = ", ".join(dict.fromkeys(n for n, _ in selections[role].columns))
             raise first.error(f"the unit is doubtful: {doubt}", fields)
         if decision.converts:

@@ -520,6 +520,12 @@ def test_a_table_of_lerobot_has_joints_commands_and_grippers(tmp_path):
     assert made.meaning.kept["action"][1] == ("gripper.pos",)
 
 
+def test_rx_ry_rz_may_be_angles(tmp_path):
+    rows = np.column_stack([TIME, Q, 0.1 * Q])
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="t,x,y,z,rx,ry,rz", comments="")
+    assert "euler_xyz" in " ".join(plan(tmp_path / "a.csv").meaning.notes)
+
+
 def test_a_topic_of_ros_as_a_table(tmp_path):
     head = "%time," + ",".join(
         f"field.{n}{k}" for n in ("position", "velocity") for k in range(3)
