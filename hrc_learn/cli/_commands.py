@@ -47,6 +47,7 @@ COMMANDS: dict[str, Command] = {
     "show": Command("dashboard_commands.show", arguments.Show, ("dataset",)),
     "check": Command("dataset_commands.check", arguments.Check, ("dataset",)),
     "repair": Command("dataset_commands.repair", arguments.Repair, ("dataset", "out")),
+    "merge": Command("dataset_commands.merge", arguments.Merge, ("datasets",)),
     "curate": Command("dataset_commands.curate", arguments.Curate, ("dataset",)),
     "recover": Command("dataset_commands.recover", arguments.Recover, ("path",)),
     "extract": Command("conversion_commands.extract", arguments.Extract, ("dataset",)),

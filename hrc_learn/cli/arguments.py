@@ -140,6 +140,26 @@ class Repair(Columns, OnDataset):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Merge(Measured):
+    """Merge datasets of one robot into a new one, and list their differences.
+
+    Columns are matched by name and brought to the order and units of the first dataset, tasks
+    by their texts. Videos are copied. What cannot be matched is refused.
+
+        hrc merge monday tuesday --out pour
+    """
+
+    datasets: tuple[Path, ...]
+    """Folders of two LeRobot datasets or more."""
+    out: Path
+    """Folder of the new dataset, which must not exist."""
+    fps: float | None = None
+    """Resample datasets of other frame rates [1/s], which needs --no-videos."""
+    videos: bool = True
+    """Keep the videos."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Curate(OnDataset):
     """Review the episodes of a dataset, the most doubtful first, and keep the good ones.
 

@@ -1,4 +1,4 @@
-"""`hrc check`, `repair`, `recover`, `curate`, `push`: quality of a dataset, and its upload."""
+"""`hrc check`, `repair`, `merge`, `recover`, `curate`, `push`: datasets' quality and upload."""
 
 import sys
 import webbrowser
@@ -10,11 +10,12 @@ from rich.console import Console
 from rich.progress import track
 
 from hrc_learn.cli._run import configuration, has_screen, one_line, write_values
-from hrc_learn.cli.arguments import Check, Curate, Push, Recover, Repair
+from hrc_learn.cli.arguments import Check, Curate, Merge, Push, Recover, Repair
 from hrc_learn.demos import (
     RepairOptions,
     check_dataset,
     load_demos,
+    merge_datasets,
     push_dataset,
     recover_all,
     repair_dataset,
@@ -144,6 +145,16 @@ def repair(args: Repair) -> None:
         "frames": report.frames,
     }
     write_values(args.json, counts)
+
+
+def merge(args: Merge) -> None:
+    """Merge the datasets and print their differences."""
+    for dataset in args.datasets:
+        _require_dataset(dataset)
+    report = merge_datasets(args.datasets, args.out, fps=args.fps, videos=args.videos)
+    print(report)
+    counts = {name: getattr(report, name) for name in ("episodes", "frames", "tasks")}
+    write_values(args.json, counts | {"notes": len(report.notes)})
 
 
 def recover(args: Recover) -> None:

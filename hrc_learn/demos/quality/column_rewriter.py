@@ -42,6 +42,7 @@ class ColumnRewriter:
     Attributes:
         tasks: Task texts by index.
         notes: Changes to all episodes.
+        header: Properties of the new dataset.
     """
 
     def __init__(
@@ -68,8 +69,9 @@ class ColumnRewriter:
         self._recorded = recorded_statistics(folder) if pictures else {}
         self._task_index = {index: n for n, index in enumerate(sorted(folder.tasks))}
         self.tasks = self._task_texts()
+        self._unlisted = self.tasks[:1]
         self._add_time = "time" not in dataset.columns.selections and fps is None
-        self._header = recorded.RecordingHeader(
+        self.header = recorded.RecordingHeader(
             fps=float(fps or folder.fps),
             robot_type=folder.robot_type or "unknown",
             features=self._features(),
@@ -118,6 +120,13 @@ class ColumnRewriter:
             units["time"] = "s"
         return replace(old, columns=columns, units=units)
 
+    def join(self, header: recorded.RecordingHeader, tasks: list[str]) -> None:
+        """Write the episodes as those of a dataset with this header and these tasks."""
+        self._task_index = {n: tasks.index(text) for n, text in self._folder.tasks.items()}
+        self.tasks, self.header, self._add_time = tasks, header, False
+        self._cameras = [key for key in self._cameras if key in header.features]
+        self._image_columns = [key for key in self._image_columns if key in header.features]
+
     def videos_of(self, edit: EpisodeEdit) -> Segments:
         """Parts of the old videos that show the remaining frames.
 
@@ -161,8 +170,8 @@ class ColumnRewriter:
         values = edit.frames | (
             {recorded.TIME_KEY: edit.time[:, None]} if self._add_time else {}
         )
-        number, features = recorded.episode_number(path), self._header.features
-        values |= recorded.index_columns(self._header.fps, number, frames_before, tasks)
+        number, features = recorded.episode_number(path), self.header.features
+        values |= recorded.index_columns(self.header.fps, number, frames_before, tasks)
         numeric = {key: values[key] for key in features if key in values}
         others = self._other_columns(edit)
         statistics = episode_statistics(
@@ -172,7 +181,7 @@ class ColumnRewriter:
             images = others.get(key, videos.get(key))
             statistics[key] = self._image_statistics(edit, key, images)
         staged = recorded.StagedEpisode(
-            header=self._header,
+            header=self.header,
             tasks=[self.tasks[i] for i in dict.fromkeys(tasks.tolist())],
             statistics=statistics,
             table=recorded.to_table(numeric, features, others),
@@ -181,7 +190,7 @@ class ColumnRewriter:
 
     def _other_columns(self, edit: EpisodeEdit) -> dict[str, pa.ChunkedArray]:
         """Columns that hold no numbers, for the remaining frames."""
-        types = {key: feature["dtype"] for key, feature in self._header.features.items()}
+        types = {key: feature["dtype"] for key, feature in self.header.features.items()}
         keys = [key for key, kind in types.items() if not kind.startswith(("video", *NUMERIC))]
         if not keys:
             return {}
@@ -212,7 +221,7 @@ class ColumnRewriter:
         Raises:
             DatasetError: A task is not in the list of tasks.
         """
-        texts = edit.entry.tasks or self.tasks[:1]
+        texts = edit.entry.tasks or self._unlisted
         if "task_index" not in edit.frames or not self._folder.tasks:
             return np.full(len(edit), self.tasks.index(texts[0]))
         indices = edit.frames["task_index"][:, 0]

@@ -1,0 +1,366 @@
+"""One dataset of several: columns by name, units and tasks as in the first, videos copied."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hrc_learn.demos.dataset_assembly import assemble
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
+from hrc_learn.demos.quality.episode_edits import ColumnSemantics, EpisodeEdit
+from hrc_learn.demos.quality.repair import RepairOptions, repair_dataset
+from hrc_learn.demos.read.contract import fingerprint, keep_contract
+from hrc_learn.demos.read.dataset_folder import open_folder
+from hrc_learn.demos.read.frames import RawFrames, read_each
+from hrc_learn.demos.read.metadata import Feature
+from hrc_learn.demos.read.quantities import INDEX_KEYS
+from hrc_learn.demos.read.source import OpenedDataset, open_dataset
+from hrc_learn.demos.read.units import UnitDecision, unit_factor
+from hrc_learn.demos.recorded_episode import RecordingHeader, episode_path
+from hrc_learn.demos.videos import Segments, read_segments, video_keys
+from hrc_learn.store import DATASET, replacing
+
+_ESSENTIAL = ("action", "observation.state")
+"""Features without which no policy learns; others may be left out."""
+
+
+@dataclass(kw_only=True)
+class MergeReport:
+    """Content of a merged dataset."""
+
+    path: Path
+    episodes: int = 0
+    frames: int = 0
+    tasks: int = 0
+    notes: list[str] = field(default_factory=list)
+    """Differences between the datasets, and the treatment of each."""
+
+    def __str__(self) -> str:
+        counts = f"{self.episodes} episodes, {self.frames} frames, {self.tasks} tasks"
+        return "\n".join([*self.notes, f"{self.path}: {counts}"])
+
+
+def merge_datasets(
+    paths: Sequence[str | Path],
+    out: str | Path,
+    *,
+    fps: float | None = None,
+    videos: bool = True,
+) -> MergeReport:
+    """Merge datasets of version 2.0, 2.1 or 3.0 into a new one of version 3.0.
+
+    Names, order, units and types of the columns are those of the first dataset. Columns of the
+    others are matched by their names, or by the quantity and joint that they hold. Tasks are
+    matched by their texts. Features that not all datasets have are left out.
+
+    Args:
+        paths: The datasets, two or more. They are not changed.
+        out: Folder of the new dataset, which must not exist.
+        fps: Rate to which datasets of other rates are resampled [1/s]; None refuses those.
+        videos: Keep the videos, which are copied without a new encoding.
+
+    Raises:
+        DatasetError: A dataset cannot be read, or does not fit the first one: its rate, a
+            component, a unit or the size of its images.
+        FileExistsError: `out` exists.
+        ValueError: Fewer than two datasets are given.
+    """
+    if len(paths) < 2:
+        raise ValueError("give two datasets or more to merge")
+    report = MergeReport(path=Path(out))
+    with ExitStack() as stack:
+        opened = [open_dataset(path) for path in paths]
+        rate = opened[0].folder.fps if fps is None else float(fps)
+        for number, dataset in enumerate(opened):
+            if not np.isclose(dataset.folder.fps, rate):
+                if fps is None:
+                    raise _other_rate(dataset, opened[0])
+                folder = stack.enter_context(tempfile.TemporaryDirectory())
+                opened[number] = _resampled(dataset, Path(folder), rate, videos, report)
+        _Merge(opened, videos, report).write()
+    return report
+
+
+def _other_rate(dataset: OpenedDataset, first: OpenedDataset) -> DatasetError:
+    return DatasetError(
+        f"runs at {dataset.folder.fps:g} fps, but {first.folder.root} at {first.folder.fps:g}: "
+        f"--fps {first.folder.fps:g} --no-videos resamples it",
+        file=dataset.folder.root,
+    )
+
+
+def _resampled(
+    dataset: OpenedDataset, folder: Path, fps: float, videos: bool, report: MergeReport
+) -> OpenedDataset:
+    root = dataset.folder.root
+    options = RepairOptions(trim=False, unwrap=False, fix_signs=False, fps=fps, videos=videos)
+    repair_dataset(root, folder / root.resolve().name, options)
+    report.notes.append(f"{root}: resampled from {dataset.folder.fps:g} to {fps:g} fps")
+    return open_dataset(folder / root.resolve().name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Source:
+    """One of the datasets, and the way from its columns to those of the first."""
+
+    dataset: OpenedDataset
+    units: Mapping[str, UnitDecision]
+    places: dict[str, list[int]] = field(default_factory=dict)
+    """Component of the source for each component of a feature of the first dataset."""
+    factors: dict[str, np.ndarray] = field(default_factory=dict)
+    """Factor to the unit of the first dataset for each of them."""
+
+    @classmethod
+    def of(cls, dataset: OpenedDataset) -> "_Source":
+        return cls(dataset=dataset, units=dataset.decide_units(dataset.sample(32), {}))
+
+    @property
+    def root(self) -> Path:
+        return self.dataset.folder.root
+
+    @property
+    def features(self) -> dict[str, Feature]:
+        return self.dataset.folder.features
+
+    def meanings(self, key: str) -> list[tuple[str, str] | None]:
+        """Quantity and label of each component of a feature; None where they are unknown."""
+        known = {
+            column: (role, label.removesuffix(".pos"))
+            for role, selection in self.dataset.columns.selections.items()
+            for column, label in zip(selection.columns, selection.labels, strict=True)
+        }
+        return [known.get((key, index)) for index in range(self.features[key].width)]
+
+    def unit(self, key: str, index: int) -> UnitDecision | None:
+        """Decision on one component, in its own unit."""
+        for role, selection in self.dataset.columns.selections.items():
+            if (key, index) in selection.columns and role in self.units:
+                decision = self.units[role]
+                own = decision.unit_of(selection.columns.index((key, index)))
+                return replace(decision, unit=own, units=())
+        return None
+
+    def converted(self, frames: RawFrames, features: Mapping[str, dict]) -> RawFrames:
+        """Columns of an episode in the order and units of the first dataset."""
+        made: RawFrames = {}
+        for key, places in self.places.items():
+            values = frames[key].reshape(len(frames[key]), -1)[:, places]
+            if (self.factors[key] != 1).any():
+                values = values * self.factors[key]
+            made[key] = values.astype(features[key]["dtype"])
+        return made | {"task_index": frames["task_index"]} if "task_index" in frames else made
+
+
+class _Merge:
+    """One merge: the datasets, the features of all of them, and the report."""
+
+    def __init__(self, opened: Sequence[OpenedDataset], videos: bool, report: MergeReport):
+        self.sources, self.report, self.videos = [*map(_Source.of, opened)], report, videos
+        self.first = self.sources[0]
+        self.features = self._common_features()
+        for source in self.sources:
+            for key, feature in self.features.items():
+                if feature.numeric:
+                    self._match(source, key)
+            if source.dataset.folder.robot_type != self.first.dataset.folder.robot_type:
+                self.report.notes.append(
+                    f"{source.root}: robot {source.dataset.folder.robot_type}; the merged "
+                    f"dataset names {self.first.dataset.folder.robot_type}"
+                )
+
+    def _common_features(self) -> dict[str, Feature]:
+        """Features of all datasets, as the first one declares them."""
+        common = {}
+        everywhere = dict.fromkeys(key for source in self.sources for key in source.features)
+        for key in everywhere:
+            if key in INDEX_KEYS:
+                continue
+            without = [
+                str(source.root) for source in self.sources if key not in source.features
+            ]
+            if without and key in _ESSENTIAL:
+                raise DatasetError(f"has no {key}, as the others have", file=without[0])
+            if without:
+                self.report.notes.append(f"{key}: left out, {', '.join(without)} has none")
+            elif self.first.features[key].dtype != "video" or self.videos:
+                self._require_same_kind(key)
+                common[key] = self.first.features[key]
+        return common
+
+    def _require_same_kind(self, key: str) -> None:
+        own = self.first.features[key]
+        for source in self.sources:
+            other = source.features[key]
+            if own.numeric and other.numeric and own.width == other.width:
+                continue
+            if other.dtype != own.dtype or other.shape != own.shape:
+                raise DatasetError(
+                    f"is {other.dtype} of shape {list(other.shape)}, but {own.dtype} of shape "
+                    f"{list(own.shape)} in {self.first.root}"
+                    + "; --no-videos leaves videos out"
+                    * own.is_picture,
+                    file=source.root,
+                    key=key,
+                )
+
+    def _match(self, source: _Source, key: str) -> None:
+        """Find the component of a source for each of the first dataset, and its factor.
+
+        Raises:
+            DatasetError: A component is missing, or its unit cannot be converted.
+        """
+        own, other = self.first.features[key], source.features[key]
+        places = [*range(own.width)]
+        if own.names and other.names and own.names != other.names:
+            names, meanings = list(other.names), source.meanings(key)
+            places = []
+            for name, meaning in zip(own.names, self.first.meanings(key), strict=True):
+                if name in names:
+                    places.append(names.index(name))
+                elif meaning is not None and meaning in meanings:
+                    places.append(meanings.index(meaning))
+                else:
+                    raise DatasetError(
+                        f"has no component {name} of {self.first.root}; there are "
+                        f"{', '.join(names)}: rename it in {source.root}/meta/info.json",
+                        file=source.root,
+                        key=key,
+                    )
+            if len({*places}) < len(places):
+                raise DatasetError(
+                    f"its components do not name those of {self.first.root} one to one: "
+                    f"{', '.join(names)}",
+                    file=source.root,
+                    key=key,
+                )
+            self.report.notes.append(f"{source.root}: {key} matched by name to {own.names}")
+        elif source is not self.first and own.width > 1 and not (own.names and other.names):
+            text = f"{source.root}: {key} taken in its order, as not both datasets name it"
+            self.report.notes.append(text)
+        source.places[key] = places
+        source.factors[key] = np.array(
+            [self._factor(source, key, index, place) for index, place in enumerate(places)]
+        )
+
+    def _factor(self, source: _Source, key: str, index: int, place: int) -> float:
+        own, other = self.first.unit(key, index), source.unit(key, place)
+        if own is None or other is None or own.unit == other.unit:
+            return 1.0
+        for dataset, decision in ((self.first, own), (source, other)):
+            if decision.doubt:
+                raise DatasetError(
+                    f"{decision.doubt}; `hrc check {dataset.root} --units {decision.role} UNIT "
+                    f"--keep-contract` declares it",
+                    file=dataset.root,
+                    key=key,
+                )
+        if own.role != other.role or own.si_unit != other.si_unit:
+            raise DatasetError(
+                f"{source.features[key].component(place)} is {other.role} in {other.unit}, but "
+                f"{own.role} in {own.unit} in {self.first.root}: one does not follow from the "
+                f"other",
+                file=source.root,
+                key=key,
+            )
+        note = f"{source.root}: {key} converted from {other.unit} to {own.unit}"
+        if note not in self.report.notes:
+            self.report.notes.append(note)
+        return unit_factor(other.role, other.unit) / unit_factor(own.role, own.unit)
+
+    def write(self) -> None:
+        """Write the merged dataset."""
+        writers, tasks = self._writers()
+        report, segments = self.report, []
+        with replacing(self.report.path, DATASET) as target:
+            staging = target / "episodes"
+            staging.mkdir(parents=True)
+            paths: list[Path] = []
+            for source, writer in zip(self.sources, writers, strict=True):
+                for edit in self._episodes(source, writer.header.features):
+                    shown = writer.videos_of(edit)
+                    paths.append(episode_path(staging, len(paths)))
+                    writer.stage(paths[-1], edit, shown, writer.tasks_of(edit), report.frames)
+                    segments.append(shown)
+                    report.frames += len(edit)
+            assemble(paths, target, videos=segments, tasks=tasks, link_videos=False)
+            self._carry_contract(target)
+            shutil.rmtree(staging)
+        report.episodes, report.tasks = len(paths), len(tasks)
+
+    def _writers(self) -> tuple[list[ColumnRewriter], list[str]]:
+        """Writer of each dataset's episodes, and the tasks of all."""
+        writers = []
+        for source in self.sources:
+            folder = source.dataset.folder
+            found = read_segments(folder) if self.videos else {}
+            kept: dict[int, Segments] = {
+                index: {key: segment for key, segment in shown.items() if key in self.features}
+                for index, shown in found.items()
+            }
+            for key in video_keys(folder) if self.videos else ():
+                if key in self.features and not any(key in shown for shown in kept.values()):
+                    text = "its videos are missing: copy them, or leave all out (--no-videos)"
+                    raise DatasetError(text, file=folder.root, key=key)
+            writers.append(
+                ColumnRewriter(
+                    source.dataset, {}, fps=None, segments=kept if self.videos else None
+                )
+            )
+        tasks = [*dict.fromkeys(text for writer in writers for text in writer.tasks)]
+        header = self._header(writers[0].header)
+        for writer in writers:
+            writer.join(header, tasks)
+        return writers, tasks
+
+    def _header(self, own: RecordingHeader) -> RecordingHeader:
+        """Header of the first dataset without the features that are left out."""
+        wanted = {*self.features, *INDEX_KEYS}
+        features = {key: dict(value) for key, value in own.features.items() if key in wanted}
+        for key, feature in features.items():
+            declared = [s.dataset.folder.info["features"].get(key, {}) for s in self.sources]
+            if feature["dtype"] == "video":
+                feature["info"] = _agreed([d.get("info") or {} for d in declared])
+        columns = {r: c for r, c in own.sidecar.columns.items() if c.key in features}
+        return replace(own, features=features, sidecar=replace(own.sidecar, columns=columns))
+
+    def _episodes(self, source: _Source, features: Mapping[str, dict]) -> Iterator[EpisodeEdit]:
+        """Episodes of a dataset as those of the first one, unedited."""
+        dataset, entries = source.dataset, source.dataset.folder.episodes
+        semantics = ColumnSemantics(
+            selections=dataset.columns.selections,
+            joint_names=dataset.columns.joint_names,
+            units=dict(source.units),
+        )
+        keys = [*source.places, *({"task_index"} & source.features.keys())]
+        for entry, frames in zip(
+            entries, read_each(dataset.folder, entries, keys), strict=True
+        ):
+            if isinstance(frames, DatasetError):
+                raise frames
+            yield EpisodeEdit(
+                entry=entry,
+                semantics=semantics,
+                frames=source.converted(frames, features),
+                time=np.arange(entry.length) / dataset.folder.fps,
+                kept=np.arange(entry.length),
+            )
+
+    def _carry_contract(self, target: Path) -> None:
+        contract = self.first.dataset.contract
+        if contract is not None:
+            parts = tuple(part for part in contract.components if part.key in self.features)
+            renewed = fingerprint(open_folder(target))
+            keep_contract(target, replace(contract, components=parts, fingerprint=renewed))
+
+
+def _agreed(infos: Sequence[Mapping[str, object]]) -> dict[str, object]:
+    """Entries of the videos' descriptions; null where the datasets differ."""
+    return {
+        name: value if all(info.get(name) == value for info in infos) else None
+        for name, value in infos[0].items()
+    }

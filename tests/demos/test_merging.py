@@ -1,0 +1,150 @@
+"""Merged datasets: columns by name, units and tasks of the first, videos as they were."""
+
+import numpy as np
+import pytest
+from clean_sets import CAMERA, write_video
+from lerobot_folders import FPS, joint_path, read_info, write_folder, write_info
+
+from hrc_learn.cli._commands import main
+from hrc_learn.demos import (
+    DatasetError,
+    DatasetWriter,
+    check_dataset,
+    load_demos,
+    merge_datasets,
+)
+
+STATE, ACTION = "observation.state", "action"
+NAMES = ["shoulder.pos", "elbow.pos", "wrist.pos"]
+
+
+def write(root, motion, names=NAMES, **options):
+    episodes = [{STATE: q, ACTION: q + 0.01} for q in motion]
+    return write_folder(root, episodes, {STATE: names, ACTION: names}, **options)
+
+
+def states(root):
+    return [np.asarray(demo.joint_position) for demo in load_demos(root)]
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1", "v2.0"])
+def test_columns_and_tasks_are_matched_by_name(tmp_path, version):
+    first, second = joint_path(60), joint_path(50, seed=1)
+    order = [2, 0, 1]
+    write(tmp_path / "a", [first], tasks=["pour"])
+    names = [NAMES[i] for i in order]
+    write(
+        tmp_path / "b",
+        [second[:, order]] * 2,
+        names,
+        version=version,
+        tasks=["stir", "pour"],
+    )
+    report = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
+    assert (report.episodes, report.frames, report.tasks) == (3, 160, 2)
+    assert any("matched by name" in note for note in report.notes)
+    made = states(tmp_path / "new")
+    for q, expected in zip(made, [first, second, second], strict=True):
+        np.testing.assert_allclose(q, expected, atol=1e-6)
+    assert [demo.task for demo in load_demos(tmp_path / "new")] == ["pour", "stir", "pour"]
+    assert not check_dataset(tmp_path / "new").errors
+    assert read_info(tmp_path / "new")["features"].keys() == {
+        *(STATE, ACTION, "timestamp", "frame_index", "episode_index", "index", "task_index")
+    }
+
+
+def test_degrees_become_the_unit_of_the_first(tmp_path):
+    first, second = joint_path(60), joint_path(60, seed=1)
+    write(tmp_path / "a", [first], [f"{n}_rad" for n in "abc"])
+    write(tmp_path / "b", [np.rad2deg(second)], [f"{n}_deg" for n in "abc"])
+    report = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
+    assert sum("converted from deg to rad" in note for note in report.notes) == 2
+    np.testing.assert_allclose(states(tmp_path / "new")[1], second, atol=1e-5)
+
+
+def test_components_and_features_that_one_lacks(tmp_path):
+    write(tmp_path / "a", [joint_path(60)])
+    write(tmp_path / "b", [joint_path(60)], ["shoulder.pos", "elbow.pos", "hand.pos"])
+    with pytest.raises(DatasetError, match=r"no component wrist\.pos"):
+        merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
+    episode = {STATE: joint_path(60), ACTION: joint_path(60), "observation.x": joint_path(60)}
+    write_folder(tmp_path / "c", [episode], {STATE: NAMES, ACTION: NAMES})
+    report = merge_datasets([tmp_path / "c", tmp_path / "a"], tmp_path / "new")
+    assert any(note.startswith("observation.x: left out") for note in report.notes)
+    assert "observation.x" not in read_info(tmp_path / "new")["features"]
+
+
+def test_other_rates_are_refused_or_resampled(tmp_path, capsys):
+    write(tmp_path / "a", [joint_path(60)])
+    write(tmp_path / "b", [joint_path(31)], fps=FPS / 2)
+    words = ["merge", str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "new")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["hrc"])
+        with pytest.raises(SystemExit) as ended:
+            main(*words)
+        assert ended.value.code == 2
+        assert "--fps 50" in capsys.readouterr().err
+        assert not (tmp_path / "new").exists()
+        with pytest.raises(SystemExit) as ended:
+            main(*words, "--fps", "50", "--json", str(tmp_path / "n.json"))
+        assert ended.value.code == 0
+    made = states(tmp_path / "new")
+    assert [len(q) for q in made] == [60, 61]
+    np.testing.assert_allclose(made[1][::2], joint_path(31), atol=1e-3)
+
+
+def with_video(root, names, order, frames=60):
+    """A dataset of version 2.1 with one episode and its video."""
+    q = joint_path(frames)[:, order]
+    write(root, [q], [names[i] for i in order], version="v2.1", videos=[CAMERA])
+    info = read_info(root)
+    info["video_path"] = "videos/chunk-000/{video_key}/episode_{episode_index:06d}.mp4"
+    info["features"][CAMERA]["shape"] = [48, 64, 3]
+    write_info(root, info)
+    write_video(root / f"videos/chunk-000/{CAMERA}/episode_000000.mp4", frames, FPS)
+    return root
+
+
+def test_videos_are_copied_bit_by_bit(tmp_path):
+    a = with_video(tmp_path / "a", NAMES, [0, 1, 2])
+    b = with_video(tmp_path / "b", NAMES, [1, 2, 0], frames=40)
+    merge_datasets([a, b], tmp_path / "new")
+    made = sorted((tmp_path / "new/videos").glob("**/*.mp4"))
+    old = [next((root / "videos").glob("**/*.mp4")) for root in (a, b)]
+    assert [path.read_bytes() for path in made] == [path.read_bytes() for path in old]
+    info = read_info(b)
+    info["features"][CAMERA]["shape"] = [24, 32, 3]
+    write_info(b, info)
+    with pytest.raises(DatasetError, match="--no-videos"):
+        merge_datasets([a, b], tmp_path / "other")
+    merge_datasets([a, b], tmp_path / "other", videos=False)
+    assert CAMERA not in read_info(tmp_path / "other")["features"]
+
+
+@pytest.mark.slow
+def test_lerobot_reads_a_merged_dataset_with_its_statistics(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    lerobot_dataset = pytest.importorskip("lerobot.datasets").LeRobotDataset
+    a = with_video(tmp_path / "a", NAMES, [0, 1, 2])
+    b = with_video(tmp_path / "b", NAMES, [1, 2, 0], frames=40)
+    merge_datasets([a, b], tmp_path / "new")
+    dataset = lerobot_dataset("local/new", root=tmp_path / "new", video_backend="pyav")
+    assert (dataset.num_episodes, dataset.num_frames) == (2, 100)
+    np.testing.assert_allclose(dataset[70][STATE].numpy(), joint_path(40)[10], atol=1e-6)
+    assert dataset[99][CAMERA].shape == (3, 48, 64)
+    values = np.concatenate([joint_path(60), joint_path(40)])
+    np.testing.assert_allclose(dataset.meta.stats[STATE]["mean"], values.mean(0), atol=1e-5)
+    np.testing.assert_allclose(dataset.meta.stats[STATE]["std"], values.std(0), atol=1e-5)
+    np.testing.assert_allclose(dataset.meta.stats[STATE]["max"], values.max(0), atol=1e-5)
+
+
+def test_what_this_package_records_can_be_merged(tmp_path):
+    for name in "ab":
+        with DatasetWriter(tmp_path / name, 50, "any", ["j"]) as writer:
+            writer.start_episode(name)
+            for k in range(40):
+                writer.add_frame(joint_position=[0.01 * k])
+            writer.save_episode()
+    report = merge_datasets([tmp_path / "a", tmp_path / "b"], tmp_path / "new")
+    assert (report.episodes, report.notes) == (2, [])
+    assert not check_dataset(tmp_path / "new").errors
