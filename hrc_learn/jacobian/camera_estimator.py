@@ -58,9 +58,9 @@ _UNKNOWN = 1e6
 class CameraConfig:
     """Window, noise and prior of the estimate."""
 
-    frames: int = 40
+    frames: int = 56
     """Key frames in the window."""
-    min_step: float = 0.005
+    min_step: float = 0.006
     """Least motion between key frames [m], rotation scaled with `rotation_scale`."""
     max_step: float = 0.1
     """Largest motion between key frames across which the residual is followed [m]."""

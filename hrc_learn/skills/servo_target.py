@@ -274,7 +274,7 @@ class VisualServoConfig:
 
     tolerance: float = 1.5
     """Distance of the feature from the target that counts as reached [px]."""
-    dwell: float = 0.4
+    dwell: float = 0.3
     """Time at the target until it counts as reached [s]."""
     height_tolerance: float = 0.01
     """Height error of the end effector that counts as reached [m]."""
@@ -288,11 +288,11 @@ class VisualServoConfig:
     """Predicted error above the object below which the gripper may descend [m], one standard
     deviation in the plane; until then the end effector probes."""
     probe: float = 0.06
-    """Height of a probe: the end effector rises and comes back, which shows the camera how its
-    marker moves in height [m]."""
-    probe_tolerance: float = 10.0
-    """Distance of the feature from the target at which a probe turns round [px]."""
-    max_probes: int = 5
+    """Height from which a probe comes down to the box, which shows the camera how the marker
+    moves in height [m]."""
+    probe_tolerance: float = 30.0
+    """Distance of the feature from the target at which a probe comes down [px]."""
+    max_probes: int = 6
     """Largest number of probes."""
     border: float = 80.0
     """Distance of the target from the border of the image [px]; within 50 px, a marker is cut

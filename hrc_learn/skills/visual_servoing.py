@@ -434,14 +434,16 @@ class VisualServo:
         """
         begun, start, config = self._cell.time, self._clock, self._config
         self.state = self._law.restarted(self.state, begun, self._cell.loop_state.safety)
-        for probe in range(config.max_probes + 1):
-            reached = self._converge(target, config.tolerance, start, config.dwell)
+        for _ in range(config.max_probes):
+            # From higher up first, while the gripper turns, unless the camera is known.
+            self._read()
+            if self._law.uncertainty(self.state, target) > config.object_error:
+                raised = replace(target, raised=self._law.probe_height(self.state, target))
+                self._pass(raised, start)
+            reached = self._converge(target, start)
             error = self._law.uncertainty(self.state, target)
             if error <= config.object_error:
                 return reached - begun
-            if probe < config.max_probes:
-                raised = replace(target, raised=self._law.probe_height(self.state, target))
-                self._converge(raised, config.probe_tolerance, start, 0.0)
         raise MissedGraspError(
             f"visual servoing: after {config.max_probes} probes the end effector may still be "
             f"{1e3 * error:.1f} mm off the object, more than {1e3 * config.object_error:.1f}: "
@@ -483,29 +485,42 @@ class VisualServo:
             self.state.drawn.turn, unturned if wanted is None else wanted
         )
 
-    def _converge(
-        self, target: ServoTarget, tolerance: float, start: float, dwell: float
-    ) -> float:
-        """Step until marker and height have stayed at the target; returns the time [s]."""
+    def _pass(self, target: ServoTarget, start: float) -> None:
+        """Step until marker and height are near the target, in any orientation."""
+        self.state = replace(self.state, last_detection=self._cell.time)
+        while not self._near(target, self._config.probe_tolerance):
+            self._step_within(target, start)
+
+    def _converge(self, target: ServoTarget, start: float) -> float:
+        """Step until marker, height and orientation have stayed at the target.
+
+        Returns:
+            Time of arrival [s].
+        """
         cell, config, law = self._cell, self._config, self._law
-        reached, on_target = cell.time, False
+        reached = cell.time
         self.state = replace(self.state, last_detection=reached)
-        while not on_target or cell.time - reached < dwell:
-            if law.out_of_view(self.state, cell.time):
-                self.state = replace(self.state, detected=False)
-            self._step(target)
-            reading = self._read()
-            height = float(reading.pose.position[2] - target.above.position[2])
-            on_target = abs(height - target.raised) < config.height_tolerance
-            on_target &= (
-                law.turn_error(self.state, reading.pose, target) < config.turn_tolerance
-            )
-            on_target &= law.pixel_error(self.state, reading, target) < tolerance
-            on_target &= not self.state.drawn.away
-            if not on_target:
+        while cell.time - reached < config.dwell:
+            self._step_within(target, start)
+            turned = law.turn_error(self.state, cell.pose, target) < config.turn_tolerance
+            if not (turned and self._near(target, config.tolerance)):
                 reached = cell.time
-            self._check_timeouts(target, self._clock - start)
         return reached
+
+    def _near(self, target: ServoTarget, tolerance: float) -> bool:
+        """True if marker and height are at the target, within pixels [px]."""
+        reading = self._read()
+        height = float(reading.pose.position[2] - target.above.position[2])
+        at_height = abs(height - target.raised) < self._config.height_tolerance
+        on_target = self._law.pixel_error(self.state, reading, target) < tolerance
+        return at_height and on_target and not self.state.drawn.away
+
+    def _step_within(self, target: ServoTarget, start: float) -> None:
+        """Step; raise if that takes too long or the marker stays undetected."""
+        if self._law.out_of_view(self.state, self._cell.time):
+            self.state = replace(self.state, detected=False)
+        self._step(target)
+        self._check_timeouts(target, self._clock - start)
 
     def _step(self, target: ServoTarget) -> None:
         """Take one step and execute its command."""
