@@ -121,14 +121,7 @@ def _signature(recording: Recording) -> frozenset[tuple[str, str, int]]:
 
 def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSearch]:
     """Meaning of the fields of one episode by the caller's word and by their names."""
-    explicit = {}
-    for role, tokens in options.columns.items():
-        words = [tokens] if isinstance(tokens, str) else tokens
-        places = [place for word in words for place in first.places(word, role)]
-        # The number of columns tells which encodings of an orientation are no quaternion.
-        others = {3: "rotation_vector", 6: "rotation_6d", 16: "pose_matrix"}
-        is_turn = role.startswith("quaternion")
-        explicit[others.get(len(places), role) if is_turn else role] = places
+    explicit = _explicit(first, options)
     given = {place[0] for places in explicit.values() for place in places}
     search = FieldSearch(first, options.hinted)
     search.add_fields(
@@ -187,6 +180,19 @@ def _question_of_angles(
 def _is_news(note: str) -> bool:
     """True for notes of the reader that the preview does not show already."""
     return "left among" not in note and "assumed" not in note
+
+
+def _explicit(first: Recording, options: ImportOptions) -> dict[str, list[Place]]:
+    """Columns that the caller names, by role or feature."""
+    explicit = {}
+    for role, tokens in options.columns.items():
+        words = [tokens] if isinstance(tokens, str) else tokens
+        places = [place for word in words for place in first.places(word, role)]
+        # The number of columns tells which encodings of an orientation are no quaternion.
+        others = {3: "rotation_vector", 6: "rotation_6d", 16: "pose_matrix"}
+        is_turn = role.startswith("quaternion")
+        explicit[others.get(len(places), role) if is_turn else role] = places
+    return explicit
 
 
 def _selection(first: Recording, role: str, places: Sequence[Place]) -> ColumnSelection:
