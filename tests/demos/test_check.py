@@ -397,7 +397,7 @@ def test_actions_of_some_joints_only(tmp_path):
     root = write_folder(tmp_path / "set", [{STATE: q, "action": q[:, :2]}], names)
     report = check_dataset(root)
     assert report.ok
-    assert find(report.warnings, "left among the extra columns").key == "command_position"
+    assert find(report.warnings, "c.pos.: no joint of the arm, no action has it")
 
 
 def test_leader_and_follower(tmp_path):

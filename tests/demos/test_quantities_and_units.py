@@ -297,6 +297,12 @@ def test_names_of_no_joint(name):
     assert joints == ("a",)
 
 
+@pytest.mark.parametrize("name", [*SO101[:5], "base", "base_joint", "joint_1", "panda_joint1"])
+def test_names_of_joints(name):
+    joints, _ = mapped([name, "another"], ["ee.x", "ee.y", "ee.z"])
+    assert joints == (name, "another")
+
+
 def test_poses_of_two_arms_are_one_pose_and_a_note():
     names = [f"{side}_eef_{part}" for side in ("left", "right") for part in "xyz"]
     _, notes = mapped(names, ["a", "b"])

@@ -57,9 +57,10 @@ _METRES = re.compile(r"(?:^|[._/ ])(?:p?[xyz]|pos|position|width|height|lift|ope
 
 # No joint of an arm, although its name stands among joints.
 _NO_JOINT = re.compile(
-    r"(?:^|[._/ ])(?:object|obj|cube|block|target|goal|marker|tag|pixels?|px|image|feature|"
-    r"bbox|lift|elevator|mast|base|wheels?|wheel_\w+|odom\w*|imu|battery|force|wrench|ft|"
-    r"reward|success|done|phase|time|temperature|current|voltage)(?:$|[._/ \d])"
+    r"(?:^|[._/ ])(?:object|obj|cube|block|marker|tag|pixels?|px|image|feature|bbox|elevator|"
+    r"mast|wheels?|odom\w*|imu|battery|force|wrench|ft|reward|success|done)(?:$|[._/ \d])|"
+    r"^(?:lift|torso_lift|base_(?:x|y|th|theta|yaw|vel\w*))(?:$|[._/ \d])|"
+    r"[._/ ](?:current|voltage|temperature)$"
 )
 
 # Words before a component that only name the tool or the robot.
