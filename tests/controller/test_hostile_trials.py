@@ -3,16 +3,16 @@
 import pytest
 from disturbance_trials import StressConfig, run_stress_trials
 from hostile_trials import PlantConfig, PoisonConfig, run_plant_trials, run_poison_trials
-from unchecked import shapes_unchecked
 
 from hrc_learn.controller import AdaptiveController, SafetyFilter
+
+pytestmark = pytest.mark.simulation
 
 
 @pytest.mark.parametrize("fault", ["none", "nan", "late", "lost"])
 def test_no_limit_is_broken_under_stress(fault: str):
     config = StressConfig(count=40, seed=3, duration=1.8, fault=fault)
-    with shapes_unchecked():  # for speed
-        result = run_stress_trials(config)
+    result = run_stress_trials(config)
     assert not result.beyond.any()
     assert not result.unknown.any()
     acted = result.interventions.sum(0)
@@ -21,8 +21,7 @@ def test_no_limit_is_broken_under_stress(fault: str):
 
 
 def poison_trials(**changes):
-    with shapes_unchecked():  # for speed
-        return run_poison_trials(PoisonConfig(dt=0.02, estimators=("composite",), **changes))
+    return run_poison_trials(PoisonConfig(dt=0.02, estimators=("composite",), **changes))
 
 
 def test_poisoned_arms_keep_their_limits_and_move_again():
@@ -45,8 +44,7 @@ def test_poison_that_is_remembered_is_noticed(monkeypatch):
 
 @pytest.mark.parametrize(("worse", "kept"), [(1.0, True), (10.0, False)])
 def test_plants_as_declared_keep_their_limits_and_move_again(worse, kept):
-    with shapes_unchecked():  # for speed
-        result = run_plant_trials(PlantConfig(count=40, duration=2.0, worse=worse))
+    result = run_plant_trials(PlantConfig(count=40, duration=2.0, worse=worse))
     assert not result.unknown.any()
     assert not result.beyond[:, 1].any()
     assert (not result.beyond[:, 0].any()) == kept

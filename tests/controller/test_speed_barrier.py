@@ -6,7 +6,6 @@ import pytest
 import torch
 from bench_limits import Search, points_of, search
 from sampling import generator, within
-from unchecked import shapes_unchecked
 
 from hrc_learn.controller import (
     ArmLoop,
@@ -18,6 +17,8 @@ from hrc_learn.controller import (
 )
 from hrc_learn.controller.arm_loop_state import MoveJoints
 from hrc_learn.kinematics import arm, panda
+
+pytestmark = pytest.mark.simulation
 
 READY = panda.ready
 
@@ -36,7 +37,6 @@ READY = panda.ready
         ("xarm7", 0.0, {"model_error": 0.02, "reserve": 0.025}),
     ],
 )
-@shapes_unchecked()  # for speed
 def test_a_search_over_commands_breaks_no_limit(name, dt, changes):
     options = {"batch": 64, "steps": 80, "rounds": 3} | changes
     found = search(Search(arm=name, dt=dt, **options))
@@ -47,7 +47,6 @@ def test_a_search_over_commands_breaks_no_limit(name, dt, changes):
 
 @pytest.mark.parametrize("name", ["panda", "ur5e", "so101"])
 @pytest.mark.parametrize("dt", [0.002, 0.01])
-@shapes_unchecked()  # for speed
 def test_the_bound_holds_on_the_whole_way_to_rest(name, dt):
     """Against the speeds of a simulated arm that eases off as the barrier assumes."""
     robot, rng = arm(name), generator(3)

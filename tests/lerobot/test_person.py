@@ -17,6 +17,8 @@ from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
 from hrc_learn.lerobot.policy.policy_base import read_episodes
 from hrc_learn.teleoperation import ScriptedForce
 
+pytestmark = pytest.mark.simulation
+
 JOINTS, VELOCITIES = ArmValues(panda).joints, ArmValues(panda).velocities
 NULLSPACE_INPUTS, OFFSETS = nullspace_inputs(panda), offsets(panda)
 FPS = 20.0
