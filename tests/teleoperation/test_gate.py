@@ -1,16 +1,18 @@
-"""Who leads, what may be said, and at which address: without a network."""
+"""Who leads, what may be said, and at which address."""
 
 import json
 import math
 import ssl
 import sys
 from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import ProxyHandler, Request, build_opener
 
 import cv2
 import numpy as np
 import pytest
 
-from hrc_learn.teleoperation.gate import Gate, address, qr_code
+from hrc_learn.teleoperation.gate import Content, Gate, address, qr_code
 from hrc_learn.teleoperation.gate.address import (
     Address,
     AddressConfig,
@@ -318,6 +320,32 @@ def test_a_gate_whose_thread_fails_says_so_instead_of_waiting(monkeypatch):
     with pytest.raises(ImportError, match="websockets"):
         gate.start()
     gate.close()
+
+
+def test_a_fault_of_a_source_ends_one_request_alone(caplog):
+    def data(path: str) -> Content:
+        if path == "/broken":
+            raise OSError("no such disk")
+        return Content(body=path.encode(), kind="text/plain")
+
+    gate = Gate(AddressConfig(port=0), {}, {"session": lambda *_: None}, data)
+    gate.start()
+    try:
+        secret = {"Authorization": f"Bearer {gate.address.token}"}
+
+        def answer(path: str) -> tuple[int, bytes]:
+            request = Request(gate.address.origin + path, headers=secret)
+            try:
+                with build_opener(ProxyHandler({})).open(request, timeout=30) as got:
+                    return got.status, got.read()
+            except HTTPError as refused:
+                return refused.code, refused.read()
+
+        assert answer("/broken") == (500, b"OSError: no such disk\n")
+        assert "/broken failed" in caplog.text
+        assert answer("/sound") == (200, b"/sound")
+    finally:
+        gate.close()
 
 
 def test_a_phone_reads_the_code():
