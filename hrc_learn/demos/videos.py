@@ -109,7 +109,8 @@ def _segments_v2(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
     size = int(folder.info.get("chunks_size", 1000))
     segments = {}
     for entry in folder.episodes:
-        places = {"episode_chunk": entry.index // size, "episode_index": entry.index}
+        chunk = entry.index // size
+        places = {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": entry.index}
         times = (0.0, entry.length / folder.fps)
         segments[entry.index] = {key: _segment(folder, key, times, **places) for key in keys}
     return segments

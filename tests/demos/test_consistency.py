@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lerobot_folders import FPS, write_folder
+from lerobot_folders import FPS, joint_path, read_info, write_folder, write_info
 
 from hrc_learn.demos import check_dataset
 from hrc_learn.demos.issues import ValidationReport
@@ -146,3 +146,55 @@ def test_rows_between_episodes_are_passed_over(tmp_path):
     assert [*read] == [0, 2]
     for index, frames in read.items():
         np.testing.assert_allclose(frames, values[index], rtol=1e-6)
+
+
+def resting(seed: int, frames: int = 120) -> np.ndarray:
+    """A joint path [rad] that rests for 40 frames at its end."""
+    path = joint_path(frames - 40, seed=seed)
+    return np.concatenate([path, np.repeat(path[-1:], 40, axis=0)])
+
+
+@pytest.mark.parametrize("offset", [0.0, np.deg2rad(17)])
+def test_a_leader_calibrated_differently_is_reported(tmp_path, offset):
+    names, episodes = JOINTS, []
+    for seed in range(4):
+        state = resting(seed)
+        command = state + np.array([0.0, offset, 0.0])
+        episodes.append({"observation.state": state, "action": command})
+    root = write_folder(
+        tmp_path / "set", episodes, {"observation.state": names, "action": names}
+    )
+    texts = map(str, check_dataset(root).warnings)
+    found = [text for text in texts if "from its command" in text]
+    assert len(found) == (offset > 0)
+    assert all("elbow rests 0.2967" in text for text in found)
+    episodes[2]["action"] = episodes[2]["action"] + np.array([0.0, 0.0, 0.4])
+    root = write_folder(
+        tmp_path / "drifted", episodes, {"observation.state": names, "action": names}
+    )
+    found = [
+        issue for issue in check_dataset(root).warnings if "calibration changed" in str(issue)
+    ]
+    assert [issue.episode for issue in found] == [2]
+
+
+def test_a_loop_that_is_late_now_and_then_has_another_rate(tmp_path):
+    rng = np.random.default_rng(0)
+    steps = np.where(rng.uniform(size=119) < 0.3, 0.065, 0.05)
+    time = np.concatenate([[0.0], np.cumsum(steps)])[:, None]
+    episodes = [{"observation.state": resting(0), "time": time}]
+    names = {"observation.state": ["a.pos", "b.pos", "c.pos"], "time": ["time"]}
+    root = write_folder(tmp_path / "set", episodes, names, fps=20, dtype="float64")
+    found = [issue for issue in check_dataset(root).warnings if "fps says 20" in str(issue)]
+    assert [issue.key for issue in found] == ["time"]
+    assert f"{119 / steps.sum():.4g} Hz" in str(found[0])
+
+
+def test_version_2_with_the_folder_named_as_in_version_3(tmp_path):
+    names = {"observation.state": ["a.pos", "b.pos", "c.pos"]}
+    episodes = [{"observation.state": resting(0)}]
+    root = write_folder(tmp_path / "set", episodes, names, version="v2.1")
+    info = read_info(root)
+    info["data_path"] = "data/chunk-{chunk_index:03d}/episode_{episode_index:06d}.parquet"
+    write_info(root, info)
+    assert not check_dataset(root).errors

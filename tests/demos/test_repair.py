@@ -1,6 +1,7 @@
 """A repair makes the permitted changes, and its result is a sound dataset."""
 
 import json
+import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -50,6 +51,19 @@ def repaired(tmp_path, motions, options, names=NAMES, **how):
     return report, load_demos(tmp_path / "new")
 
 
+def trimmed(report):
+    """Frames that were trimmed from the first episode: at its beginning and at its end."""
+    cut = re.match(r"trimmed (\S+) s at the beginning, (\S+) s at", report.changes[0][0])
+    return tuple(round(float(seconds) * FPS) for seconds in cut.groups())
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_repair_adds_no_feature_where_the_clock_is_regular(tmp_path, version):
+    root = write(tmp_path / "old", [joint_path(60)], version=version)
+    repair_dataset(root, tmp_path / "new")
+    assert read_info(tmp_path / "new")["features"].keys() == read_info(root)["features"].keys()
+
+
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("without", [(), ("frame_index", "index", "task_index")])
 def test_what_is_sound_stays_as_it_is_in_every_version(tmp_path, version, without):
@@ -75,8 +89,9 @@ def test_standing_still_is_trimmed(tmp_path, version):
     assert report.changes[0][0].startswith("trimmed 1.")
     assert 100 <= len(demo) <= 130
     assert report.frames_before == 260
-    # Cut out in one piece, stamps and all.
-    start = round(demo.start_time * FPS)
+    # Cut out in one piece.
+    start, stop = trimmed(report)
+    assert len(demo) == 260 - start - stop
     np.testing.assert_array_equal(demo.joint_position, waiting[start : start + len(demo)])
 
 
@@ -394,10 +409,9 @@ def test_trimming_waits_for_the_gripper_and_for_the_command(tmp_path):
     episode = {STATE: np.hstack([waiting, opening]), "action": command}
     names = {STATE: [*NAMES, "gripper.pos"], "action": NAMES}
     root = write_folder(tmp_path / "old", [episode], names, dtype="float64")
-    repair_dataset(root, tmp_path / "new")
-    (demo,) = load_demos(tmp_path / "new")
-    first, last = round(demo.start_time * FPS), round((demo.start_time + demo.duration) * FPS)
-    assert (first, last) == (40, 251)
+    start, stop = trimmed(repair_dataset(root, tmp_path / "new"))
+    assert (start, 299 - stop) == (40, 251)
+    assert len(load_demos(tmp_path / "new")[0]) == 212
 
 
 def test_a_dry_run_says_the_same_and_writes_nothing(tmp_path):

@@ -165,6 +165,7 @@ def _check_content(
     report.run(structure_checks.statistics_fit, folder, features)
     report.run(consistency.lengths, [entries[i] for i in profiles])
     report.run(consistency.command_tracking, folder, columns, entries, profiles)
+    report.run(consistency.command_offsets, columns, entries, profiles, features)
     for feature in features:
         report.run(consistency.sizes, feature)
         for check in CONSISTENCY_CHECKS:

@@ -52,6 +52,7 @@ class ColumnRewriter:
         *,
         fps: float | int | None,
         segments: Mapping[int, Segments] | None,
+        add_time: bool = False,
     ):
         """
         Args:
@@ -59,6 +60,7 @@ class ColumnRewriter:
             units: Units from the caller.
             fps: Rate that episodes are resampled to [1/s]; None for the old one.
             segments: Video segments by episode index; None leaves the videos out.
+            add_time: Add the old stamps as `time`.
         """
         folder = self._folder = dataset.folder
         self.notes: list[str] = [dataset.contract_note] if dataset.contract_note else []
@@ -70,7 +72,7 @@ class ColumnRewriter:
         self._task_index = {index: n for n, index in enumerate(sorted(folder.tasks))}
         self.tasks = self._task_texts()
         self._unlisted = self.tasks[:1]
-        self._add_time = "time" not in dataset.columns.selections and fps is None
+        self._add_time = add_time
         self.header = recorded.RecordingHeader(
             fps=float(fps or folder.fps),
             robot_type=folder.robot_type or "unknown",
@@ -123,7 +125,7 @@ class ColumnRewriter:
     def join(self, header: recorded.RecordingHeader, tasks: list[str]) -> None:
         """Write the episodes as those of a dataset with this header and these tasks."""
         self._task_index = {n: tasks.index(text) for n, text in self._folder.tasks.items()}
-        self.tasks, self.header, self._add_time = tasks, header, False
+        self.tasks, self.header = tasks, header
         self._cameras = [key for key in self._cameras if key in header.features]
         self._image_columns = [key for key in self._image_columns if key in header.features]
 

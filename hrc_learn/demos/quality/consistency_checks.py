@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 from hrc_learn.demos.issues import Issue, warning
 from hrc_learn.demos.read.columns import ColumnMapping
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.read.naming import meaning_of_component
+from hrc_learn.demos.read.naming import is_hand, meaning_of_component
 from hrc_learn.demos.read.profiles import (
     ColumnProfile,
     EpisodeProfile,
@@ -36,6 +36,9 @@ _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
 # R squared above which a state follows its command, and below which it does not.
 _FOLLOWS, _LOST = 0.8, 0.4
+_OFFSET = 0.1
+"""Distance between command and state at rest that is reported, relative to the joint's range:
+hobby servos stop within a few degrees under load."""
 _PROMPT = 0.2
 """Delay within which an arm follows [s]; a slow motion resembles its own rate later."""
 
@@ -383,6 +386,46 @@ def command_tracking(
         elif len(known) >= FEWEST:
             for text, level in _component_tracking(tracking, usual_slope, follow, names):
                 yield entry.fault(text, key=key, components=names, level=level)
+
+
+def command_offsets(
+    mapping: ColumnMapping,
+    entries: Mapping[int, EpisodeEntry],
+    profiles: Mapping[int, EpisodeProfile],
+    features: Sequence[FeatureProfiles],
+) -> Iterator[Issue]:
+    """Constant distances between command and state at rest, and episodes where they changed.
+
+    A leader and a follower that were calibrated differently are such a distance apart.
+    """
+    known = [p for p in profiles.values() if "command_position" in p.tracking]
+    if not known or "command_position" not in mapping.selections:
+        return
+    command, states = (mapping.selections[r] for r in ("command_position", "joint_position"))
+    spans = {feature.key: feature.median("span") for feature in features}
+    offsets = np.stack([p.tracking["command_position"].offset for p in known])
+    for number, (name, (key, index)) in enumerate(
+        zip(command.labels, states.columns, strict=True)
+    ):
+        found = np.flatnonzero(np.isfinite(offsets[:, number]))
+        # Hands that hold an object, and flags, do not reach their command.
+        if not len(found) or key not in spans or is_hand(name):
+            continue
+        own = offsets[found, number]
+        usual, least = float(np.median(own)), _OFFSET * float(spans[key][index])
+        if least > 0 and abs(usual) > least and np.median(np.abs(own - usual)) < least / 2:
+            text = (
+                f"{name} rests {usual:.4g} from its command (action minus state) in {len(own)} "
+                f"episodes: leader and follower were calibrated differently?"
+            )
+            yield warning(message=text, key=command.columns[0][0])
+        for place in found[np.abs(own - usual) > least] if len(own) >= FEWEST else ():
+            text = (
+                f"{name} rests {offsets[place, number]:.4g} from its command, in the other "
+                f"episodes {usual:.4g}: its calibration changed?"
+            )
+            entry = entries[known[place].index]
+            yield entry.warning(text, key=command.columns[0][0])
 
 
 def _median(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " components"]:

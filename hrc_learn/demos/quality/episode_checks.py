@@ -133,6 +133,14 @@ def stamps(
         )
         yield entry.warning(text, key=key)
     gaps = np.flatnonzero(steps > _GAP * usual)
+    rate = 1 / float(steps.mean())
+    if not len(gaps) and abs(usual * fps - 1) <= _RATE_TOLERANCE < abs(rate / fps - 1):
+        # A loop that is late now and then keeps its usual step, but not its rate.
+        text = (
+            f"{len(time)} frames in {time[-1] - time[0]:.4g} s are {rate:.4g} Hz, but fps says "
+            f"{fps:g}: the loop was late; hrc repair --fps {fps:g} resamples"
+        )
+        yield entry.warning(text, key=key)
     if len(gaps):
         lost = int(np.rint(steps[gaps] / usual - 1).sum())
         text = (

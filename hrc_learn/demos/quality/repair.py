@@ -23,6 +23,8 @@ from hrc_learn.demos.recorded_episode import episode_path
 from hrc_learn.demos.videos import Segments, read_segments
 from hrc_learn.store import DATASET, Count, read_json, replacing, write_json
 
+_STAMP_TOLERANCE = 1e-3
+"""Deviation from a regular clock that is kept [s]: above the rounding of float32 stamps."""
 _LARGEST_NOTE = 2**20
 """Largest card, licence or foreign metadata file that is copied [bytes]."""
 
@@ -107,9 +109,10 @@ def repair_dataset(
 ) -> RepairReport:
     """Repair a dataset of version 2.0, 2.1 or 3.0 into a new one of version 3.0.
 
-    The old dataset is not changed. Columns keep their keys, names and units. If no column holds
-    true stamps and the frames are not resampled, `time` is added with LeRobot's old
-    stamps, because the new `timestamp` is frame / fps by definition.
+    The old dataset is not changed. Columns keep their keys, names and units. The new
+    `timestamp` is frame / fps by definition. If LeRobot's old stamps differ from that, or
+    frames may be dropped in the middle, and no column holds true stamps, `time` is added with
+    the old ones.
 
     Args:
         path: The dataset to repair.
@@ -160,7 +163,14 @@ class _Repair:
             selections=columns.selections, joint_names=columns.joint_names, units=decisions
         )
         segments = read_segments(self.folder) if options.videos else None
-        self.rewriter = ColumnRewriter(dataset, units, fps=options.fps, segments=segments)
+        add_time = (
+            "time" not in columns.selections
+            and options.fps is None
+            and (options.drop_bad_frames or options.drop_repeats or not self._regular())
+        )
+        self.rewriter = ColumnRewriter(
+            dataset, units, fps=options.fps, segments=segments, add_time=add_time
+        )
         self.report = RepairReport(path=out, notes=self.rewriter.notes, dry_run=options.dry_run)
 
     def _readable(self) -> Iterator[tuple[EpisodeEntry, Quantities]]:
@@ -168,6 +178,20 @@ class _Repair:
         for entry, frames in zip(self.folder.episodes, self._read(), strict=True):
             if not isinstance(frames, DatasetError):
                 yield entry, select_quantities(frames, self.dataset.columns.selections)
+
+    def _regular(self) -> bool:
+        """True if LeRobot's stamps that increase are 1/fps apart in every readable episode."""
+        if "timestamp" not in self.folder.features:
+            return True
+        for frames in read_each(self.folder, self.folder.episodes, ["timestamp"]):
+            if isinstance(frames, DatasetError):
+                continue
+            time = frames["timestamp"][:, 0].astype(float)
+            expected = time[0] + np.arange(len(time)) / self.folder.fps
+            off = np.abs(time - expected).max()
+            if off > _STAMP_TOLERANCE and (np.diff(time) > 0).all():
+                return False
+        return True
 
     def _read(self) -> Iterator[RawFrames | DatasetError]:
         """Numeric columns of every episode."""

@@ -235,8 +235,10 @@ def _episodes_v2(root: Path, info: dict) -> Iterator[EpisodeEntry]:
     size = integer(info.get("chunks_size", 1000), "chunks_size", INFO_PATH, lowest=1)
     for row in rows:
         index, length = (integer(row[n], n, name) for n in ("episode_index", "length"))
-        # Version 2 keeps one file per episode, and `chunks_size` files per folder.
-        places = {"episode_chunk": index // size, "episode_index": index}
+        # Version 2 keeps one file per episode, and `chunks_size` files per folder. Some
+        # converters name the folder as version 3 does.
+        chunk = index // size
+        places = {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": index}
         file = path_in(root, info.get("data_path"), "data_path", **places)
         tasks = _task_texts(row.get("tasks"))
         yield EpisodeEntry(index=index, length=length, tasks=tasks, file=file, start=0)

@@ -4,6 +4,7 @@ No statistic depends on a single value: sizes are quantiles, delays and slopes u
 The contract and the consistency checks compare these profiles over episodes.
 """
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -24,6 +25,10 @@ _LONGEST_DELAY = 1.5
 _NEGLIGIBLE = 0.01
 # Largest residual variance of a component that follows its command.
 _FOLLOWED = 0.2
+_REST, _FEWEST_STILL = 5, 5
+"""Frames over which a component must hardly move to be at rest, and fewest such frames."""
+_REST_MOTION = 0.005
+"""Motion at rest, relative to the range."""
 # Relative variance of a window in which a component rests, up to rounding.
 _RESTING = 1e-10
 
@@ -81,6 +86,8 @@ class Tracking:
     """State component most similar to each command component."""
     similarity: Float64[np.ndarray, " components"]
     """Absolute correlation with the partner; 0 if either rests."""
+    offset: Float64[np.ndarray, " components"]
+    """Command minus state while both rest; NaN where they rest too seldom."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -226,6 +233,7 @@ def track(
     moving = size > 1e-9 * (1 + np.abs(state).max(0))
     if not moving.any():
         return None
+    offset = _resting_offset(command, state)
     left = 1 - np.maximum(_correlations(command[:, moving], state[:, moving], reach), 0) ** 2
     # Hands and grippers that stop at an object do not show the delay.
     followed = left.min(0) < _FOLLOWED
@@ -248,7 +256,24 @@ def track(
         fit=fit,
         partner=similarity.argmax(1),
         similarity=similarity.max(1),
+        offset=offset,
     )
+
+
+def _resting_offset(
+    command: Float64[np.ndarray, "frames components"],
+    state: Float64[np.ndarray, "frames components"],
+) -> Float64[np.ndarray, " components"]:
+    """Median of command minus state over the frames between which both hardly move."""
+    span = np.maximum(np.ptp(state, axis=0), np.ptp(command, axis=0))
+    # Over five frames: a slow motion is no rest.
+    still = np.maximum(
+        *(np.abs(values[_REST:] - values[:-_REST]) for values in (command, state))
+    ) <= _REST_MOTION * np.maximum(span, 1e-12)
+    gap = np.where(still, (command - state)[_REST:], np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # no frame at rest
+        return np.where(still.sum(0) >= _FEWEST_STILL, np.nanmedian(gap, axis=0), np.nan)
 
 
 def track_quantities(quantities: Quantities, fps: float) -> dict[str, Tracking]:
