@@ -58,7 +58,8 @@ _METRES = re.compile(r"(?:^|[._/ ])(?:p?[xyz]|pos|position|width|height|lift|ope
 # No joint of an arm, although its name stands among joints.
 _NO_JOINT = re.compile(
     r"(?:^|[._/ ])(?:object|obj|cube|block|marker|tag|pixels?|px|image|feature|bbox|elevator|"
-    r"mast|wheels?|odom\w*|imu|battery|force|wrench|ft|reward|success|done)(?:$|[._/ \d])|"
+    r"mast|wheels?|odom\w*|imu|battery|force|wrench|ft|reward|success|done|pad|padding|dummy|"
+    r"unused)(?:$|[._/ \d])|"
     r"^(?:lift|torso_lift|base_(?:x|y|th|theta|yaw|vel\w*))(?:$|[._/ \d])|"
     r"[._/ ](?:current|voltage|temperature)$"
 )
@@ -83,12 +84,13 @@ _COMPONENTS: list[tuple[str, str]] = [
     ("position", rf"{_POSITION}?_?(?P<slot>[xyz])"),
     ("quaternion_wxyz", rf"{_QUATERNION}_?(?P<slot>[wxyz])"),
     ("quaternion", r"(?:quat|quaternion|rot_?quat)_?(?P<slot>[0-3])"),
-    ("rotation_vector", rf"(?:{_VECTOR}|w|r)_?(?P<slot>[xyz])"),
+    ("rotation_vector", rf"(?:{_VECTOR}|w)_?(?P<slot>[xyz])"),
     ("rotation_vector", rf"{_VECTOR}_?(?P<slot>[0-2])"),
     ("euler_xyz", rf"{_EULER}_?(?P<slot>[xyz0-2])"),
     ("euler_xyz", rf"(?:{_EULER}_|{_ROTATION}_)?(?P<slot>roll|pitch|yaw)"),
     ("rotation_6d", rf"{_SIX}_?(?P<slot>[0-5])"),
     ("rotation", rf"{_ROTATION}_?(?P<slot>[wxyz0-8])"),
+    ("rotation", r"r_?(?P<slot>[wxyz])"),
     ("rotation", rf"(?:{_ROTATION}_)?(?:matrix|mat)_?(?P<slot>[0-8])"),
 ]
 _NAMES = [(role, re.compile(_BEFORE + rest)) for role, rest in _COMPONENTS]

@@ -16,6 +16,12 @@ _RADIANS, _DEGREES = 4 * math.pi, 400.0
 # Largest fraction of a range, allowing for noise, and widest opening of a gripper [m].
 _FINGER_RATIO, _GRIPPER_RATIO, _PERCENT, _WIDEST_GRIPPER = 1.05, 2.0, 105.0, 0.2
 _BYTE = 255.5
+_SLIDE = 0.12
+"""Longest stroke of a gripper's finger [m]."""
+# Old datasets of LeRobot name the columns of joints and of poses alike.
+_MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
+_SHORTEST_ARM, _POSE_AND_FINGERS = 5, 8
+"""Joints of the smallest usual arms; columns of a pose with two fingers."""
 # LeRobot clips normalised positions at exactly 100.
 _CLIPPED = 0.002
 """Fraction of the frames at exactly 100 from which a column counts as clipped."""
@@ -179,12 +185,54 @@ def _degrees_or_range(
     return Guess("deg", 0.75, reach, "%")
 
 
-def guess_fingers(sizes: Sizes, arm_unit: str, hobby: bool) -> list[str]:
+def guess_fingers(
+    sizes: Sizes,
+    hand: Bool[np.ndarray, " components"],
+    labels: Sequence[str],
+    arm_unit: str,
+    hobby: bool,
+) -> list[str]:
     """Unit of each component if it is a finger, from its size and the unit of the arm."""
-    return [
+    # A hand counts all its fingers alike, also those that move little.
+    counted = hand & sizes.whole & (sizes.peak > _FINGER_RATIO) & (sizes.peak <= _BYTE)
+    counts = bool((sizes.peak[counted] > _PERCENT).any())
+    slides = np.array([("finger" in label.lower()) for label in labels] or [False] * len(hand))
+    units = [
         _finger_unit(float(peak), bool(whole), arm_unit, hobby)
         for peak, whole in zip(sizes.peak, sizes.whole, strict=True)
     ]
+    metres = slides & (sizes.peak > 0) & (sizes.peak <= _SLIDE)
+    return [
+        "byte" if counts and counted[i] else "m" if metres[i] else unit
+        for i, unit in enumerate(units)
+    ]
+
+
+def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: bool) -> Guess:
+    """The guess, doubted where columns without telling names may hold no joints at all.
+
+    Args:
+        guess: Unit, if the columns are joints.
+        sizes: Sizes of all components.
+        labels: Names of the columns.
+        numbered: True if the dataset gives no names.
+    """
+    count, largest = len(sizes.peak), float(sizes.peak.max())
+    named_alike = bool(labels) and all(map(_MOTOR.fullmatch, labels))
+    if not (named_alike or numbered) or count > _POSE_AND_FINGERS:
+        return guess
+    last = float(sizes.peak[-1])
+    if count > _SHORTEST_ARM and 1e-3 < last <= _SLIDE and largest > 10 * last:
+        reason = f"the last column stays within {last:.2g}, as a gripper in m does"
+    elif named_alike and count < _SHORTEST_ARM:
+        reason = f"{count} columns are few for an arm"
+    else:
+        return guess
+    text = (
+        f"{guess.evidence}; names do not tell joints from a pose, and {reason}: a pose is "
+        f"read with --mapping position KEY[0:3]"
+    )
+    return guess._replace(confidence=min(guess.confidence, 0.5), evidence=text)
 
 
 def _finger_unit(peak: float, whole: bool, arm_unit: str, hobby: bool) -> str:

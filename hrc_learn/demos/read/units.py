@@ -22,6 +22,7 @@ from hrc_learn.demos.read.unit_evidence import (
     ROTATION_LIMITS,
     Guess,
     Sizes,
+    doubt_meaning,
     guess_fingers,
     guess_gripper,
     guess_joints,
@@ -74,6 +75,8 @@ class UnitDecision:
     """Evidence for a guess, in words."""
     other: str = ""
     """Second candidate for the unit; "" if there is none."""
+    leader: str = ""
+    """Quantity whose unit this one takes over; "" if none."""
 
     @property
     def factor(self) -> float | Float64[np.ndarray, " components"]:
@@ -85,7 +88,7 @@ class UnitDecision:
     @property
     def doubt(self) -> str | None:
         """Question to the user if the guess is not sure enough to be used; else None."""
-        if self.confidence >= CONFIDENT:
+        if self.confidence >= CONFIDENT or self.leader:
             return None
         candidates = [self.unit, *filter(None, [self.other])]
         ways = " or ".join(f"--units {self.role} {unit}" for unit in candidates)
@@ -129,7 +132,8 @@ def units_of(role: str) -> dict[str, float]:
     options = next(units for units in _DIMENSIONS.values() if own in units)
     if role in ("gripper", "joint_position", "command_position"):
         # Grippers and hands give a fraction of their opening, hobby arms of their range.
-        options = options | _DIMENSIONS["ratio"]
+        # Fingers of some slide, in metres.
+        options = options | _DIMENSIONS["ratio"] | {"m": 1.0}
     return options
 
 
@@ -187,6 +191,11 @@ def decide_units(
             decisions[role] = _guess_time(frame_step)
         elif role in _GUESSABLE:
             known = own if isinstance(own, Sizes) else Sizes.of_peaks(own)
+            command = sizes.get("command_position") if role == "joint_position" else None
+            if isinstance(command, Sizes) and len(command.peak) == len(known.peak):
+                # Commands are clipped at exactly 100 where the motion stops before.
+                clipped = np.maximum(known.clipped, command.clipped)
+                known = known._replace(clipped=clipped)
             decisions[role] = _guess(role, known, selection, robot_type, named)
         else:
             assumed = "" if selection is None else selection.assumed
@@ -228,6 +237,7 @@ def _following(role: str, leader: UnitDecision) -> UnitDecision:
         unit=unit if followed else ROLES[role].unit,
         units=() if velocity else leader.units,
         confidence=leader.confidence,
+        leader=leader.role,
         evidence=f"that of {leader.role}" if followed or not velocity else "",
     )
 
@@ -283,7 +293,8 @@ def _guess_joint_units(
     if len(stated) != len(hand):
         stated = np.zeros(len(hand), bool)
     guess = guess_joints(sizes, ~hand & ~stated, labels, robot_type)
-    fingers = guess_fingers(sizes, guess.unit, is_hobby_arm(robot_type, labels))
+    guess = doubt_meaning(guess, sizes, labels, selection is not None and selection.numbered)
+    fingers = guess_fingers(sizes, hand, labels, guess.unit, is_hobby_arm(robot_type, labels))
     units = tuple(
         named[i] if stated[i] else fingers[i] if hand[i] else guess.unit
         for i in range(len(hand))

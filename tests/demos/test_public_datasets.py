@@ -1,0 +1,382 @@
+"""Units and meaning of published LeRobot datasets, decided by hand and by the reader.
+
+Names, shapes and robot types are those of the datasets' `meta/info.json`. Ranges marked as
+measured are those of their `meta/stats.json`; the others follow the datasets' documentation.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from hrc_learn.demos.read.columns import map_columns
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry
+from hrc_learn.demos.read.metadata import Sidecar, read_features
+from hrc_learn.demos.read.units import units_from_episodes
+
+SO101 = [f"{j}.pos" for j in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex")] + [
+    "wrist_roll.pos",
+    "gripper.pos",
+]
+KOCH = ["main_" + name.removesuffix(".pos") for name in SO101]
+ALOHA = [
+    f"{side}_{joint}"
+    for side in ("left", "right")
+    for joint in (
+        *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
+        "gripper",
+    )
+]
+G1 = [
+    f"k{side}{joint}"
+    for side in ("Left", "Right")
+    for joint in (
+        *("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow"),
+        *("WristRoll", "WristPitch", "WristYaw"),
+    )
+] + [
+    f"k{side}Hand{finger}"
+    for side in ("Left", "Right")
+    for finger in ("Pinky", "Ring", "Middle", "Index", "ThumbBend", "ThumbRotation")
+]
+PANDA = [f"panda_joint{i}" for i in range(1, 8)] + [
+    "panda_finger_joint1",
+    "panda_finger_joint2",
+]
+LINGZU = [f"{s}.joint_{i}.pos" for s in ("left", "right") for i in range(1, 8)] + [
+    f"{s}_hand.joint_{i}.pos" for s in ("left", "right") for i in range(1, 11)
+]
+
+
+class Vector(NamedTuple):
+    """Feature with the range of each component."""
+
+    names: object
+    low: Sequence[float]
+    high: Sequence[float]
+
+
+def motors(count):
+    return [f"motor_{i}" for i in range(count)]
+
+
+def spread(names, half):
+    """Feature whose components reach from -half to half."""
+    count = len(names["motors"] if isinstance(names, dict) else names)
+    half = list(np.broadcast_to(half, count))
+    return Vector(names, [-h for h in half], half)
+
+
+LIBERO_LOW = [-0.48, -0.31, 0.008, 0.35, -3.64, -1.8, 0.0, -0.042]
+LIBERO_HIGH = [0.21, 0.39, 1.33, 3.72, 3.56, 1.39, 0.042, 0.0]
+LIBERO_MOTORS = ["x", "y", "z", "roll", "pitch", "yaw", "gripper", "gripper"]
+PANDA_LOW = [-0.56, -0.79, -0.56, -2.79, -0.18, 1.57, -1.07, 0.0, 0.0]
+PANDA_HIGH = [0.33, 1.18, 0.2, -0.96, 0.45, 3.0, 0.78, 0.04, 0.04]
+OPEN_LOW = [
+    *(-1.51, 1.31, 42.85, 0.98, 152.48, -2.63, -5.29),
+    *(-11.51, -10.93, -45.9, -11.48, -174.24, -32.52, -30.69),
+    *[0.0] * 10,
+    *[5, 5, 5, 5, 5, 14, 5, 250, 5, 5],
+]
+OPEN_HIGH = [
+    *(1.29, 4.03, 43.16, 3.86, 152.55, 1.57, -4.27),
+    *(53.31, 8.63, -2.49, 101.36, -138.79, 16.67, 41.18),
+    *[0.0] * 10,
+    *[250, 250, 250, 236, 5, 242, 250, 250, 250, 250],
+]
+TICKS_LOW = [1700, 1224, 1490, 2518, 3144, 1980, 1561, 766, 1564, 2348, 1880, 1448]
+TICKS_HIGH = [2076, 2335, 2863, 3192, 3590, 2845, 1951, 1773, 2892, 3316, 2100, 2327]
+G1_LOW = [-0.9, 0.35, -0.64, 0.86, 0.66, -0.63, 0.47, -0.99, -0.56, -0.57, 0.16, -0.27]
+G1_LOW += [-0.9, -0.23, 0.38, 0.47, 0.5, 0.51, 0.48, 0.0, 0.25, 0.34, 0.42, 0.47, 0.15, 0.0]
+G1_HIGH = [-0.58, 0.54, -0.36, 1.31, 0.84, -0.33, 0.98, -0.18, 0.06, 0.43, 1.27, 0.48]
+G1_HIGH += [0.17, 1.34, 0.84, 0.91, 0.9, 0.9, 1.0, 0.8, 1.0, 1.0, 1.0, 1.0, 1.0, 0.99]
+DROID = {
+    "observation.state.joint_position": spread(
+        [f"joint_{i}" for i in range(7)], [2.7, 1.7, 2.7, 2.9, 2.7, 4.4, 2.9]
+    ),
+    "observation.state.cartesian_position": spread(
+        ["x", "y", "z", "roll", "pitch", "yaw"], [0.8, 0.7, 0.9, 3.14, 1.4, 3.1]
+    ),
+    "observation.state.gripper_position": Vector(["gripper"], [0.0], [1.0]),
+    "action.joint_position": spread([f"joint_{i}" for i in range(7)], 2.9),
+}
+STATE, ACTION = "observation.state", "action"
+JOINTS = {"joint_position": "rad"}
+ASKS: dict = {}
+"""By hand: the metadata and the values do not decide, so the reader has to ask."""
+
+DATASETS = {
+    # Measured ranges.
+    "SamueleSandrini/record-test": (
+        "so101_follower",
+        {
+            STATE: Vector(
+                SO101,
+                [-35.03, -98.96, 9.21, 32.31, -75.54, 1.95],
+                [0.04, 10.64, 99.55, 82.16, -44.09, 39.15],
+            ),
+            ACTION: Vector(
+                SO101,
+                [-35.22, -99.1, 3.29, 30.83, -76.07, 0.16],
+                [0.54, 9.73, 100.0, 83.41, -43.32, 39.58],
+            ),
+        },
+        {"joint_position": "%", "gripper": "%"},
+    ),
+    "Sachin-2007/oc_models": (
+        "so101_follower",
+        {
+            STATE: Vector(
+                SO101,
+                [-66.63, -99.32, -96.46, 3.15, -37.02, 0.58],
+                [56.99, 70.19, 99.27, 99.47, 41.91, 87.78],
+            ),
+            ACTION: Vector(
+                SO101,
+                [-66.4, -100.0, -99.74, 1.71, -36.73, 0.0],
+                [57.24, 69.6, 100.0, 100.0, 41.8, 88.16],
+            ),
+        },
+        {"joint_position": "%", "gripper": "%"},
+    ),
+    "Bhavya007-17/p1-so101-sim-t1": (
+        "so101_follower_sim",
+        {
+            STATE: Vector(
+                SO101,
+                [-0.49, -0.96, 0.3, 0.65, -0.58, 0.01],
+                [1.53, 0.03, 1.32, 1.66, 0.49, 1.26],
+            ),
+            "observation.velocity": spread(SO101, [1.05, 1.03, 1.18, 1.06, 0.97, 4.79]),
+        },
+        {"joint_position": "rad", "joint_velocity": "rad/s"},
+    ),
+    "WangzyNicole/Bimanual-Cloth-Manipulation": (
+        "so101_bimanual",
+        {
+            STATE: Vector(
+                [f"arm{a}_j{i}" for a in (1, 2) for i in range(1, 7)], TICKS_LOW, TICKS_HIGH
+            )
+        },
+        {"joint_position": "tick"},
+    ),
+    "YifanTian07/G1-policy-train": (
+        "Unitree_G1_Inspire",
+        {STATE: Vector([G1], G1_LOW, G1_HIGH)},
+        {"joint_position": ["rad"] * 14 + ["1"] * 12},
+    ),
+    "chenfei-source/ACT-robot-manipulation": (
+        "piper",
+        {
+            STATE: Vector(
+                [f"joint_{i}.pos" for i in range(1, 7)] + ["gripper.pos"],
+                [-24.46, -100.0, -74.08, -1.7, 21.11, -45.4, 0.6],
+                [47.86, 70.37, 99.74, 0.83, 100.0, 95.89, 98.4],
+            )
+        },
+        {"joint_position": "%", "gripper": "%"},
+    ),
+    "priyabiswas-cmd/lerobot_sim_omx, dataset": (
+        "panda",
+        {STATE: Vector({"joints": PANDA}, PANDA_LOW, PANDA_HIGH)},
+        {"joint_position": ["rad"] * 7 + ["m"] * 2},
+    ),
+    "priyabiswas-cmd/lerobot_sim_omx, franka_pickplace": (
+        "panda",
+        {
+            STATE: Vector(
+                {"joints": [f"j{i}" for i in range(1, 7)]}, PANDA_LOW[:6], PANDA_HIGH[:6]
+            )
+        },
+        JOINTS,
+    ),
+    "yipiandanxinxiangyangkai/open_50": (
+        "lingzu_highcam_pi05",
+        {"state": Vector(LINGZU, OPEN_LOW, OPEN_HIGH)},
+        {"joint_position": ["deg"] * 14 + ["1"] * 10 + ["byte"] * 10},
+    ),
+    # Names measured, ranges as documented.
+    "QianHuixun/New-Test": (
+        "",
+        {
+            STATE: spread(
+                [f"{s}_arm_joint_{i}_rad" for s in ("left", "right") for i in range(7)], 2
+            )
+        },
+        JOINTS,
+    ),
+    "SpriteWithoutIce/JEPA_WAM": (
+        "panda",
+        {STATE: Vector(["state"], LIBERO_LOW, LIBERO_HIGH)},
+        ASKS,
+    ),
+    "nvidia/PhysicalAI-Robotics-GR00T-X-Embodiment-Sim": (
+        "GR1ArmsOnly",
+        {STATE: spread(motors(44), 2.0)},
+        JOINTS,
+    ),
+    "lerobot/svla_so100_pickplace": (
+        "so100",
+        {STATE: Vector(KOCH, [-40, 20, 40, -20, -90, 0], [70, 190, 180, 100, 30, 60])},
+        {"joint_position": "deg", "gripper": "%"},
+    ),
+    "lerobot/koch_pick_place_1_lego": (
+        "koch",
+        {STATE: spread(KOCH, [60, 130, 150, 90, 95, 50])},
+        {"joint_position": "deg"},
+    ),
+    "lerobot/aloha_static_coffee": (
+        "aloha",
+        {STATE: spread({"motors": ALOHA}, [1, 1.9, 1.7, 1.2, 1.8, 2.0, 1.0] * 2)},
+        JOINTS,
+    ),
+    "lerobot/aloha_sim_insertion_human": (
+        "aloha",
+        {STATE: spread({"motors": ALOHA}, [0.7, 1.1, 1.5, 0.8, 1.2, 1.1, 1.0] * 2)},
+        JOINTS,
+    ),
+    "lerobot/reachy2, open_door": (
+        "reachy2",
+        {STATE: Vector(None, [-2.0] * 19, [2.0] * 19)},
+        JOINTS,
+    ),
+    "lerobot/pusht": (
+        "unknown",
+        {STATE: Vector({"motors": motors(2)}, [13.2, 30.4], [496.1, 510.7])},
+        ASKS,
+    ),
+    "lerobot/xarm_lift_medium": (
+        "unknown",
+        {STATE: spread({"motors": motors(4)}, [1.0, 1.0, 0.6, 1.0])},
+        ASKS,
+    ),
+    "lerobot/umi_cup_in_the_wild": (
+        "unknown",
+        {STATE: spread({"motors": motors(7)}, [0.5, 0.6, 0.7, 2.9, 2.8, 2.5, 0.08])},
+        ASKS,
+    ),
+    "lerobot/droid_1.0.1": (
+        "Franka",
+        DROID,
+        {"joint_position": "rad", "position": "m", "euler_xyz": "rad", "gripper": "1"},
+    ),
+    "IPEC-COMMUNITY/bridge_orig_lerobot": (
+        "widowx",
+        {
+            STATE: spread(
+                {"motors": ["x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper"]},
+                [0.5, 0.4, 0.3, 3.1, 1.5, 3.1, 0.0, 1.0],
+            )
+        },
+        {"position": "m", "euler_xyz": "rad", "gripper": "1"},
+    ),
+    "IPEC-COMMUNITY/fractal20220817_data_lerobot": (
+        "google_robot",
+        {
+            STATE: spread(
+                {"motors": ["x", "y", "z", "rx", "ry", "rz", "rw", "gripper"]},
+                [0.9, 0.5, 1.2, 1.0, 1.0, 1.0, 1.0, 1.0],
+            )
+        },
+        {"position": "m", "quaternion_wxyz": "1", "gripper": "1"},
+    ),
+    "nvidia/libero_spatial, by names": (
+        "franka",
+        {STATE: Vector({"motors": LIBERO_MOTORS[:7]}, LIBERO_LOW[:7], LIBERO_HIGH[:7])},
+        {"position": "m", "euler_xyz": "rad", "gripper": "m"},
+    ),
+    "robomimic, converted": (
+        "panda",
+        {
+            "observation.robot0_joint_pos": Vector(None, PANDA_LOW[:7], PANDA_HIGH[:7]),
+            "observation.robot0_eef_pos": Vector(None, [-0.2, -0.3, 0.8], [0.2, 0.3, 1.1]),
+            "observation.robot0_eef_quat": Vector(None, [-1.0] * 4, [1.0] * 4),
+            "observation.robot0_gripper_qpos": Vector(None, [0.0, -0.04], [0.04, 0.0]),
+        },
+        {"joint_position": "rad", "position": "m", "quaternion_xyzw": "1", "gripper": "m"},
+    ),
+    "lerobot/unitreeh1_two_robot_greeting": (
+        "unitreeh1",
+        {STATE: spread({"motors": [n for n in G1 if "Hand" not in n]}, 1.6)},
+        JOINTS,
+    ),
+    "LeRobot so100_follower_end_effector": (
+        "so100_follower_end_effector",
+        {
+            STATE: spread(
+                ["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz", "ee.gripper_pos"],
+                [0.3, 0.3, 0.3, 2.0, 2.0, 2.0, 80.0],
+            )
+        },
+        {"position": "m", "rotation_vector": "rad", "gripper": "%"},
+    ),
+}
+
+
+def decide(robot_type, vectors):
+    """Decisions on three episodes that reach from the lowest to the highest values."""
+    info = {
+        "features": {
+            key: {"dtype": "float32", "shape": [len(v.low)], "names": v.names}
+            for key, v in vectors.items()
+        }
+    }
+    columns = map_columns(read_features(info), Sidecar())
+    way = np.clip(1.1 * np.sin(np.linspace(0, 3, 300)), 0, 1)[:, None]
+    values = {k: np.array(v.low) + way * np.subtract(v.high, v.low) for k, v in vectors.items()}
+    for key, v in vectors.items():
+        # Ranges of encoders and of hands end at whole numbers, since these count.
+        counts = [
+            a == round(a) and b == round(b) and b >= 5
+            for a, b in zip(v.low, v.high, strict=True)
+        ]
+        values[key] = np.where(counts, np.rint(values[key]), values[key])
+    quantities = {
+        role: np.stack([values[key][:, i] for key, i in selection.columns], axis=1)
+        for role, selection in columns.selections.items()
+    }
+    episodes = [
+        (EpisodeEntry(index=i, length=300, tasks=(), file="f", start=0), quantities)
+        for i in range(3)
+    ]
+    selections = columns.selections
+    decisions, _ = units_from_episodes(
+        selections, episodes, 30.0, {}, {}, robot_type=robot_type
+    )
+    return columns, decisions
+
+
+def verdict(name):
+    """ "right", "asks" or what is wrong."""
+    robot_type, vectors, truth = DATASETS[name]
+    columns, decisions = decide(robot_type, vectors)
+    if doubts := [d.doubt for d in decisions.values() if d.doubt]:
+        return "asks", doubts
+    faults = []
+    for role in {"joint_position", "position", "gripper"} | truth.keys():
+        if role == "gripper" and role not in truth:
+            continue
+        decision = decisions.get(role)
+        if (decision is None) != (role not in truth):
+            faults.append(f"{role}: {decision}")
+        elif decision is not None:
+            width = len(columns.selections[role].columns)
+            units = [decision.unit_of(i) for i in range(width)]
+            expected = truth[role]
+            expected = [expected] * width if isinstance(expected, str) else expected
+            if units != expected:
+                faults.append(f"{role}: {units} for {expected}")
+    return ("wrong", faults) if faults else ("right", [])
+
+
+@pytest.mark.parametrize("name", [name for name, (_, _, truth) in DATASETS.items() if truth])
+def test_units_and_meaning_are_those_found_by_hand(name):
+    assert verdict(name) == ("right", [])
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, (_, _, truth) in DATASETS.items() if not truth]
+)
+def test_what_the_data_do_not_decide_is_asked(name):
+    assert verdict(name)[0] == "asks"
