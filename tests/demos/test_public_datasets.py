@@ -196,6 +196,66 @@ DATASETS = {
         {"state": Vector(LINGZU, OPEN_LOW, OPEN_HIGH)},
         {"joint_position": ["deg"] * 14 + ["1"] * 10 + ["byte"] * 10},
     ),
+    "abhinxx/saathi-robot": (
+        "so_follower",
+        {
+            STATE: Vector(
+                SO101,
+                [-19.08, -99.43, 38.42, -0.35, -12.04, 14.03],
+                [-17.14, -38.24, 96.53, 45.36, -7.91, 14.04],
+            ),
+            ACTION: Vector(
+                SO101,
+                [-19.08, -100.13, 35.52, -1.58, -12.04, 14.41],
+                [-16.88, -40.53, 96.97, 45.54, -7.82, 14.42],
+            ),
+        },
+        {"joint_position": "deg", "gripper": "%"},
+    ),
+    "chenfei-source/smolVLA-robot-manipulation": (
+        "piper",
+        {
+            STATE: Vector(
+                [f"joint_{i}.pos" for i in range(1, 7)] + ["gripper.pos"],
+                [-18.05, -100.0, -82.69, -2.53, 7.26, -65.13, 0.5],
+                [31.5, 77.87, 99.61, 5.71, 100.0, 95.86, 99.5],
+            )
+        },
+        {"joint_position": "%", "gripper": "%"},
+    ),
+    "NY-WaKeUp/MyI10Tele": (
+        "aubo_i10_inspire",
+        {
+            STATE: Vector(
+                ["state"],
+                [-1.27, -0.72, 0.67, -0.23, 1.57, 0.3, 0.0],
+                [-1.06, -0.49, 1.33, 0.24, 1.58, 0.51, 1.0],
+            )
+        },
+        {"joint_position": ["rad"] * 6 + ["1"]},
+    ),
+    "yash-joshi5379/IXN-Project-Team-Extensify": (
+        "mobile",
+        {
+            STATE: Vector(
+                [f"qpos_{i}" for i in range(8)],
+                [-0.08, -1.47, -2.06, 0.86, -1.61, 1.04, -3.11, 0.0],
+                [3.11, 0.95, 0.44, 2.73, 0.75, 2.49, -0.99, 1.0],
+            )
+        },
+        {"joint_position": ["rad"] * 7 + ["1"]},
+    ),
+    "keertimanney/reBot-DevArm": (
+        "seeed_b601_dm_follower",
+        {
+            STATE: Vector(
+                [*SO101[:4], "wrist_yaw.pos", *SO101[4:]],
+                [-35.51, -96.82, -32.29, -64.1, -4.84, -40.58, -20.38],
+                [36.97, -0.01, -2.81, 22.85, 14.02, 13.54, -9.19],
+            )
+        },
+        ASKS,
+    ),
     # Names measured, ranges as documented.
     "QianHuixun/New-Test": (
         "",
@@ -323,7 +383,7 @@ def decide(robot_type, vectors):
         }
     }
     columns = map_columns(read_features(info), Sidecar())
-    way = np.clip(1.1 * np.sin(np.linspace(0, 3, 300)), 0, 1)[:, None]
+    way = np.clip(1.2 * np.sin(np.linspace(0, 3, 300)) - 0.1, 0, 1)[:, None]
     values = {k: np.array(v.low) + way * np.subtract(v.high, v.low) for k, v in vectors.items()}
     for key, v in vectors.items():
         # Ranges of encoders and of hands end at whole numbers, since these count.

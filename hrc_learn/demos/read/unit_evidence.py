@@ -23,8 +23,8 @@ _MOTOR = re.compile(r"motor_?\d+", re.IGNORECASE)
 _SHORTEST_ARM, _POSE_AND_FINGERS = 5, 8
 """Joints of the smallest usual arms; columns of a pose with two fingers."""
 # LeRobot clips normalised positions at exactly 100.
-_CLIPPED = 0.002
-"""Fraction of the frames at exactly 100 from which a column counts as clipped."""
+_CLIP, _CLIPPED = 100.0, 0.002
+"""Value, and fraction of the frames at it from which a column counts as clipped."""
 # Reach of an arm on a fixed base: 5 m, and what 1.5 m are in cm; poses below 60 mm are rare.
 _REACH = (5.0, 60.0, 150.0)
 # One turn and some noise; two turns for an unwrapped vector.
@@ -53,13 +53,15 @@ class Sizes(NamedTuple):
     """True where all values are whole numbers."""
     unit_length: Bool[np.ndarray, " components"]
     """True where this component and the three after it have unit length, and move."""
+    opening: Bool[np.ndarray, " components"]
+    """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
 
     @classmethod
     def of_peaks(cls, peak: float | Sequence[float]) -> "Sizes":
         """Sizes of which only the peaks are known."""
         peaks = np.atleast_1d(np.asarray(peak, float))
         no = np.zeros(len(peaks), bool)
-        return cls(peaks, np.zeros(len(peaks)), no, no)
+        return cls(peaks, np.zeros(len(peaks)), no, no, no)
 
 
 class Guess(NamedTuple):
@@ -91,6 +93,7 @@ def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
         clipped=(sizes == 100.0).mean(0),
         whole=(known == np.rint(known)).all(0),
         unit_length=length,
+        opening=(known.min(0) == 0) & (known.max(0) == 1),
     )
 
 
@@ -101,6 +104,7 @@ def typical(sizes: Sequence[Sizes]) -> Sizes:
         clipped=np.mean([s.clipped for s in sizes], axis=0),
         whole=np.all([s.whole for s in sizes], axis=0),
         unit_length=np.all([s.unit_length for s in sizes], axis=0),
+        opening=np.all([s.opening for s in sizes], axis=0),
     )
 
 
@@ -170,7 +174,7 @@ def _degrees_or_range(
     """Degrees, or LeRobot's -100..100 of a joint's range."""
     reach = f"values usually reach {largest:.3g}"
     hobby = is_hobby_arm(robot_type, labels)
-    if largest > 100.5:
+    if largest > _CLIP + 0.05:
         return Guess("deg", 0.9 if hobby else 0.8, reach, "%")
     if (sizes.clipped[fitting] > _CLIPPED).any():
         share = 100 * float(sizes.clipped[fitting].max())

@@ -195,7 +195,9 @@ def decide_units(
             if isinstance(command, Sizes) and len(command.peak) == len(known.peak):
                 # Commands are clipped at exactly 100 where the motion stops before.
                 clipped = np.maximum(known.clipped, command.clipped)
-                known = known._replace(clipped=clipped)
+                near = (known.peak > 90) & (command.peak > 90)
+                peak = np.where(near, np.maximum(known.peak, command.peak), known.peak)
+                known = known._replace(clipped=clipped, peak=peak)
             decisions[role] = _guess(role, known, selection, robot_type, named)
         else:
             assumed = "" if selection is None else selection.assumed
@@ -289,6 +291,8 @@ def _guess_joint_units(
     hand = np.array([is_hand(label) for label in labels] or [False] * len(sizes.peak))
     if len(hand) != len(sizes.peak) or hand.all():
         hand = np.zeros(len(sizes.peak), bool)
+    # A gripper without a name of its own comes last.
+    hand[-1] |= sizes.opening[-1] and not sizes.opening.all()
     stated = np.array([bool(unit) for unit in named] or [False] * len(hand))
     if len(stated) != len(hand):
         stated = np.zeros(len(hand), bool)
