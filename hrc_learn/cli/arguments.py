@@ -617,19 +617,24 @@ class Run(WithImperfections, WithDriver, Written):
 
 @dataclass(frozen=True, kw_only=True)
 class Record(WithRobot, Written):
-    """Record demonstrations by a scripted expert in simulation.
+    """Record demonstrations by a scripted expert in simulation, or by a leader arm.
 
     Placing carries an object to a shelf, the elbow pulled past the cabinet's door. Servoing
     moves the marked end effector above an object, watched by an uncalibrated camera. Expert
-    records the columns of LeRobot's robots, for its policies.
+    records the columns of LeRobot's robots, for its policies. Leader leads a real arm of
+    LeRobot by one of its teleoperators, within the arm's limits:
+
+        hrc record leader --robot so101 --out demos --robot.type=so101_follower
+            --robot.port=/dev/ttyACM0 --teleop.type=so101_leader --teleop.port=/dev/ttyACM1
     """
 
-    demonstration: Literal["placing", "servoing", "expert"]
+    demonstration: Literal["placing", "servoing", "expert", "leader"]
     """Demonstrations to record."""
     out: Path
     """Folder of the new dataset."""
     episodes: int | None = None
-    """Number of demonstrations. Default: 3 of placing, 8 of servoing, 10 of the expert."""
+    """Number of demonstrations. Default: 3 of placing, 8 of servoing, 10 of the expert, 5 by
+    the leader."""
     seed: int | None = None
     """Seed of initial positions, tremor and image noise. Default: 0, of servoing 1."""
     shelf: Shelf = "middle"

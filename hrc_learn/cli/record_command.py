@@ -1,18 +1,28 @@
-"""`hrc record`: demonstrations by a scripted expert, in simulation."""
+"""`hrc record`: demonstrations by a scripted expert in simulation, or by a leader arm."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+import torch
 from rich.progress import Progress, track
 
-from hrc_learn.cli._run import configuration, with_settings, write_values
+from hrc_learn.cli._run import configuration, refuse_existing, with_settings, write_values
 from hrc_learn.cli.arguments import Record
+from hrc_learn.demos import DatasetWriter
+from hrc_learn.deploy import Rate
+from hrc_learn.experiments.real_arm import ArmSite, opened_arm
 from hrc_learn.experiments.simulated_cell import SIMULATED
-from hrc_learn.kinematics import ArmChoice
+from hrc_learn.hardware import ending_at_rest
+from hrc_learn.hardware.driver_process import StoppableArm
+from hrc_learn.hardware.lerobot_device import GRIPPER, LeaderArm
+from hrc_learn.kinematics import Arm, ArmChoice
 from hrc_learn.sim import PhysicsError, World, open_camera
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import (
     ANGLE_FEATURE,
@@ -30,7 +40,7 @@ from hrc_learn.teleoperation.scripted_demonstrations import (
     write_demonstrations,
 )
 
-_DEFAULTS = {"placing": (3, 0), "servoing": (8, 1), "expert": (10, 0)}
+_DEFAULTS = {"placing": (3, 0), "servoing": (8, 1), "expert": (10, 0), "leader": (5, 0)}
 """Number of episodes and seed by kind of demonstration."""
 
 
@@ -53,10 +63,11 @@ def record(args: Record) -> int:
         "placing": _record_placing,
         "servoing": _record_servoing,
         "expert": _record_expert,
+        "leader": _record_leader,
     }
     try:
         recorders[args.demonstration](args, episodes, seed)
-    except (TaskFailedError, PhysicsError, RuntimeError) as error:
+    except (TaskFailedError, PhysicsError, RuntimeError, ConnectionError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
     return 0
@@ -165,3 +176,93 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
             progress.update(task, completed=written)
     print(f"{episodes} demonstrations in {args.out} ({failed} discarded)")
     write_values(args.json, {"episodes": episodes, "discarded": failed})
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LeaderConfig:
+    """Settings of demonstrations by a leader arm."""
+
+    task: str = "follow the leader"
+    """Task in words."""
+    duration: float = 20.0
+    """Duration of a demonstration [s]; Ctrl-C ends the recording and keeps the saved ones."""
+    pause: float = 5.0
+    """Time before each demonstration, in which the arm follows already [s]."""
+    fps: int = 50
+    """Frames a second: the rate of the loop."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LeaderSettings:
+    demonstration: _LeaderConfig = field(default_factory=_LeaderConfig)
+    site: ArmSite = field(default_factory=ArmSite)
+
+
+def _record_leader(args: Record, episodes: int, seed: int) -> None:
+    """A real arm follows a leader; positions, commands and gripper of both are recorded."""
+    settings = with_settings(args.config, _LeaderSettings())
+    config = settings.demonstration
+    frames = round(config.duration * config.fps)
+    if frames < 2 or config.pause < 0:
+        raise ValueError("demonstration.duration must be positive, and pause not negative.")
+    refuse_existing(args.out, False)
+    site = replace(settings.site, driver="lerobot")
+    robot = ArmChoice(args.robot, tip=args.tip).arm()
+    names = robot.chain.joint_names
+    writer = DatasetWriter(
+        args.out,
+        fps=config.fps,
+        robot_type=str(site.device.get("type", robot.name)),
+        joint_names=names,
+        features={"action": (*(f"{name}.pos" for name in names), GRIPPER)},
+        frames={"base": f"{robot.name} base", "ee": f"{robot.name} tool centre point"},
+        details={"demonstrated by": "a leader arm", "recorded with": configuration(args)},
+    )
+    rate = Rate(1 / config.fps)
+    with (
+        writer,
+        closing(LeaderArm(site.leader, names)) as leader,
+        opened_arm(site, robot.chain) as arm,
+        ending_at_rest(arm.stop),
+    ):
+        follow = _follower(robot, arm, leader, site, 1 / config.fps)
+        for episode in range(episodes):
+            print(
+                f"demonstration {episode + 1} of {episodes} in {config.pause:g} s", flush=True
+            )
+            for _ in range(round(config.pause * config.fps)):
+                follow()
+                rate.wait()
+            print(f"recording for {config.duration:g} s", flush=True)
+            writer.start_episode(config.task)
+            for _ in range(frames):
+                writer.add_frame(**follow())
+                rate.wait()
+            writer.save_episode()
+    print(f"{episodes} demonstrations in {args.out}")
+    figures = {"episodes": episodes, "frames": episodes * frames, "missed_ticks": rate.missed}
+    write_values(args.json, figures)
+
+
+def _follower(
+    robot: Arm, arm: StoppableArm, leader: LeaderArm, site: ArmSite, dt: float
+) -> Callable[[], dict[str, Any]]:
+    """Function that takes one step after the leader within the limits; returns its frame."""
+    servo_config = PositionServoConfig(safety=site.cell_config().safety)
+    servo = PositionServo(robot.chain, arm, dt, servo_config)
+    opening = site.lerobot.opening
+
+    def follow() -> dict[str, Any]:
+        wanted, share = leader.read()
+        state, sent = servo.follow(wanted)
+        arm.move(share * opening)
+        tool = robot.forward(torch.from_numpy(state.joint_position))
+        return {
+            "joint_position": state.joint_position,
+            "gripper": state.gripper_width,
+            "position": tool.position.numpy(),
+            "orientation": tool.orientation.numpy(),
+            "action": np.append(sent, share * opening),
+        }
+
+    return follow

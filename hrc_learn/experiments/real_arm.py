@@ -69,6 +69,8 @@ class ArmSite:
     """Franka arm with its limits."""
     device: dict[str, Any] = field(default_factory=dict)
     """LeRobot's settings of the robot, which `--robot.NAME=VALUE` sets: type, port, id."""
+    leader: dict[str, Any] = field(default_factory=dict)
+    """LeRobot's settings of the teleoperator, which `--teleop.NAME=VALUE` sets."""
     lerobot: LeRobotConfig = field(default_factory=LeRobotConfig)
     """Settings of LeRobot's robot as our driver leads it."""
     camera_delay: float = 0.0

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.hardware.franky_arm import ArmFaultError
-from hrc_learn.hardware.lerobot_device import JointUnits, open_device
+from hrc_learn.hardware.lerobot_device import JointUnits, forget_late_replies, open_device
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
@@ -29,6 +29,8 @@ _SLOPE = 5
 at 50 Hz would be 0.08 rad/s."""
 _STATUS = 0.5
 """Time between two readings of the servos' status [s]."""
+_CONFIRMED, _LATE = 3, 0.005
+"""Readings that confirm an alarm, and the time before each for late replies to arrive [s]."""
 _ALARMS = ("voltage", "angle sensor", "temperature", "current", "", "overload")
 """Meaning of the bits of a Feetech servo's register "Status"."""
 
@@ -222,6 +224,7 @@ class LeRobotArm:
                     self._turn()
             except Exception as error:  # a lost reply: the silence counts
                 self._failure = _text(error)
+                forget_late_replies(self._robot)
 
     def _turn(self) -> None:
         """Read once, and send the next positions."""
@@ -245,7 +248,16 @@ class LeRobotArm:
 
     def _alarm(self) -> str:
         """Fault that a servo reports; empty without one."""
-        for motor, status in self.units.alarms(self._robot).items():
+        alarms = self.units.alarms(self._robot)
+        for _ in range(_CONFIRMED):
+            if not any(alarms.values()):
+                return ""
+            # The SDK may have taken a late reply to another question for this one's.
+            time.sleep(_LATE)
+            forget_late_replies(self._robot)
+            again = self.units.alarms(self._robot)
+            alarms = {motor: status & again[motor] for motor, status in alarms.items()}
+        for motor, status in alarms.items():
             if status:
                 bits = [word for i, word in enumerate(_ALARMS) if status >> i & 1 and word]
                 return (

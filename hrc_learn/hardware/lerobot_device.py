@@ -205,6 +205,45 @@ class JointUnits:
         return {}
 
 
+def forget_late_replies(device: Any) -> None:
+    """Discard what a serial bus has received: replies that came after their time."""
+    serial = getattr(getattr(getattr(device, "bus", None), "port_handler", None), "ser", None)
+    if serial is not None:
+        with suppress(Exception):  # a cable that was pulled
+            serial.reset_input_buffer()
+
+
+class LeaderArm:
+    """A teleoperator of LeRobot with the joints of an arm, such as the SO-101 leader."""
+
+    def __init__(self, settings: Mapping[str, Any], joint_names: Sequence[str]):
+        """Connect; a leader's own calibration gives its units.
+
+        Args:
+            settings: LeRobot's settings of the teleoperator: type, port, id and others.
+            joint_names: Joints of the arm that it leads.
+
+        Raises:
+            ValueError: There is no such type, or its joints are others.
+            ConnectionError: It cannot be reached, or is not calibrated.
+        """
+        self._device = open_device("teleop", settings)
+        self._units = JointUnits.of(self._device, joint_names)
+
+    def read(self) -> tuple[Float[np.ndarray, " joints"], float]:
+        """Joint positions [rad], and the fraction that the gripper's handle is open by.
+
+        Raises:
+            ConnectionError: The leader does not answer.
+        """
+        return self._units.observed(self._device.get_action())
+
+    def close(self) -> None:
+        """Disconnect."""
+        with suppress(Exception):  # a bus that has gone
+            self._device.disconnect()
+
+
 def _rad_per_unit(device: Any, key: str, unit: str) -> tuple[float, float]:
     """Radians in one unit of a joint's value, and half of its calibrated range [rad]."""
     if unit:

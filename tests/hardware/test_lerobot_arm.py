@@ -19,6 +19,8 @@ from hrc_learn.kinematics.registry import arm as named_arm
 pytest.importorskip("lerobot")
 pytest.importorskip("scservo_sdk")
 
+pytestmark = pytest.mark.realtime
+
 STEP = 2 * math.pi / 4095
 """One step of the encoder, as LeRobot counts a turn [rad]."""
 
