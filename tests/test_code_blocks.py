@@ -3,18 +3,22 @@
 import functools
 import importlib
 import importlib.util
+import json
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from commands import hrc
 from lerobot_folders import joint_path, write_folder
 from unchecked import shapes_unchecked
 from urdf_text import to_urdf
 
 from hrc_learn.dmp import PoseDMP
 from hrc_learn.kinematics import panda
+from hrc_learn.kinematics.registry import arm_of_robot
 from hrc_learn.teleoperation import dashboard_page
 
 ROOT = Path(__file__).parents[1]
@@ -103,6 +107,53 @@ def test_a_page_can_be_pasted_from_top_to_bottom(page):
     code = compile(pasted(page), str(page), "exec")
     with shapes_unchecked():
         exec(code, {"__name__": "__main__"})
+
+
+def so101_dataset(root: Path) -> None:
+    """What `lerobot-record` leaves of an SO-101 in degrees, without its images."""
+    joints = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+    names = [f"{name}.pos" for name in (*joints, "gripper")]
+    episodes = []
+    for seed in range(4):
+        moved = np.array([-20.0, -40, 40, 30, 0]) + 25 * joint_path(90, 5, seed)
+        state = np.column_stack([moved, np.where(np.arange(90) < 50, 70.0, 10.0)])
+        episodes.append({"observation.state": state, "action": np.roll(state, -2, axis=0)})
+        episodes[-1]["action"][-2:] = state[-1]
+    write_folder(root, episodes, {"observation.state": names, "action": names}, fps=30)
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps(info | {"robot_type": "so101_follower"}))
+    statistics = {}
+    for key in episodes[0]:
+        values = np.concatenate([episode[key] for episode in episodes])
+        statistics[key] = {
+            name: getattr(values, name)(axis=0).tolist()
+            for name in ("min", "max", "mean", "std")
+        } | {"count": [len(values)]}
+    (root / "meta/stats.json").write_text(json.dumps(statistics))
+
+
+SHELL_PAGES = {"so101.md": ("so101_pick", so101_dataset)}
+"""Pages whose commands are run in turn, with the name of the dataset that they begin with."""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("reader")
+@pytest.mark.parametrize("name", SHELL_PAGES)
+def test_the_commands_of_a_page_run_in_turn(name):
+    """Word for word. Targets may be missed: the dataset is small."""
+    if arm_of_robot("so101") is None:
+        pytest.skip("example-robot-data is not installed")
+    folder, make = SHELL_PAGES[name]
+    make(Path(folder))
+    page = (ROOT / "docs/howto" / name).read_text("utf-8")
+    (block,) = (m["body"] for m in BLOCK.finditer(page) if m["language"] == "sh")
+    for line in block.splitlines():
+        program, *words = shlex.split(line, comments=True)
+        assert program == "hrc"
+        ended = hrc(*words)
+        assert ended.status == 0, f"{line}: {ended.error or ended.output}"
+        if "--out" in words:
+            assert Path(words[words.index("--out") + 1]).exists(), line
 
 
 def test_few_blocks_are_not_run():
