@@ -107,7 +107,7 @@ class GraspingScene:
         # A generator of its own: the scenes are the same with any imperfections.
         drawn = sizes.draw(rng.spawn(1)[0], workplace.robot.joints)
         yaw = max(_ALONG_EDGES, sizes.object_yaw)
-        pose = workplace.random_object_pose(_OBJECT_REACH, rng, yaw)
+        pose = workplace.random_object_pose(workplace.scaled(_OBJECT_REACH), rng, yaw)
         camera_model = _draw_camera(workplace, config, rng)
         workplace = replace(workplace, scene=replace(scene, camera=camera_model))
         item = scene.objects[0]
@@ -236,7 +236,8 @@ def _starts(
     while True:
         q = rng.uniform(lower, upper)
         tool = workplace.robot.chain.forward(torch.from_numpy(q)).position
-        if tool[2] > _START_HEIGHT and (tool - hover).norm() > START_DISTANCE:
+        size = workplace.robot.hand_size
+        if tool[2] > size * _START_HEIGHT and (tool - hover).norm() > size * START_DISTANCE:
             yield q
 
 

@@ -126,7 +126,9 @@ def place(
             cell.joints, measured_goal, space=space, dt=cell.config.dt, speed=speed
         )
         lowering = workplace.lowering(item.half_size)
-        release_time = place_along(cell, plan, measured_goal, lowering)
+        release_time = place_along(
+            cell, plan, measured_goal, lowering, workplace.robot.hand_size
+        )
     contacts = unwanted_contacts(world, cell.log, {item.name: release_time})
     return SimulatedPlacing(
         goal=goal,

@@ -200,7 +200,8 @@ def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: f
         cell.follow_path(home.path)
         plan = skill.plan(cell.joints, goal, space="pose", dt=cell.config.dt, speed=speed)
         check(plan)
-        place_along(cell, plan, goal, workplace.lowering(item.half_size))
+        lowering, size = workplace.lowering(item.half_size), workplace.robot.hand_size
+        place_along(cell, plan, goal, lowering, size)
         return ""
 
     return task

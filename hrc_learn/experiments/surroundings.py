@@ -112,7 +112,8 @@ def workplace_for(shelves: Sequence[str], robot: Arm) -> Workplace:
             f"{len(shelves)} shelves are named, but there are 1 to {len(THREE_OBJECTS)} "
             "objects, each with a shelf of its own."
         )
-    return with_objects(Workplace.of(robot), THREE_OBJECTS[: len(shelves)])
+    items = [item.scaled(robot.hand_size) for item in THREE_OBJECTS[: len(shelves)]]
+    return with_objects(Workplace.of(robot), items)
 
 
 def check_shelves(workplace: Workplace, shelves: Sequence[str]) -> None:
@@ -146,11 +147,12 @@ def draw_object_poses(
         ValueError: If the objects do not fit.
     """
     items = world.config.objects
-    reach = OBJECT_REACH[:2] if len(items) == 1 else OBJECTS_REACH
+    size = workplace.robot.hand_size
+    reach = size * np.array(OBJECT_REACH[:2] if len(items) == 1 else OBJECTS_REACH)
     for _ in range(_ARRANGEMENTS):
         positions = workplace.table_centre + rng.uniform(-1, 1, (len(items), 2)) * reach
         gaps = np.linalg.norm(positions[:, None] - positions, axis=-1)
-        if (gaps + np.eye(len(items)) >= _APART).all():
+        if (gaps + np.eye(len(items)) >= size * _APART).all():
             return {
                 item.name: pose_on_table(
                     position, rng.uniform(-yaw, yaw), world.table_top + item.half_size[2]
@@ -170,7 +172,7 @@ def points_to_see(workplace: Workplace, world: World) -> Float[np.ndarray, "poin
         workplace: Workplace of the world.
         world: World with the true place of the marker on the gripper.
     """
-    reach = np.array([*OBJECTS_REACH, 0.0])
+    reach = workplace.robot.hand_size * np.array([*OBJECTS_REACH, 0.0])
     corners = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)])
     hover, offset = workplace.hover(), torch.from_numpy(world.hand_marker_offset())
     turns = torch.linspace(*workplace.hover_turns, 7, dtype=torch.float64)

@@ -116,6 +116,7 @@ class Arm(SerialChain):
         description: File of the description; None for arms written in this package.
         base: Link of the file that is the base.
         tip: Link of the file that is the flange.
+        hand_size: Size of the hand and of what it handles, relative to the Franka hand.
     """
 
     def __init__(
@@ -130,6 +131,7 @@ class Arm(SerialChain):
         description: Path | None = None,
         base: str | None = None,
         tip: str | None = None,
+        hand_size: float = 1.0,
     ):
         """Add a shape and inverse kinematics to a chain.
 
@@ -143,6 +145,7 @@ class Arm(SerialChain):
             description: File that the arm was read from.
             base: Link of the file that is the base.
             tip: Link of the file that is the flange.
+            hand_size: Size of the hand on the flange relative to the Franka hand.
         """
         super().__init__(
             joint_names=chain.joint_names,
@@ -156,6 +159,7 @@ class Arm(SerialChain):
         self.name = name
         self.description, self.base, self.tip = description, base, tip
         self.shape = shape or ArmShape()
+        self.hand_size = hand_size
         self._capsules, self._overlapping = capsules, tuple(overlapping)
         self._closed_form = closed_form
 
@@ -409,8 +413,11 @@ class Arm(SerialChain):
         found = solutions_from(self, pose, torch.cat([wish, starts], dim=-2))
         return unwound(self, found, wish)
 
-    def with_hand(self) -> Arm:
-        """The same arm with the Franka hand on its flange, whose z axis points away from it.
+    def with_hand(self, size: float = 1.0) -> Arm:
+        """The same arm with the Franka hand on its flange, along the approach of its own tool.
+
+        Args:
+            size: Size of the hand relative to the Franka hand.
 
         Raises:
             ValueError: The arm has too few joints for a full pose of its tool.
@@ -422,8 +429,9 @@ class Arm(SerialChain):
                 "the tool, for which it takes six. With fewer it can servo by position and "
                 "axis (docs/concepts/controller.md)."
             )
-        tcp = torch.eye(4, dtype=torch.float64)
-        tcp[2, 3] = TCP_OFFSET
+        # Along the arm's own direction of approach, which need not be the flange's z axis.
+        tcp = self.tcp.clone()
+        tcp[:3, 3] = size * TCP_OFFSET * tcp[:3, 2]
         links = tuple(capsule for capsule in self.whole.capsules if capsule.link <= n)
         return Arm(
             name=self.name,
@@ -431,22 +439,29 @@ class Arm(SerialChain):
             shape=ArmShape(
                 meshes=self.meshes, masses=(*self.masses[:-1], None), shapes=self.shape.shapes
             ),
-            capsules=(*links, *hand_capsules(n + 2)),
+            capsules=(*links, *hand_capsules(n + 2, size)),
             overlapping=(*self.whole.overlapping, (n - 1, n + 2), (n, n + 2)),
             description=self.description,
             base=self.base,
             tip=self.tip,
+            hand_size=size,
         )
 
 
-def hand_capsules(link: int) -> tuple[LinkCapsule, ...]:
+def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:
     """Capsules of the Franka hand and its fingers, mounted on the frame of the tool.
 
     Args:
         link: Number of that frame.
+        size: Size relative to the Franka hand.
     """
+
+    def scaled(point: tuple[float, float, float]) -> tuple[float, float, float]:
+        x, y, z = point
+        return size * x, size * y, size * z
+
     return tuple(
-        LinkCapsule(link=link, start=start, end=end, radius=radius)
+        LinkCapsule(link=link, start=scaled(start), end=scaled(end), radius=size * radius)
         for start, end, radius in _HAND
     )
 

@@ -289,4 +289,6 @@ class ArmChoice:
 @cache
 def _equipped(choice: ArmChoice) -> Arm:
     found = choice.arm()
-    return found if found.is_franka else found.with_hand()
+    if found.is_franka:
+        return found
+    return found.with_hand(_sources().get(choice.name, {}).get("hand_size", 1.0))

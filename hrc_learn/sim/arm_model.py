@@ -139,12 +139,17 @@ class ArmModelConfig:
         if self.robot.name in _SERVOS:
             stiffness, damping = _SERVOS[self.robot.name]
             return stiffness[joint], damping[joint]
-        stiffness = _STIFFNESS * float(self.robot.limits.torque[joint])
+        stiffness = _STIFFNESS * self.torque(joint)
         return stiffness, _DAMPING * stiffness
+
+    def torque(self, joint: int) -> float:
+        """Largest torque of a joint [N m]; 50 where the description states none."""
+        torque = float(self.robot.limits.torque[joint])
+        return torque if math.isfinite(torque) else 50.0
 
     def armature(self, joint: int) -> float:
         """Inertia of the motor and its gear, at the joint [kg m^2]."""
-        torque = float(self.robot.limits.torque[joint])
+        torque = self.torque(joint)
         # Small motors have lighter rotors; those of 50 N m and more are taken for the Panda's.
         return 0.1 * min(1.0, torque / 50.0) if self.robot.name not in _SERVOS else 0.1
 
@@ -221,7 +226,7 @@ def whole_arm(config: ArmModelConfig) -> CapsuleArm:
     across = half / _STRIPS
     radius = float(np.hypot(across, _THICKNESS))
     # Transform from the gripper's frame, at the flange, to that of the tool.
-    centre = np.array(plate.position) - [0.0, 0.0, float(robot.tcp[2, 3])]
+    centre = np.array(plate.position) - [0.0, 0.0, float(robot.tcp[:3, 3].norm())]
     capsules = []
     for k in range(_STRIPS):
         x = -half + (2 * k + 1) * across
@@ -269,7 +274,7 @@ def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: ArmModelCon
         range=(float(limits.lower[i]), float(limits.upper[i])),
         armature=config.armature(i),
     )
-    torque = float(limits.torque[i])
+    torque = config.torque(i)
     # Position and velocity servo together follow a moving reference without lag, as the
     # arm's own velocity interface does.
     position = _add_servo(spec, f"{name}_position", name, torque)
@@ -288,34 +293,48 @@ def _add_servo(spec: mujoco.MjSpec, name: str, joint: str, strongest: float):
 
 
 def _add_hand(spec: mujoco.MjSpec, hand, config: ArmModelConfig) -> None:
-    add_box(hand, _HAND, (0.03, 0.1, 0.033), _GREY, pos=(0, 0, 0.033), mass=0.73)
+    size = config.robot.hand_size
+
+    def scaled(*lengths: float) -> tuple[float, ...]:
+        return tuple(size * length for length in lengths)
+
+    add_box(
+        hand,
+        _HAND,
+        scaled(0.03, 0.1, 0.033),
+        _GREY,
+        pos=scaled(0.0, 0.0, 0.033),
+        mass=0.73 * size**3,
+    )
     if config.marker is not None:
         add_plate(spec, hand, "hand_marker", config.marker)
     for name, side in (("finger_left", 1.0), ("finger_right", -1.0)):
-        finger = hand.add_body(name=name, pos=(0, 0, 0.0584))
+        finger = hand.add_body(name=name, pos=scaled(0.0, 0.0, 0.0584))
         finger.gravcomp = 1.0
         finger.add_joint(
             name=name,
             type=mujoco.mjtJoint.mjJNT_SLIDE,
             axis=(0, side, 0),
-            range=(0, FINGER_STROKE),
+            range=(0, size * FINGER_STROKE),
             armature=0.1,
             damping=5.0,
         )
-        place = (0, side * 0.012, 0.018)
-        add_box(finger, name, (0.009, 0.008, 0.016), _GREY, pos=place, mass=0.01)
+        place = scaled(0.0, side * 0.012, 0.018)
+        add_box(finger, name, scaled(0.009, 0.008, 0.016), _GREY, pos=place, mass=0.01)
         add_box(
             finger,
             f"{name}_pad",
-            (0.010, 0.004, 0.012),
+            scaled(0.010, 0.004, 0.012),
             (0.1, 0.1, 0.1, 1.0),
-            pos=(0, side * 0.004, 0.045),
+            pos=scaled(0.0, side * 0.004, 0.045),
             mass=0.005,
             # Torsional friction keeps a held box from turning about the pads' axis.
-            friction=(1.5, 0.02, 0.001),
+            friction=(1.5, 0.02 * size, 0.001 * size),
             **FIRM,
         )
-        _add_servo(spec, name, name, config.grip_force).set_to_position(kp=2000.0, kv=60.0)
+        _add_servo(spec, name, name, size * config.grip_force).set_to_position(
+            kp=2000.0, kv=60.0
+        )
     # One motor drives both fingers of the real hand.
     coupling = spec.add_equality(name="fingers", name1="finger_left", name2="finger_right")
     coupling.type = mujoco.mjtEq.mjEQ_JOINT
@@ -400,7 +419,9 @@ class MujocoArm:
 
     def move(self, width: float) -> None:
         """Open or close the gripper to a width [m]; 0 squeezes what is between the fingers."""
-        self._data.ctrl[self._finger_servos] = np.clip(width / 2, 0.0, FINGER_STROKE)
+        self._data.ctrl[self._finger_servos] = np.clip(
+            width / 2, 0.0, self.robot.hand_size * FINGER_STROKE
+        )
 
     def place(self, joint_position: Float[np.ndarray, " joints"], gripper_width: float) -> None:
         """Set the joints at once, at rest. For resets, not for control."""

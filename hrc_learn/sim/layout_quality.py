@@ -36,16 +36,17 @@ _DURATION = 14.0  # which the way to a shelf takes [s]
 
 
 def clearance_quality(
-    clearances: Clearances, q: Float[Tensor, "*batch joints"]
+    clearances: Clearances, q: Float[Tensor, "*batch joints"], size: float = 1.0
 ) -> Float[Tensor, "*batch"]:
     """Margin to furniture and to the arm itself; 0: contact, 1 and more: ample.
 
     Args:
         clearances: Clearances of the arm.
         q: Joint positions [rad].
+        size: Size of the hand relative to the Franka hand.
     """
     furniture, itself = clearances(q)
-    return torch.minimum(furniture / _CLEAR, itself / _APART)
+    return torch.minimum(furniture / _CLEAR, itself / _APART) / size
 
 
 def _quality(
@@ -57,8 +58,8 @@ def _quality(
     """Quality from 0 (pose not reached, or contact) to 1 (ample margins)."""
     margin = torch.minimum(q - robot.limits.lower, robot.limits.upper - q).amin(-1)
     smallest = torch.linalg.svdvals(robot.jacobian(q))[..., -1]
-    clear = clearance_quality(clearances, q)
-    ratios = torch.stack([margin / _MARGIN, smallest / _SINGULAR, clear])
+    clear = clearance_quality(clearances, q, robot.hand_size)
+    ratios = torch.stack([margin / _MARGIN, smallest / (_SINGULAR * robot.hand_size), clear])
     return torch.where(error < _LOST, ratios.amin(0).clamp(0.0, 1.0), 0.0)
 
 

@@ -5,7 +5,7 @@ right (-y) the cabinet, whose open door obstructs a careless elbow.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import mujoco
@@ -112,6 +112,16 @@ class ObjectConfig:
     marker: Marker = field(default_factory=lambda: Marker(11, 0.030))
     colour: tuple[float, float, float, float] = (0.16, 0.44, 0.70, 1.0)
 
+    def scaled(self, size: float) -> "ObjectConfig":
+        """The same object of the same density at another size, its marker included."""
+        a, b, c = self.half_size
+        return replace(
+            self,
+            half_size=(size * a, size * b, size * c),
+            mass=size**3 * self.mass,
+            marker=replace(self.marker, size=size * self.marker.size),
+        )
+
 
 _TABLE = Box(
     name="table",
@@ -131,13 +141,13 @@ def overhead_camera() -> CameraModel:
     )
 
 
-def marked_plate() -> Plate:
-    """The plate on the hand, by which the camera finds it."""
+def marked_plate(size: float = 1.0) -> Plate:
+    """The plate on the hand, by which the camera finds it; `size` is that of the hand."""
     # It sticks out sideways, clear of the forearm as seen from above, and is mounted off the
     # middle: it is as wide as objects are, and must not be the first to meet a board.
     return Plate(
-        marker=Marker(HAND_MARKER, 0.048),
-        position=(-0.008, 0.145, 0.02),
+        marker=Marker(HAND_MARKER, 0.048 * size),
+        position=(-0.008 * size, 0.145 * size, 0.02 * size),
         orientation=(0.0, 1.0, 0.0, 0.0),
     )
 

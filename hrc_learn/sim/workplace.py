@@ -43,6 +43,7 @@ _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 # Distances of table and cabinet from the base, relative to the usual ones, and where the
 # cabinet stands besides: further along the base's x axis, and higher [m].
 _SCALES = (1.0, 0.85, 0.7, 0.55)
+# All lengths below are those of a cell for the Franka hand; a smaller hand makes them smaller.
 # Distance from the middle of the table to reach in view of the camera [m]: with a margin to
 # spare, then no further than objects are put.
 _REACHES = (0.14, 0.1)
@@ -231,6 +232,11 @@ class Workplace:
         position = np.array(self.table_centre) + rng.uniform(-1, 1, 2) * reach[:2]
         return pose_on_table(position, turn, self.scene.objects[0].half_size[2])
 
+    def scaled(self, lengths: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Lengths meant for the Franka hand, at the size of this hand [m]."""
+        x, y, z = (self.robot.hand_size * length for length in lengths)
+        return x, y, z
+
     def shelf_names(self) -> tuple[str, ...]:
         """Names of the shelves, from bottom to top."""
         shelves = self.scene.cabinet.shelves
@@ -272,7 +278,8 @@ class Workplace:
         Args:
             half_size: Half size of the object, which lies on its side [m].
         """
-        return max(half_size[1] + self.clearance - _HAND_HALF - _OVER_BOARD, 0.0)
+        spare = (_HAND_HALF + _OVER_BOARD) * self.robot.hand_size
+        return max(half_size[1] + self.clearance - spare, 0.0)
 
     def shelf_front(self, name: str) -> Pose:
         """End effector in front of a shelf, at the height of the release."""
@@ -344,7 +351,7 @@ def _candidates(robot: Arm) -> Iterator[tuple[list[Workplace], _Above]]:
     for reach in _REACHES:
         for scale in _SCALES:
             places = [
-                replace(place, table_reach=(reach, reach))
+                replace(place, table_reach=(robot.hand_size * reach,) * 2)
                 for place in _workplaces(robot, scale)
             ]
             above = _above_table(places[0])
@@ -376,21 +383,26 @@ def _placed(
 ) -> Workplace:
     """The usual workplace with other distances."""
     place, cabinet, table = Workplace(), usual.cabinet, usual.table
+    size = usual.arm.robot.hand_size
+    scale, along, higher, depth = (size * x for x in (scale, along, higher, depth))
     level_at = scale * place.level_at
     left = scale * cabinet.left + along
+    home_x, home_y, home_z = place.home_position
     moved = replace(
         cabinet,
         left=left,
-        right=left + cabinet.right - cabinet.left,
+        right=left + size * (cabinet.right - cabinet.left),
+        depth=size * cabinet.depth,
         front=depth - level_at,
         shelves={name: scale * z + higher for name, z in cabinet.shelves.items()},
-        top=cabinet.top + higher,
+        top=size * cabinet.top + higher,
         # The door tests null-space motion of the elbow, which six joints do not have.
         door_reach=scale * cabinet.door_reach * (usual.arm.robot.null_space != "none"),
     )
     (x, y, z), (a, b, c) = table.centre, table.half_size
     pose = usual.camera.pose.copy()
     pose[:2, 3] *= scale
+    pose[2, 3] *= size
     scene = replace(
         usual,
         cabinet=moved,
@@ -398,13 +410,18 @@ def _placed(
             table, centre=(scale * x, scale * y, z), half_size=(scale * a, scale * b, c)
         ),
         camera=replace(usual.camera, pose=pose),
+        objects=tuple(item.scaled(size) for item in usual.objects),
     )
-    home_x, home_y, home_z = place.home_position
     return Workplace(
         scene=scene,
         home_position=(scale * home_x + along, home_y, scale * home_z + max(higher, 0.0)),
         table_centre=(scale * place.table_centre[0], scale * place.table_centre[1]),
         shelf_x=scale * place.shelf_x + along,
+        hover_height=size * place.hover_height,
+        fingertip=size * place.fingertip,
+        palm=size * place.palm,
+        clearance=size * place.clearance,
+        approach=size * place.approach,
         shelf_depth=depth,
         level_at=level_at,
     )
@@ -424,7 +441,7 @@ def _above_table(workplace: Workplace) -> _Above:
                 robot,
                 workplace.arm_clearances,
                 scene.camera,
-                marked_plate(),
+                marked_plate(robot.hand_size),
                 workplace.hover(),
                 workplace.table_reach,
                 hover,
@@ -455,7 +472,7 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
         nearest = sorted(above, key=lambda pair: float((pair[0] - home).abs().max()))
         for hover, marked in nearest if quality > 0 else ():
             between = torch.lerp(home, hover, torch.linspace(0, 1, 25).double()[:, None])
-            clear = float(clearance_quality(clearances, between).min())
+            clear = float(clearance_quality(clearances, between, robot.hand_size).min())
             layout = CellLayout(
                 workplace=replace(
                     workplace,
@@ -477,6 +494,6 @@ def _path_to_shelf(workplace: Workplace, name: str) -> Float[Tensor, "points 3"]
     it [m].
     """
     goal, front = workplace.shelf(name).position, workplace.shelf_front(name).position
-    lift = _vector(0.0, 0.0, _LIFT)
+    lift = _vector(0.0, 0.0, workplace.robot.hand_size * _LIFT)
     inside = goal + _INSIDE * (front - goal) + lift
     return torch.stack([workplace.home().position, front + lift, inside, goal])

@@ -78,7 +78,7 @@ class GraspingConfig:
     detection_timeout: float = 5.0
     """Give up after an object is undetected for this long [s]."""
     lift: float = 0.20
-    """Height by which an object is lifted [m]."""
+    """Height by which an object is lifted [m]; lower in proportion for a smaller hand."""
     attempts: int = 3
     """Largest number of grasps."""
 
@@ -141,6 +141,7 @@ class Grasping:
         """
         self._cell = cell
         self._workplace = workplace
+        self._size = workplace.robot.hand_size
         if skill.target is None:
             raise ValueError(
                 f"the skill has no visual target: its demonstrations lack {OBJECT_FEATURE}."
@@ -148,7 +149,7 @@ class Grasping:
         self._visual = skill.target
         self._config = config = config or GraspingConfig()
         self._check = check
-        self._table = _TableHeight()
+        self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
         controller = AdaptiveController(
             cell.chain,
             camera_estimator(skill.jacobian),
@@ -240,7 +241,9 @@ class Grasping:
         postures, home = self._workplace.hover_postures(), self._workplace.home_joints()
         for posture in postures:
             here = self._cell.joints
-            if self._free(here, posture, _PLATE_CLEARANCE) and self._free(posture, home):
+            if self._free(here, posture, self._size * _PLATE_CLEARANCE) and self._free(
+                posture, home
+            ):
                 return posture
         self.go_home()
         return postures[0]
@@ -269,7 +272,7 @@ class Grasping:
         table = self._workplace.robot.whole.box_distance(
             posture, *self._workplace.object_region()
         )
-        if float(table) < _PLATE_CLEARANCE:
+        if float(table) < self._size * _PLATE_CLEARANCE:
             return "too close to objects on the table"
         try:
             self._check(joint_plan(self._cell, here, posture))
@@ -291,7 +294,7 @@ class Grasping:
         move_fingers(self._cell, CLOSED, CLOSING_TIME)
         if not holds(self._cell, item):
             # The contact may not have been with the table.
-            self._table = _TableHeight()
+            self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Check that {item.name!r} is under its "
                 "marker."
@@ -310,7 +313,9 @@ class Grasping:
         self._cell.move_straight(self._at_height(expected + margin), speed=DESCENT_SPEED)
         met = self._cell.move_until_contact(self._at_height(expected - margin))
         if met is not None:
-            self._table = _TableHeight(float(met.position[2]) - reach, _OBJECT_RANGE)
+            self._table = _TableHeight(
+                float(met.position[2]) - reach, self._size * _OBJECT_RANGE
+            )
 
     def _at_height(self, height: float) -> Pose:
         """Pose of the end effector after moving along its own axis to a height [m]."""
@@ -323,7 +328,7 @@ class Grasping:
     def lift(self) -> None:
         """Lift the end effector straight up."""
         self._cell.begin_phase("lift")
-        self._cell.move_straight(raised(self._cell.pose, self._config.lift))
+        self._cell.move_straight(raised(self._cell.pose, self._size * self._config.lift))
 
     def go_home(self) -> None:
         """Move the joints home, via another posture if the straight path is blocked.
@@ -335,7 +340,7 @@ class Grasping:
         here, home = self._cell.joints, self._workplace.home_joints()
         postures = self._workplace.hover_postures()
         # With clearance if any path has it, else without.
-        for clearance in (_PLATE_CLEARANCE, None):
+        for clearance in (self._size * _PLATE_CLEARANCE, None):
             if self._free(here, home, clearance):
                 break
             reachable = (

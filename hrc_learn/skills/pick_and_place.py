@@ -155,7 +155,9 @@ class PickAndPlaceConfig:
     """Duration of each wait [s]."""
 
 
-def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> float:
+def place_along(
+    cell: WorkCell, plan: Plan, goal: Pose, lowering: float, size: float = 1.0
+) -> float:
     """Carry the grasped object along a plan, put it down and retreat.
 
     Args:
@@ -163,6 +165,7 @@ def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> floa
         plan: Plan to the goal.
         goal: Pose of the end effector where it starts to put down, in the arm's readings.
         lowering: Distance to go down without a contact [m].
+        size: Size of the hand relative to the Franka hand, to which the retreat is scaled.
 
     Returns:
         Time at which it started to put down [s].
@@ -175,7 +178,7 @@ def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> floa
     begun = cell.time
     _put_down(cell, goal, lowering)
     cell.begin_phase(Phase.RETREAT)
-    clear = goal.apply(goal.position.new_tensor([0.0, 0.0, -_CLEARANCE]))
+    clear = goal.apply(goal.position.new_tensor([0.0, 0.0, -size * _CLEARANCE]))
     cell.move_straight(Pose(clear, goal.orientation), speed=_RETREAT_SPEED)
     return begun
 
@@ -434,7 +437,9 @@ class PickAndPlace:
         plan = joint_plan(self._cell, self._cell.joints, self._workplace.hover_joints())
         self._check(plan)
         self._cell.follow_path(plan.path)
-        self._cell.move_straight(raised(job.picked_up, self._config.grasping.lift))
+        self._cell.move_straight(
+            raised(job.picked_up, self._workplace.robot.hand_size * self._config.grasping.lift)
+        )
         self._cell.move_straight(job.picked_up, speed=DESCENT_SPEED)
         self._grasping.start_over()
         return Phase.OVER

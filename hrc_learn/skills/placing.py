@@ -308,7 +308,8 @@ def plan_candidates(
         return skill.plan(start, goal, space=space, dt=dt, speed=speed)
 
     yield CandidatePlan("as learned", learned(start))
-    up = goal.position.new_tensor([0.0, 0.0, _RAISED])
+    size = workplace.robot.hand_size
+    up = goal.position.new_tensor([0.0, 0.0, size * _RAISED])
     with suppress(UnreachableError):
         raised = Pose(goal.position + up, goal.orientation)
         yield CandidatePlan("a little higher", learned(start, raised))
@@ -323,7 +324,12 @@ def _via_postures(workplace: Workplace) -> Iterator[tuple[str, Float[Tensor, " j
     """Reachable joint positions near home, with their names."""
     for name, offset in _VIA_POINTS.items():
         with suppress(UnreachableError):
-            yield name, workplace.home_joints(torch.tensor(offset, dtype=torch.float64))
+            yield (
+                name,
+                workplace.home_joints(
+                    workplace.robot.hand_size * torch.tensor(offset, dtype=torch.float64)
+                ),
+            )
     if workplace.robot.null_space != "arm angle":
         return
     for name, change in _ARM_ANGLES.items():

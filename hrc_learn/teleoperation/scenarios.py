@@ -78,14 +78,15 @@ class Grasping:
 
     def begin(self, world: World, rng: np.random.Generator) -> Human:
         item = self.workplace.scene.objects[0]
-        pose = self.workplace.random_object_pose(_REACH, rng)
+        pose = self.workplace.random_object_pose(self.workplace.scaled(_REACH), rng)
         # On the table as it is, of an object as tall as it is.
         pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
         hover = self.workplace.hover()
         joints = self.workplace.robot.inverse(hover, near=self.workplace.hover_joints())
         world.reset(joints.numpy(), {item.name: pose})
         grasp = pose[:3, 3]
-        above, lifted = (grasp + np.array([0.0, 0.0, h]) for h in (0.08, _HEIGHT))
+        size = self.workplace.robot.hand_size
+        above, lifted = (grasp + np.array([0.0, 0.0, size * h]) for h in (0.08, _HEIGHT))
 
         def lead(points: list[np.ndarray], duration: float, start: float) -> ScriptedExpert:
             return ScriptedExpert(
@@ -105,7 +106,9 @@ class Grasping:
     def succeeded(self, world: World) -> bool:
         item = self.workplace.scene.objects[0]
         bottom = world.object_pose(item.name)[2, 3] - max(item.half_size)
-        return world.holds(item.name) and bool(bottom > 0.5 * _HEIGHT)
+        return world.holds(item.name) and bool(
+            bottom > 0.5 * self.workplace.robot.hand_size * _HEIGHT
+        )
 
 
 Scenario = Placing | Grasping

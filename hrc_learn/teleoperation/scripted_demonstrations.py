@@ -169,9 +169,10 @@ def servo_expert(
     the orientation of the approach.
     """
     middle = workplace.hover().position.numpy()
-    spread = rng.uniform(-1, 1, (config.points, 3)) * config.reach
+    size = workplace.robot.hand_size
+    spread = rng.uniform(-1, 1, (config.points, 3)) * workplace.scaled(config.reach)
     spread[:, 2] = np.abs(spread[:, 2])
-    higher = above + np.array([0.0, 0.0, config.descent])
+    higher = above + np.array([0.0, 0.0, size * config.descent])
     path = GuidedPath(np.vstack([middle + spread, higher, above]), config.duration)
     # Three incommensurate rotations, each about once in 5 s, excite all directions.
     rates, phases = rng.uniform(0.8, 1.6, 3), rng.uniform(0, 2 * np.pi, 3)
@@ -219,7 +220,7 @@ def demonstrate_servoing(
     """
     item, home = workplace.scene.objects[0], workplace.home_joints().numpy()
     for _ in range(_DRAWS):
-        pose = workplace.random_object_pose(config.reach, rng, config.yaw)
+        pose = workplace.random_object_pose(workplace.scaled(config.reach), rng, config.yaw)
         world.reset(home, {item.name: pose})
         target = sensor.corners().get(item.marker.id)
         if target is not None:
@@ -306,9 +307,11 @@ def placing_expert(
     """
     goal, front = workplace.shelf(shelf).position, workplace.shelf_front(shelf).position
     # The gripper is not quite level yet at the edge: what it carries hangs a little lower.
-    lifted = torch.tensor([0.0, 0.0, config.lift], dtype=torch.float64)
+    size = workplace.robot.hand_size
+    lifted = torch.tensor([0.0, 0.0, size * config.lift], dtype=torch.float64)
     inside = goal + 0.3 * (front - goal)
-    start = workplace.home().position + config.spread * torch.from_numpy(rng.standard_normal(3))
+    spread = size * config.spread
+    start = workplace.home().position + spread * torch.from_numpy(rng.standard_normal(3))
     waypoints = torch.stack([start, front + lifted, inside + lifted, goal]).numpy()
     # Whose elbow is where it has to be, once the hand is, cannot be pulled aside.
     pulled = config.pull_elbow and workplace.robot.null_space == "arm angle"

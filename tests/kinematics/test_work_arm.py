@@ -1,4 +1,5 @@
 import math
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ from bare_arm import bare
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import ArmChoice, JointLimits, UnreachableError, panda
+from hrc_learn.kinematics import arm as registered
 from hrc_learn.kinematics.inverse import follow_poses, solutions_from
 
 
@@ -235,3 +237,13 @@ def test_a_path_out_of_reach_is_not_followed():
     q, error = follow_poses(chain, path, chain.ready)
     assert error[0] < 1e-6 < 0.5 < error[-1]
     assert chain.limits.contain(q).all()
+
+
+@pytest.mark.skipif(find_spec("gym_aloha") is None, reason="gym-aloha is not installed")
+def test_a_hand_of_the_cell_points_where_the_arm_approaches():
+    # The ViperX's description approaches along its gripper's x axis, not along z.
+    described, held = registered("viperx"), ArmChoice("viperx").work_arm()
+    approach, pointed = described.tcp[:3, 2], held.tcp[:3, 3]
+    torch.testing.assert_close(pointed / pointed.norm(), approach, rtol=0, atol=1e-12)
+    assert held.hand_size == pytest.approx(0.7)
+    assert float(pointed.norm()) == pytest.approx(0.7 * float(panda.tcp[:3, 3].norm()))
