@@ -585,7 +585,6 @@ def test_a_video_beside_a_table_is_a_camera_at_its_own_rate(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.simulation
 @pytest.mark.parametrize(
     ("name", "write", "options"),
     [
