@@ -306,10 +306,12 @@ def _describe_extra(part: ComponentContract, discrete: float) -> ComponentContra
     """Complete the contract of a component that no quantity uses."""
     if part.low == part.high:
         return replace(part, role="constant", evidence="never changes")
+    is_command = part.key.startswith("action") and is_hand(part.name)
     if discrete > 0.5:
-        is_command = part.key.startswith("action") and is_hand(part.name)
         role = "gripper command" if is_command else "flag"
         return replace(part, role=role, evidence="switches between few levels")
+    if is_command:
+        return replace(part, role="gripper command", evidence="named as a gripper")
     return replace(part, confidence=0.5, evidence="the name says nothing")
 
 
