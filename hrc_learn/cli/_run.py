@@ -91,6 +91,9 @@ def status_of(work: Callable[[], int]) -> int:
         if not _output_closed():
             raise
         return 1
+    except ConnectionError as error:  # a device that cannot be reached
+        print(f"failed: {one_line(error)}", file=sys.stderr)
+        return 1
     except OSError as error:
         if error.filename is None and error.errno not in DISK_ERRORS:
             raise

@@ -8,7 +8,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -33,7 +33,7 @@ from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
 from hrc_learn.experiments.real_arm import ArmSite, opened_arm
 from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.hardware import ending_at_rest
+from hrc_learn.hardware import DriverError, ending_at_rest
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
@@ -83,7 +83,11 @@ def _access(
 
 @contextmanager
 def _real_arm(site: ArmSite, world: World, chain: SerialChain) -> Iterator[OpenedArm]:
-    with opened_arm(site, chain) as arm:
+    with ExitStack() as stack:
+        try:
+            arm = stack.enter_context(opened_arm(site, chain))
+        except DriverError as error:
+            raise ConnectionError(str(error)) from error
         world.follow(arm.read())
         yield OpenedArm(arm=arm, gripper=arm, advance=lambda _time: world.follow(arm.read()))
 
