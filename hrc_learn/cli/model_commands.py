@@ -219,10 +219,10 @@ def smooth(args: Smooth) -> None:
     if args.urdf is None and args.calibration is None:
         ends = zip(panda.limits.lower.tolist(), panda.limits.upper.tolist(), strict=True)
         limits = limits.within(dict(zip(ArmValues(panda).joints, ends, strict=True)))
+    if args.checkpoint is not None:
+        add_smoothing(args.checkpoint, limits, args.dataset)
     if args.limits is not None:
         limits.save(args.limits)
-    if args.checkpoint is not None:
-        add_smoothing(args.checkpoint, limits)
     values = asdict(limits)
     table = Table("value", "velocity [1/s]", "acceleration [1/s^2]", "jerk [1/s^3]")
     kinds = ("velocity", "acceleration", "jerk")

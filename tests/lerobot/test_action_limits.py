@@ -196,6 +196,13 @@ def test_what_is_known_is_put_together(tmp_path):
     assert limits.jerk == plain.jerk
 
 
+def test_the_calibration_of_another_robot_is_refused(tmp_path):
+    dataset = write(tmp_path / "set", paths())
+    (tmp_path / "me.json").write_text(json.dumps(dict.fromkeys(("a", "z"), CALIBRATION["a"])))
+    with pytest.raises(ValueError, match=r"has z\.pos in place of b\.pos, c\.pos"):
+        gathered_limits(dataset, calibration=tmp_path / "me.json")
+
+
 @pytest.mark.parametrize(
     ("read", "content", "message"),
     [

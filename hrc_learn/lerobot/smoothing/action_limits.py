@@ -204,6 +204,13 @@ def gathered_limits(
     if calibration is not None:
         ranges = calibrated_ranges(calibration, degrees=degrees)
         _require_names(limits, set(ranges), calibration)
+        missing = [n for n in limits.names if n.endswith(".pos") and n not in ranges]
+        others = [n for n in ranges if n not in limits.names]
+        if missing and others:
+            raise ValueError(
+                f"{calibration} has {', '.join(others)} in place of {', '.join(missing)}: "
+                "it is the calibration of another robot"
+            )
         limits = limits.within(ranges)
     return limits
 

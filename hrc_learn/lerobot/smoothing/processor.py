@@ -22,7 +22,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from .action_limits import ActionLimits, MotionState, read_json, write_json
+from .action_limits import ACTION, ActionLimits, MotionState, read_json, write_json
 
 WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
 PREPROCESSOR = "policy_preprocessor.json"
@@ -32,6 +32,10 @@ _JUMP = 5.0
 """A robot that moves this many times faster than its limit was put there: an episode began."""
 _SAME = 1e-6
 """Changes below this are rounding."""
+_CLOSE = 1e-3
+"""Relative difference of statistics of the same actions: float32, and quantised episodes."""
+_FAR = 5.0
+"""Deviations between means, and ratio of deviations, of actions of another robot."""
 
 _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
@@ -271,7 +275,7 @@ for _name, _step in ((WATCH, WatchStateStep), (SMOOTH, SmoothActionsStep)):
         ProcessorStepRegistry.register(_name)(_step)
 
 
-def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
+def add_smoothing(checkpoint: Path, limits: ActionLimits, dataset: Path | None = None) -> None:
     """Add smoothing of the actions to a trained policy's checkpoint.
 
     Steps from an earlier call are replaced. Weights and all other steps stay as they are.
@@ -279,11 +283,16 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
     Args:
         checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
         limits: Limits of its actions.
+        dataset: Dataset that the limits are from; its actions are compared with those that the
+            policy was trained on.
 
     Raises:
         FileNotFoundError: The folder holds no processors.
-        ValueError: They cannot be read.
+        ValueError: They cannot be read, or the limits are not those of the policy's actions.
     """
+    _require_width(checkpoint, limits)
+    if dataset is not None:
+        _require_same_actions(checkpoint, dataset, limits.names)
     before, after = (read_pipeline(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
     watch = {"registry_name": WATCH, "config": {}}
     smooth = {"registry_name": SMOOTH, "config": asdict(limits)}
@@ -292,6 +301,66 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
     # Without the one that watches, the other still works: so it comes first.
     write_json(checkpoint / PREPROCESSOR, before)
     write_json(checkpoint / POSTPROCESSOR, after)
+
+
+def _require_width(checkpoint: Path, limits: ActionLimits) -> None:
+    path = checkpoint / "config.json"
+    config = read_json(path) if path.is_file() else {}
+    feature = (config.get("output_features") or {}).get(ACTION) or {}
+    width = (feature.get("shape") or [None])[0]
+    if width not in (None, len(limits.names)):
+        raise ValueError(
+            f"the policy of {checkpoint} has {width} values in an action, but the limits are "
+            f"those of {', '.join(limits.names)}: give the dataset that it was trained on"
+        )
+
+
+def _require_same_actions(checkpoint: Path, dataset: Path, names: list[str]) -> None:
+    """Compare the statistics of actions that both keep.
+
+    Raises:
+        ValueError: The dataset has them in another order, or far from those of the policy.
+    """
+    trained, path = _trained_statistics(checkpoint), dataset / "meta" / "stats.json"
+    shown = (read_json(path) if path.is_file() else {}).get(ACTION) or {}
+    if not {"mean", "std"} <= shown.keys() or trained.shape != (2, len(names)):
+        return
+    found = np.array([shown["mean"], shown["std"]], dtype=np.float64).reshape(2, -1)
+    if found.shape != trained.shape or np.allclose(found, trained, rtol=_CLOSE, atol=_SAME):
+        return
+    pairs = np.isclose(found[:, :, None], trained[:, None, :], rtol=_CLOSE, atol=_SAME)
+    alike = pairs[0] & pairs[1]
+    places = alike.argmax(1)
+    if alike.any(1).all() and len({*places.tolist()}) == len(names):
+        order = ", ".join(names[i] for i in np.argsort(places))
+        raise ValueError(
+            f"the policy of {checkpoint} has its actions in another order than {dataset}: "
+            f"{order}, not {', '.join(names)}; give the dataset that it was trained on"
+        )
+    (mean, std), trained_std = found, trained[1]
+    wide = np.maximum(std, trained_std)
+    ratio = np.abs(np.log(np.maximum(std, _SAME) / np.maximum(trained_std, _SAME)))
+    far = (np.abs(mean - trained[0]) > _FAR * wide) | (ratio > np.log(_FAR))
+    if far.any():
+        i = int(far.argmax())
+        raise ValueError(
+            f"{names[i]} of {dataset} is {mean[i]:.3g} +- {std[i]:.3g}, but the policy of "
+            f"{checkpoint} was trained on {trained[0, i]:.3g} +- {trained_std[i]:.3g}: that is "
+            f"another robot, unit or order; give the dataset that it was trained on"
+        )
+
+
+def _trained_statistics(checkpoint: Path) -> np.ndarray:
+    """Mean and deviation of the actions that the policy was trained on; empty if not kept."""
+    from safetensors.numpy import load_file
+
+    for step in read_pipeline(checkpoint / POSTPROCESSOR)["steps"]:
+        file = checkpoint / str(step.get("state_file"))
+        if step.get("state_file") and file.is_file():
+            kept = load_file(file)
+            if {f"{ACTION}.mean", f"{ACTION}.std"} <= kept.keys():
+                return np.stack([kept[f"{ACTION}.{n}"].astype(float) for n in ("mean", "std")])
+    return np.empty(0)
 
 
 def remove_smoothing(checkpoint: Path) -> None:
