@@ -35,6 +35,9 @@ _CORNERS = 16
 # Steps towards the smallest circle around points (Badoiu and Clarkson 2003).
 _CIRCLE_STEPS = 32
 _SEED, _POSTURES = 0, 2000
+# Radius of links of unknown shape [m], at most this part of the length of the arm. Chosen: that
+# of a large arm's forearm.
+_BARE_RADIUS, _BARE_FRACTION = 0.045, 0.06
 # Pairs of links that come no nearer in any sampled posture are left out [m].
 _FAR = 0.1
 # Fractions of postures in which capsules overlap: always; and more often than tells anything,
@@ -55,8 +58,8 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
 
     Args:
         chain: The arm.
-        shapes: Number of a link's frame, and a shape there. Without any shape, each link gets a
-            capsule from its own frame to the next.
+        shapes: Number of a link's frame, and a shape there. A link without any gets a capsule
+            from its own frame to the next.
     """
     hulls: dict[int, list[Hull]] = defaultdict(list)
     capsules: list[LinkCapsule] = []
@@ -74,12 +77,16 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape]]) -> Capsule
                 hulls[link].append(hull)
     for link, parts in hulls.items():
         capsules += [link_capsule(link, *fitted) for fitted in fit_link(parts)]
-    if not capsules:
-        steps = [*chain.mounts, chain.flange, chain.tcp]
-        capsules = [
-            link_capsule(link, np.zeros(3), step[:3, 3].numpy(), 0.045)
-            for link, step in enumerate(steps)
-        ]
+    steps = [step[:3, 3].numpy() for step in (*chain.mounts, chain.flange, chain.tcp)]
+    lengths = [float(np.linalg.norm(step)) for step in steps]
+    radius = min(_BARE_RADIUS, _BARE_FRACTION * sum(lengths))
+    shown = {capsule.link for capsule in capsules}
+    capsules += [
+        link_capsule(link, np.zeros(3), step, radius)
+        for link, (step, length) in enumerate(zip(steps, lengths, strict=True))
+        # A step shorter than that is inside its neighbours.
+        if link not in shown and (length > radius or not shown)
+    ]
     return CapsuleArm(chain, capsules, _left_out(chain, capsules))
 
 

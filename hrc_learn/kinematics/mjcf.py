@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,16 @@ from hrc_learn.kinematics.description import (
     transform,
 )
 
+_NO_MASS = 1e-9
+"""Mass of bodies without any [kg]."""
+
 
 def read_mjcf(path: Path) -> Description:
     """Read a file.
 
     A body is a link, a site a link fixed to its body. Several joints of one body become links
-    in a row, named after the body and the joint.
+    in a row, named after the body and the joint. A warning names the first mesh that is
+    missing; links do without.
 
     Raises:
         ValueError: The file is not MJCF.
@@ -39,8 +44,39 @@ def read_mjcf(path: Path) -> Description:
     try:
         model: Any = mujoco.MjModel.from_xml_path(str(path))  # pyright: ignore
     except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
+        model = _model_without_missing_meshes(path, mujoco)
+        if model is None:
+            raise ValueError(f"{path}: {' '.join(str(error).split())}") from None
     return _Reader(path, model, mujoco).description()
+
+
+def _model_without_missing_meshes(path: Path, mujoco: Any) -> Any | None:
+    """The model without meshes whose files are missing, named in a warning; None if it has
+    another fault.
+    """
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        folder = path.parent / spec.meshdir
+        missing = [
+            mesh for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()
+        ]
+        names, files = {mesh.name for mesh in missing}, [mesh.file for mesh in missing]
+        for geom in [g for g in spec.geoms if g.meshname and g.meshname in names]:
+            spec.delete(geom)
+        for mesh in missing:
+            spec.delete(mesh)
+        # Bodies whose mass was that of their meshes; `_NO_MASS` tells them apart.
+        spec.compiler.boundmass = spec.compiler.boundinertia = _NO_MASS
+        model = spec.compile()
+    except ValueError:
+        return None
+    if files:
+        warnings.warn(
+            f"{path}: {len(files)} meshes are missing, such as {files[0]}: their links are "
+            "taken for capsules",
+            stacklevel=4,
+        )
+    return model if files else None
 
 
 class _Reader:
@@ -89,7 +125,7 @@ class _Reader:
         mass = float(model.body_mass[i])
         return Link(
             name=self._name(i),
-            mass=mass if mass > 0 else None,
+            mass=mass if mass > _NO_MASS else None,
             visuals=tuple(drawn),
             collisions=tuple(collisions),
         )

@@ -53,7 +53,7 @@ def read_urdf(path: Path) -> Description:
     if reader.missing:
         warnings.warn(
             f"{path}: {len(reader.missing)} meshes are missing, such as {reader.missing[0]}: "
-            "their links have no shape (ROS_PACKAGE_PATH names folders of packages)",
+            "their links are taken for capsules (ROS_PACKAGE_PATH names folders of packages)",
             stacklevel=2,
         )
     return Description(path, links, joints)

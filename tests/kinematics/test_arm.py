@@ -310,7 +310,8 @@ def test_round_shapes_are_their_own_capsules(kind, half):
     pose[:3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]  # z along x of the link
     pose[:3, 3] = (0.1, 0.2, 0.3)
     shape = Shape(pose=pose, kind=kind, size=(0.02, half))
-    (capsule,) = fit_body(panda, [(3, shape)]).capsules
+    # Links without shapes have capsules of their own.
+    (capsule,) = (c for c in fit_body(panda, [(3, shape)]).capsules if c.link == 3)
     assert (capsule.link, capsule.radius) == (3, 0.02)
     np.testing.assert_allclose(capsule.start, (0.1 - half, 0.2, 0.3), atol=1e-12)
     np.testing.assert_allclose(capsule.end, (0.1 + half, 0.2, 0.3), atol=1e-12)

@@ -112,3 +112,31 @@ def test_the_fingers_of_a_panda_part_by_the_width_of_the_gripper():
     left, right = arm_bodies(panda, panda.ready.numpy()[None], np.array([0.5]))[-2:]
     assert (left.name, right.name) == ("finger_left", "finger_right")
     assert np.linalg.norm(left.position - right.position) == pytest.approx(0.04)
+
+
+def test_an_mjcf_without_its_meshes_is_an_arm_of_capsules(tmp_path):
+    """MuJoCo itself refuses it; the geoms that need no mesh stay, others become capsules."""
+    pytest.importorskip("mujoco")
+    path = tmp_path / "heron.xml"
+    path.write_text(
+        '<mujoco><compiler meshdir="assets"/><asset><mesh name="one" file="one.obj"/>'
+        '<mesh file="two.obj"/></asset><worldbody><body name="base">'
+        '<geom type="mesh" mesh="one"/><body name="l1" pos="0 0 0.2">'
+        '<joint name="j1" axis="0 0 1" range="-90 90"/><geom type="mesh" mesh="two"/>'
+        '<body name="l2" pos="0 0 0.3"><joint name="j2" axis="0 1 0" range="-90 90"/>'
+        '<inertial pos="0 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>'
+        '<geom type="capsule" size="0.04 0.1" pos="0 0 0.1"/>'
+        '<site name="tcp" pos="0 0 0.3"/></body></body></body></worldbody></mujoco>'
+    )
+    with pytest.warns(UserWarning, match="2 meshes are missing, such as one.obj"):
+        found = arm(path)
+    assert (found.joint_names, found.tip) == (("j1", "j2"), "tcp")
+    assert found.shape.masses[:3] == (None, None, 2.0)
+    np.testing.assert_allclose(found.forward([0.0, 0.0]).position, [0, 0, 0.8], atol=1e-12)
+    radii = {capsule.link: capsule.radius for capsule in found.whole.capsules}
+    assert radii == {0: 0.045, 1: 0.045, 2: pytest.approx(0.04)}
+    assert {body.name for body in arm_bodies(found, np.zeros((1, 2)))} == {
+        "link0",
+        "link1",
+        "link2",
+    }
