@@ -318,6 +318,8 @@ def _with_units(
             doubt = f"{role} in m or mm? It moves to {largest:.4g}: say --units {role} mm, or m"
         if doubt is not None:
             doubt = doubt.partition(", or leave columns")[0]  # an option of other commands
+            if role == "joint_position" and "gripper" not in selections:
+                doubt = "; ".join([doubt, *_gripper_among(first, selections[role])])
             fields = ", ".join(dict.fromkeys(n for n, _ in selections[role].columns))
             raise first.error(f"the unit is doubtful: {doubt}", fields)
         if decision.converts:
