@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -61,7 +62,10 @@ def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
         robot: The arm.
         body: link0, link1, ..., hand, finger_left or finger_right.
     """
-    if robot.is_franka or body in ("hand", "finger_left", "finger_right"):
+    if body in ("hand", "finger_left", "finger_right"):
+        size = (robot.hand_size,) * 3
+        return tuple(replace(mesh, scale=size) for mesh in panda_meshes(body))
+    if robot.is_franka:
         return panda_meshes(body)
     return tuple(robot.meshes.get(body, ()))
 

@@ -9,6 +9,7 @@ from bare_arm import bare
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import ArmChoice, JointLimits, UnreachableError, panda
 from hrc_learn.kinematics import arm as registered
+from hrc_learn.kinematics.drawing import arm_meshes
 from hrc_learn.kinematics.inverse import follow_poses, solutions_from
 
 
@@ -247,3 +248,11 @@ def test_a_hand_of_the_cell_points_where_the_arm_approaches():
     torch.testing.assert_close(pointed / pointed.norm(), approach, rtol=0, atol=1e-12)
     assert held.hand_size == pytest.approx(0.7)
     assert float(pointed.norm()) == pytest.approx(0.7 * float(panda.tcp[:3, 3].norm()))
+
+
+@pytest.mark.skipif(find_spec("gym_aloha") is None, reason="gym-aloha is not installed")
+def test_a_small_hand_is_drawn_small():
+    # A hand drawn at full size hid its own marker from the camera.
+    meshes = arm_meshes(ArmChoice("viperx").work_arm(), "hand")
+    assert all(mesh.scale == pytest.approx((0.7, 0.7, 0.7)) for mesh in meshes)
+    assert all(mesh.scale == (1.0, 1.0, 1.0) for mesh in arm_meshes(panda, "hand"))
