@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.interpolate import PchipInterpolator
 
 from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.kinematics import SerialChain, coarse_orientation
@@ -162,6 +161,8 @@ class GuidedPath:
                 "a guided path needs at least two different way points, no two the same in a "
                 f"row, and a positive duration; got {len(waypoints)} in {duration} s."
             )
+        from scipy.interpolate import PchipInterpolator  # a quarter of a second
+
         length = np.concatenate([[0.0], np.cumsum(chords)])
         # Monotone between way points: a hand that overshoots would hit the boards.
         self._curve = PchipInterpolator(length / length[-1], waypoints)
