@@ -15,7 +15,7 @@ from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
-from hrc_learn.demos.read.naming import is_hand
+from hrc_learn.demos.read.naming import is_hand, role_of_key
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.unit_evidence import (
     CONFIDENT,
@@ -297,7 +297,13 @@ def _guess_joint_units(
     if len(stated) != len(hand):
         stated = np.zeros(len(hand), bool)
     guess = guess_joints(sizes, ~hand & ~stated, labels, robot_type)
-    guess = doubt_meaning(guess, sizes, labels, selection is not None and selection.numbered)
+    # The key of a whole feature may tell its content, such as `qpos`.
+    unnamed = (
+        selection is not None
+        and selection.numbered
+        and role_of_key(selection.columns[0][0]) is None
+    )
+    guess = doubt_meaning(guess, sizes, labels, unnamed)
     fingers = guess_fingers(sizes, hand, labels, guess.unit, is_hobby_arm(robot_type, labels))
     units = tuple(
         named[i] if stated[i] else fingers[i] if hand[i] else guess.unit
