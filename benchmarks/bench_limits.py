@@ -256,7 +256,8 @@ def _exported(package: Path, observation: WantedVelocity) -> _Filter:
         runner.observation["joint_position"][:] = q.numpy()
         runner.observation["joint_velocity"][:] = u.numpy()
         runner.observation["dt"][...] = dt
-        return torch.from_numpy(runner.step()).double(), int((excess > 0).sum())
+        # A copy: the next step writes to the same memory.
+        return torch.from_numpy(runner.step().copy()).double(), int((excess > 0).sum())
 
     return send
 
