@@ -1,7 +1,8 @@
 """Units and meaning of published LeRobot datasets, decided by hand and by the reader.
 
-Names, shapes and robot types are those of the datasets' `meta/info.json`. Ranges marked as
-measured are those of their `meta/stats.json`; the others follow the datasets' documentation.
+Ranges marked as measured are those of the datasets' `meta/stats.json`, with the names of their
+`meta/info.json`. Names and ranges of the others follow the conventions of their kind, and were
+not compared with the files. The rules were adjusted on these sets: they are no held-out sample.
 """
 
 from collections.abc import Sequence
