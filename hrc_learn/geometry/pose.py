@@ -32,7 +32,7 @@ class Pose:
         # NumPy arrays and lists become tensors; placeholders of tracers pass unchanged.
         for name in ("position", "orientation"):
             value = getattr(self, name)
-            if isinstance(value, np.ndarray | list | tuple):
+            if isinstance(value, (np.ndarray, list, tuple)):  # which torch 2.15 traces
                 object.__setattr__(self, name, as_tensor(value))
 
     @staticmethod
