@@ -325,7 +325,7 @@ ROWS = {
     "docs_words": ("words in docs/", "{:,.0f}"),
 }
 TABLE = re.compile(r"(<!-- house:begin -->\n).*?(<!-- house:end -->)", re.DOTALL)
-RAISE = re.compile(r"^\| \+(\d+) lines(?:, (\d+) modules)? \| .+? \|$", re.MULTILINE)
+RAISE = re.compile(r"^\| \+(\d+) lines(?:, (\d+) modules?)? \| .+? \|$", re.MULTILINE)
 
 
 def docs_words(root: Path) -> int:
