@@ -31,7 +31,8 @@ PROGRAM_PATH = re.compile(rf"(?<![\w/.])(?:{'|'.join(FOLDERS)})/[\w./-]*\w")
 MAKE_TARGET = re.compile(r"\bmake ([a-z][\w-]*)")
 COMMAND = re.compile(r"\b((?:datasets|training|control|benchmarks)/\w+\.py)([^\n|;&]*)")
 HRC = re.compile(r"\bhrc ([a-z-][^\n|;&`]*)")
-OPTION = re.compile(r"(?<!\S)--([a-z][\w-]*)")
+OPTION = re.compile(r"(?<!\S)--(?!(?:robot|teleop)\.)([a-z][\w-]*)")
+"""Option of a command; those of LeRobot's robots and leader arms are handed on."""
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
