@@ -86,15 +86,6 @@ class ColumnMapping:
     unmatched: dict[str, str]
     """Role -> note, for quantities of other joints than `joint_names`."""
 
-    def reads_like(self, other: "ColumnMapping") -> bool:
-        """True if both mappings read the same numbers under the same names."""
-
-        def content(mapping: ColumnMapping) -> tuple:
-            columns = {role: s.columns for role, s in mapping.selections.items()}
-            return columns, mapping.joint_names, {*mapping.extra}
-
-        return content(self) == content(other)
-
 
 def map_columns(
     features: Mapping[str, Feature],
