@@ -2,9 +2,9 @@
 way saves, compared with arms that stop and wait.
 
 Another worker comes in each run, puts something on the table, reaches for markers under the arm
-and walks away. The arms keep the protective distance of ISO/TS 15066 from what a tracker sees,
-and their null space makes way or not; others stop and wait while the worker is nearer than a
-fixed distance. The exit status is 1 if an arm that keeps the distance violated it.
+and walks away. The arms keep the protective distance of ISO 10218-2:2025 from what a tracker
+sees, and their null space makes way or not; others stop and wait while the worker is nearer
+than a fixed distance. The exit status is 1 if an arm that keeps the distance violated it.
 """
 
 from __future__ import annotations

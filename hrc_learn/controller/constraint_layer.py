@@ -236,8 +236,8 @@ class ConstraintConfig:
 class SeparationConfig:
     """Speed and separation monitoring: the speed allowed near a person.
 
-    The fields are the terms of the protective separation distance (ISO/TS 15066:2016,
-    5.5.4.2.3).
+    The fields are the terms of the protective separation distance (ISO 10218-2:2025, Annex L;
+    before it ISO/TS 15066:2016, 5.5.4.2.3).
     """
 
     human_speed: float = 1.6

@@ -28,7 +28,7 @@ LOOK_AHEAD = 0.15
 # an error of 0.5 mm.
 _BENDING, _METRES_PER_RADIAN = 0.2, 0.1
 _DIFFERENCE_STEP = 1e-4  # [s]
-# Highest speed of the elbow under guidance [m/s]: the reduced speed of ISO 10218-1:2011, 3.23.
+# Highest speed of the elbow under guidance [m/s]: the reduced speed of ISO 10218-1:2025.
 # Fraction of a cap on speed that a guided elbow may use: the speed barrier follows it without
 # lag, as its bound allows for braking and delay (0.15 m/s of 0.25 m/s on a Panda).
 _GUIDED_SPEED, _GUIDED_FRACTION = 0.25, 0.6

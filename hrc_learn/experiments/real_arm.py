@@ -54,7 +54,7 @@ _DELAY = 0.03
 _SERVO_DELAY = 0.08
 """The same delay of position servos on a bus that is read at 50 Hz [s], not measured."""
 _REDUCED_SPEED = 0.25
-"""Speed of the tool near people [m/s] (ISO 10218-1, reduced speed)."""
+"""Speed of the tool near people [m/s] (ISO 10218-1:2025, reduced speed)."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -101,7 +101,7 @@ def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -
                 "The worker",
                 "A worker comes to the table, puts something down, reaches for markers under "
                 "the arm and leaves, without regard to the robot. The robot sees the worker "
-                "late and with noise, keeps the protective distance of ISO/TS 15066 and waits "
+                "late and with noise, keeps the protective distance of ISO 10218-2 and waits "
                 "if necessary. The expert drags joint 4 forward and back twice to make space.",
                 (
                     "worker",

@@ -39,7 +39,7 @@ class FrankaPandaConfig(FrankyConfig, ArmRobotConfig):
     ip: str
     """Address of the control box."""
     tcp_speed: float = 0.25
-    """Cap on the speed of the tool centre point [m/s] (ISO 10218: reduced speed)."""
+    """Cap on the speed of the tool centre point [m/s] (ISO 10218-1:2025: reduced speed)."""
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     """Cameras of LeRobot, by name."""
 

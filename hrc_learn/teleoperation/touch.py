@@ -61,7 +61,7 @@ class TouchConfig:
     """[s]"""
     collision_force: float = 110.0
     """Force that stops the arm however slowly it came [N]: the smallest quasi-static limit of
-    ISO/TS 15066, table A.2, but for face and head."""
+    ISO 10218-2:2025, Annex M (ISO/TS 15066:2016, table A.2), but for face and head."""
     torque_deviation: float = 0.3
     """Standard deviation of what no bias explains of each joint's torque [N m]."""
     smoothing: float = 0.03

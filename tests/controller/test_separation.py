@@ -1,4 +1,4 @@
-"""Speed and separation monitoring after ISO/TS 15066."""
+"""Speed and separation monitoring after ISO 10218-2:2025, Annex L."""
 
 import math
 
