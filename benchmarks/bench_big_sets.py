@@ -147,7 +147,7 @@ def _run(command: str, dataset: Set) -> Used:
         "show": [root, "--out", dataset.folder / "shown.rrd"],
         "curate": [root, "--no-browser"],
         "repair": ["--dataset", root, "--out", out],
-        "recover": [out],
+        "recover": ["--dataset", out],
     }[command]
     if command == "recover":
         killed = Process(target=write, args=(out, dataset.episodes, dataset.frames, True))
@@ -155,7 +155,8 @@ def _run(command: str, dataset: Set) -> Used:
         killed.join()
     if command == "evaluate" and not model.exists():
         _run("fit", dataset)
-    line = [sys.executable, "-m", "hrc_learn.cli", command, *map(str, words)]
+    name = "repair" if command == "recover" else command
+    line = [sys.executable, "-m", "hrc_learn.cli", name, *map(str, words)]
     process = subprocess.Popen(line, stdout=subprocess.DEVNULL)
     _, status, used = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)

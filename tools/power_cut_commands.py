@@ -69,15 +69,15 @@ CASES = {
     "show": Case("{inputs}/placing_demos --out demos.rrd --json j.json"),
     "check": Case("{inputs}/placing_demos --out out --json j.json"),
     "repair": Case("{inputs}/placing_demos --out out --json j.json"),
-    "recover": Case(
-        ". --json j.json", copies=("set.recording", ".fit.writing"), datasets=("set",)
-    ),
-    "extract": Case(
-        "marked --marker 7 --json j.json", copies=("marked",), grows=("marked.features",)
+    "repair .": Case(
+        "--json j.json", copies=("set.recording", ".fit.writing"), datasets=("set",)
     ),
     "push": Case("{inputs}/placing_demos me/set --dry-run --json j.json"),
     "fit": Case("--dataset {inputs}/placing_demos --out out --json j.json"),
     "fit image-jacobian": Case("--dataset {inputs}/aiming_demos --out out --json j.json"),
+    "fit image-jacobian marked": Case(
+        "--marker 7 --out out --json j.json", copies=("marked",), grows=("marked.features",)
+    ),
     "evaluate": Case("{inputs}/placing {inputs}/placing_demos --out out --json j.json"),
     "play": Case("{inputs}/placing --goal 0.5 0 0.4 --robot panda --out out --json j.json"),
     "smooth": Case(
@@ -453,7 +453,7 @@ def make_inputs(inputs: Path) -> None:
 
 
 def _record_marker(root: Path) -> None:
-    """A dataset with videos in which a marker moves."""
+    """A dataset with videos in which a marker on the gripper moves."""
     import cv2
     import numpy as np
 
@@ -461,13 +461,16 @@ def _record_marker(root: Path) -> None:
 
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     marker = cv2.aruco.generateImageMarker(dictionary, 7, 60)
-    with DatasetWriter(root, 50, "any", ["a"], cameras={"front": (160, 240)}) as writer:
-        for _ in range(3):
+    with DatasetWriter(root, 50, "any", cameras={"front": (480, 640)}) as writer:
+        for episode in range(3):
             writer.start_episode("look")
-            for k in range(10):
-                image = np.full((160, 240, 3), 255, np.uint8)
-                image[40:100, 50 + 4 * k : 110 + 4 * k] = marker[..., None]
-                writer.add_frame(joint_position=[0.01 * k], images={"front": image})
+            for phase in np.linspace(0, 3, 30) + episode:
+                x, y, z = 0.1 * np.sin([phase, 1.7 * phase + 1, 0.9 * phase]) - [0, 0, 0.7]
+                u, v = round(320 + 500 * y / z), round(240 + 500 * x / z)
+                image = np.full((480, 640, 3), 255, np.uint8)
+                image[v - 30 : v + 30, u - 30 : u + 30] = marker[..., None]
+                pose = {"position": [x, y, z], "orientation": [0.0, 1.0, 0.0, 0.0]}
+                writer.add_frame(**pose, images={"front": image})
             writer.save_episode()
 
 

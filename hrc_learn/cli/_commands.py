@@ -49,8 +49,6 @@ COMMANDS: dict[str, Command] = {
     "repair": Command("dataset_commands.repair", arguments.Repair, ("dataset", "out")),
     "merge": Command("dataset_commands.merge", arguments.Merge, ("datasets",)),
     "curate": Command("dataset_commands.curate", arguments.Curate, ("dataset",)),
-    "recover": Command("dataset_commands.recover", arguments.Recover, ("path",)),
-    "extract": Command("conversion_commands.extract", arguments.Extract, ("dataset",)),
     "push": Command("dataset_commands.push", arguments.Push, ("dataset", "repo")),
     "fit": Command("fit_command.fit_primitives", arguments.FitPrimitives, ("dataset",)),
     "fit image-jacobian": Command(

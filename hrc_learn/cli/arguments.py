@@ -108,13 +108,18 @@ class Check(Columns, OnDataset, Written):
 
 @dataclass(frozen=True, kw_only=True)
 class Repair(Columns, OnDataset):
-    """Repair a dataset into a new copy and list the changes by episode.
+    """Repair a dataset into a new copy, or finish what a killed process left of it.
 
     By default the copy is trimmed, measured angles are unwrapped and the signs of quaternions
-    are made continuous. Commands, grippers and discrete columns stay as they are. The original
-    dataset is not changed.
+    are made continuous. Commands, grippers and discrete columns stay as they are. The changes
+    are listed by episode; the original dataset stays as it is.
+
+    What a killed process left unfinished at DATASET or in a folder below it is finished first,
+    in place: an interrupted recording becomes a dataset of its saved episodes, an interrupted
+    replacement is completed. A copy follows then only if --out is given.
 
         hrc repair broken repaired
+        hrc repair killed_recording
         hrc repair broken repaired --fps 50 --drop bad-episodes --no-videos
     """
 
@@ -271,22 +276,6 @@ class Show(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract(OnDataset):
-    """Find a marker in a dataset's videos and store its pixels next to the dataset.
-
-    The pixels go to NAME.features, where `load_demos` finds them. An interrupted run is
-    resumed.
-
-        hrc extract grasping --marker 3 --camera front
-    """
-
-    marker: int
-    """Marker number in OpenCV's ArUco dictionary 4x4_50."""
-    camera: str | None = None
-    """Camera name. May be left out if there is only one."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Push(OnDataset):
     """Check a dataset and upload it to the Hugging Face Hub with a dataset card.
 
@@ -308,18 +297,6 @@ class Push(OnDataset):
     """Upload a dataset that has errors."""
     dry_run: bool = False
     """Show the card and the files without uploading them."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recover(Measured):
-    """Recover or remove what a killed process left unfinished in a folder and below it.
-
-    Interrupted recordings become datasets of their saved episodes. Interrupted replacements are
-    completed. Files that a running process writes are not touched.
-    """
-
-    path: Path
-    """Dataset, model or folder of results, or a folder of several."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -371,9 +348,18 @@ class FitImageJacobian(Fit):
     """Fit the image Jacobian of an uncalibrated camera to a dataset.
 
     Learns the motion of the marker's image as a function of the end effector's motion, with its
-    uncertainty, and the target in the image if an object was observed. Under torchrun each
-    process reads a part of the demonstrations.
+    uncertainty, and the target in the image if an object was observed. With --marker it finds
+    the marker in the videos first; the pixels go to DATASET.features, and an interrupted search
+    is resumed. Under torchrun each process reads a part of the demonstrations.
+
+        hrc fit image-jacobian grasping --marker 3 --camera front
     """
+
+    marker: int | None = None
+    """Marker on the end effector, by its number in OpenCV's ArUco dictionary 4x4_50. Default:
+    pixels are in the dataset or were found earlier."""
+    camera: str | None = None
+    """Camera of --marker. May be left out if there is only one."""
 
     neurons: Literal["around", "grid"] = "around"
     """Thirteen neurons around the demonstrated poses, or the paper's grid over x and y."""

@@ -1,21 +1,15 @@
-"""`hrc import` and `hrc extract`: datasets of recordings, and markers in videos."""
+"""`hrc import`: datasets of recordings."""
 
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 
-import numpy as np
-from rich.progress import track
-
 from hrc_learn.cli._run import write_values
-from hrc_learn.cli.arguments import Extract, Import
-from hrc_learn.demos import Detector, extract_features
+from hrc_learn.cli.arguments import Import
 from hrc_learn.demos.recording_import import plan_import, write_plan
 from hrc_learn.demos.recording_names import ImportOptions
 from hrc_learn.store import read_json, read_toml, write_text
-from hrc_learn.vision import MarkerDetector, centre
 
 
 def import_recordings(args: Import) -> None:
@@ -79,47 +73,3 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
 def _words(values: Sequence[str]) -> list[str]:
     """Words that are separated by spaces or commas."""
     return [word for value in values for word in value.split(",") if word]
-
-
-def extract(args: Extract) -> int:
-    """Search every new image for the marker; status 1 if some could not be read."""
-    if not 0 <= args.marker < 50:
-        raise ValueError(f"--marker must be from 0 to 49, got {args.marker}")
-    start = time.perf_counter()
-    done = extract_features(
-        args.dataset,
-        f"marker_{args.marker}",
-        lambda: _detector(args.marker),
-        camera=args.camera,
-        progress=lambda episodes: track(episodes, description="Searching episodes"),
-    )
-    rate = done.frames / max(time.perf_counter() - start, 1e-9)
-    seen = done.seen / done.frames if done.frames else 1.0
-    print(
-        f"{done.name}: {done.episodes} episodes searched, {done.known} known before; marker in "
-        f"{100 * seen:.1f} % of {done.frames} frames, {done.without_image} without an image"
-    )
-    values = {
-        "episodes": done.episodes,
-        "episodes_known_before": done.known,
-        "frames": done.frames,
-        "seen_fraction": seen,
-        "frames_without_image": done.without_image,
-        "frames_per_s": rate,
-        "episodes_left_out": len(done.left_out),
-    }
-    for reason in done.left_out.values():
-        print(f"left out: {reason}")
-    write_values(args.json, values)
-    return int(bool(done.left_out))
-
-
-def _detector(marker: int) -> Detector:
-    """Detector of one marker's centre [px]."""
-    markers = MarkerDetector([marker])
-
-    def detect(image: np.ndarray) -> np.ndarray | None:
-        corners = markers.detect(image).get(marker)
-        return None if corners is None else centre(corners)
-
-    return detect

@@ -1,4 +1,4 @@
-"""`hrc check`, `repair`, `merge`, `recover`, `curate`, `push`: datasets' quality and upload."""
+"""`hrc check`, `repair`, `merge`, `curate`, `push`: datasets' quality and upload."""
 
 import sys
 import webbrowser
@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import track
 
 from hrc_learn.cli._run import configuration, has_screen, one_line, write_values
-from hrc_learn.cli.arguments import Check, Curate, Merge, Push, Recover, Repair
+from hrc_learn.cli.arguments import Check, Curate, Merge, Push, Repair
 from hrc_learn.demos import (
     RepairOptions,
     check_dataset,
@@ -115,7 +115,13 @@ def _camera_moved(args: Check) -> bool:
 
 
 def repair(args: Repair) -> None:
-    """Repair the dataset and print the changes."""
+    """Finish what a killed process left; repair the dataset and print the changes."""
+    mended = [] if args.dry_run else recover_all(args.dataset)
+    print(*mended, sep="\n", end="\n" if mended else "")
+    if mended and args.out is None:
+        write_values(args.json, {"mended": len(mended)})
+        return
+    _require_dataset(args.dataset)
     options = RepairOptions(
         trim="trim" not in args.skip,
         unwrap="unwrap" not in args.skip,
@@ -138,6 +144,7 @@ def repair(args: Repair) -> None:
     )
     print(report)
     counts = {
+        "mended": len(mended),
         "episodes": len(report.changes),
         "episodes_changed": report.changed,
         "episodes_left_out": len(report.left_out),
@@ -155,18 +162,6 @@ def merge(args: Merge) -> None:
     print(report)
     counts = {name: getattr(report, name) for name in ("episodes", "frames", "tasks")}
     write_values(args.json, counts | {"notes": len(report.notes)})
-
-
-def recover(args: Recover) -> None:
-    """Finish or remove what a killed process left unfinished."""
-    done = recover_all(args.path)
-    if not done and not args.path.exists():
-        raise FileNotFoundError(f"there is nothing at {args.path}, finished or unfinished")
-    for mended in done:
-        print(mended)
-    if not done:
-        print(f"{args.path}: nothing to recover")
-    write_values(args.json, {"mended": len(done)})
 
 
 def curate(args: Curate) -> None:

@@ -4,13 +4,24 @@ import shlex
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from rich.console import Console
+from rich.progress import track
 
 from hrc_learn import distributed
 from hrc_learn.cli._run import refuse_repeats, with_settings, write_values
-from hrc_learn.cli.arguments import Evaluate, FitImageJacobian
-from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
+from hrc_learn.cli.arguments import Evaluate, FitImageJacobian, refuse_given
+from hrc_learn.demos import (
+    DemonstrationSet,
+    DemonstrationSource,
+    Detector,
+    Extraction,
+    attach_features,
+    extract_features,
+    load_demos,
+    open_demos,
+)
 from hrc_learn.jacobian import (
     EvidenceConfig,
     ImageJacobianFitConfig,
@@ -22,6 +33,7 @@ from hrc_learn.learning.fit_dashboards import record_learning
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
+from hrc_learn.vision import MarkerDetector, centre
 from hrc_learn.viz.report import Measurement, show_command, show_measurements
 
 # Key in JSON, title, factor, unit, largest value that passes, resolution. Most of a relative
@@ -62,7 +74,7 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
     refuse_repeats(args.episodes)
     with distributed.processes() as rank:
         console = Console(quiet=rank != 0)
-        demos = open_demos(args.dataset, episodes=args.episodes or None)
+        demos, searched = _demonstrations(args, console, rank)
         for note in demos.notes:
             console.print(f"note: {note}")
         if args.learn and len(demos) < learning.hold_out:
@@ -84,13 +96,68 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
                 ),
             )
         if rank == 0:
-            _write(args, skill, demos)
+            _write(args, skill, demos, searched)
+
+
+def _demonstrations(
+    args: FitImageJacobian, console: Console, rank: int
+) -> tuple[DemonstrationSource | DemonstrationSet, dict[str, int]]:
+    """Demonstrations with the pixels of `--marker`, and figures of the search for it."""
+    demos = open_demos(args.dataset, episodes=args.episodes or None)
+    if args.marker is None:
+        refuse_given(args, ["camera"], "is the camera of --marker")
+        return demos, {}
+    if rank != 0:
+        distributed.sum_over_processes(torch.zeros(()))  # the first process searches
+    found = _find_marker(args, args.marker, console)
+    if rank == 0:
+        distributed.sum_over_processes(torch.zeros(()))
+    return attach_features(demos.load(), found.name), {
+        "episodes_searched": found.episodes,
+        "episodes_known_before": found.known,
+        "episodes_left_out": len(found.left_out),
+        "frames_searched": found.frames,
+        "frames_without_image": found.without_image,
+        "frames_with_marker": found.seen,
+    }
+
+
+def _find_marker(args: FitImageJacobian, marker: int, console: Console) -> Extraction:
+    """Search every new image for the marker; the pixels are kept next to the dataset."""
+    if not 0 <= marker < 50:
+        raise ValueError(f"--marker must be from 0 to 49, got {marker}")
+    found = extract_features(
+        args.dataset,
+        f"marker_{marker}",
+        lambda: _detector(marker),
+        camera=args.camera,
+        progress=lambda episodes: track(episodes, "Searching episodes", console=console),
+    )
+    console.print(
+        f"{found.name}: {found.episodes} episodes searched, {found.known} known before; marker "
+        f"in {found.seen} of {found.frames} frames, {found.without_image} without an image"
+    )
+    for reason in found.left_out.values():
+        console.print(f"left out: {reason}")
+    return found
+
+
+def _detector(marker: int) -> Detector:
+    """Detector of one marker's centre [px]."""
+    markers = MarkerDetector([marker])
+
+    def detect(image: np.ndarray) -> np.ndarray | None:
+        corners = markers.detect(image).get(marker)
+        return None if corners is None else centre(corners)
+
+    return detect
 
 
 def _write(
     args: FitImageJacobian,
     skill: VisualServoSkill,
-    demos: DemonstrationSource,
+    demos: DemonstrationSource | DemonstrationSet,
+    searched: dict[str, int],
 ) -> None:
     metrics = skill.metrics()
     with new_folder(args.folder, asdict(args) | {"out": args.folder}, args.overwrite) as folder:
@@ -114,7 +181,7 @@ def _write(
     print(f"Found: {skill.jacobian.camera_fit}.")
     print(f"Model in {shlex.quote(str(args.folder))}")
     print(f"Dashboard: {show_command(args.folder)}")
-    write_values(args.json, metrics)
+    write_values(args.json, metrics | searched)
 
 
 MOST_ERROR = 0.05

@@ -8,6 +8,7 @@ from hrc_learn.demos.demonstration import DemonstrationSet as DemonstrationSet
 from hrc_learn.demos.demonstration import PaddedDemonstrations as PaddedDemonstrations
 from hrc_learn.demos.hub import push_dataset as push_dataset
 from hrc_learn.demos.image_features import Detector as Detector
+from hrc_learn.demos.image_features import Extraction as Extraction
 from hrc_learn.demos.image_features import attach_features as attach_features
 from hrc_learn.demos.image_features import extract_features as extract_features
 from hrc_learn.demos.images import ImageReader as ImageReader

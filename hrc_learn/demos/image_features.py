@@ -25,6 +25,7 @@ from hrc_learn.demos.videos import VideoSegment, decode, image_key, read_segment
 from hrc_learn.store import new_file
 
 _SOURCE = b"hrc_learn.video"
+_ADVICE = "hrc fit image-jacobian --marker N searches the videos that are left"
 
 Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
 """Pixel (u right, v down) of the feature in an RGB image, or None if it is not visible."""
@@ -77,13 +78,12 @@ class FeatureCache:
             return DatasetError(message, file=path, episode=episode, frame=row)
 
         if not path.is_file():
-            text = "was not extracted from this episode: hrc extract continues an interrupted"
-            raise fault(None, f"{self.name} {text} extraction")
+            raise fault(None, f"{self.name} was not extracted from this episode: {_ADVICE}")
         table = read_table(open_parquet(self._folder, path.name, episode), str(path))
         u, v, visible = (to_numpy(table[c], fault)[:, 0] for c in ("u", "v", "visible"))
         if len(u) != frames:
-            text = f"has {len(u)} frames, the episode {frames}: run hrc extract again"
-            raise fault(None, f"{self.name} {text}")
+            text = f"{self.name} has {len(u)} frames, the episode {frames}: {_ADVICE}"
+            raise fault(None, text)
         return np.stack([u, v], axis=1), visible.astype(bool)
 
 
@@ -236,7 +236,7 @@ def missing_note(cache: FeatureCache, episodes: Sequence[int]) -> tuple[str, ...
     first = ", ".join(map(str, without[:5])) + ", ..." * (len(without) > 5)
     return (
         f"{cache.name} was not extracted from {len(without)} episodes ({first}) and counts as "
-        f"not visible there; hrc extract continues an interrupted extraction",
+        f"not visible there: {_ADVICE}",
     )
 
 

@@ -164,7 +164,7 @@ def test_choices_are_those_of_the_package(alias, known):
         (("fit", "image-jacobian", "--dataset", "none", "--out", "new"), "none"),
         (("evaluate", "none", "none"), "no model at none"),
         (("evaluate", "--dataset", "none"), "no dataset at none"),
-        (("recover", "none"), "none"),
+        (("repair", "none"), "no dataset at none"),
         (("smooth", "--checkpoint", "none"), "no folder none"),
         (
             ("run", "collaboration", "--placing", "none", "--aiming", "none", "--out", "new"),

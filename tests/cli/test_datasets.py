@@ -244,29 +244,44 @@ def test_a_broken_dataset_is_repaired_checked_and_read(tmp_path):
     assert demo.fps == 40
 
 
-def test_markers_are_found_in_the_videos_of_a_dataset(tmp_path):
+def record_marker(root, episodes=3, frames=30):
+    """A dataset in whose videos marker 7 is seen by a camera that looks down at the gripper."""
     cv2 = pytest.importorskip("cv2")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     marker = cv2.aruco.generateImageMarker(dictionary, 7, 60)
-    root = tmp_path / "set"
-    with DatasetWriter(root, 50, "any", ["a"], cameras={"front": (160, 240)}) as writer:
-        writer.start_episode("look")
-        for k in range(10):
-            image = np.full((160, 240, 3), 255, np.uint8)
-            image[40:100, 50 + 4 * k : 110 + 4 * k] = marker[..., None]
-            writer.add_frame(joint_position=[0.01 * k], images={"front": image})
-        writer.save_episode()
-    arguments = ("extract", root, "--marker", 7, "--json", tmp_path / "values.json")
-    status, text, _ = hrc(*arguments)
-    assert status == 0
-    assert "front.marker_7: 1 episodes searched" in text
-    assert json.loads((tmp_path / "values.json").read_text())["seen_fraction"] == 1
-    (demo,) = load_demos(root)
-    # A square of pixels 50 to 109 has its middle at 79.5.
-    truth = np.stack([79.5 + 4 * np.arange(10), np.full(10, 69.5)], axis=1)
-    np.testing.assert_allclose(demo.feature, truth, atol=0.5)
-    assert "1 known before" in hrc(*arguments)[1]
-    assert hrc("extract", root, "--marker", 70)[0] == 2
+    centres = []
+    with DatasetWriter(root, 50, "any", cameras={"front": (480, 640)}) as writer:
+        for episode in range(episodes):
+            writer.start_episode("look")
+            phase = np.linspace(0, 3, frames) + episode
+            path = np.stack([np.sin(phase), np.cos(1.7 * phase), np.sin(0.9 * phase)], axis=1)
+            for position in path * 0.1 + [0.5, 0.0, 0.3]:
+                x, y, z = position - [0.5, 0.0, 1.0]  # from the camera
+                u, v = round(320 + 500 * y / z), round(240 + 500 * x / z)
+                centres.append([u - 0.5, v - 0.5])  # of pixels u - 30 to u + 29
+                image = np.full((480, 640, 3), 255, np.uint8)
+                image[v - 30 : v + 30, u - 30 : u + 30] = marker[..., None]
+                pose = {"position": position, "orientation": [0.0, 1.0, 0.0, 0.0]}
+                writer.add_frame(**pose, images={"front": image})
+            writer.save_episode()
+    return np.array(centres)
+
+
+def test_an_image_jacobian_is_fitted_to_a_marker_found_in_the_videos(tmp_path):
+    root, values = tmp_path / "set", tmp_path / "values.json"
+    truth = record_marker(root)
+    words = ("fit", "image-jacobian", root, "--marker", 7, "--no-learn", "--json", values)
+    status, text, error = hrc(*words)
+    assert status == 0, error
+    assert "front.marker_7: 3 episodes searched" in text
+    measured = json.loads(values.read_text())
+    assert measured["frames_with_marker"] == measured["frames_searched"] == 90
+    assert measured["pairs"] > 50
+    found = np.concatenate([demo.feature for demo in load_demos(root)])
+    np.testing.assert_allclose(found, truth, atol=0.5)
+    assert "3 known before" in hrc(*words, "--overwrite")[1]
+    assert hrc("fit", "image-jacobian", root, "--marker", 70)[0] == 2
+    assert "--marker" in hrc("fit", "image-jacobian", root, "--camera", "front").error
 
 
 def test_no_package_shadows_hugging_faces_datasets():
@@ -433,7 +448,11 @@ def test_saved_episodes_are_recovered(tmp_path):
         writer.save_episode()
     writer.start_episode("move")
     del writer  # as a kill leaves it
-    outcome = hrc("recover", tmp_path / "set", "--json", tmp_path / "figures.json")
+    assert hrc("repair", tmp_path / "set", "--dry-run").status == 2  # nothing is written
+    outcome = hrc("repair", tmp_path / "set", "--json", tmp_path / "figures.json")
     assert outcome.status == 0, outcome.error
     assert json.loads((tmp_path / "figures.json").read_text()) == {"mended": 1}
     assert len(load_demos(tmp_path / "set")) == 2
+    assert not (tmp_path / "set_repaired").exists()
+    assert hrc("repair", tmp_path / "set").status == 0  # nothing is left to finish
+    assert len(load_demos(tmp_path / "set_repaired")) == 2

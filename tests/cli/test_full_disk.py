@@ -73,9 +73,9 @@ def test_a_full_disk_is_one_line(places, command, size, tmp_path):
     assert "File too large" in last
     assert "Traceback" not in errors
     assert ".writing" not in last
-    # Only the saved episodes of a recording are kept, for `hrc recover`, and the line says so.
+    # Only the saved episodes of a recording are kept, for `hrc repair`, and the line says so.
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == ({"out.recording"} if "hrc recover" in last else set())
+    assert left == ({"out.recording"} if "hrc repair" in last else set())
 
 
 def test_episodes_that_wait_for_room_on_the_disk_become_the_dataset(tmp_path):
@@ -86,8 +86,8 @@ def test_episodes_that_wait_for_room_on_the_disk_become_the_dataset(tmp_path):
     writer.save_episode()
     with small_files(60), pytest.raises(OSError, match="File too large") as full:
         writer.finalize()
-    assert "hrc recover" in full.value.__notes__[0]
-    done("recover", tmp_path)
+    assert "hrc repair" in full.value.__notes__[0]
+    done("repair", tmp_path)
     (demo,) = load_demos(tmp_path / "set")
     assert len(demo) == 30
 
@@ -127,7 +127,7 @@ def test_a_decision_that_does_not_fit_keeps_those_before(places, tmp_path):
 def test_a_feature_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path):
     root = write_set(tmp_path / "set", **SETS["v3.0 with a camera"])
     with small_files(60):
-        status, _, errors = hrc("extract", root, "--marker", 3)
+        status, _, errors = hrc("fit", "image-jacobian", root, "--marker", 3)
     assert status == 2
     assert errors.strip().splitlines()[-1].endswith("episode_000000.parquet: File too large")
     (demo,) = load_demos(root, [0])

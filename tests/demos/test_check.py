@@ -551,7 +551,7 @@ def test_a_long_message_keeps_its_advice():
 
 
 def test_a_command_in_a_message_keeps_its_long_path():
-    command = f"`hrc recover --path /{'folder/' * 60}set`"
+    command = f"`hrc repair --dataset /{'folder/' * 60}set`"
     assert command in str(warning(message=f"not found. {command} makes a dataset of it"))
 
 

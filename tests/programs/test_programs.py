@@ -69,10 +69,10 @@ def test_a_program_is_a_command(program, run_here):
     assert len(program.read_text().splitlines()) < 15
 
 
-def test_every_command_but_demo_and_recover_is_a_program():
+def test_every_command_but_demo_is_a_program():
     found = {command_of(program) for program in PROGRAMS}
     found |= {name.split()[0] for name in found}
-    assert cli.commands().keys() - found == {"demo", "recover"}
+    assert cli.commands().keys() - found == {"demo"}
 
 
 @every_benchmark

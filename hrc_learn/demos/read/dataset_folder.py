@@ -180,7 +180,7 @@ def staging_folder(root: Path) -> Path:
 
 def recovery_advice(root: Path) -> str:
     """Command and call that turn an interrupted recording into a dataset."""
-    command = shlex.join(["hrc", "recover", "--path", str(root)])
+    command = shlex.join(["hrc", "repair", "--dataset", str(root)])
     return f"`{command}`, or hrc_learn.demos.recover_dataset({str(root)!r}),"
 
 
