@@ -1,6 +1,5 @@
 """Movement primitive of joints, or of any coordinates that add up like them."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypedDict, Unpack
@@ -17,7 +16,7 @@ from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling, find_scaling
 from hrc_learn.dmp.linear_primitive import LinearPrimitive, check_names
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.response import Response, response_of
-from hrc_learn.dmp.samples import Samples, check_samples, padded, smoothed, warn_of_few_samples
+from hrc_learn.dmp.samples import Samples, check_samples, densified, padded, smoothed
 from hrc_learn.dmp.solvers import (
     REGULARIZATION,
     fit_samples,
@@ -83,13 +82,12 @@ def _fit(
     chosen = n_basis is not None or basis is not None
     if basis is None:
         basis = GaussianBasis(count=DEFAULT_COUNT if n_basis is None else n_basis)
-    if chosen:
-        warn_of_few_samples(recorded, basis.count)
     response = response_of(spring or SpringDamper(), basis, float(approach))
     samples, noise = recorded, None
     if smooth or (smooth is None and not chosen):
         samples, noise = smoothed(recorded)
-    fitted = fit_samples(method, response, samples, regularization)
+    dense = densified(samples, basis.count)
+    fitted = fit_samples(method, response, dense, regularization)
     return response, samples, noise, *fitted
 
 
@@ -149,7 +147,8 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
                 (T_i, D) with a list of (T_i,), for demonstrations of different lengths. Its
                 floating-point dtype is that of the primitive; the fit runs in float64.
             n_basis: N, unless `basis` is given. None: 50, and noise is removed from the
-                samples; see `FitOptions.smooth`.
+                samples; see `FitOptions.smooth`. Between fewer than 1.5 N samples the motion
+                follows a cubic spline.
             velocity: Recorded velocity per second, like `position`. Without it, the default
                 method also fits the start velocity, and the others differentiate positions.
             mask: (*B, T), false at samples to ignore, such as padding and dropouts.
@@ -265,10 +264,7 @@ def select_basis_count(
         square, weight = torch.zeros((), dtype=torch.float64), 0
         for held in folds:
             kept = (samples.mask & ~held).reshape(*samples.batch, -1)
-            with warnings.catch_warnings():
-                # More functions than samples show in the held-out error; no warning is needed.
-                warnings.simplefilter("ignore", UserWarning)
-                dmp = JointDMP.fit(time, position, count, mask=kept, scaling=scaling, **options)
+            dmp = JointDMP.fit(time, position, count, mask=kept, scaling=scaling, **options)
             with torch.no_grad():
                 reproduction = dmp.rollout(elapsed).position.mT.reshape(samples.position.shape)
                 error = (reproduction - samples.position).double() / samples.span.amax()

@@ -337,7 +337,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         Start and goal stay, with their velocities, and so does any column without a via point.
         With `within`, so does the motion outside of that time. Via points hold for the
         primitive's own start, goal and duration: set others before, with `with_boundary`.
-        Gradients flow to times, values and velocities.
+        Gradients flow to times, values and velocities. No change is larger than 1.5 times that
+        of the curve through the via points; where that fails, the points are too close.
 
         Args:
             time: Times of the via points [s], (*batch, n).
@@ -347,8 +348,8 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             options: Via points of this kind of primitive.
 
         Raises:
-            ValueError: Via points at one time or outside of the window, or too many for the
-                basis.
+            ValueError: Via points at one time or outside of the window, or too many or too
+                close together for the basis; the message names the distance that works.
         """
         via = self.via_points(time, value, velocity, **options)
         return self.with_motion(through_via_points(self.motion, via, within))

@@ -8,7 +8,6 @@ deviation of the noise, whether it comes from encoders, a tracker or a trembling
 """
 
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -38,6 +37,11 @@ CLEAN = 2e-5
 fifty functions."""
 ORDER = 3
 """Order of the penalised differences: a motion without jerk is a parabola."""
+SAMPLES_EACH = 1.5
+"""Samples per basis function from which a fit determines the motion between samples: with fewer,
+accelerations exceed the true ones several times."""
+DENSE = 4
+"""Samples per basis function of denser grids, on which a spline hides no detail."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -371,19 +375,76 @@ def _smooth(s: Float[Tensor, "T"], y: Float[Tensor, "C T"]) -> tuple[Tensor, Ten
     return _spline(s.cpu().numpy().tobytes(), s.device).smooth(y)
 
 
-def warn_of_few_samples(samples: Samples, n_basis: int) -> None:
-    """Warn if there are at most as many samples as functions, which leaves gaps arbitrary."""
-    if samples.complete and samples.s.shape[-1] > n_basis:
-        return  # without counting, which a short fit would notice
-    counts = samples.mask.sum(-1)
-    if (counts <= n_basis).any():
-        i = int((counts <= n_basis).nonzero()[0])
-        warnings.warn(
-            f"{demo_label(i, samples.batch)}{n_basis} basis functions are fitted to "
-            f"{int(counts[i])} samples, which do not determine them: the motion between "
-            "samples is arbitrary. Use fewer functions, or remove noise (smooth=True).",
-            stacklevel=4,
-        )
+def densified(samples: Samples, n_basis: int) -> Samples:
+    """Samples dense enough to determine all functions, in each demonstration.
+
+    Between recorded samples they follow the cubic spline through them, which is exact for
+    polynomials of degree three, or two for three samples; with recorded velocities, the cubic
+    with these velocities.
+    """
+    few = samples.mask.sum(-1) <= SAMPLES_EACH * n_basis
+    if not few.any():
+        return samples
+    T, G = samples.mask.shape[-1], DENSE * n_basis + 1
+    grid = torch.linspace(0, 1, G, dtype=torch.float64, device=samples.s.device)
+    more = 0 if few.all() else max(T - G, 0)
+    s = torch.cat([grid, grid[-1:].expand(more)]).repeat(len(few), 1)
+    mask = (torch.arange(G + more, device=s.device) < G).repeat(len(few), 1)
+    position = samples.position.new_zeros(*samples.position.shape[:2], G + more).double()
+    velocity = None if samples.velocity is None else torch.zeros_like(position)
+    pairs = (s, samples.s), (mask, samples.mask), (position, samples.position)
+    for to, given in (*pairs, (velocity, samples.velocity)):
+        if to is not None:
+            # Other demonstrations keep their samples, padded at the end.
+            to[~few] = 1 if to is s else 0
+            to[~few, ..., :T] = given[~few].to(to)
+    for i in few.nonzero()[:, 0].tolist():
+        valid, tau, rate = samples.mask[i], samples.duration[i], None
+        if samples.velocity is not None:
+            rate = samples.velocity[i][:, valid].double() * tau
+        y = samples.position[i][:, valid].double()
+        position[i, :, :G], slope = _cubic(samples.s[i, valid], y, rate, grid)
+        if velocity is not None:
+            velocity[i, :, :G] = slope / tau
+    whole = {"mask": mask, "complete": bool(mask.all())}
+    return replace(samples, s=s, position=position, velocity=velocity, **whole)
+
+
+def _cubic(
+    knots: Float[Tensor, "T"],
+    y: Float[Tensor, "C T"],
+    rate: Float[Tensor, "C T"] | None,
+    s: Float[Tensor, "G"],
+) -> tuple[Float[Tensor, "C G"], Float[Tensor, "C G"]]:
+    """Value and derivative of the cubic spline through samples (not-a-knot; de Boor 1978)."""
+    h = knots.diff()
+    d = y.diff() / h
+    if rate is None:
+        A, right = torch.zeros(len(knots), len(knots)).to(h), torch.zeros_like(y)
+        i = torch.arange(1, len(knots) - 1)
+        A[i, i - 1], A[i, i], A[i, i + 1] = h[1:], 2 * (h[1:] + h[:-1]), h[:-1]
+        right[:, 1:-1] = 3 * (h[1:] * d[:, :-1] + h[:-1] * d[:, 1:])
+        # No third derivative jumps at the second and at the last knot but one; three samples
+        # make these conditions one, and a parabola has a linear slope.
+        for end, near, far, k, m in ((0, 1, 2, 0, 1), (-1, -2, -3, -1, -2)):
+            span = 1.0 if len(knots) == 3 else abs(knots[far] - knots[end])
+            A[end, end], A[end, near] = (1.0, 1.0) if len(knots) == 3 else (h[m], span)
+            right[:, end] = 2 * d[:, k]
+            if len(knots) > 3:
+                first = (h[k] + 2 * span) * h[m] * d[:, k] + h[k] ** 2 * d[:, m]
+                right[:, end] = first / span
+        rate = torch.linalg.solve(A, right.mT).mT
+    k = torch.searchsorted(knots, s, right=True).clamp(1, len(knots) - 1) - 1
+    u, h, y0, d, r0, r1 = (
+        (s - knots[k]) / h[k],
+        h[k],
+        y[:, k],
+        d[:, k],
+        rate[:, k],
+        rate[:, k + 1],
+    )
+    b, c = 3 * d - 2 * r0 - r1, r0 + r1 - 2 * d
+    return y0 + h * u * (r0 + u * (b + u * c)), r0 + u * (2 * b + 3 * u * c)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import readable
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.response import Response
 
@@ -32,6 +33,12 @@ QUINTIC = torch.tensor(
 change of the value, and for the rates at the start and the end."""
 DEPENDENT = 1e-12
 """Relative singular value below which a constraint follows from the others."""
+OVERSHOOT = 1.5
+"""Largest change of a motion relative to that of the curve through its via points."""
+CLOSEST, CLOSEST_TO_WINDOW = 2, 6
+"""Distances, in those of basis functions, of via points from one another and from start and end,
+and from the ends of a window, at which no overshoot occurs with any basis, gain or change; the
+next smaller steps, 1.5 and 5, overshoot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +65,8 @@ def through_via_points(
         within: Times [s] between which the motion may change; None: from start to end.
 
     Raises:
-        ValueError: Via points at one time or outside of the window, or too many for the basis.
+        ValueError: Via points at one time or outside of the window, or too many or too close
+            together for the basis.
     """
     x = motion.coordinates().detach()
     weights = x[..., :-3] + _weight_change(motion, via, within)
@@ -79,7 +87,8 @@ def _weight_change(
             f"functions between {window[0]:.3f} and {window[1]:.3f} of the duration"
         )
     missing = _missing(motion, via)
-    z = follower.follow(_change_curve(follower.s, via.s, missing, window))
+    curve = _change_curve(follower.s, via.s, missing, window)
+    z = follower.follow(curve)
     # What the basis cannot follow is corrected at the constraints, by the smallest change.
     required = ~missing.flatten(-3, -2).mT.isnan()
     H = motion.response.evaluate(via.s)[..., :2, follower.chosen]
@@ -95,9 +104,37 @@ def _weight_change(
     residual = (wanted - (A @ z[..., None])[..., 0]) / size
     inverse = torch.linalg.pinv(A / size[..., None], rtol=DEPENDENT)
     z = z + (inverse @ residual[..., None])[..., 0]
+    _check_overshoot(motion, follower.change(z), curve[..., 0, :].mT, window)
     change = z.new_zeros(*z.shape[:-1], motion.basis.count)
     change = change.index_copy(-1, follower.chosen, z @ follower.to_weights.mT)
     return motion.forcing_scale.unscale(change.mT, motion.demonstrated()).mT
+
+
+def _check_overshoot(
+    motion: LinearPrimitive,
+    change: Float[Tensor, "*batch D G"],
+    curve: Float[Tensor, "*batch D G"],
+    window: tuple[float, float],
+) -> None:
+    """Raise ValueError if the motion leaves the curve through its via points far behind."""
+    if not readable(change, curve):
+        return
+    largest, asked = (x.detach().abs().amax(-1) for x in (change, curve))
+    rounding = 1e-6 * motion.amplitude.double()
+    if (largest <= OVERSHOOT * asked + rounding).all():
+        return
+    ratio = (largest / (asked + rounding)).max().item()
+    spacing = motion.duration.max().item() / (motion.basis.count - 1)
+    inside = (
+        ""
+        if window == (0.0, 1.0)
+        else (f" ({CLOSEST_TO_WINDOW * spacing:.3g} s from the ends of `within`)")
+    )
+    raise ValueError(
+        f"the motion would change {ratio:.2g} times as far as its via points ask: they are too "
+        f"close for {motion.basis.count} basis functions. Keep {CLOSEST * spacing:.3g} s "
+        f"between them and from start and end{inside}, or fit with more functions (n_basis)"
+    )
 
 
 def _missing(motion: LinearPrimitive, via: ViaPoints) -> Float[Tensor, "*batch n 2 D"]:
@@ -175,6 +212,10 @@ class _CurveFollower:
     def follow(self, curve: Float[Tensor, "*batch G 3 D"]) -> Float[Tensor, "*batch D K"]:
         """Coordinates z of the closest motion."""
         return (curve * self.units[:, None]).flatten(-3, -2).mT @ self.Q
+
+    def change(self, z: Float[Tensor, "*batch D K"]) -> Float[Tensor, "*batch D G"]:
+        """Change of the motion at `s`."""
+        return z @ self.Q[:: len(self.units)].mT
 
 
 # A decomposition of 8 N x 3 rows each; a task has few windows.

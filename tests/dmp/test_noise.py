@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion
+from scipy.interpolate import CubicSpline
 
 from hrc_learn.dmp import JointDMP
 
@@ -82,10 +83,29 @@ def test_encoder_steps_are_noise_too():
     assert error < step / np.sqrt(12)
 
 
-def test_as_many_functions_as_samples_are_warned_of():
-    s, samples, *_ = recorded(40, 2e-3, 0)
-    with pytest.warns(UserWarning, match="50 basis functions are fitted to 40 samples"):
-        JointDMP.fit(s, samples, 50)
+@pytest.mark.parametrize("count", [3, 4, 5, 8, 20, 60])
+@pytest.mark.parametrize("n_basis", [None, 60])
+@pytest.mark.parametrize("velocity", [False, True])
+def test_few_samples_leave_the_motion_between_them_smooth(count, n_basis, velocity):
+    t, fine = (torch.linspace(0, 2, n, dtype=torch.float64) for n in (count, 1001))
+    y, rate = t**2 - t, (2 * t - 1 if velocity else None)
+    dmp = JointDMP.fit(t, y, n_basis, velocity=rate)
+    made = dmp.rollout(fine)
+    truth = (fine**2 - fine)[:, None]
+    assert (made.position - truth).abs().max() < 2e-3
+    # At its very end a motion that has not come to rest brakes, with any number of samples.
+    inner = (fine > 0.4) & (fine < 1.6)
+    assert (made.acceleration[inner] - 2).abs().max() < 0.15
+
+
+@pytest.mark.parametrize("count", [3, 5, 9])
+def test_few_samples_are_joined_as_a_cubic_spline_joins_them(count):
+    s = np.sort(np.random.default_rng(0).uniform(0.05, 0.95, count))
+    s[[0, -1]] = 0, 1
+    y = np.cos(5 * s)
+    fine = np.linspace(0, 1, 101)
+    made = JointDMP.fit(s, y, smooth=False).rollout(fine).numpy()["position"][:, 0]
+    np.testing.assert_allclose(made, CubicSpline(s, y)(fine), atol=1e-3)
 
 
 def test_the_shortest_admissible_duration():

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -206,6 +208,38 @@ def test_gradients_are_exact():
     inputs = [torch.tensor([0.907, 2.013], dtype=torch.float64), *rand]
     with shapes_unchecked():
         assert gradcheck(moved, [x.requires_grad_() for x in inputs], atol=1e-6, rtol=1e-5)
+
+
+@pytest.mark.parametrize("n_basis", [12, 50])
+def test_no_via_points_move_the_path_further_than_they_ask_or_they_are_refused(n_basis):
+    """At the distance that the refusal names, the same changes are possible."""
+    dmp, spacing = flat(n_basis), 3.0 / (n_basis - 1)
+    for times, change in (
+        (lambda d: [1.5, 1.5 + d], [1.0, -1.0]),
+        (lambda d: [3.0 - d], [1.0]),
+        (lambda d: [d], [1.0]),
+        (lambda d: [1.0, 1.0 + d, 1.0 + 2 * d, 1.0 + 3 * d], [1.0, -1.0, 1.0, -1.0]),
+    ):
+        column = torch.tensor(change).double()[:, None]
+        with pytest.raises(ValueError, match="too close") as refused:
+            dmp.condition(times(spacing / 4), column)
+        least = float(re.findall(r"Keep ([\d.e-]+) s", str(refused.value))[0])
+        assert least == pytest.approx(2 * spacing, rel=1e-2)
+        for distance in np.linspace(spacing / 4, 1.01 * least, 8):
+            try:
+                moved = dmp.condition(times(distance), column).rollout(time=DENSE).position
+            except ValueError:
+                assert distance < least
+            else:
+                assert moved.abs().max() < 1.5
+
+
+def test_points_too_near_the_ends_of_a_window_are_refused():
+    dmp = flat(50)
+    with pytest.raises(ValueError, match=r"0\.367 s from the ends of `within`"):
+        dmp.condition([1.0], [[1.0]], within=(0.8, 2.4))
+    moved = dmp.condition([1.17], [[1.0]], within=(0.8, 2.4)).rollout(time=DENSE).position
+    assert moved.abs().max() < 1.01
 
 
 def test_what_cannot_be_is_refused():
