@@ -38,8 +38,8 @@ fifty functions."""
 ORDER = 3
 """Order of the penalised differences: a motion without jerk is a parabola."""
 SAMPLES_EACH = 1.5
-"""Samples per basis function from which a fit determines the motion between samples: with fewer,
-accelerations exceed the true ones several times."""
+"""Samples per basis function from which a fit determines the motion between samples: with
+fewer, accelerations exceed the true ones several times."""
 DENSE = 4
 """Samples per basis function of denser grids, on which a spline hides no detail."""
 
@@ -391,21 +391,20 @@ def densified(samples: Samples, n_basis: int) -> Samples:
     s = torch.cat([grid, grid[-1:].expand(more)]).repeat(len(few), 1)
     mask = (torch.arange(G + more, device=s.device) < G).repeat(len(few), 1)
     position = samples.position.new_zeros(*samples.position.shape[:2], G + more).double()
-    velocity = None if samples.velocity is None else torch.zeros_like(position)
-    pairs = (s, samples.s), (mask, samples.mask), (position, samples.position)
-    for to, given in (*pairs, (velocity, samples.velocity)):
-        if to is not None:
-            # Other demonstrations keep their samples, padded at the end.
-            to[~few] = 1 if to is s else 0
-            to[~few, ..., :T] = given[~few].to(to)
+    velocity, recorded = torch.zeros_like(position), samples.velocity
+    for to, given in ((s, samples.s), (mask, samples.mask), (position, samples.position)):
+        # Other demonstrations keep their samples, padded at the end.
+        to[~few] = 1 if to is s else 0
+        to[~few, ..., :T] = given[~few].to(to)
+    if recorded is not None:
+        velocity[~few, ..., :T] = recorded[~few].double()
     for i in few.nonzero()[:, 0].tolist():
-        valid, tau, rate = samples.mask[i], samples.duration[i], None
-        if samples.velocity is not None:
-            rate = samples.velocity[i][:, valid].double() * tau
+        valid, tau = samples.mask[i], samples.duration[i]
+        rate = None if recorded is None else recorded[i][:, valid].double() * tau
         y = samples.position[i][:, valid].double()
         position[i, :, :G], slope = _cubic(samples.s[i, valid], y, rate, grid)
-        if velocity is not None:
-            velocity[i, :, :G] = slope / tau
+        velocity[i, :, :G] = slope / tau
+    velocity = None if recorded is None else velocity
     whole = {"mask": mask, "complete": bool(mask.all())}
     return replace(samples, s=s, position=position, velocity=velocity, **whole)
 
@@ -419,32 +418,39 @@ def _cubic(
     """Value and derivative of the cubic spline through samples (not-a-knot; de Boor 1978)."""
     h = knots.diff()
     d = y.diff() / h
-    if rate is None:
-        A, right = torch.zeros(len(knots), len(knots)).to(h), torch.zeros_like(y)
-        i = torch.arange(1, len(knots) - 1)
-        A[i, i - 1], A[i, i], A[i, i + 1] = h[1:], 2 * (h[1:] + h[:-1]), h[:-1]
-        right[:, 1:-1] = 3 * (h[1:] * d[:, :-1] + h[:-1] * d[:, 1:])
-        # No third derivative jumps at the second and at the last knot but one; three samples
-        # make these conditions one, and a parabola has a linear slope.
-        for end, near, far, k, m in ((0, 1, 2, 0, 1), (-1, -2, -3, -1, -2)):
-            span = 1.0 if len(knots) == 3 else abs(knots[far] - knots[end])
-            A[end, end], A[end, near] = (1.0, 1.0) if len(knots) == 3 else (h[m], span)
-            right[:, end] = 2 * d[:, k]
-            if len(knots) > 3:
-                first = (h[k] + 2 * span) * h[m] * d[:, k] + h[k] ** 2 * d[:, m]
-                right[:, end] = first / span
-        rate = torch.linalg.solve(A, right.mT).mT
+    r = torch.linalg.solve(*_slope_equations(knots, h, d)).mT if rate is None else rate
     k = torch.searchsorted(knots, s, right=True).clamp(1, len(knots) - 1) - 1
     u, h, y0, d, r0, r1 = (
         (s - knots[k]) / h[k],
         h[k],
         y[:, k],
         d[:, k],
-        rate[:, k],
-        rate[:, k + 1],
+        r[:, k],
+        r[:, k + 1],
     )
     b, c = 3 * d - 2 * r0 - r1, r0 + r1 - 2 * d
     return y0 + h * u * (r0 + u * (b + u * c)), r0 + u * (2 * b + 3 * u * c)
+
+
+def _slope_equations(
+    knots: Float[Tensor, "T"], h: Float[Tensor, "n"], d: Float[Tensor, "C n"]
+) -> tuple[Float[Tensor, "T T"], Float[Tensor, "T C"]]:
+    """Equations of the slopes at knots, from the spacings and the slopes of the chords."""
+    T = len(knots)
+    A, right = torch.zeros(T, T).to(h), torch.zeros(T, len(d)).to(h)
+    i = torch.arange(1, T - 1)
+    A[i, i - 1], A[i, i], A[i, i + 1] = h[1:], 2 * (h[1:] + h[:-1]), h[:-1]
+    right[1:-1] = 3 * (h[1:] * d[:, :-1] + h[:-1] * d[:, 1:]).mT
+    for end, near, far, k, m in ((0, 1, 2, 0, 1), (-1, -2, -3, -1, -2)):
+        if T == 3:  # the slope of a parabola is linear
+            A[end, end] = A[end, near] = 1.0
+            right[end] = 2 * d[:, k]
+            continue
+        # No third derivative jumps at the second and at the last knot but one.
+        span = (knots[far] - knots[end]).abs()
+        A[end, end], A[end, near] = h[m], span
+        right[end] = ((h[k] + 2 * span) * h[m] * d[:, k] + h[k] ** 2 * d[:, m]) / span
+    return A, right
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,9 +36,9 @@ DEPENDENT = 1e-12
 OVERSHOOT = 1.5
 """Largest change of a motion relative to that of the curve through its via points."""
 CLOSEST, CLOSEST_TO_WINDOW = 2, 6
-"""Distances, in those of basis functions, of via points from one another and from start and end,
-and from the ends of a window, at which no overshoot occurs with any basis, gain or change; the
-next smaller steps, 1.5 and 5, overshoot."""
+"""Distances, in those of basis functions, of via points from one another and from start and
+end, and from the ends of a window, at which no overshoot occurs with any basis, gain or change;
+the next smaller steps, 1.5 and 5, overshoot."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
