@@ -10,13 +10,11 @@ import base64
 import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
-from urllib.parse import quote
 
 from hrc_learn.store import new_file, read_json, write_json
 from hrc_learn.viz.report_content import Film as Film
@@ -34,6 +32,8 @@ from hrc_learn.viz.report_content import software_versions as software_versions
 def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = ()) -> str:
     """One page about one or several runs, as HTML.
 
+    Quantities that two or more runs measured stand side by side.
+
     Args:
         title: Title of the page.
         reports: Reports in order. Several are first listed with their verdicts.
@@ -42,197 +42,31 @@ def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = 
     Raises:
         ValueError: If there is no report.
     """
+    # Used only here; it takes some hundredths of a second to import.
+    from jinja2 import Environment, PackageLoader
+
     if not reports:
         raise ValueError("a page needs at least one report.")
-    if len(reports) == 1:
-        body = _report(reports[0], "run1", linked)
-    else:
-        articles = [
-            f"<article>{_report(report, f'run{i}')}</article>"
-            for i, report in enumerate(reports, 1)
-        ]
-        heading = f"<h1>{escape(title)}</h1>"
-        overview = "\n".join(
-            f'<tr><td class="n">{i}</td><td><a href="#run{i}">{escape(report.title)}</a></td>'
-            f"<td>{_verdict(report)}</td></tr>"
-            for i, report in enumerate(reports, 1)
-        )
-        overview = f'<table class="overview"><tbody>{overview}</tbody></table>'
-        body = "\n".join([heading, overview, _side_by_side(reports), *articles])
-    style = files(__package__).joinpath("report.css").read_text(encoding="utf-8")
-    return _PAGE.format(title=escape(title), style=style, body=body)
-
-
-def _side_by_side(reports: Sequence[Report]) -> str:
-    """HTML table of all quantities that two or more runs measured; empty without any.
-
-    Each column is a run, numbered as in the overview. Missed targets are marked.
-    """
     tables = [{m.name: m for m in report.table} for report in reports]
     common = [name for name, n in Counter(n for t in tables for n in t).items() if n > 1]
-    if not common:
-        return ""
     compared = [i for i, table in enumerate(tables) if table.keys() & set(common)]
-    heads = "".join(f'<th class="n"><a href="#run{i + 1}">{i + 1}</a></th>' for i in compared)
-    rows = []
-    for name in common:
-        cells = "".join(_cell(tables[i].get(name)) for i in compared)
-        rows.append(f"<tr><td>{escape(name)}</td>{cells}</tr>")
-    return f"<h2>Side by side</h2>{_table(f'<th>Measured</th>{heads}', rows)}"
-
-
-def _table(heads: str, rows: Sequence[str]) -> str:
-    """HTML table that scrolls on a narrow page."""
-    return (
-        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{'\n'.join(rows)}</tbody></table></div>"
+    pages = Environment(
+        loader=PackageLoader("hrc_learn.viz", ""),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-
-
-def _cell(m: Measurement | None) -> str:
-    if m is None:
-        return "<td></td>"
-    missed = ' class="n miss"' if m.ok is False else ' class="n"'
-    return f"<td{missed}>{escape(m.shown)}</td>"
-
-
-def _report(report: Report, anchor: str, linked: Sequence[str] = ()) -> str:
-    return "\n".join(
-        [
-            f'<h1 id="{anchor}">{escape(report.title)}</h1>',
-            _verdict(report),
-            _paragraphs(report.summary),
-            "" if report.film is None else _film(report.film),
-            _measurements(report.table),
-            _links(linked),
-            *(_section(section) for section in report.sections),
-            *(
-                [f"<h2>Reproduce</h2>\n<pre>{escape(report.command)}</pre>"]
-                * bool(report.command)
-            ),
-            _details("Configuration", flatten(report.configuration)),
-            _details("Versions", report.versions),
-        ]
+    return pages.get_template("report.html").render(
+        title=title,
+        reports=reports,
+        linked=linked if len(reports) == 1 else (),
+        common={name: [tables[i].get(name) for i in compared] for name in common},
+        compared=[i + 1 for i in compared],
+        style=files(__package__).joinpath("report.css").read_text(encoding="utf-8"),
+        base64=lambda content: base64.b64encode(content).decode("ascii"),
+        leading=leading,
+        flatten=flatten,
     )
-
-
-def _verdict(report: Report) -> str:
-    if not report.targets:
-        return ""
-    if not report.missed:
-        reached = "The target" if report.targets == 1 else f"All {report.targets} targets"
-        return f'<span class="verdict ok">{reached} reached.</span>'
-    missed = f"{len(report.missed)} of {report.targets} targets missed."
-    return f'<span class="verdict miss">{missed}</span>'
-
-
-_FIRST = 6
-"""Number of values shown unfolded."""
-
-
-def _measurements(table: Sequence[Measurement]) -> str:
-    """First values as a table, the others folded."""
-    if not table:
-        return ""
-    first, others = leading(table, _FIRST)
-    page = _values(first)
-    if others:
-        summary = f"{len(others)} more value" + "s" * (len(others) > 1)
-        page += f"<details><summary>{summary}</summary>{_values(others)}</details>"
-    return page
-
-
-def _values(table: Sequence[Measurement]) -> str:
-    """Values with their targets, and the claims of the paper if there are any."""
-    claims = any(m.claim for m in table)
-    heads = '<th>Measured</th><th class="n">Value</th><th class="n">Target</th><th></th>'
-    if claims:
-        heads += "<th>The paper says</th>"
-    return _table(heads, [_row(m, claims) for m in table])
-
-
-def _links(linked: Sequence[str]) -> str:
-    """Links to the other files in the folder of the page."""
-    if not linked:
-        return ""
-    links = ", ".join(f'<a href="{quote(name)}">{escape(name)}</a>' for name in linked)
-    opens = " <code>hrc show</code> with this folder opens the recording."
-    shown = opens if any(name.endswith(".rrd") for name in linked) else ""
-    return f"<p>In this folder: {links}.{shown}</p>"
-
-
-def _row(m: Measurement, claims: bool) -> str:
-    marks = {
-        True: '<td class="ok">✓ ok</td>',
-        False: '<td class="miss">✗ missed</td>',
-        None: "<td></td>",
-    }
-    claim = f"<td>{escape(m.claim)}</td>" if claims else ""
-    return (
-        f'<tr><td>{escape(m.name)}</td><td class="n">{escape(m.shown)}</td>'
-        f'<td class="n">{escape(m.bound)}</td>{marks[m.ok]}{claim}</tr>'
-    )
-
-
-def _section(section: Section) -> str:
-    figures = "\n".join(_figure(picture) for picture in section.figures)
-    heading = f"<h2>{escape(section.heading)}</h2>"
-    return f"<section>{heading}{_paragraphs(section.text)}{figures}</section>"
-
-
-def _figure(picture: Picture) -> str:
-    kind, content = ("svg+xml", picture.svg) if picture.svg else ("png", picture.png())
-    data = base64.b64encode(content).decode("ascii")
-    caption = escape(picture.caption)
-    return (
-        f'<figure><img alt="{caption}" src="data:image/{kind};base64,{data}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _film(film: Film) -> str:
-    data = base64.b64encode(film.mp4).decode("ascii")
-    caption = escape(film.caption)
-    return (
-        f'<figure><video controls autoplay muted loop playsinline aria-label="{caption}" '
-        f'src="data:video/mp4;base64,{data}"></video>'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def _paragraphs(text: str) -> str:
-    parts = [part.strip() for part in text.split("\n\n")]
-    return "\n".join(f"<p>{escape(part)}</p>" for part in parts if part)
-
-
-def _details(summary: str, values: Mapping[str, object]) -> str:
-    if not values:
-        return ""
-    rows = "\n".join(
-        f"<tr><td>{escape(str(key))}</td><td>{escape(str(value))}</td></tr>"
-        for key, value in values.items()
-    )
-    return (
-        f"<details><summary>{escape(summary)}</summary>"
-        '<div class="scroll"><table class="plain"><tbody>'
-        f"{rows}</tbody></table></div></details>"
-    )
-
-
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{style}</style>
-</head>
-<body><main>
-{body}
-</main></body>
-</html>
-"""
 
 
 REPORT = "report.json"

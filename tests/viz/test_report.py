@@ -139,6 +139,7 @@ def test_nothing_is_fetched_from_elsewhere():
     html = reports_page("Page", [report(), report()])
     assert "http" not in html
     assert "url(" not in html
+    assert '"Segoe UI"' in html  # the style, unescaped
     assert not {"script", "link", "iframe"} & Page(html).tags
 
 
