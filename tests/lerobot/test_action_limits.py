@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from hrc_learn.lerobot.smoothing import (
     gathered_limits,
 )
 from hrc_learn.lerobot.smoothing.action_limits import calibrated_ranges, urdf_limits
-from hrc_learn.lerobot.smoothing.command import main
 
 FPS = 20.0
 
@@ -223,7 +223,17 @@ def test_files_that_tell_no_limits_are_refused(tmp_path, read, content, message)
         read(tmp_path / "none")
 
 
+PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_smooth"
+
+
 def test_the_command_says_what_is_wrong_and_writes_what_it_found(tmp_path, capsys):
+    name = "hrc_learn.lerobot.smoothing.command"  # in the distribution: lerobot_smooth.command
+    spec = spec_from_file_location(name, PLUGIN / "command.py")
+    assert spec is not None
+    assert spec.loader is not None
+    command = module_from_spec(spec)
+    spec.loader.exec_module(command)
+    main = command.main
     dataset, out = write(tmp_path / "set", paths()), tmp_path / "limits.json"
     arguments = ["limits", "--dataset", str(dataset), "--out", str(out)]
     assert main([*arguments, "--scale", "0"]) == 1
@@ -242,9 +252,8 @@ def test_the_command_says_what_is_wrong_and_writes_what_it_found(tmp_path, capsy
 def test_the_distribution_of_its_own_imports_nothing_else_of_ours(tmp_path):
     """Built as a wheel, loaded where hrc_learn cannot be found, and then together with it."""
     pytest.importorskip("hatchling", reason="the build backend is not installed")
-    project = Path(__file__).parents[2] / "plugins" / "lerobot_smooth"
     build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
-    subprocess.run(build, cwd=project, check=True, capture_output=True)
+    subprocess.run(build, cwd=PLUGIN, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     program = (
         "import sys; sys.modules['hrc_learn'] = None; import lerobot_smooth.command;"
@@ -252,7 +261,7 @@ def test_the_distribution_of_its_own_imports_nothing_else_of_ours(tmp_path):
         "print('smooth' in RobotConfig.get_known_choices());"
         "del sys.modules['hrc_learn']; import hrc_learn.lerobot.smoothing"
     )
-    path = os.pathsep.join([str(wheel), str(project.parents[1])])
+    path = os.pathsep.join([str(wheel), str(PLUGIN.parents[1])])
     ran = subprocess.run(
         [sys.executable, "-c", program],
         capture_output=True,
