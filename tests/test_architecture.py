@@ -121,7 +121,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "cli": {"huggingface_hub", "httpx"},
     "demos": {"av", "scipy", "huggingface_hub", "h5py", "zarr", "tfrecord"},
     "vision": {"cv2"},
-    "viz": {"av", "rich"},
+    "viz": {"av", "jinja2", "rich"},
     "hardware": {"franky", "pylibfranka", "cv2"},
     "teleoperation": {
         "viser",

@@ -35,7 +35,7 @@ _LIBRARIES = {
     "sim": ("mujoco", "cv2"),
     "demos": ("pyarrow", "av", "scipy"),
     "import": ("h5py", "zarr", "tfrecord"),
-    "viz": ("rerun", "matplotlib"),
+    "viz": ("rerun", "matplotlib", "jinja2"),
     "ui": ("viser",),
     "gamepad": ("pygame",),
     "haptic": ("forcedimension_core",),
