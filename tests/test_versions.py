@@ -14,7 +14,7 @@ from packaging.version import Version
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
-TESTED = ("all", "hardware", "dev", "docs")
+TESTED = ("all", "hardware", "ros2", "dev", "docs")
 """What `make test` and `make docs` install between them."""
 
 

@@ -7,7 +7,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 torch=${UV_TORCH_BACKEND:-}
-extras='.[all,hardware,dev,docs]'
+extras='.[all,hardware,ros2,dev,docs]'
 
 say() { printf '%s\n' "$*" >&2; }
 

@@ -201,12 +201,14 @@ class Import(Measured):
     """Convert recordings of any format to a LeRobot dataset.
 
     Reads .npz, .npy, text tables (.csv, .tsv, .txt), Parquet, HDF5 (ALOHA, robomimic and
-    others), zarr, .mat, RLDS and folders of these with videos. A preview lists what each field
-    was understood as; options or a mapping file correct it. Recorded commands become actions.
+    others), zarr, .mat, RLDS, bags of ROS 1 and 2, MCAP, and folders of these with videos. A
+    preview lists what each field was understood as; options or a mapping file correct it.
+    Recorded commands become actions.
 
         hrc import pour.npz --out pour --joints q --time t
         hrc import episode_*.hdf5 --out aloha --fps 50
         hrc import demos.zarr --out set --fps 10 --dry-run --mapping map.json
+        hrc import rosbag2_* --out bags
     """
 
     files: tuple[Path, ...]
@@ -242,7 +244,7 @@ class Import(Measured):
     duration: float | None = None
     """Duration of each demonstration [s] if there are no time stamps."""
     fps: float | None = None
-    """Frame rate [1/s] if there are no time stamps."""
+    """Frame rate [1/s] if there are no time stamps; bags are thinned to it."""
     actions: bool = True
     """Where no commands were recorded, take the state of the next frame as action, as LeRobot's
     policies need them."""

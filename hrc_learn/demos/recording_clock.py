@@ -1,5 +1,6 @@
 """Clocks of recordings: stamps in seconds, and all fields on the clock of the state."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,10 @@ _STALE = 0.2
 """Age above which a held value no longer counts as measured [s], or three of its periods."""
 _JUMP = 10.0
 """Gap between stamps that is reported, as a multiple of the usual one."""
+
+
+_FASTER = 1.5
+"""States per image from which states of topics are thinned to the images."""
 
 
 class Clock(NamedTuple):
@@ -66,8 +71,42 @@ def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOption
     if partial:
         cut = len(time) - (stop - start)
         notes.append(f"{cut} frames without {', '.join(partial)} are cut at the ends")
-    cut_frames = {name: index[start:stop] for name, index in frames.items()}
-    return Clock(time[start:stop], cut_frames, tuple(f"{place}: {note}" for note in notes))
+    rows = np.arange(start, stop)
+    if recording.streams:
+        cameras = {camera: frames[name][rows] for camera, name in meaning.cameras.items()}
+        rows = rows[_thinned(time[rows], cameras, options.fps, notes)]
+    chosen = {name: index[rows] for name, index in frames.items()}
+    return Clock(time[rows], chosen, tuple(f"{place}: {note}" for note in notes))
+
+
+def _thinned(
+    time: Float64[np.ndarray, " frames"],
+    cameras: Mapping[str, Int64[np.ndarray, " frames"]],
+    fps: float | int | None,
+    notes: list[str],
+) -> Int64[np.ndarray, " _rows"]:
+    """Rows of a state that is faster than the cameras or than the wanted rate.
+
+    Args:
+        time: Stamps of the state [s].
+        cameras: Latest image of each camera at each stamp.
+        fps: Wanted rate [1/s]; None: that of the fastest camera.
+        notes: Receives the method.
+    """
+    rows, rate = np.arange(len(time)), (len(time) - 1) / (time[-1] - time[0])
+    if fps is not None:
+        ticks = np.arange(time[0], time[-1] + 1e-6, 1 / fps)
+        rows = np.unique(np.searchsorted(time, ticks - 0.25 / rate))
+        rows = rows[rows < len(time)]
+        method = f"the first state from each tick of {fps:g} Hz on"
+    elif cameras:
+        name = max(cameras, key=lambda camera: len(np.unique(cameras[camera])))
+        new = np.flatnonzero(np.diff(cameras[name], prepend=-1) > 0)
+        rows = new if len(rows) > _FASTER * len(new) else rows
+        method = f"the first state after each image of {name}"
+    if len(rows) < len(time):
+        notes.append(f"states at {rate:.0f} Hz are thinned: {method}")
+    return rows
 
 
 def _stamps_of_state(

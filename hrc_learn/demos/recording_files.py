@@ -12,7 +12,8 @@ from jaxtyping import Shaped
 
 from hrc_learn.demos.issues import DatasetError
 
-Kind = Literal["number", "image", "encoded", "text", "depth", "other"]
+Kind = Literal["number", "image", "encoded", "text", "depth", "pose", "other"]
+"""Content of a field; "pose" is that of another frame than the tool's."""
 Read = Callable[[int, int], Shaped[np.ndarray, "_frames ..."]]
 
 UNNAMED = "array"
@@ -62,6 +63,8 @@ class Field:
     """Video file that holds the images."""
     rate: float = 0.0
     """Frame rate of the video [1/s]."""
+    clock: str = ""
+    """Field of its stamps, if the file says which."""
 
     @property
     def frames(self) -> int:
@@ -98,6 +101,10 @@ class Recording:
     """Frame rate that the file states [1/s]."""
     task: str = ""
     """Task in words, if the file gives it."""
+    streams: bool = False
+    """True if each field has its own rate and stamps, as topics have."""
+    notes: tuple[str, ...] = ()
+    """Remarks of the reader, for the preview."""
 
     def error(self, message: str, key: str | None = None) -> DatasetError:
         """Reading error located in this episode."""
@@ -147,6 +154,8 @@ class Recording:
         It is one that is named after the field, then one of the same group, then of a group
         around, then the preferred one.
         """
+        if self.fields[name].clock:
+            return self.fields[name].clock
         group, _, last = name.rpartition("/")
         word = re.split(r"[_\d]", last)[0]
 

@@ -1,6 +1,6 @@
-"""Readers of recordings: numpy, text, Parquet, HDF5, zarr, MATLAB, RLDS, videos and folders.
+"""Readers of recordings: numpy, text, Parquet, HDF5, zarr, MATLAB, RLDS, bags and folders.
 
-To add a format, such as bags of ROS, write a reader and list its suffix in `READERS`.
+To add a format, write a reader and list its suffix in `READERS`.
 """
 
 import contextlib
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.recording_bags import is_bag, read_bag
 from hrc_learn.demos.recording_files import (
     UNNAMED,
     Field,
@@ -65,6 +66,8 @@ def _reader_of(path: Path, columns: Sequence[str]) -> Callable[[Path], list[Reco
         if (path / "meta" / "info.json").is_file():
             text = "is a LeRobot dataset already: `hrc check`, `repair` and `merge` take it"
             raise DatasetError(text, file=path)
+        if is_bag(path):
+            return read_bag
         return read_zarr if _is_zarr(path) else partial(_read_folder, columns=columns)
     if not path.is_file():
         raise DatasetError("not found", file=path)
@@ -382,6 +385,7 @@ READERS: dict[str, Callable[..., list[Recording]]] = {
     ".mat": read_mat,
     ".zarr.zip": read_zarr,
     ".tfrecord": read_tfrecord,
+    **dict.fromkeys((".bag", ".db3", ".mcap"), read_bag),
 }
 """Reader of each suffix."""
 
@@ -399,7 +403,7 @@ def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
     known = [
         p for p in entries if p.name.lower().endswith((*READERS,)) or ".tfrecord" in p.name
     ]
-    tables = [p for p in entries if p in known or (p.is_dir() and _is_zarr(p))]
+    tables = [p for p in entries if p in known or (p.is_dir() and (_is_zarr(p) or is_bag(p)))]
     videos = [p for p in entries if p.suffix.lower() in _VIDEOS]
     if not tables:
         folders = [p for p in entries if p.is_dir()]

@@ -104,6 +104,7 @@ class ImportPlan:
             names = [name for name, why in meaning.left_out.items() if why == reason]
             yield f"left out: {', '.join(names)} ({reason})"
         yield from (f"note: {note}" for note in meaning.notes)
+        yield from (f"note: {r.file.name}: {note}" for r in self.recordings for note in r.notes)
         if not self.has_actions:
             made = (
                 "the next states are the actions" if actions else "the dataset has no actions"

@@ -407,6 +407,13 @@ def _followed(
     votes = []
     for one in recordings[:: max(1, len(recordings) // _CHECKED_EPISODES)]:
         given, measured = read_columns(one, command), read_columns(one, state)
+        if one.streams:  # each topic has its own rate
+            own = [one.fields[places[0][0]].clock for places in (command, state)]
+            times = [one.fields[clock].numbers()[:, 0] for clock in own]
+            first, last = max(t[0] for t in times), min(t[-1] for t in times)
+            ticks = np.arange(first, last, 1 / _CHECK_RATE)
+            at = [np.searchsorted(t, ticks, side="right") - 1 for t in times]
+            given, measured = given[at[0]], measured[at[1]]
         count = min(len(given), len(measured))
         given, measured = given[:count], measured[:count]
         span = np.ptp(measured, axis=0)

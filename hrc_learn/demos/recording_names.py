@@ -58,6 +58,8 @@ _TURNS = {
 """Width of a pose without names -> the question about its orientation."""
 _MEASURED = re.compile(r"^(?:(?:measured|meas|follower|puppet|obs|observation|state)[_. /])+")
 _INDEXED = re.compile(r"(.*?)[_.\[ ]?(\d+)\]?")
+_NO_CAMERA = re.compile(r"image(?:_\w+)?|color|rgb|compressed|ffmpeg|video")
+"""Parts of a topic that do not name its camera."""
 _OTHER_FRAME = re.compile(r"cam|trinsic|obj|goal|start")
 # ALOHA's `qpos`, `qvel`, `effort` and `action`: github.com/tonyzhaozh/act, record_episodes.py.
 _ALOHA_ARM = "waist shoulder elbow forearm_roll wrist_angle wrist_rotate gripper"
@@ -124,7 +126,9 @@ def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str,
         return found
     for name, one in first.fields.items():
         if one.kind in ("image", "encoded") and not re.search(r"(?:^|/)next_", name):
-            last = re.sub(r"_(?:image|rgb|img|color)$", "", name.split("/")[-1])
+            parts = [p for p in name.split("/") if not _NO_CAMERA.fullmatch(p)]
+            last = ((first.streams and parts) or name.split("/"))[-1]
+            last = re.sub(r"_(?:image|rgb|img|color)$", "", last)
             plain = re.sub(r"\W+", "_", last).strip("_")
             found[plain if plain not in found else re.sub(r"\W+", "_", name)] = name
     return found
@@ -156,6 +160,7 @@ class FieldSearch:
         self.fingers: list[tuple[bool, str, Place]] = []
         self.two_fingers = ""
         kinds = {"depth": "depth images are not written", "text": "text", "other": "no frames"}
+        kinds["pose"] = "no tool by its name; to take it: --orientation"
         kept = first.fields.items()
         self.left_out = {name: kinds[one.kind] for name, one in kept if one.kind in kinds}
 

@@ -1,0 +1,329 @@
+"""Bags of ROS 1 and ROS 2 (.bag, .db3, .mcap, folders) and other MCAP files as recordings.
+
+No ROS is needed: the packages rosbags and mcap read the files.
+"""
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float64
+
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.recording_files import Field, Recording, array_field
+from hrc_learn.demos.recording_messages import (
+    TOOL,
+    Messages,
+    Topic,
+    image_field,
+    matrix_of,
+    parts_of,
+    poses_of_frames,
+    stamp_of,
+)
+
+_STALE, _PERIODS = 0.2, 3.0
+"""A topic that is silent for longer than this time [s] and number of its periods has a gap."""
+_SHORTEST = 0.5
+"""Parts between gaps that are shorter are left out [s]."""
+_SAME_CLOCK = 0.5
+"""Largest difference between a message's own stamp and its reception on one clock [s]."""
+_BURST = 2e-4
+"""Messages that follow each other this fast were written by a program, not by an arm [s]."""
+_ALIKE = 0.3
+"""Distance of commands from their joint, as a fraction of that from any other joint, below
+which their order is known."""
+_ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
+_COMMAND = re.compile(r"(?:^|[/_])(?:commands?|cmd|goal|target|desired)(?:$|[/_])")
+
+
+def is_bag(path: Path) -> bool:
+    """True for the folder of a ROS 2 bag."""
+    return (path / "metadata.yaml").is_file()
+
+
+def read_bag(path: Path) -> list[Recording]:
+    """Episodes of a bag; one with gaps in its joints or images becomes several.
+
+    Stamps are those in the messages where their clock is that of the recorder or that of all
+    topics, and times of reception elsewhere.
+
+    Raises:
+        DatasetError: The bag is damaged, or holds no topic that is understood.
+    """
+    types, messages = _opened_mcap(path) if path.suffix == ".mcap" else _opened_bag(path)
+    topics, order, notes = _gathered(types, messages)
+    if not topics:
+        kinds = ", ".join(f"{topic} ({kind})" for topic, kind in types.items())
+        raise DatasetError(f"no topic holds joints, poses or images: {kinds}", file=path)
+    times, fields = _times(topics, notes), {}
+    for name, one in topics.items():
+        made = _field(name, one, messages, order, notes)
+        if made is None:
+            continue
+        clock = f"{name}/stamp"
+        time, places = np.unique(times[name], return_index=True)
+        if made.kind == "number" and len(time) < made.frames:
+            notes.append(f"{name}: {made.frames - len(time)} messages with repeated stamps")
+        if made.kind in ("number", "pose"):
+            values = made.read(0, made.frames)[places]
+            made = replace(array_field(name, values, names=made.names), kind=made.kind)
+        elif len(time) < made.frames or (np.diff(places) < 0).any():
+            time = np.array(one.received)
+        fields |= {name: replace(made, clock=clock), clock: array_field(clock, time, unit="s")}
+    fields = _with_joints_of_commands(fields)
+    used = " ".join(f"/{name}/" for name in topics)
+    unread = [t for t in types if f"/{t.strip('/')}/" not in used]
+    if unread:
+        notes.append(f"topics left out: {', '.join(f'{t} ({types[t]})' for t in unread)}")
+    return _without_gaps(Recording(file=path, fields=fields, streams=True), notes)
+
+
+def _opened_bag(path: Path) -> tuple[dict[str, str], Messages]:
+    """Types of the topics of a bag, and its messages."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    # Bags from before ROS 2 Iron hold no definitions.
+    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    reader.open()
+
+    def messages(topics: Sequence[str], start: int | None = None) -> Iterator:
+        known = reader.typestore.fielddefs
+        wanted = [c for c in reader.connections if c.topic in topics and c.msgtype in known]
+        for connection, time, raw in reader.messages(wanted, start=start) if wanted else ():
+            yield connection.topic, time, reader.deserialize(raw, connection.msgtype)
+
+    return {c.topic: c.msgtype for c in reader.connections}, messages
+
+
+def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
+    """Types of the topics of an MCAP file, and its messages."""
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    stream = path.open("rb")
+    reader, store = make_reader(stream), get_typestore(Stores.EMPTY)
+    try:
+        summary = reader.get_summary()
+    except McapError as error:
+        text = f"is damaged or was not closed ({error}): repair it by `mcap recover`"
+        raise DatasetError(text, file=path) from error
+    if summary is None:
+        raise DatasetError("has no index: repair it by `mcap recover`", file=path)
+    for schema in summary.schemas.values():
+        if schema.encoding == "ros2idl":
+            store.register(get_types_from_idl(schema.data.decode()))
+        elif schema.encoding in ("ros1msg", "ros2msg"):
+            store.register(get_types_from_msg(schema.data.decode(), schema.name))
+
+    def decoded(schema: Any, encoding: str, data: bytes) -> Any:
+        if encoding in _ROS:
+            name = schema.name if "/msg/" in schema.name else schema.name.replace("/", "/msg/")
+            return getattr(store, _ROS[encoding])(data, name)
+        if encoding == "json":
+            return json.loads(data, object_hook=lambda one: SimpleNamespace(**one))
+        from mcap_protobuf.decoder import DecoderFactory
+
+        decode = DecoderFactory().decoder_for(encoding, schema)
+        return None if decode is None else decode(data)
+
+    def messages(topics: Sequence[str], start: int | None = None) -> Iterator:
+        for schema, channel, one in reader.iter_messages([*topics], starting_at=start):
+            content = decoded(schema, channel.message_encoding, one.data)
+            if content is not None:
+                yield channel.topic, one.log_time, content
+
+    schemas, channels = summary.schemas, summary.channels.values()
+    names = {c.topic: schemas[c.schema_id].name if c.schema_id else "" for c in channels}
+    return names, messages
+
+
+def _gathered(
+    types: Mapping[str, str], messages: Messages
+) -> tuple[dict[str, Topic], list[str], list[str]]:
+    """Topics by field, joints in the order of the robot's description, and notes."""
+    sets: dict[str, dict[frozenset[str], Topic]] = {}
+    edges: dict[tuple[str, str], list[tuple[float, float, np.ndarray]]] = {}
+    order: list[str] = []
+    for topic, received, message in messages([*types]):
+        stamp, data = stamp_of(message), getattr(message, "data", None)
+        for one in getattr(message, "transforms", ()):
+            edge = (one.header.frame_id.strip("/"), one.child_frame_id.strip("/"))
+            pose = matrix_of(one.transform.translation, one.transform.rotation)
+            edges.setdefault(edge, []).append((received * 1e-9, stamp_of(one), pose))
+        if isinstance(data, str) and topic.endswith("robot_description") and not order:
+            order = [j.get("name", "") for j in ElementTree.fromstring(data).iter("joint")]
+        for name, names, value in parts_of(topic.strip("/"), message):
+            group = sets.setdefault(name, {})
+            one = group.setdefault(frozenset(names or ()), Topic(names))
+            one.add(received, stamp, value, names)
+            one.sample = one.sample or message
+    topics = {}
+    for name, group in sets.items():
+        ranked = sorted(group.values(), key=lambda one: -len(one.values) * one.values[0].size)
+        topics[name] = ranked[0]
+        for one in ranked[1:]:  # a gripper's driver may publish to the same topic
+            parent, _, last = name.rpartition("/")
+            topics["/".join(filter(None, (parent, (one.names or "?")[0], last)))] = one
+    joints = [one for name, one in topics.items() if name.endswith("joint_positions")]
+    main = max(joints, key=lambda one: len(one.values), default=Topic())
+    return topics | poses_of_frames(edges), order or [*(main.names or ())], []
+
+
+def _times(
+    topics: Mapping[str, Topic], notes: list[str]
+) -> dict[str, Float64[np.ndarray, " _messages"]]:
+    """Times of the messages of each topic [s], on one clock."""
+    times, late = {}, {}
+    for name, one in topics.items():
+        stamps, received = np.array(one.stamps), np.array(one.received)
+        late[name] = float(np.median(stamps - received)) if stamps[1:].all() else np.nan
+    offsets = np.array([*late.values()])
+    shared = bool(np.ptp(offsets) < _SAME_CLOCK)  # such as the clock of a simulation
+    for name, one in topics.items():
+        own = shared or abs(late[name]) < _SAME_CLOCK
+        times[name] = np.array(one.stamps if own else one.received)
+        if not own and not np.isnan(late[name]):
+            text = f"its stamps are {late[name]:.3g} s from the recorder's clock"
+            notes.append(f"{name}: {text}: times of reception are used")
+    return times
+
+
+def _field(
+    name: str, one: Topic, messages: Messages, order: Sequence[str], notes: list[str]
+) -> Field | None:
+    """Field of a topic; None if it cannot be used, which a note says."""
+    if not one.values[0].size:
+        return image_field(name, one, messages, notes)
+    if len({value.shape for value in one.values}) > 1:
+        notes.append(f"{name} is left out: its messages differ in size")
+        return None
+    values, names = np.stack(one.values), one.names
+    if not np.isfinite(values).all() and not name.endswith("joint_positions"):
+        notes.append(f"{name} is left out: it holds NaN")
+        return None
+    if names and {*names} <= {*order}:
+        places = [names.index(name) for name in order if name in names]
+        values, names = values[:, places], tuple(names[i] for i in places)
+    made = array_field(name, values, names=names)
+    is_pose = values.shape[1:] == (4, 4) and not TOOL.search(name)
+    return replace(made, kind="pose") if is_pose else made
+
+
+def _with_joints_of_commands(fields: Mapping[str, Field]) -> dict[str, Field]:
+    """Name the columns of commands that have no names, by the joints that follow them.
+
+    A controller has an order of its own, which such messages do not tell.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    found = dict(fields)
+    states = [
+        name
+        for name, one in fields.items()
+        if name.endswith("joint_positions") and not _COMMAND.search(name)
+    ]
+    for name, one in fields.items():
+        same = [state for state in states if fields[state].width == one.width > 1]
+        if one.kind != "number" or one.names or not same or not _COMMAND.search(name):
+            continue
+        state = fields[same[0]]
+        time, own = (fields[f.clock].numbers()[:, 0] for f in (one, state))
+        at = np.clip(np.searchsorted(own, time), 0, len(own) - 1)
+        apart = np.abs(one.numbers()[:, :, None] - state.numbers()[at][:, None]).mean(0)
+        rows, columns = linear_sum_assignment(apart)
+        best, others = apart[rows, columns], apart.copy()
+        others[rows, columns] = np.inf
+        if (best < _ALIKE * others.min(1)).all() and state.names:
+            values = one.numbers()[:, np.argsort(columns)]
+            made = array_field(name, values, names=state.names, clock=one.clock)
+            found[f"{name}/joint_positions"] = made
+            del found[name]
+    return found
+
+
+def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
+    """The parts of a recording in which the joints and all images are present."""
+    fields = whole.fields
+    if not any(one.kind == "number" and one.clock for one in fields.values()):
+        fields = {
+            n: replace(f, kind="number" if f.kind == "pose" else f.kind)
+            for n, f in fields.items()
+        }
+        whole = replace(whole, fields=fields)
+    numbers = [n for n, one in fields.items() if one.kind == "number" and one.clock]
+    main = max(
+        numbers, key=lambda n: (n.endswith("joint_positions"), fields[n].frames), default=""
+    )
+    if not main:
+        raise whole.error("no topic holds joints or poses of a tool")
+    steady = [main, *(n for n, one in fields.items() if one.kind in ("image", "encoded"))]
+    times = {n: fields[one.clock].numbers()[:, 0] for n, one in fields.items() if one.clock}
+    if np.median(np.diff(times[main])) < _BURST:
+        notes.append(
+            f"{main}: its messages have no times of their own and were written at once"
+        )
+        bare = {n: replace(one, clock="") for n, one in fields.items() if one.clock}
+        return [replace(whole, fields=bare, streams=False, notes=tuple(notes))]
+    gaps = {name: _gaps(time) for name, time in times.items()}
+    start = max(times[name][0] for name in steady)
+    stop = min(times[name][-1] for name in steady)
+    parts = [(start, stop)]
+    for name in steady:
+        for left, right in gaps[name]:
+            parts = [p for a, b in parts for p in ((a, min(b, left)), (max(a, right), b))]
+            if start < left < stop:
+                text = f"silent for {right - left:.2f} s at {left - times[main][0]:.2f} s"
+                notes.append(f"{name} is {text}: divided there")
+    parts = [(a, b) for a, b in parts if b - a >= _SHORTEST]
+    if not parts:
+        raise whole.error(f"{', '.join(steady)} are never present together for {_SHORTEST} s")
+    silent = [
+        name
+        for name, found in gaps.items()
+        if name not in steady
+        and any(a < right and left < b for left, right in found for a, b in parts)
+    ]
+    for name in silent:
+        longest = max(right - left for left, right in gaps[name])
+        notes.append(f"{name} is left out: it is silent for {longest:.2f} s")
+    kept = {n: one for n, one in fields.items() if n not in silent}
+    whole = replace(whole, fields=kept, notes=tuple(notes))
+    if len(parts) == 1 and parts[0] == (start, stop):
+        return [whole]
+    return [
+        replace(
+            whole,
+            label=f"part {k}",
+            fields=_during(kept, a, b),
+            notes=tuple(notes) if k == 0 else (),
+        )
+        for k, (a, b) in enumerate(parts)
+    ]
+
+
+def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:
+    """Times of the last message before each gap and of the first one after it [s]."""
+    steps = np.diff(time)
+    if not len(steps):
+        return [(-np.inf, np.inf)]
+    wide = np.flatnonzero(steps > max(_STALE, _PERIODS * float(np.median(steps))))
+    return [(float(time[k]), float(time[k + 1])) for k in wide]
+
+
+def _during(fields: Mapping[str, Field], start: float, stop: float) -> dict[str, Field]:
+    """Fields from their last frames before a time to a later time [s]."""
+    found = {}
+    for name, one in fields.items():
+        time = fields[one.clock or name].numbers()[:, 0]
+        first = max(0, int(np.searchsorted(time, start, side="right")) - 1)
+        found[name] = one.part(first, int(np.searchsorted(time, stop, side="right")))
+    return found

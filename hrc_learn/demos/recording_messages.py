@@ -1,0 +1,227 @@
+"""Messages of robots as numbers, poses and images, understood by their attributes.
+
+Types of any ROS version, JSON and protobuf are read alike, whether they are installed or not.
+"""
+
+import base64
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.recording_files import Field
+
+_JOINTS = {"position": "joint_positions", "velocity": "joint_velocities"}
+_JOINTS |= {"effort": "joint_efforts"}
+_VECTORS = {
+    ("force", "torque"): ("fx", "fy", "fz", "tx", "ty", "tz"),
+    ("linear", "angular"): ("vx", "vy", "vz", "wx", "wy", "wz"),
+}
+# Encodings of raw images: channels, and PyAV's name of the format.
+_PIXELS = {"rgb8": (3, "rgb24"), "bgr8": (3, "bgr24"), "8UC3": (3, "bgr24")}
+_PIXELS |= {"mono8": (1, "gray8"), "8UC1": (1, "gray8"), "yuv422_yuy2": (2, "yuyv422")}
+_PIXELS |= {"rgba8": (4, "rgba"), "bgra8": (4, "bgra")}
+_PIXELS |= {f"bayer_{p}8": (1, f"bayer_{p}8") for p in ("rggb", "bggr", "gbrg", "grbg")}
+_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": "vp9"}
+TOOL = re.compile(
+    r"(?:^|[/_])(?:tcp|tool\d*|eef?|end_?effector|flange|hand)(?:$|[/_])", re.IGNORECASE
+)
+"""Frames of a tool, and topics that tell its pose."""
+_BASE = re.compile(r"(?:^|[/_])base(?:_link)?$|link_?0$", re.IGNORECASE)
+
+type Messages = Callable[..., Iterator[tuple[str, int, Any]]]
+"""Function of topics and of the first time [ns]; gives topic, reception [ns] and message."""
+
+
+@dataclass
+class Topic:
+    """Messages of one topic, or of one set of joints in it."""
+
+    names: tuple[str, ...] | None = None
+    received: list[float] = field(default_factory=list)
+    """Times of reception [s]."""
+    stamps: list[float] = field(default_factory=list)
+    """Times in the messages [s]; 0 where they have none."""
+    values: list[np.ndarray] = field(default_factory=list)
+    sample: Any = None
+    """First message of images."""
+
+    def add(self, received: int, stamp: float, value: np.ndarray, names: Any) -> None:
+        """Add numbers, in the order of the first message's names."""
+        self.received.append(received * 1e-9)
+        self.stamps.append(stamp)
+        if names is not None and names != self.names:
+            value = value[[names.index(name) for name in self.names or ()]]
+        self.values.append(value)
+
+
+def stamp_of(message: Any) -> float:
+    """Time in a message [s]; 0 without one."""
+    stamp = getattr(getattr(message, "header", message), "stamp", None)
+    stamp = stamp or getattr(message, "timestamp", None)
+    seconds = getattr(stamp, "sec", getattr(stamp, "secs", getattr(stamp, "seconds", 0)))
+    parts = ("nanosec", "nsecs", "nsec", "nanos")
+    return seconds + 1e-9 * next((getattr(stamp, p) for p in parts if hasattr(stamp, p)), 0)
+
+
+type Part = tuple[str, tuple[str, ...] | None, np.ndarray]
+"""Field of a message, names of its components, and values; none of an image."""
+
+
+def parts_of(name: str, message: Any) -> Iterator[Part]:
+    """Fields of a message; quantities that no attribute tells are left out."""
+    has = lambda *names: all(hasattr(message, n) for n in names)  # noqa: E731
+    if has("name", "position", "velocity"):
+        for part, known in _JOINTS.items():
+            values = np.array(getattr(message, part, ()), float)
+            if len(values) == len(message.name) > 0:
+                yield f"{name}/{known}", tuple(message.name), values
+    elif has("joint_names"):
+        points = getattr(message, "points", ())
+        point = points[0] if len(points) == 1 else getattr(message, "reference", None)
+        values = np.array(getattr(point or getattr(message, "desired", None), "positions", ()))
+        if len(values) == len(message.joint_names) > 0:
+            yield f"{name}/command/joint_positions", tuple(message.joint_names), values
+    elif has("data") and (has("encoding", "width") or has("format") or has("pts")):
+        yield name, None, np.zeros(0)
+    elif inner := [part for part in ("pose", "wrench", "twist") if has(part)]:
+        yield from parts_of(name, getattr(message, inner[0]))
+    elif has("position", "orientation"):
+        yield name, None, matrix_of(message.position, message.orientation)
+    elif vectors := [pair for pair in _VECTORS if has(*pair)]:
+        both = [getattr(message, part) for part in vectors[0]]
+        yield name, _VECTORS[vectors[0]], np.array([v for b in both for v in (b.x, b.y, b.z)])
+    elif has("data") and not isinstance(message.data, (str, bytes)):
+        values = np.atleast_1d(np.array(message.data))
+        if values.dtype.kind in "fiub" and values.size and values.ndim == 1:
+            yield name, None, values.astype(float)
+
+
+def matrix_of(position: Any, turn: Any) -> Float64[np.ndarray, "4 4"]:
+    """Transform of a position and a quaternion of any length."""
+    from scipy.spatial.transform import Rotation
+
+    matrix, wxyz = np.eye(4), (turn.w, turn.x, turn.y, turn.z)
+    if any(wxyz):
+        matrix[:3, :3] = Rotation.from_quat(wxyz, scalar_first=True).as_matrix()
+    matrix[:3, 3] = position.x, position.y, position.z
+    return matrix
+
+
+def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, Topic]:
+    """Poses of tools and of last frames in their base, from `/tf` and `/tf_static`."""
+    parents = {child: parent for parent, child in edges}
+    moving = {c for (_, c), rows in edges.items() if np.ptp([r[2] for r in rows], axis=0).any()}
+    wanted = [c for c in parents if TOOL.search(c) or c not in parents.values()]
+    paths = {}
+    for tip in wanted:
+        chain = [tip]
+        while parents.get(chain[-1]) not in (None, *chain):
+            chain.append(parents[chain[-1]])
+        last = max((k for k, frame in enumerate(chain) if frame in moving), default=-1)
+        if last < 0:
+            continue
+        bases = [frame for frame in chain[last + 1 :] if _BASE.search(frame)]
+        base = (bases or chain)[0 if bases else -1]
+        links = chain[: chain.index(base)]
+        rows = [edges[parents[c], c] for c in links]
+        main = max((r for c, r in zip(links, rows, strict=True) if c in moving), key=len)
+        times = np.array([r[1] or r[0] for r in main])
+        poses = np.broadcast_to(np.eye(4), (len(times), 4, 4))
+        for frame, one in zip(links, rows, strict=True):
+            own = np.array([r[1] or r[0] for r in one])
+            at = np.maximum(np.searchsorted(own, times, side="right") - 1, 0)
+            poses = np.stack([one[k if frame in moving else -1][2] for k in at]) @ poses
+        received, stamps, _ = map(list, zip(*main, strict=True))
+        name = f"tf/{base}/{tip}"
+        paths[name] = Topic(received=received, stamps=stamps, values=[*poses])
+    return paths
+
+
+def image_field(name: str, one: Topic, messages: Messages, notes: list[str]) -> Field | None:
+    first, count = one.sample, len(one.received)
+    kind = str(getattr(first, "encoding", "") or getattr(first, "format", "")).lower()
+    empty = lambda a, b: np.zeros(0)  # noqa: E731
+    raw, codec = hasattr(first, "width"), next((c for w, c in _CODECS.items() if w in kind), "")
+    known = {k.lower(): v for k, v in _PIXELS.items()}
+    if "depth" in kind or kind in ("16uc1", "32fc1", "mono16"):
+        return Field(shape=(count,), kind="depth", read=empty)
+    if raw and not codec and kind not in known:
+        notes.append(f"{name} is left out: images of encoding {kind} are not read")
+        return None
+    read = _ImageReader(name, one.received, messages, codec, known.get(kind))
+    if not raw and not codec:
+        return Field(shape=(count,), kind="encoded", read=read)
+    shape = read(0, 1)[0].shape
+    return Field(shape=(count, *shape), kind="image", read=read)
+
+
+class _ImageReader:
+    """Reads the images of a topic in order, and starts again where they go back."""
+
+    def __init__(
+        self,
+        name: str,
+        received: Sequence[float],
+        messages: Messages,
+        codec: str,
+        pixels: tuple[int, str] | None,
+    ):
+        self._name, self._messages, self._codec, self._pixels = name, messages, codec, pixels
+        self._received, self._next = received, -1
+        self._stream: Iterator = iter(())
+
+    def __call__(self, start: int, stop: int) -> np.ndarray:
+        """Images from a first to a last one (exclusive)."""
+        if not 0 <= self._next <= start or (start > self._next + 100 and not self._codec):
+            self._next = 0 if self._codec else start
+            since = int(self._received[self._next] * 1e9) - 1000  # rounded to a microsecond
+            self._stream = self._decoded(since)
+        found = []
+        while self._next < stop:
+            image = next(self._stream)
+            if self._next >= start:
+                found.append(image)
+            self._next += 1
+        whole = np.empty(len(found), object)
+        whole[:] = found
+        return whole
+
+    def _decoded(self, since: int) -> Iterator[Any]:
+        import av
+
+        decoder: Any = av.CodecContext.create(self._codec, "r") if self._codec else None
+        image = None
+        topics = [self._name, f"/{self._name}"]
+        for _, _, message in self._messages(topics, since):
+            data = message.data
+            data = base64.b64decode(data) if isinstance(data, str) else bytes(data)
+            if decoder is not None:
+                for frame in decoder.decode(av.Packet(data)):
+                    image = frame.to_ndarray(format="rgb24")
+                if image is None:
+                    raise DatasetError("begins without a key frame", key=self._name)
+                yield image
+            elif self._pixels is None:
+                yield data
+            else:
+                yield _rgb(message, data, *self._pixels)
+
+
+def _rgb(message: Any, data: bytes, channels: int, form: str) -> np.ndarray:
+    """RGB image of a raw one, whose rows may be longer than the image is wide."""
+    import av
+
+    rows = np.frombuffer(data, np.uint8).reshape(message.height, -1)
+    image = rows[:, : message.width * channels]
+    if channels > 1:
+        image = image.reshape(message.height, message.width, channels)
+    if form == "rgb24":
+        return image
+    return av.VideoFrame.from_ndarray(np.ascontiguousarray(image), form).to_ndarray(
+        format="rgb24"
+    )
