@@ -113,16 +113,31 @@ LIBRARIES: dict[str, set[str]] = {
 }
 """Libraries that modules of a package may import as soon as they are imported."""
 
+ROS2 = {
+    f"{name}_msgs" for name in ("sensor", "std", "trajectory", "diagnostic", "visualization")
+} | {"geometry_msgs", "rclpy"}
+"""Packages of ROS 2, from the registry or the system."""
+
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "geometry": {"trimesh", "collada"},
     "kinematics": {"frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
     "dmp": {"threadpoolctl"},
     "cli": {"huggingface_hub", "httpx"},
-    "demos": {"av", "scipy", "huggingface_hub", "h5py", "zarr", "tfrecord"},
+    "demos": {
+        "av",
+        "scipy",
+        "huggingface_hub",
+        "h5py",
+        "zarr",
+        "tfrecord",
+        "rosbags",
+        "mcap",
+        "mcap_protobuf",
+    },
     "vision": {"cv2"},
     "viz": {"av", "jinja2", "rich"},
-    "hardware": {"franky", "pylibfranka", "cv2"},
+    "hardware": {"franky", "pylibfranka", "cv2", *ROS2},
     "teleoperation": {
         "viser",
         "pygame",
@@ -138,6 +153,8 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
 """Libraries that they may import in the functions that need them, and nowhere else."""
 
 DISTRIBUTIONS = {
+    "mcap_protobuf": "mcap-protobuf-support",
+    **{name: f"ros-{name.replace('_', '-')}" for name in ROS2},
     "forcedimension_core": "forcedimension-core",
     "collada": "pycollada",
     "cv2": "opencv-python-headless",

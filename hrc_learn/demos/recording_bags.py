@@ -90,17 +90,18 @@ def _opened_bag(path: Path) -> tuple[dict[str, str], Messages]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    # Bags from before ROS 2 Iron hold no definitions.
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    reader.open()
+    def opened() -> AnyReader:  # bags from before ROS 2 Iron hold no definitions
+        return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
     def messages(topics: Sequence[str], start: int | None = None) -> Iterator:
-        known = reader.typestore.fielddefs
-        wanted = [c for c in reader.connections if c.topic in topics and c.msgtype in known]
-        for connection, time, raw in reader.messages(wanted, start=start) if wanted else ():
-            yield connection.topic, time, reader.deserialize(raw, connection.msgtype)
+        with opened() as reader:
+            known = reader.typestore.fielddefs
+            wanted = [c for c in reader.connections if c.topic in topics and c.msgtype in known]
+            for connection, time, raw in reader.messages(wanted, start) if wanted else ():
+                yield connection.topic, time, reader.deserialize(raw, connection.msgtype)
 
-    return {c.topic: c.msgtype for c in reader.connections}, messages
+    with opened() as reader:
+        return {c.topic: c.msgtype for c in reader.connections}, messages
 
 
 def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
