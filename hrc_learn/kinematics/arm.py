@@ -104,6 +104,8 @@ class ArmShape:
     """Number of a link's frame, and a collision shape there; the capsules contain them."""
     masses: tuple[float | None, ...] = ()
     """Masses of base, links, flange and tool [kg], as far as the description gives them."""
+    inertia: tuple[Float[np.ndarray, "4 4"] | None, ...] = ()
+    """Their pseudo-inertias (`description.pseudo_inertia`), each in its own frame."""
 
 
 class Arm(SerialChain):
@@ -437,7 +439,10 @@ class Arm(SerialChain):
             name=self.name,
             chain=self.with_tool(tcp),
             shape=ArmShape(
-                meshes=self.meshes, masses=(*self.masses[:-1], None), shapes=self.shape.shapes
+                meshes=self.meshes,
+                masses=(*self.masses[:-1], None),
+                inertia=(*self.shape.inertia[:-1], None) if self.shape.inertia else (),
+                shapes=self.shape.shapes,
             ),
             capsules=(*links, *hand_capsules(n + 2, size)),
             overlapping=(*self.whole.overlapping, (n - 1, n + 2), (n, n + 2)),

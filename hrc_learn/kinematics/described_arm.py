@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -215,7 +215,7 @@ def _shape(
         for link, (number, pose) in places.items()
         for shape in _touching(description, link)
     ]
-    owners = {link: number for link, (number, _) in places.items()}
+    bodies = dict(places)
     gripper = []
     # A joint, its parent's pose in the frame of the tool with the gripper open, the joint that
     # carries the parent, and the parent's pose there.
@@ -233,7 +233,7 @@ def _shape(
         mount = place @ joint.origin
         gripper.append(replace(finger, carrier=carrier, mount=mount, meshes=meshes))
         for link, within in child.items():
-            owners[link] = last + 2
+            bodies[link] = (last + 2, postures[-1] @ within)
             shapes += [
                 (last + 2, replace(shape, pose=at @ within @ shape.pose))
                 for shape in _touching(description, link)
@@ -248,7 +248,7 @@ def _shape(
         gripper=tuple(gripper),
         hand=_meshes(description, hand, 0).get("link0", ()),
         shapes=tuple(shapes),
-        masses=_masses(description, owners, last),
+        **_inertias(description, bodies, last),
     )
 
 
@@ -304,19 +304,25 @@ def _touching(description: Description, link: str) -> tuple[Shape, ...]:
     return found.collisions or found.visuals
 
 
-def _masses(
-    description: Description, owners: Mapping[str, int], last: int
-) -> tuple[float | None, ...]:
-    """Masses of base, links, flange and tool [kg]; None where the description has none."""
+def _inertias(
+    description: Description, bodies: Mapping[str, tuple[int, Transform]], last: int
+) -> dict[str, Any]:
+    """Masses and pseudo-inertias of base, links, flange and tool, as fields of `ArmShape`; None
+    where the description has none.
+    """
     masses: list[float | None] = [None] * (last + 3)
-    for link, number in owners.items():
-        if (mass := description.links[link].mass) is not None:
-            masses[number] = (masses[number] or 0.0) + mass
+    inertia: list[np.ndarray | None] = [None] * (last + 3)
+    for name, (number, pose) in bodies.items():
+        link = description.links[name]
+        if link.mass is not None:
+            masses[number] = (masses[number] or 0.0) + link.mass
+        if link.inertia is not None:
+            more, before = pose @ link.inertia @ pose.T, inertia[number]
+            inertia[number] = more if before is None else before + more
     # Nothing is mounted on the flange's own frame; without a gripper, nor on the tool's.
-    masses[last + 1] = 0.0
-    if last + 2 not in owners.values():
-        masses[last + 2] = 0.0
-    return tuple(masses)
+    for number in {last + 1, last + 2} - {number for number, _ in bodies.values()}:
+        masses[number], inertia[number] = 0.0, np.zeros((4, 4))
+    return {"masses": tuple(masses), "inertia": tuple(inertia)}
 
 
 # Number of random postures among which `_comfortable` chooses; the seed repeats the choice.

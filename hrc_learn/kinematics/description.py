@@ -57,6 +57,29 @@ class Shape:
     colour: Colour | None = None
 
 
+def pseudo_inertia(
+    mass: float,
+    centre: Sequence[float] | Float[np.ndarray, "3"],
+    inertia: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "4 4"]:
+    """Pseudo-inertia of a body: [[S, m c], [m c^T, m]], S its second moments about the origin.
+
+    Those of bodies that move together add up; in a frame T it is T P T^T (Wensing et al. 2018,
+    "Linear matrix inequalities for physically consistent inertial parameter identification").
+
+    Args:
+        mass: [kg]
+        centre: Centre of mass in the frame of the body [m].
+        inertia: Inertia about the centre, along the axes of that frame [kg m^2].
+    """
+    c = np.asarray(centre, dtype=float)
+    found = np.empty((4, 4))
+    found[:3, :3] = np.eye(3) * np.trace(inertia) / 2 - inertia + mass * np.outer(c, c)
+    found[:3, 3] = found[3, :3] = mass * c
+    found[3, 3] = mass
+    return found
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Link:
     """A rigid body."""
@@ -64,6 +87,8 @@ class Link:
     name: str
     mass: float | None = None
     """[kg]"""
+    inertia: Float[np.ndarray, "4 4"] | None = None
+    """Pseudo-inertia in the frame of the link."""
     visuals: tuple[Shape, ...] = ()
     collisions: tuple[Shape, ...] = ()
 

@@ -17,6 +17,7 @@ from hrc_learn.kinematics.description import (
     Shape,
     Transform,
     motion,
+    pseudo_inertia,
     transform,
 )
 
@@ -122,10 +123,13 @@ class _Reader:
         # A geom of either kind is drawn only where a body has none that is visual alone.
         alone = [shape for touches, shape in visuals if not touches]
         drawn = alone or [shape for _, shape in visuals]
-        mass = float(model.body_mass[i])
+        mass, known = float(model.body_mass[i]), float(model.body_mass[i]) > _NO_MASS
+        axes = self._pose(model.body_ipos[i], model.body_iquat[i])
+        body = pseudo_inertia(mass, (0.0, 0.0, 0.0), np.diag(model.body_inertia[i]))
         return Link(
             name=self._name(i),
-            mass=mass if mass > _NO_MASS else None,
+            mass=mass if known else None,
+            inertia=axes @ body @ axes.T if known else None,
             visuals=tuple(drawn),
             collisions=tuple(collisions),
         )

@@ -20,6 +20,7 @@ from hrc_learn.kinematics.description import (
     Shape,
     Transform,
     motion,
+    pseudo_inertia,
 )
 
 _BOUNDS = ("lower", "upper", "velocity", "effort")
@@ -114,9 +115,26 @@ class _Reader:
         return Link(
             name=name,
             mass=value,
+            inertia=None if value is None else self._inertia(element, value, name),
             visuals=self._shapes(element, "visual", name),
             collisions=self._shapes(element, "collision", name),
         )
+
+    def _inertia(
+        self, element: ElementTree.Element, mass: float, name: str
+    ) -> Transform | None:
+        """Pseudo-inertia of a link; None where the file has its mass alone."""
+        moments, inertial = element.find("inertial/inertia"), element.find("inertial")
+        if moments is None or inertial is None:
+            return None
+        what = f"inertia of link {name}"
+        xx, xy, xz, yy, yz, zz = (
+            self._number(moments, key, what)
+            for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        )
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        pose = self._origin(inertial, what)
+        return pose @ pseudo_inertia(mass, (0.0, 0.0, 0.0), inertia) @ pose.T
 
     def joint(self, element: ElementTree.Element) -> Joint:
         name = self._attribute(element, "name", "a joint")
