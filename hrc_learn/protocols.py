@@ -234,6 +234,9 @@ class PersonObservation:
     """Radii of the capsules [m]."""
     velocity: Float[np.ndarray, "parts 2 3"]
     """Velocities of the ends [m/s]; zero after the first image."""
+    regions: tuple[str, ...] = ()
+    """Body region of each capsule (`hrc_learn.controller.BODY_REGIONS`); empty: unknown, so
+    that none may be touched."""
 
 
 @runtime_checkable

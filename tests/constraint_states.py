@@ -1,6 +1,6 @@
 """Random states of an arm amid limits and distances, and an oracle for what it should do."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import sampling
@@ -25,6 +25,7 @@ class State:
     lower: Tensor
     upper: Tensor
     distances: Distances
+    separation: SeparationConfig = field(default_factory=SeparationConfig)
 
     @property
     def arguments(self) -> tuple:
@@ -83,13 +84,17 @@ def _of(J: Tensor, pairs: int, rng: torch.Generator) -> State:
             gradient=0.3 * noise(pairs, joints),
             approach_speed=torch.where(comes, 0.5 * noise(pairs).abs(), 0.0),
             person=torch.rand(count, pairs, generator=rng) < 0.3,
+            # Half of the parts of a person must not be touched.
+            contact_speed=(torch.rand(count, pairs, generator=rng, dtype=DOUBLE) - 0.5).clamp(
+                min=0
+            ),
         ),
     )
 
 
 def allowed(state: State, config: ConstraintConfig) -> Tensor:
     """How fast each distance may shrink by the arm's own motion [m/s]."""
-    d, s = state.distances, SeparationConfig()
+    d, s = state.distances, state.separation
     thing = config.rate * (d.distance - config.clearance) - d.approach_speed
     # Of a person v with  v^2/(2 a) + v (T_r + v_h/a) = d - v_h T_r - C, as a root of NumPy's.
     person = [
@@ -103,7 +108,14 @@ def allowed(state: State, config: ConstraintConfig) -> Tensor:
         )
     ]
     assert d.person is not None
-    return torch.where(d.person, torch.tensor(person, dtype=DOUBLE).view_as(thing), thing)
+    assert d.contact_speed is not None
+    apart = torch.tensor(person, dtype=DOUBLE).view_as(thing)
+    touching = (d.contact_speed - d.approach_speed).clamp(min=0)
+    if s.mode == "ssm+pfl":
+        apart = torch.maximum(apart, touching)
+    elif s.mode == "pfl":
+        apart = torch.where(d.contact_speed > 0, touching, apart)
+    return torch.where(d.person, apart, thing)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,9 @@ from hrc_learn.controller.constraint_layer import SeparationConfig as Separation
 from hrc_learn.controller.constraint_layer import (
     constrained_velocity as constrained_velocity,
 )
+from hrc_learn.controller.contact_limits import BODY_REGIONS as BODY_REGIONS
+from hrc_learn.controller.contact_limits import ContactConfig as ContactConfig
+from hrc_learn.controller.contact_limits import contact_speed as contact_speed
 from hrc_learn.controller.interface import GRIPPER_DOWN as GRIPPER_DOWN
 from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
 from hrc_learn.controller.interface import INTERVENTIONS as INTERVENTIONS

@@ -14,13 +14,14 @@ do not depend on the data, so they compile and export.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import NamedTuple, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hrc_learn.controller.contact_limits import ContactConfig, PersonMode
 from hrc_learn.geometry.numerics import is_number, matmul, may_branch, orthonormal_basis
 from hrc_learn.pytree import pytree
 
@@ -234,10 +235,10 @@ class ConstraintConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SeparationConfig:
-    """Speed and separation monitoring: the speed allowed near a person.
+    """Speed allowed near a person: speed and separation monitoring, power and force limiting.
 
-    The fields are the terms of the protective separation distance (ISO 10218-2:2025, Annex L;
-    before it ISO/TS 15066:2016, 5.5.4.2.3).
+    The first fields are the terms of the protective separation distance (ISO 10218-2:2025,
+    Annex L; before it ISO/TS 15066:2016, 5.5.4.2.3).
     """
 
     human_speed: float = 1.6
@@ -251,8 +252,16 @@ class SeparationConfig:
     clearance: float = 0.2
     """C + Z_d + Z_r, intrusion and the uncertainty of both positions [m]: the distance left
     when both have come to rest."""
+    mode: PersonMode = "ssm"
+    """Speed and separation monitoring ("ssm"), power and force limiting wherever contact is
+    allowed ("pfl"), or the one that allows the higher speed ("ssm+pfl"). From regions of the
+    body that must not be touched the protective distance is kept in all modes."""
+    contact: ContactConfig = field(default_factory=ContactConfig)
+    """Surface and load of the arm, for power and force limiting."""
 
     def __post_init__(self):
+        if self.mode not in (modes := get_args(PersonMode)):
+            raise ValueError(f"mode must be {' or '.join(modes)}, but is {self.mode!r}")
         for name in ("human_speed", "reaction_time", "clearance"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, but is {getattr(self, name)}")
@@ -298,6 +307,28 @@ class SeparationConfig:
         delay = self.reaction_time + v_h / a
         return a * (torch.sqrt(delay**2 + (2 / a) * spare) - delay)
 
+    def allowed_speed(
+        self,
+        distance: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"],
+        contact_speed: Float[Tensor, "*batch"] | None,
+    ) -> Float[Tensor, "*batch"]:
+        """Speed of the arm towards a person that `mode` allows [m/s].
+
+        Args:
+            distance: Distance between person and arm [m].
+            human_speed: v_h, as of `highest_speed` [m/s].
+            contact_speed: Highest relative speed of an allowed contact (`contact_limits`), zero
+                where none is allowed [m/s]; None: nowhere.
+        """
+        kept = self.highest_speed(distance, human_speed)
+        if contact_speed is None or self.mode == "ssm":
+            return kept
+        touching = (contact_speed - human_speed.clamp(min=0)).clamp(min=0)
+        if self.mode == "pfl":
+            return torch.where(contact_speed > 0, touching, kept)
+        return torch.maximum(kept, touching)
+
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
@@ -315,10 +346,15 @@ class Distances:
     """True for pairs with a person: the arm approaches only as fast as the protective distance
     allows, and does not retreat from a person who approaches. False for objects; None: all
     pairs are objects."""
+    contact_speed: Float[Tensor, "*batch pairs"] | None = None
+    """Highest relative speed of an allowed contact with the person [m/s]; zero where none is
+    allowed, None: nowhere."""
 
     def known(self) -> Bool[Tensor, "*batch"]:
         """True where all values are finite."""
         known = is_number(self.distance) & is_number(self.approach_speed)
+        if self.contact_speed is not None:
+            known = known & is_number(self.contact_speed)
         return (known & is_number(self.gradient).all(-1)).all(-1)
 
     def double(self) -> Distances:
@@ -328,16 +364,18 @@ class Distances:
             gradient=self.gradient.double(),
             approach_speed=self.approach_speed.double(),
             person=self.person,
+            contact_speed=None if self.contact_speed is None else self.contact_speed.double(),
         )
 
     def where(self, known: Bool[Tensor, "*batch"]) -> Distances:
         """The distances where `known`, zeros elsewhere."""
-        unknown = ~known.unsqueeze(-1)
+        unknown, contact = ~known.unsqueeze(-1), self.contact_speed
         return Distances(
             distance=self.distance.masked_fill(unknown, 0),
             gradient=self.gradient.masked_fill(unknown.unsqueeze(-1), 0),
             approach_speed=self.approach_speed.masked_fill(unknown, 0),
             person=self.person,
+            contact_speed=None if contact is None else contact.masked_fill(unknown, 0),
         )
 
     def closing_speed(
@@ -349,7 +387,9 @@ class Distances:
         towards_object = config.rate * (self.distance - config.clearance) - self.approach_speed
         if self.person is None:
             return towards_object
-        towards_person = separation.highest_speed(self.distance, self.approach_speed)
+        towards_person = separation.allowed_speed(
+            self.distance, self.approach_speed, self.contact_speed
+        )
         return torch.where(self.person, towards_person, towards_object)
 
 

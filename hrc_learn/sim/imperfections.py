@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.controller import SafetyConfig, SeparationConfig
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.vision import ImageNoise
 
 # pyright: reportAttributeAccessIssue=false
@@ -140,7 +140,8 @@ class Imperfections:
         """
         # One in 700 normally distributed delays exceeds the mean by three deviations.
         delay = self.command_delay + 3 * self.command_jitter + self.servo_lag
-        separation = SeparationConfig(
+        separation = replace(
+            safety.separation,
             reaction_time=max(delay, _SIMULATED_SERVOS) + _RAMP,
             clearance=_BEYOND_CAPSULES + 3 * self.person_noise,
         )

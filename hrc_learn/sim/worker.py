@@ -79,6 +79,17 @@ _PARTS = (
 )
 PARTS = tuple(name for name, _, _ in _PARTS)
 """Names of the body's capsules, in the order of all arrays."""
+# Body regions (`hrc_learn.controller.BODY_REGIONS`) by kind; others are named alike.
+_REGION = {
+    "shoulders": "back and shoulders",
+    "pelvis": "abdomen",  # the capsule holds both, and the limits of the abdomen are lower
+    "upper_arm": "upper arm",
+    "forearm": "lower arm",
+    "shank": "lower leg",
+    "foot": "lower leg",
+}
+REGIONS = tuple(_REGION.get(kind, kind) for _, kind, _ in _PARTS)
+"""Body regions of the capsules."""
 COLOURS = tuple(colour for _, _, colour in _PARTS)
 """Radii of the capsules [m]."""
 # Numbers of the parts that come in pairs, left and right.
@@ -400,6 +411,8 @@ class WorkerSensor:
         if self._before:
             old = self._before[0]
             velocity = (ends - old.ends) / (time - old.time)
-        seen = PersonObservation(time=time, ends=ends, radius=self._radius, velocity=velocity)
+        seen = PersonObservation(
+            time=time, ends=ends, radius=self._radius, velocity=velocity, regions=REGIONS
+        )
         self._before.append(seen)
         self._pending.append(seen)

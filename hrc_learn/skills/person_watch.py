@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from hrc_learn.controller import ConstraintConfig, Distances, SeparationConfig
-from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
+from hrc_learn.controller.contact_limits import contact_speeds, region_numbers
+from hrc_learn.geometry import Box
+from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, separation
+from hrc_learn.kinematics.inertia import MassMatrix
 from hrc_learn.protocols import PersonTracker
 
 _NAN = math.nan
@@ -41,12 +45,17 @@ class PersonWatchConfig:
     contact: float = 0.03
     """Observed distance below which a person may touch the arm [m], three standard deviations
     of a tracker's noise. The arm stops, as the direction away from the person is not known."""
+    fastest: float = 1.0
+    """Highest speed of a part of the arm [m/s]: the default of `SafetyConfig.tcp_speed`. A
+    person who may be touched slows the arm down to this times the speed scale."""
 
     def __post_init__(self) -> None:
         if self.acceleration < 0:
             raise ValueError(f"acceleration must not be negative, but is {self.acceleration}.")
         if self.pairs < 1:
             raise ValueError(f"pairs must be at least 1, but is {self.pairs}.")
+        if not self.fastest > 0:
+            raise ValueError(f"fastest must be positive, but is {self.fastest}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,18 +83,27 @@ class PersonWatch:
         arm: CapsuleArm,
         separation: SeparationConfig | None = None,
         config: PersonWatchConfig | None = None,
+        furniture: Sequence[Box] = (),
     ):
         """Begin without an observation.
 
         Args:
             tracker: Tracker of the people.
             arm: Capsules of arm and tool.
-            separation: Protective distance, by which the urgency of pairs is judged.
+            separation: Protective distance, and the mode: with power and force limiting the
+                contact speeds of all pairs are computed as well.
             config: Assumptions about people.
+            furniture: Boxes against which the arm may clamp people, in the base frame.
+
+        Raises:
+            ValueError: The mode needs the masses of the arm, and it has none.
         """
         self._tracker, self._arm = tracker, arm
         self._separation = separation or SeparationConfig()
         self._config = config or PersonWatchConfig()
+        self._limits = None
+        if self._separation.mode != "ssm":
+            self._limits = ContactLimits(arm, self._separation, furniture)
 
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
@@ -112,12 +130,72 @@ class PersonWatch:
             torch.from_numpy(x).to(joints) for x in (seen.ends, seen.radius, seen.velocity)
         )
         found, age = separation(self._arm, joints, ends, radius, load), time - seen.time
-        observed = found, velocity, joints.new_tensor(age), self._separation, self._config
+        contact = None
+        if self._limits is not None and seen.regions:
+            regions = region_numbers(seen.regions)
+            contact = self._limits.speeds(found, joints, regions, load is not None)
+        observed = (
+            found,
+            velocity,
+            joints.new_tensor(age),
+            self._separation,
+            self._config,
+            contact,
+        )
         return WatchedPeople(
             distances=urgent_distances(*observed),
             nearest=float(found.distance.min()),
             age=age,
             speed_scale=float(person_speed_scale(*observed)),
+        )
+
+
+class ContactLimits:
+    """Contact speeds of an arm beside furniture, for power and force limiting."""
+
+    def __init__(self, arm: CapsuleArm, separation: SeparationConfig, furniture: Sequence[Box]):
+        """Prepare the mass matrix of the arm.
+
+        Args:
+            arm: Capsules of arm and tool.
+            separation: Reaction and deceleration of the arm, its surface and load.
+            furniture: Boxes against which the arm may clamp people, in the base frame.
+
+        Raises:
+            ValueError: The chain of the capsules is no arm with masses.
+        """
+        if not isinstance(arm.chain, Arm):
+            raise ValueError(
+                f"power and force limiting (mode={separation.mode!r}) needs the masses of the "
+                "arm: use one of `hrc_learn.kinematics.arm`, or mode='ssm'."
+            )
+        self._separation, self._furniture = separation, furniture
+        self._mass = MassMatrix(arm.chain, separation.contact.rotor_inertia)
+
+    def speeds(
+        self,
+        found: Separation,
+        joints: Float[Tensor, "*batch joints"],
+        regions: Int[Tensor, "*#batch H"],
+        holds: bool,
+    ) -> Float[Tensor, "*batch C H"]:
+        """Highest relative speeds of contacts [m/s], zero where none is allowed.
+
+        Args:
+            found: Distances between arm and person.
+            joints: Joint positions [rad].
+            regions: Body region of each part of the person (`region_numbers`).
+            holds: True if the gripper holds an object.
+        """
+        config = self._separation.contact
+        return contact_speeds(
+            found,
+            self._mass(joints, config.load if holds else 0.0),
+            regions,
+            self._furniture,
+            config,
+            self._separation.reaction_time,
+            self._separation.deceleration,
         )
 
 
@@ -127,6 +205,7 @@ def urgent_distances(
     age: Float[Tensor, "*batch"],
     separation: SeparationConfig,
     config: PersonWatchConfig,
+    contact: Float[Tensor, "*batch C H"] | None = None,
 ) -> Distances:
     """Distances of the most urgent pairs, for people observed some time ago.
 
@@ -136,6 +215,7 @@ def urgent_distances(
         age: Age of the observation [s].
         separation: Protective distance, by which the urgency of pairs is judged.
         config: Assumptions about people.
+        contact: Highest relative speeds of contacts [m/s]; None: no contact is allowed.
 
     Returns:
         The distances, reduced by the distance that people may have moved since. NaN where they
@@ -145,7 +225,8 @@ def urgent_distances(
     gain = (config.acceleration * (age + separation.reaction_time))[..., None, None]
     towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten(-2)
     distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
-    allowed = separation.highest_speed(distance, towards)
+    speed = None if contact is None else contact.flatten(-2)
+    allowed = separation.allowed_speed(distance, towards, speed)
     # Among pairs that allow no approach the nearest are the most urgent.
     number = min(config.pairs, distance.shape[-1])
     _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
@@ -155,6 +236,7 @@ def urgent_distances(
         gradient=found.gradient_of(urgent),
         approach_speed=towards.gather(-1, urgent),
         person=torch.ones_like(urgent, dtype=torch.bool),
+        contact_speed=None if speed is None else speed.gather(-1, urgent),
     )
 
 
@@ -164,6 +246,7 @@ def person_speed_scale(
     age: Float[Tensor, "*batch"],
     separation: SeparationConfig,
     config: PersonWatchConfig,
+    contact: Float[Tensor, "*batch C H"] | None = None,
 ) -> Float[Tensor, "*batch"]:
     """Speed scale imposed on the arm by approaching people, 0 to 1.
 
@@ -171,7 +254,8 @@ def person_speed_scale(
     or makes way, approaches them as soon as they have come near; so it comes to rest by the
     time at which they may touch any part of it, if they accelerate all the while. People who
     recede count as at rest: a hand turns round faster than a tracker, which averages over some
-    images, can show.
+    images, can show. Where contact is allowed, the arm slows down to a speed that is allowed in
+    every direction instead.
 
     Args:
         found: Distances of the arm as it is now from people as they were observed.
@@ -179,10 +263,16 @@ def person_speed_scale(
         age: Age of the observation [s].
         separation: Protective distance, for the reaction time of the arm.
         config: Assumptions about people.
+        contact: Highest relative speeds of contacts [m/s]; None: no contact is allowed.
     """
     coming = (-found.person_rate(velocity)).clamp(min=0)
     # The root t of  coming t + a t^2/2 = distance.
     a, distance = config.acceleration, (found.distance - config.contact).clamp(min=0)
     arrival = 2 * distance / (coming + (coming**2 + 2 * a * distance).sqrt()).clamp(min=1e-9)
-    left = arrival.amin((-2, -1)) - age - separation.reaction_time
-    return (left / _COMING_TO_REST).clamp(0, 1)
+    if contact is None:
+        arrival = arrival.amin((-2, -1), keepdim=True)
+    late = (age + separation.reaction_time)[..., None, None]
+    scale = ((arrival - late) / _COMING_TO_REST).clamp(0, 1)
+    if contact is not None:
+        scale = scale.maximum(((contact - coming - a * late) / config.fastest).clamp(0, 1))
+    return scale.amin((-2, -1))

@@ -18,6 +18,7 @@ from hrc_learn.controller import (
     Distances,
     SafetyConfig,
     SafetyFilter,
+    SeparationConfig,
     constrained_velocity,
 )
 from hrc_learn.geometry.numerics import (
@@ -43,7 +44,7 @@ def off_path(state: State, found: ConstrainedVelocity) -> Tensor:
 
 
 def assert_optimal(state: State, config: ConstraintConfig) -> None:
-    found = constrained_velocity(*state.arguments, config)
+    found = constrained_velocity(*state.arguments, config, separation=state.separation)
     assert found.solved.all()
     off = off_path(state, found).norm(dim=-1).numpy()
     weights = config.task_weight * np.array(
@@ -58,6 +59,12 @@ def assert_optimal(state: State, config: ConstraintConfig) -> None:
 
 def test_the_optimum_is_that_of_a_general_solver():
     assert_optimal(constraint_states.of_panda(120), ENOUGH)
+
+
+@pytest.mark.parametrize("mode", ["pfl", "ssm+pfl"])
+def test_the_optimum_where_people_may_be_touched(mode):
+    state = constraint_states.of_panda(60, seed=8)
+    assert_optimal(replace(state, separation=SeparationConfig(mode=mode)), ENOUGH)
 
 
 @pytest.mark.slow
