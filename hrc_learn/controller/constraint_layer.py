@@ -329,6 +329,25 @@ class SeparationConfig:
             return torch.where(contact_speed > 0, touching, kept)
         return torch.maximum(kept, touching)
 
+    def touches_gently(
+        self,
+        speed: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"],
+        contact_speed: Float[Tensor, "*batch"] | None,
+    ) -> Bool[Tensor, "*batch"]:
+        """True where a contact at these speeds is allowed, so that no distance is needed.
+
+        Args:
+            speed: Closing speed of the arm [m/s].
+            human_speed: v_h, as of `highest_speed` [m/s].
+            contact_speed: As of `allowed_speed` [m/s].
+        """
+        if contact_speed is None or self.mode == "ssm":
+            return torch.zeros_like(speed, dtype=torch.bool)
+        # The solver leaves rounding.
+        gentle = speed + human_speed <= contact_speed + _TOLERANCE
+        return gentle & (contact_speed > 0)
+
 
 @pytree
 @dataclass(frozen=True, kw_only=True)

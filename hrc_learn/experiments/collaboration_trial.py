@@ -167,6 +167,7 @@ class CollaborationRun:
                 item.name: (as_load(item), self.motion.held(item.name)[: len(log)])
                 for item in self.workplace.scene.objects
             },
+            furniture=self.workplace.scene.boxes(),
         )
 
     @property
@@ -332,7 +333,11 @@ class _Stage:
             )
             plant = access.declared(self._sizes).plant(scenario.cell.safety)
             self.watch = PersonWatch(
-                self._tracker, whole_arm(scene.arm), plant.separation, expected
+                self._tracker,
+                whole_arm(scene.arm),
+                plant.separation,
+                expected,
+                workplace.scene.boxes(),
             )
         self._occluder = ScriptedOcclusion(world, scenario.disturbances.occlusions)
         self.update()

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller import SeparationConfig
+from hrc_learn.controller.contact_limits import region_numbers
 from hrc_learn.dmp import InteractionPrimitive
-from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.geometry import Box, Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, panda, separation
 from hrc_learn.log import LoggedSteps
 from hrc_learn.protocols import PersonObservation
@@ -28,9 +29,10 @@ from hrc_learn.sim import (
     whole_arm,
 )
 from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over
-from hrc_learn.sim.worker import IMAGE_RATE, PARTS
+from hrc_learn.sim.worker import IMAGE_RATE, PARTS, REGIONS
 from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace, pose_on_table
+from hrc_learn.skills.person_watch import ContactLimits
 from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig
 from hrc_learn.vision import Marker
 
@@ -265,6 +267,7 @@ def margin_to_stop(
     joint_velocity: Float[Tensor, "*batch joints"],
     person_velocity: Float[Tensor, "*batch H 2 3"],
     config: SeparationConfig,
+    contact: Float[Tensor, "*batch C H"] | None = None,
 ) -> Float[Tensor, "*batch C H"]:
     """Margin of each distance over the one within which the arm can stop before a person [m].
 
@@ -273,15 +276,18 @@ def margin_to_stop(
         joint_velocity: Joint velocity of the arm [rad/s].
         person_velocity: Velocity of both ends of the person's capsules [m/s].
         config: Protective distance, with the deceleration of the arm.
+        contact: Highest relative speeds of contacts [m/s]; None: no contact is allowed.
 
     Returns:
-        d - v_h v/a - v^2/(2 a), infinite where the arm does not approach.
+        d - v_h v/a - v^2/(2 a), infinite where the arm does not approach, or would touch the
+        person within the limits of power and force limiting.
     """
     stop = replace(config, reaction_time=0.0, clearance=0.0)
     closing = -found.rate(joint_velocity, torch.zeros_like(person_velocity))
     coming = -found.person_rate(person_velocity)
     spare = found.distance - stop.protective_distance(closing, coming)
-    return torch.where(closing > _AT_REST, spare, torch.inf)
+    gentle = config.touches_gently(closing, coming, contact)
+    return torch.where((closing > _AT_REST) & ~gentle, spare, torch.inf)
 
 
 def separation_margin(
@@ -292,13 +298,14 @@ def separation_margin(
     *,
     encoder_offset: Float[np.ndarray, " joints"],
     loads: Mapping[str, tuple[GraspedBox, Bool[np.ndarray, " steps"]]],
+    furniture: Sequence[Box] = (),
 ) -> Float[np.ndarray, " steps"]:
     """Margin of the true distance from the worker over the stopping distance, at each step [m].
 
     The stopping distance is v_h v/a + v^2/(2 a), for a part of the arm that approaches a part
     of the worker at speed v while that comes at v_h: the protective distance without reaction
     time and uncertainty. The result is the smallest margin over all parts, infinite while the
-    arm approaches none.
+    arm approaches none, and for contacts within the limits of power and force limiting.
 
     Args:
         log: Log of the run.
@@ -307,7 +314,13 @@ def separation_margin(
         config: Protective distance, with the deceleration of the arm.
         encoder_offset: Offset of the logged joint positions: measured minus true [rad].
         loads: Objects in the gripper, and the steps in which they were.
+        furniture: Boxes against which the arm may clamp the worker.
     """
+    limits = None
+    if config.mode != "ssm":
+        whole = replace(config, contact=replace(config.contact, used=1.0))
+        limits = ContactLimits(arm, whole, furniture)
+    regions = region_numbers(REGIONS)
     time = log["time"]
     q = torch.from_numpy(log["joint_position"] - encoder_offset)
     v = torch.from_numpy(log["joint_velocity"])
@@ -318,7 +331,11 @@ def separation_margin(
         ends, speed = torch.from_numpy(there.ends), torch.from_numpy(there.velocity)
         radius = torch.from_numpy(there.radius).expand(len(steps), -1)
         found = separation(arm, q[steps], ends, radius, load)
-        margin[steps] = margin_to_stop(found, v[steps], speed, config).amin((-2, -1)).numpy()
+        contact = None
+        if limits is not None:
+            contact = limits.speeds(found, q[steps], regions, load is not None)
+        spare = margin_to_stop(found, v[steps], speed, config, contact)
+        margin[steps] = spare.amin((-2, -1)).numpy()
 
     rest = np.ones(len(time), dtype=bool)
     for load, held in [*loads.values(), (None, rest)]:

@@ -284,7 +284,8 @@ def separation_columns(
     velocity: Float[Tensor, " joints"],
     people_scale: float,
 ) -> dict[str, float]:
-    """Columns of the distance from people, and of the protective one at this speed.
+    """Columns of the distance from people, and of the protective one at this speed, which is
+    zero for contacts that power and force limiting allows.
 
     Args:
         watched: People near the arm.
@@ -293,7 +294,11 @@ def separation_columns(
         people_scale: Speed scale imposed by people, 0 to 1.
     """
     near = watched.distances
-    needed = separation.protective_distance(-(near.gradient @ velocity), near.approach_speed)
+    closing, coming = -(near.gradient @ velocity), near.approach_speed
+    needed = separation.protective_distance(closing, coming)
+    needed = needed.masked_fill(
+        separation.touches_gently(closing, coming, near.contact_speed), 0.0
+    )
     tightest = (near.distance - needed).argmin()
     return {
         "person_distance": watched.nearest,

@@ -23,7 +23,7 @@ from hrc_learn.sim import (
     random_visit,
     whole_arm,
 )
-from hrc_learn.sim.worker import PARTS
+from hrc_learn.sim.worker import PARTS, REGIONS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
 
@@ -84,6 +84,28 @@ def test_the_margin_is_what_both_would_still_go_while_the_arm_stops():
     np.testing.assert_allclose(found, expected, atol=1e-3)
     assert np.isinf(found[3])  # who rests closes in on nobody
     assert np.isfinite(found).sum() > 8
+
+
+def test_contacts_within_the_limits_need_no_margin_those_of_the_head_do():
+    """An arm that moves anyhow while a worker reaches under it."""
+    arm, rng, log, steps = whole_arm(SCENE.arm), np.random.default_rng(0), StepLog(), 40
+    time = VISIT.begin + np.linspace(1.0, 8.0, steps)
+    q = WORKPLACE.hover_joints().numpy() + 0.3 * rng.standard_normal((steps, 7))
+    v = 0.15 * rng.standard_normal((steps, 7))
+    for k in range(steps):
+        log.append(time=time[k], joint_position=q[k], joint_velocity=v[k])
+
+    def margins(mode, regions=REGIONS):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("hrc_learn.experiments.surroundings.REGIONS", regions)
+            config = SeparationConfig(mode=mode)
+            zero = np.zeros(7)
+            return separation_margin(log, VISIT, arm, config, encoder_offset=zero, loads={})
+
+    apart, both = margins("ssm"), margins("ssm+pfl")
+    assert (both >= apart).all()
+    assert (both > apart + 0.05).sum() > 5
+    np.testing.assert_array_equal(margins("ssm+pfl", ("head",) * len(REGIONS)), apart)
 
 
 @pytest.mark.parametrize("held", [True, False])

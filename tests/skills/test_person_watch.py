@@ -9,8 +9,9 @@ import pytest
 import sampling
 import torch
 
-from hrc_learn.controller import SafetyConfig, SeparationConfig
-from hrc_learn.kinematics import GraspedBox, panda, separation
+from hrc_learn.controller import ConstraintConfig, SafetyConfig, SeparationConfig
+from hrc_learn.geometry import Box
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, panda, separation
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import (
     Imperfections,
@@ -280,7 +281,62 @@ def test_nobody_who_stays_away_slows_the_arm_down():
     assert found.speed_scale == 1.0
 
 
-@pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"pairs": 0}])
+def ball(down, region, speed=0.0, *, age=0.0, mode="ssm+pfl", furniture=()):
+    """What is thought of a ball below the gripper that comes up, a part of some region."""
+    tip = panda.forward(WORKPLACE.hover_joints()).position.numpy()
+    ends = np.full((1, 2, 3), tip - np.array([0.0, 0.0, down + 0.04]))
+    seen = PersonObservation(
+        time=1.0,
+        ends=ends,
+        radius=np.array([0.04]),
+        velocity=np.broadcast_to([0.0, 0.0, speed], (1, 2, 3)).copy(),
+        regions=region,
+    )
+    separation = replace(SEPARATION, mode=mode)
+    config = PersonWatchConfig(acceleration=2.0)
+    tracker = SimpleNamespace(read=lambda: seen)
+    watch = PersonWatch(tracker, ARM, separation, config, furniture)
+    found = watch.look(1.0 + age, WORKPLACE.hover_joints())
+    return found, found.distances.closing_speed(ConstraintConfig(), separation)
+
+
+def test_the_arm_goes_on_before_a_hand_but_not_before_a_face():
+    hand, near_hand = ball(0.052, ("hand",))
+    face, near_face = ball(0.052, ("head",))
+    unknown, near_unknown = ball(0.052, ())
+    apart, near_apart = ball(0.052, ("hand",), mode="ssm")
+    assert hand.speed_scale == 1.0
+    assert face.speed_scale == unknown.speed_scale == apart.speed_scale < 0.7
+    assert near_hand.min() > 0.5
+    assert near_apart.min() < 0.2
+    torch.testing.assert_close(near_face, near_apart)
+    torch.testing.assert_close(near_unknown, near_apart)
+    assert unknown.distances.contact_speed is None
+    # Towards a hand that comes too fast for any contact the arm is at rest.
+    assert ball(0.15, ("hand",), speed=2.0)[1].min() == 0.0
+    assert ball(0.15, ("hand",), speed=2.0)[0].speed_scale == 0.0
+
+
+def test_a_hand_on_the_table_is_met_as_slowly_as_one_that_cannot_yield():
+    tip = panda.forward(WORKPLACE.hover_joints()).position.tolist()
+    under = Box(centre=(tip[0], tip[1], tip[2] - 0.115 - 0.02), half_size=(0.3, 0.3, 0.02))
+    free, clamped = (
+        ball(0.035, ("hand",), mode="pfl", furniture=boxes)[0].distances.contact_speed.min()
+        for boxes in ([], [under])
+    )
+    assert clamped < 0.1 * free
+    assert clamped > 0.01
+
+
+def test_contact_limits_need_an_arm_with_masses():
+    chain = CapsuleArm(panda.with_tool(torch.eye(4, dtype=torch.float64)), panda.whole.capsules)
+    separation = SeparationConfig(mode="pfl")
+    with pytest.raises(ValueError, match=r"mode='pfl'.*needs the masses of the arm"):
+        PersonWatch(SimpleNamespace(read=lambda: None), chain, separation)
+    PersonWatch(SimpleNamespace(read=lambda: None), chain, SeparationConfig())
+
+
+@pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"pairs": 0}, {"fastest": 0.0}])
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         PersonWatchConfig(**wrong)
