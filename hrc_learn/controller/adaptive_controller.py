@@ -48,7 +48,7 @@ from hrc_learn.controller.task_pace import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import ArrayLike, is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
-from hrc_learn.kinematics import SerialChain, TaskSpace, task_basis, task_rank
+from hrc_learn.kinematics import Arm, SerialChain, TaskSpace, task_basis, task_rank
 from hrc_learn.kinematics.inverse import TASK_ROWS
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import JointRegion
@@ -172,7 +172,8 @@ class AdaptiveController(nn.Module):
 
     Goals for less than the whole tool pose (`Goals.task`) leave more null space: with the rows
     J_t = B J of the Jacobian, u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q), along which the
-    potential falls as with six rows.
+    potential falls as with six rows. An arm whose task is the nearest pose (`Arm.task`) is led
+    so by goals for the whole pose.
 
     A step is a pure function `(state, observation) -> (command, state)`; the module stores no
     state. Run real-time loops under `torch.inference_mode()`.
@@ -206,6 +207,7 @@ class AdaptiveController(nn.Module):
         self.config = config = config or ControllerConfig()
         # Ranks depend on the arm alone; computing them once keeps branches out of a step.
         self._ranks = {task: task_rank(arm, task) for task in TASK_ROWS}
+        self._nearest = isinstance(arm, Arm) and arm.task == "nearest pose"
         self._check_task(goals)
         limits = arm.limits
         self.joint_region = joint_region or JointRegion.from_limits(limits.lower, limits.upper)
@@ -237,7 +239,7 @@ class AdaptiveController(nn.Module):
 
     def _check_task(self, goals: Goals) -> None:
         task, n = goals.task, len(self.chain.joint_names)
-        if task == "pose" and n < 6:
+        if task == "pose" and n < 6 and not self._nearest:
             left = self.null_space_dimension("position+axis")
             raise ValueError(
                 f"the goals control the whole tool pose, which needs six joints, but the "
@@ -506,9 +508,9 @@ class AdaptiveController(nn.Module):
     def _basis(self, goals: Goals, pose: Pose, J: Tensor) -> Tensor | None:
         """Basis of the controlled tool motion; None: all of it."""
         task = goals.task
-        return (
-            None if task == "pose" else task_basis(J, pose.orientation, task, self._ranks[task])
-        )
+        if task == "pose" and not self._nearest:
+            return None
+        return task_basis(J, pose.orientation, task, self._ranks[task])
 
     def _nullspace_input(self, observation: Observation) -> Tensor | None:
         """Null-space input of the person, plus the input equivalent to way-making."""

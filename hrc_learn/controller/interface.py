@@ -154,6 +154,7 @@ type ToolRegion = OrientationRegion | AxisRegion | None
 
 _TOOL_REGIONS: dict[TaskSpace, Callable[[Tensor], ToolRegion]] = {
     "pose": lambda goal: OrientationRegion(goal=goal),
+    "nearest pose": lambda goal: OrientationRegion(goal=goal),
     "position+axis": lambda goal: AxisRegion(goal=goal),
     "position": lambda goal: None,
 }

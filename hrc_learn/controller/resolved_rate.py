@@ -30,7 +30,7 @@ from hrc_learn.geometry.numerics import (
     null_projection,
     solve_positive,
 )
-from hrc_learn.kinematics.inverse import SINGULAR_BELOW
+from hrc_learn.kinematics.inverse import SINGULAR_BELOW, position_first
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import PostureRegion
 
@@ -93,8 +93,11 @@ def resolved_rate(
     the null space gains a dimension, of which N keeps n - 6 that may change from one step to
     the next; the safety filter limits the resulting acceleration.
 
+    Of an arm with fewer joints than rows the position follows the twist, and the rotation as
+    nearly as it can (`position_first`); it has no null space.
+
     Args:
-        J: Geometric Jacobian, or its rows in the task: at most 6, and at most n.
+        J: Geometric Jacobian, or its rows in the task: at most 6.
         twist: Twist of the tool (linear [m/s], angular [rad/s]), or its part in the task.
         null_velocity: Wanted joint velocity w, of which N keeps the part that leaves the tool
             at rest [rad/s].
@@ -102,6 +105,8 @@ def resolved_rate(
     Returns:
         Joint velocity of the task, and joint velocity of the null space [rad/s].
     """
+    if J.shape[-1] < J.shape[-2]:
+        return task_rate(J, twist), torch.zeros_like(null_velocity)
     return task_rate(J, twist), null_projection(J, null_velocity)
 
 
@@ -112,6 +117,9 @@ def task_rate(
 
     Arguments are those of `resolved_rate`.
     """
+    if J.shape[-1] < J.shape[-2]:
+        basis = position_first(J)
+        J, twist = matmul(basis, J), matmul(basis, twist.unsqueeze(-1)).squeeze(-1)
     return matmul(J.mT, solve_positive(_damped_gram(J), twist.unsqueeze(-1))).squeeze(-1)
 
 

@@ -40,6 +40,7 @@ _STARTS = 200  # random starts from which `postures` searches
 _SCAN = 57  # solutions among which `inverse` chooses where a joint is redundant
 _POSTURE_SCAN = 29  # positions of joint 7 among which `postures` chooses
 _MARGIN = 0.02  # distance of the scan from the limits of joint 7 [rad]
+_FEWEST_JOINTS = 5
 _LARGEST_STEP = 0.5  # joint motion between poses of a path that calls for a wider search [rad]
 
 TCP_OFFSET = 0.1034
@@ -119,6 +120,8 @@ class Arm(SerialChain):
         base: Link of the file that is the base.
         tip: Link of the file that is the flange.
         hand_size: Size of the hand and of what it handles, relative to the Franka hand.
+        task: Constrained part of the tool's pose in inverse kinematics: "pose", or "nearest
+            pose" for an arm of fewer than six joints with the hand of the work cell.
     """
 
     def __init__(
@@ -134,6 +137,7 @@ class Arm(SerialChain):
         base: str | None = None,
         tip: str | None = None,
         hand_size: float = 1.0,
+        task: TaskSpace = "pose",
     ):
         """Add a shape and inverse kinematics to a chain.
 
@@ -148,6 +152,7 @@ class Arm(SerialChain):
             base: Link of the file that is the base.
             tip: Link of the file that is the flange.
             hand_size: Size of the hand on the flange relative to the Franka hand.
+            task: Constrained part of the tool's pose.
         """
         super().__init__(
             joint_names=chain.joint_names,
@@ -161,7 +166,7 @@ class Arm(SerialChain):
         self.name = name
         self.description, self.base, self.tip = description, base, tip
         self.shape = shape or ArmShape()
-        self.hand_size = hand_size
+        self.hand_size, self.task = hand_size, task
         self._capsules, self._overlapping = capsules, tuple(overlapping)
         self._closed_form = closed_form
 
@@ -260,7 +265,7 @@ class Arm(SerialChain):
         q7: ArrayLike | None = None,
         near: ArrayLike | None = None,
         *,
-        task: TaskSpace = "pose",
+        task: TaskSpace | None = None,
         samples: int = _SCAN,
     ) -> Float[Tensor, "*batch joints"]:
         """Joint positions within the limits that bring the tool centre point to poses [rad].
@@ -276,7 +281,8 @@ class Arm(SerialChain):
                 settles their redundancy; None leaves it free. Their elbow branch with
                 q4 > -0.467 rad is never returned.
             near: Configuration to stay close to [rad], one for all poses or one for each.
-            task: Constrained part of the pose; five joints cannot reach a whole pose.
+            task: Constrained part of the pose; None: that of the arm. Five joints reach few
+                whole poses.
             samples: Solutions to choose from where a joint is redundant.
 
         Raises:
@@ -288,6 +294,7 @@ class Arm(SerialChain):
                 f"{self.name} has no closed-form inverse, so q7 does not apply: pass near= to "
                 "choose among its solutions."
             )
+        task = task or self.task
         shapes = [pose.position.shape[:-1], pose.orientation.shape[:-1]]
         batch = np.broadcast_shapes(*shapes, () if q7 is None else as_tensor(q7).shape)
         if near is None and batch:
@@ -389,7 +396,7 @@ class Arm(SerialChain):
         self, pose: Pose, q7: ArrayLike | None, near: Tensor, task: TaskSpace, samples: int
     ) -> tuple[Float[Tensor, "*batch joints"], Bool[Tensor, "*batch"]]:
         """Solution closest to a configuration, for each pose by itself, and where none is."""
-        if task == "pose":
+        if task == self.task:
             found = self.solutions(pose, q7, near=near, samples=samples)
             distance = (found - near.to(found).unsqueeze(-2)).norm(dim=-1)
             least = torch.where(distance.isnan(), torch.inf, distance).min(-1)
@@ -412,32 +419,43 @@ class Arm(SerialChain):
         random = torch.rand(samples, self.joints, generator=rng, dtype=torch.float64)
         wish = near.unsqueeze(-2)
         starts = (low + (high - low) * random).expand(*near.shape[:-1], -1, -1)
-        found = solutions_from(self, pose, torch.cat([wish, starts], dim=-2))
+        found = solutions_from(
+            self, pose, torch.cat([wish, starts], dim=-2), task=self.task
+        )
         return unwound(self, found, wish)
 
-    def with_hand(self, size: float = 1.0) -> Arm:
-        """The same arm with the Franka hand on its flange, along the approach of its own tool.
+    def with_hand(
+        self, size: float = 1.0, mount: Float[Tensor, "4 4"] | None = None
+    ) -> Arm:
+        """The same arm with the Franka hand in place of its gripper.
+
+        An arm of fewer than six joints brings it to the nearest pose of its tool.
 
         Args:
             size: Size of the hand relative to the Franka hand.
+            mount: Frame of the hand in that of the flange, its z axis the approach; None: at
+                the flange, along the approach of the arm's own tool.
 
         Raises:
-            ValueError: The arm has too few joints for a full pose of its tool.
+            ValueError: The arm has too few joints for a position of its tool and its tilt.
         """
         n = self.joints
-        if n < 6:
+        if n < _FEWEST_JOINTS:
             raise ValueError(
-                f"{self.name} has {n} joints, but grasping and placing need the full pose of "
-                "the tool, for which it takes six. With fewer it can servo by position and "
-                "axis (docs/concepts/controller.md)."
+                f"{self.name} has {n} joints, but grasping and placing need the position of "
+                f"the tool, its tilt and its turn, for which it takes {_FEWEST_JOINTS}."
             )
+        flange, tcp = self.flange, self.tcp.clone()
+        links = [capsule for capsule in self.whole.capsules if capsule.link <= n]
+        if mount is not None:
+            flange, tcp = flange @ mount.to(flange), torch.eye(4, dtype=flange.dtype)
+            # A fixed jaw belongs to the gripper that the hand replaces.
+            links = [capsule for capsule in links if not _is_ahead(capsule, n, flange)]
         # Along the arm's own direction of approach, which need not be the flange's z axis.
-        tcp = self.tcp.clone()
         tcp[:3, 3] = size * TCP_OFFSET * tcp[:3, 2]
-        links = tuple(capsule for capsule in self.whole.capsules if capsule.link <= n)
         return Arm(
             name=self.name,
-            chain=self.with_tool(tcp),
+            chain=self.with_tool(tcp, flange),
             shape=ArmShape(
                 meshes=self.meshes,
                 masses=(*self.masses[:-1], None),
@@ -450,7 +468,15 @@ class Arm(SerialChain):
             base=self.base,
             tip=self.tip,
             hand_size=size,
+            task="nearest pose" if n < 6 else "pose",
         )
+
+
+def _is_ahead(capsule: LinkCapsule, link: int, hand: Float[Tensor, "4 4"]) -> bool:
+    """True if a capsule lies on the last link, ahead of the base of a hand in its frame."""
+    axis, origin = hand[:3, 2], hand[:3, 3]
+    ends = torch.tensor([capsule.start, capsule.end], dtype=hand.dtype)
+    return capsule.link == link and bool(((ends - origin) @ axis > 0).all())
 
 
 def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:

@@ -190,12 +190,19 @@ class SerialChain:
     def __repr__(self) -> str:
         return f"SerialChain({self.joint_names[0]} ... {self.joint_names[-1]})"
 
-    def with_tool(self, tcp: Float[Tensor, "4 4"]) -> SerialChain:
-        """The same chain with another tool centre point, given in the frame of the flange."""
+    def with_tool(
+        self, tcp: Float[Tensor, "4 4"], flange: Float[Tensor, "4 4"] | None = None
+    ) -> SerialChain:
+        """The same chain with another tool centre point, in the frame of the flange.
+
+        Args:
+            tcp: Frame of the tool centre point.
+            flange: Another flange, in the frame of the last joint; None: the same.
+        """
         return SerialChain(
             joint_names=self.joint_names,
             mounts=self.mounts,
-            flange=self.flange,
+            flange=self.flange if flange is None else flange,
             tcp=tcp,
             limits=self.limits,
             ready=self.ready,

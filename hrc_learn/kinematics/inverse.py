@@ -19,15 +19,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.numerics import Constant
+from hrc_learn.geometry.numerics import Constant, orthonormal_basis
 from hrc_learn.kinematics.chain import SerialChain
 
-type TaskSpace = Literal["pose", "position+axis", "position"]
+type TaskSpace = Literal["pose", "nearest pose", "position+axis", "position"]
 """Constrained part of the tool's pose: all, all but the rotation about its z axis, or the
-position.
+position. The "nearest pose" is a pose for six joints; with fewer, the position exactly and the
+orientation as near as they bring it there.
 """
 
-TASK_ROWS: dict[TaskSpace, int] = {"pose": 6, "position+axis": 5, "position": 3}
+TASK_ROWS: dict[TaskSpace, int] = {
+    "pose": 6,
+    "nearest pose": 6,
+    "position+axis": 5,
+    "position": 3,
+}
 # Weight of an angle against a distance [m/rad]: turning by 1 rad moves what is this far away.
 _LEVER = 0.3
 # Singular values below this part of the largest are none (`null_space_dimension`), and below
@@ -36,6 +42,9 @@ _LEVER = 0.3
 _RANK, _LED = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular where the task has more rows than n
 _STARTS, _ROUNDS, _ITERATIONS = 12, 6, 40
+# Rotation by which a nearest pose may miss the wanted one [rad]: an arm that turns away further
+# does another task.
+_MISSED_TURN = 0.6
 _CORRECTIONS = 2  # of Newton's, from one pose of a path to the next
 
 
@@ -64,7 +73,7 @@ def task_error_and_jacobian(
         task: Constrained part of the pose.
     """
     T, J = chain.transform_and_jacobian(q)
-    if task == "pose":
+    if task in ("pose", "nearest pose"):
         return Pose.from_matrix(T).twist_to(pose), J
     error = task_error(T, pose, task)
     if task == "position":
@@ -89,7 +98,7 @@ def task_error(
         pose: Wanted.
         task: Constrained part of the pose.
     """
-    if task == "pose":
+    if task in ("pose", "nearest pose"):
         return Pose.from_matrix(T).twist_to(pose)
     linear = pose.position - T[..., 3]
     if task == "position":
@@ -154,6 +163,22 @@ def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
 _LINEAR = Constant(torch.eye(6, dtype=torch.float64)[:3])
 
 
+def position_first(J: Float[Tensor, "*batch 6 n"]) -> Float[Tensor, "*batch n 6"]:
+    """Orthonormal twists of the tool that an arm of three to five joints leads.
+
+    The linear ones, then the rotations that the joints make with the position at rest:
+    B = [I 0; 0 U^T] with U an orthonormal basis of J_w Z and J_v Z = 0. Solving B J q_dot = B v
+    moves the position as wanted and turns the tool as near to the wanted rotation as it can.
+
+    Args:
+        J: Geometric Jacobian of the tool.
+    """
+    still = orthonormal_basis(J[..., :3, :])[..., 3:]
+    U = orthonormal_basis((J[..., 3:, :] @ still).mT)[..., : J.shape[-1] - 3]
+    rows = _LINEAR.like(J).expand(*J.shape[:-2], 3, 6)
+    return torch.cat([rows, torch.nn.functional.pad(U.mT, (3, 0))], dim=-2)
+
+
 def task_basis(
     J: Float[Tensor, "*batch 6 joints"],
     orientation: Float[Tensor, "*batch 4"],
@@ -172,7 +197,9 @@ def task_basis(
         rank: `task_rank` of the arm.
     """
     rows = _LINEAR.like(J).expand(*J.shape[:-2], 3, 6)
-    if task == "pose":
+    if task in ("pose", "nearest pose"):
+        if rank < 6:
+            return position_first(J)
         rows = torch.eye(6, dtype=J.dtype, device=J.device).expand(*J.shape[:-2], 6, 6)
     elif task == "position+axis":
         across = quaternion.to_matrix(orientation)[..., :2].mT
@@ -303,7 +330,7 @@ def follow_poses(
             path.orientation[k].expand(*rows, 4).reshape(-1, 4),
         )
         for _ in range(_CORRECTIONS):
-            q, _ = _step(chain, goal, q, "pose")
+            q, _ = _step(chain, goal, q, "nearest pose")
         left, _ = task_error_and_jacobian(chain, q, goal)
         positions.append(q.reshape(start.shape))
         errors.append(left.unflatten(-1, (2, 3)).norm(dim=-1).amax(-1).reshape(rows))
@@ -319,6 +346,11 @@ def _step(
 ) -> tuple[Tensor, Tensor]:
     """One iteration, and the error before it [m, rad]."""
     error, J = task_error_and_jacobian(chain, q, goal, task)
+    missed = error[..., 3:]
+    if task == "nearest pose" and J.shape[-1] < 6:
+        basis = position_first(J)
+        error, J = (basis @ error[..., None])[..., 0], basis @ J
+    far = torch.linalg.vector_norm(missed, dim=-1, keepdim=True) > _MISSED_TURN
     weight = torch.ones_like(error[:1])
     weight[:, 3:] = _LEVER
     e, A = error * weight, J * weight[..., None]
@@ -329,6 +361,8 @@ def _step(
     if wish is not None:
         away = wish - q
         dq = dq + away - (A.mT @ torch.linalg.solve(gram, A @ away[..., None]))[..., 0]
+    if task == "nearest pose":
+        error = torch.where(far, torch.inf, error)
     return (q + dq).clamp(*_limits(chain, q)), error
 
 

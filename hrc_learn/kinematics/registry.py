@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -281,7 +282,7 @@ class ArmChoice:
         """The arm with the hand of our work cell: two parallel fingers, as the Franka hand.
 
         Raises:
-            ValueError: There is no such arm, or it has fewer than six joints.
+            ValueError: There is no such arm, or it has fewer than five joints.
         """
         return _equipped(self)
 
@@ -291,4 +292,10 @@ def _equipped(choice: ArmChoice) -> Arm:
     found = choice.arm()
     if found.is_franka:
         return found
-    return found.with_hand(_sources().get(choice.name, {}).get("hand_size", 1.0))
+    hand, mount = _sources().get(choice.name, {}).get("hand", {}), None
+    if "origin" in hand:
+        c, s = math.cos(hand["turn"]), math.sin(hand["turn"])
+        mount = found.tcp.clone()
+        mount[:3, 3] += mount[:3, :3] @ mount.new_tensor(hand["origin"])
+        mount[:3, :2] = mount[:3, :2] @ mount.new_tensor([[c, -s], [s, c]])
+    return found.with_hand(hand.get("size", 1.0), mount)

@@ -141,13 +141,21 @@ def overhead_camera() -> CameraModel:
     )
 
 
-def marked_plate(size: float = 1.0) -> Plate:
-    """The plate on the hand, by which the camera finds it; `size` is that of the hand."""
+_BEYOND = 0.04  # distance of the plate's middle from the links above the hand [m]
+
+
+def marked_plate(size: float = 1.0, thickness: float = 0.0) -> Plate:
+    """The plate on the hand, by which the camera finds it.
+
+    Args:
+        size: Size of the hand relative to the Franka hand.
+        thickness: Radius of the links above the hand, beyond which the plate sticks out [m].
+    """
     # It sticks out sideways, clear of the forearm as seen from above, and is mounted off the
     # middle: it is as wide as objects are, and must not be the first to meet a board.
     return Plate(
         marker=Marker(HAND_MARKER, 0.048 * size),
-        position=(-0.008 * size, 0.145 * size, 0.02 * size),
+        position=(-0.008 * size, max(0.145 * size, thickness + _BEYOND), 0.02 * size),
         orientation=(0.0, 1.0, 0.0, 0.0),
     )
 

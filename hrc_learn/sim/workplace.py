@@ -7,6 +7,7 @@ the usual ones first, until one suits the arm (`layout_quality`).
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,12 @@ _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 # Distances of table and cabinet from the base, relative to the usual ones, and where the
 # cabinet stands besides: further along the base's x axis, and higher [m].
 _SCALES = (1.0, 0.85, 0.7, 0.55)
+# An arm of fewer than six joints keeps its tool in a plane through the axis of its first joint.
+# So its cabinet stands straight beside that axis, so many times as far away as the table, and it
+# is at home on the way there, at these fractions of that distance. Its wrist is above the tool
+# all over the table, which is nearer, and seen from behind by the camera.
+_BESIDE_SCALES, _BESIDE, _ON_THE_WAY = (0.78, 0.7, 0.85), (1.4, 1.6, 1.2), (0.55, 0.65)
+_HOVER_BESIDE, _CAMERA_BESIDE = 0.85, 1.5
 # All lengths below are those of a cell for the Franka hand; a smaller hand makes them smaller.
 # Distance from the middle of the table to reach in view of the camera [m]: with a margin to
 # spare, then no further than objects are put.
@@ -132,8 +139,9 @@ class Workplace:
         return HAND_MARKER
 
     def home(self) -> Pose:
-        """End effector at home, pointing down."""
-        return Pose(_vector(*self.home_position), gripper_down())
+        """End effector at home, pointing down where that is in front of the base."""
+        position = _vector(*self.home_position)
+        return Pose(position, coarse_orientation(position, self.level_at))
 
     def home_joints(
         self, offset: Float[Tensor, "3"] | None = None, q7_offset: float = 0.0
@@ -161,8 +169,11 @@ class Workplace:
         return Pose(position, _vector(*self.hover_orientation))
 
     def approached(self, approach: Approach | None) -> "Workplace":
-        """The same with the demonstrated orientation above the table; None: as it is."""
-        if approach is None:
+        """The same with the demonstrated orientation above the table; None: as it is.
+
+        An arm of fewer than six joints points straight down, as it can all over the table.
+        """
+        if approach is None or self.robot.task == "nearest pose":
             return self
         w, x, y, z = approach.orientation.tolist()
         return replace(self, hover_orientation=(w, x, y, z))
@@ -349,7 +360,7 @@ def _candidates(robot: Arm) -> Iterator[tuple[list[Workplace], _Above]]:
     """Workplaces that suit an arm, with postures above their table; the likely ones first."""
     unlikely = []
     for reach in _REACHES:
-        for scale in _SCALES:
+        for scale in _SCALES if robot.task == "pose" else _BESIDE_SCALES:
             places = [
                 replace(place, table_reach=(robot.hand_size * reach,) * 2)
                 for place in _workplaces(robot, scale)
@@ -372,20 +383,54 @@ def _workplaces(robot: Arm, scale: float) -> Iterator[Workplace]:
     """Layouts with the table at one distance and the cabinet in several places."""
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))
+    if robot.task == "nearest pose":
+        for far, higher, home in product(_BESIDE, _HIGHER, _ON_THE_WAY):
+            yield _beside(_placed(usual, scale, 0.0, higher, _DEPTHS[-1], far), home)
+        return
     shifts = [(along, higher) for along in _ALONG for higher in _HIGHER]
     for along, higher in sorted(shifts, key=lambda shift: abs(shift[0]) + abs(shift[1])):
         for depth in _DEPTHS:
             yield _placed(usual, scale, along, higher, depth)
 
 
+def _beside(place: Workplace, home: float) -> Workplace:
+    """The workplace with cabinet and home in the plane of the tool of an arm turned right.
+
+    Args:
+        place: Workplace with the cabinet to the right.
+        home: Distance of the home position, as a fraction of that of the shelves.
+    """
+    axis = float(place.robot.joint_origins(place.robot.ready)[0, 0])
+    scene, (x, y), camera = place.scene, place.table_centre, place.scene.camera
+    half = (scene.cabinet.right - scene.cabinet.left) / 2
+    eye = camera.pose[:3, 3] * (_CAMERA_BESIDE, _CAMERA_BESIDE, 1.0)
+    heights = [place.shelf(name).position[2] for name in place.shelf_names()]
+    return replace(
+        place,
+        scene=replace(
+            scene,
+            cabinet=replace(scene.cabinet, left=axis - half, right=axis + half),
+            camera=camera.look_at(eye, np.array([x, y, 0.0])),
+        ),
+        shelf_x=axis,
+        hover_height=_HOVER_BESIDE * place.hover_height,
+        home_position=(axis, -home * place.level_at, float(sum(heights)) / len(heights)),
+    )
+
+
 def _placed(
-    usual: SceneConfig, scale: float, along: float, higher: float, depth: float
+    usual: SceneConfig,
+    scale: float,
+    along: float,
+    higher: float,
+    depth: float,
+    far: float = 1.0,
 ) -> Workplace:
-    """The usual workplace with other distances."""
+    """The usual workplace with other distances, its cabinet `far` times as far as its table."""
     place, cabinet, table = Workplace(), usual.cabinet, usual.table
     size = usual.arm.robot.hand_size
     scale, along, higher, depth = (size * x for x in (scale, along, higher, depth))
-    level_at = scale * place.level_at
+    level_at = far * scale * place.level_at
     left = scale * cabinet.left + along
     home_x, home_y, home_z = place.home_position
     moved = replace(
@@ -441,7 +486,7 @@ def _above_table(workplace: Workplace) -> _Above:
                 robot,
                 workplace.arm_clearances,
                 scene.camera,
-                marked_plate(robot.hand_size),
+                marked_plate(robot.hand_size, _wrist_radius(robot)),
                 workplace.hover(),
                 workplace.table_reach,
                 hover,
@@ -451,6 +496,12 @@ def _above_table(workplace: Workplace) -> _Above:
     ]
     found.sort(key=lambda pair: _worth(pair[1].quality, pair[1].seen), reverse=True)
     return found[: 2 * _TRIED]
+
+
+def _wrist_radius(robot: Arm) -> float:
+    """Largest radius of the capsules of the last two links [m]."""
+    wrist = [c.radius for c in robot.body.capsules if c.link >= robot.joints - 1]
+    return max(wrist, default=0.0)
 
 
 def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
