@@ -311,7 +311,9 @@ class _Stage:
         elif scenario.handover:
             worker = WorkerConfig.draw(np.random.default_rng([seed, 4]))
         scene = replace(scene, worker=worker)
-        self.world = world = World(scene, self._sizes.draw(rng, workplace.robot.joints))
+        robot = workplace.robot
+        drawn = self._sizes.draw(rng, robot.joints, robot.hand_size)
+        self.world = world = World(scene, drawn)
         poses = draw_object_poses(workplace, world, self._sizes.object_yaw, rng)
         world.reset(workplace.home_joints().numpy(), poses)
         self.giving: GivingPerson | None = None

@@ -105,7 +105,8 @@ class GraspingScene:
         """
         scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
         # A generator of its own: the scenes are the same with any imperfections.
-        drawn = sizes.draw(rng.spawn(1)[0], workplace.robot.joints)
+        robot = workplace.robot
+        drawn = sizes.draw(rng.spawn(1)[0], robot.joints, robot.hand_size)
         yaw = max(_ALONG_EDGES, sizes.object_yaw)
         pose = workplace.random_object_pose(workplace.scaled(_OBJECT_REACH), rng, yaw)
         camera_model = _draw_camera(workplace, config, rng)

@@ -126,7 +126,9 @@ class PlacingExperiment:
         workplace = Workplace.of(skill.robot)
         end = demonstrated_path(demonstration, skill.robot.chain)[-1]
         shelf = demonstrated_shelf(end, workplace)
-        world = World(workplace.scene, self.imperfections.draw(rng, skill.robot.joints))
+        robot = skill.robot
+        drawn = self.imperfections.draw(rng, robot.joints, robot.hand_size)
+        world = World(workplace.scene, drawn)
         correction = None
         if self.taught:
             goal = workplace.shelf(shelf)

@@ -40,7 +40,7 @@ _STARTS = 200  # random starts from which `postures` searches
 _SCAN = 57  # solutions among which `inverse` chooses where a joint is redundant
 _POSTURE_SCAN = 29  # positions of joint 7 among which `postures` chooses
 _MARGIN = 0.02  # distance of the scan from the limits of joint 7 [rad]
-_FEWEST_JOINTS = 5
+_FEWEST_JOINTS = 5  # for the position of a tool, its tilt and its turn
 _LARGEST_STEP = 0.5  # joint motion between poses of a path that calls for a wider search [rad]
 
 TCP_OFFSET = 0.1034
@@ -166,7 +166,8 @@ class Arm(SerialChain):
         self.name = name
         self.description, self.base, self.tip = description, base, tip
         self.shape = shape or ArmShape()
-        self.hand_size, self.task = hand_size, task
+        self.hand_size = hand_size
+        self.task: TaskSpace = task
         self._capsules, self._overlapping = capsules, tuple(overlapping)
         self._closed_form = closed_form
 
@@ -419,14 +420,10 @@ class Arm(SerialChain):
         random = torch.rand(samples, self.joints, generator=rng, dtype=torch.float64)
         wish = near.unsqueeze(-2)
         starts = (low + (high - low) * random).expand(*near.shape[:-1], -1, -1)
-        found = solutions_from(
-            self, pose, torch.cat([wish, starts], dim=-2), task=self.task
-        )
+        found = solutions_from(self, pose, torch.cat([wish, starts], dim=-2), task=self.task)
         return unwound(self, found, wish)
 
-    def with_hand(
-        self, size: float = 1.0, mount: Float[Tensor, "4 4"] | None = None
-    ) -> Arm:
+    def with_hand(self, size: float = 1.0, mount: Float[Tensor, "4 4"] | None = None) -> Arm:
         """The same arm with the Franka hand in place of its gripper.
 
         An arm of fewer than six joints brings it to the nearest pose of its tool.

@@ -430,7 +430,8 @@ class MujocoArm:
         self._felt = None
         self._data.qpos[self.joints] = self._reference
         self._data.qvel[self._velocities] = 0.0
-        self._data.qpos[self._fingers] = gripper_width / 2
+        stroke = self.robot.hand_size * FINGER_STROKE
+        self._data.qpos[self._fingers] = min(gripper_width / 2, stroke)
         self.move(gripper_width)
         self.drive()
 

@@ -152,12 +152,16 @@ class Imperfections:
         """Mean delay between a command and the motion of the arm [s]."""
         return max(self.command_delay + self.servo_lag, _SIMULATED_SERVOS)
 
-    def draw(self, rng: np.random.Generator, joints: int = 7) -> DrawnImperfections:
+    def draw(
+        self, rng: np.random.Generator, joints: int = 7, size: float = 1.0
+    ) -> DrawnImperfections:
         """Draw the errors of one run.
 
         Args:
             rng: Random generator, also for the noise during the run.
             joints: Number of joints of the arm.
+            size: Size of the hand relative to the Franka hand. Heights of table and objects
+                vary in proportion, and an unknown load with the weight of what it lifts.
         """
 
         def uniform(size: int | None = None):
@@ -168,13 +172,13 @@ class Imperfections:
             rng=rng,
             encoder_offset=self.encoder_offset * uniform(joints),
             gravity_error=self.gravity_error * float(uniform()),
-            payload=self.payload * float(rng.uniform()),
+            payload=size**3 * self.payload * float(rng.uniform()),
             base_shift=self.base_error * uniform(3),
             base_turn=self.base_turn * float(uniform()),
             tool_shift=self.tool_error * uniform(3),
             tool_turn=self.tool_turn * uniform(3),
-            table_height=self.table_height * float(uniform()),
-            object_heights=self.object_height * uniform(_MOST_OBJECTS),
+            table_height=size * self.table_height * float(uniform()),
+            object_heights=size * self.object_height * uniform(_MOST_OBJECTS),
         )
 
 

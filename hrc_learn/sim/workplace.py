@@ -45,9 +45,9 @@ _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 # cabinet stands besides: further along the base's x axis, and higher [m].
 _SCALES = (1.0, 0.85, 0.7, 0.55)
 # An arm of fewer than six joints keeps its tool in a plane through the axis of its first joint.
-# So its cabinet stands straight beside that axis, so many times as far away as the table, and it
-# is at home on the way there, at these fractions of that distance. Its wrist is above the tool
-# all over the table, which is nearer, and seen from behind by the camera.
+# So its cabinet stands straight beside that axis, so many times as far away as the table, and
+# home is on the way there, at these fractions of that distance. With its wrist right above the
+# tool it works lower over the table, and its marker is seen from the far side.
 _BESIDE_SCALES, _BESIDE, _ON_THE_WAY = (0.78, 0.7, 0.85), (1.4, 1.6, 1.2), (0.55, 0.65)
 _HOVER_BESIDE, _CAMERA_BESIDE = 0.85, 1.5
 # All lengths below are those of a cell for the Franka hand; a smaller hand makes them smaller.
@@ -441,7 +441,7 @@ def _placed(
         front=depth - level_at,
         shelves={name: scale * z + higher for name, z in cabinet.shelves.items()},
         top=size * cabinet.top + higher,
-        # The door tests null-space motion of the elbow, which six joints do not have.
+        # The door tests null-space motion of the elbow, which no pose leaves to six joints.
         door_reach=scale * cabinet.door_reach * (usual.arm.robot.null_space != "none"),
     )
     (x, y, z), (a, b, c) = table.centre, table.half_size

@@ -195,9 +195,10 @@ class ScenarioRun:
 
     def _build(self, rng: np.random.Generator) -> None:
         """World with drawn imperfections, and the servo of its arm."""
+        robot = self.scenario.workplace.robot
         self.world = World(
             self.scenario.workplace.scene,
-            self._sizes.draw(rng, self.scenario.workplace.robot.joints),
+            self._sizes.draw(rng, robot.joints, robot.hand_size),
         )
         config = PositionServoConfig(safety=self._sizes.plant(SafetyConfig()))
         self.servo = PositionServo(

@@ -279,3 +279,20 @@ class TestSaturation:
         for k in range(0, len(J), 10):
             one = saturate_in_null_space(task[k], J[k], twist[k], -bound, bound)
             torch.testing.assert_close(one, whole[k])
+
+
+@pytest.mark.parametrize("joints", [4, 5])
+def test_fewer_joints_keep_the_position_and_turn_as_near_as_they_can(joints):
+    rng = torch.Generator().manual_seed(joints)
+    J = torch.randn(6, 6, joints, generator=rng, dtype=torch.float64)
+    twist = torch.randn(6, 6, generator=rng, dtype=torch.float64)
+    task, null = resolved_rate(J, twist, torch.ones(6, joints, dtype=torch.float64))
+    assert not null.any()
+    for k in range(6):
+        linear, angular = J[k, :3].numpy(), J[k, 3:].numpy()
+        # Least squares of the rotation among all motions of that linear velocity.
+        first = np.linalg.pinv(linear) @ twist[k, :3].numpy()
+        still = np.linalg.svd(linear)[2][3:].T
+        left = twist[k, 3:].numpy() - angular @ first
+        wanted = first + still @ np.linalg.lstsq(angular @ still, left, rcond=None)[0]
+        np.testing.assert_allclose(task[k].numpy(), wanted, atol=1e-9)

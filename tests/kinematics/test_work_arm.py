@@ -6,7 +6,7 @@ import pytest
 import torch
 from bare_arm import bare
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import ArmChoice, JointLimits, UnreachableError, panda
 from hrc_learn.kinematics import arm as registered
 from hrc_learn.kinematics.drawing import arm_meshes
@@ -128,8 +128,60 @@ def test_what_null_space_is_left(left_out, null_space):
 
 
 def test_too_few_joints_are_refused():
-    with pytest.raises(ValueError, match="cut has 5 joints"):
-        bare((2, 4)).with_hand()
+    with pytest.raises(ValueError, match="cut has 4 joints"):
+        bare((2, 4, 6)).with_hand()
+
+
+def test_five_joints_reach_the_position_and_the_nearest_orientation():
+    arm = bare((2, 4)).with_hand()
+    assert (arm.task, bare().with_hand().task) == ("nearest pose", "pose")
+    rng, limits = torch.Generator().manual_seed(4), arm.limits
+    middle, half = (limits.lower + limits.upper) / 2, (limits.upper - limits.lower) / 2
+    q = middle + 0.4 * half * (2 * torch.rand(20, 5, generator=rng, dtype=torch.float64) - 1)
+    poses = arm.forward(q)
+    turn = 0.1 * torch.randn(20, 3, generator=rng, dtype=torch.float64)
+    wanted = Pose(poses.position, quaternion.multiply(quaternion.exp(turn), poses.orientation))
+    found = arm.inverse(wanted, near=q)
+    assert limits.contain(found).all()
+    reached = arm.forward(found)
+    torch.testing.assert_close(reached.position, wanted.position, atol=1e-6, rtol=0)
+    angle = quaternion.angle(reached.orientation, wanted.orientation)
+    assert (angle < quaternion.angle(poses.orientation, wanted.orientation)).all()
+    # No joint motion that keeps the position turns the tool nearer: the slope is zero.
+    still = torch.linalg.svd(arm.jacobian(found)[:, :3]).Vh[:, 3:]
+    for k in range(2):
+        beside = [arm.forward(found + step * still[:, k]) for step in (1e-4, -1e-4)]
+        first, second = (quaternion.angle(b.orientation, wanted.orientation) for b in beside)
+        assert ((first - second).abs() / 2e-4 < 1e-4).all()
+
+
+def test_a_pose_of_another_direction_is_no_nearest_one():
+    arm = bare((2, 4)).with_hand()
+    _, poses = poses_of(arm, 5, seed=6)
+    away = quaternion.exp(torch.tensor([2.0, 0.0, 0.0], dtype=torch.float64))
+    refused = 0
+    for i in range(5):
+        turned = Pose(poses[i].position, quaternion.multiply(away, poses[i].orientation))
+        try:
+            found = arm.forward(arm.inverse(turned, near=arm.ready))
+        except UnreachableError:
+            refused += 1
+        else:
+            assert quaternion.angle(found.orientation, turned.orientation) < 0.7
+    assert refused
+
+
+@pytest.mark.skipif(find_spec("cmeel") is None, reason="example-robot-data is not installed")
+def test_the_hand_of_an_so101_replaces_its_jaws():
+    described, held = registered("so101"), ArmChoice("so101").work_arm()
+    q = described.ready
+    tips, jaws = held.forward(q).position, described.forward(q).position
+    # The jaws end beside the axis of wrist_roll, the hand on it.
+    assert float((tips - jaws).norm()) < 0.01
+    axis = held.link_poses(q).matrix()[-1]
+    across = torch.linalg.cross(held.forward(q).position - axis[:3, 3], axis[:3, 2], dim=-1)
+    assert float(across.norm()) < 1e-3
+    assert max(c.end[2] for c in held.body.capsules if c.link == 5) <= 0.0
 
 
 def test_a_choice_opens_the_same_arm_each_time():
