@@ -22,13 +22,16 @@ from worker_tables import Workers, WorkerTables
 from hrc_learn.controller import Distances, WayMakingConfig
 from hrc_learn.controller.arm_loop import ArmLoop
 from hrc_learn.controller.arm_loop_state import ArmLoopConfig, ArmReading, FollowPath
+from hrc_learn.controller.contact_limits import PersonMode, region_numbers
 from hrc_learn.controller.joint_path import JointPaths
 from hrc_learn.experiments.surroundings import margin_to_stop
 from hrc_learn.kinematics import CapsuleArm, Separation, panda, separation
-from hrc_learn.sim import CommandChannel, Imperfections
+from hrc_learn.sim import CommandChannel, Imperfections, WorkerConfig
+from hrc_learn.sim.worker import REGIONS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.person_watch import (
     NEAR_PEOPLE,
+    ContactLimits,
     PersonWatchConfig,
     person_speed_scale,
     urgent_distances,
@@ -64,6 +67,8 @@ class Job:
     cycle: Int[Tensor, " runs"]
     """Index of the cycle of each arm."""
     workers: WorkerTables
+    bodies: Sequence[WorkerConfig]
+    """Sizes of the workers."""
     pulls: Sequence[ScriptedForce]
     """Pull of the expert at the elbow of each arm."""
     encoder_offset: Float[Tensor, "runs joints"]
@@ -82,6 +87,8 @@ class Reaction:
     stop_distance: float | None = None
     """Distance within which the arm rests, without any other reaction [m]. None: it keeps the
     protective distance, slower or at rest."""
+    mode: PersonMode = "ssm"
+    """Separation monitoring, or power and force limiting."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,6 +121,14 @@ class WorkerRuns:
     """Largest distance of the end effector from its path [m]."""
     unsolved: Int[Tensor, " runs"]
     """Steps in which the constraint solver ran out of iterations, and the arm braked."""
+    touches: Int[Tensor, " runs"]
+    """Contacts into which the arm moved, as `contact_forces` finds them."""
+    run_into: Int[Tensor, " runs"]
+    """Contacts in which the worker ran into an arm at rest."""
+    exceedances: Int[Tensor, " runs"]
+    """Contacts into which the arm moved with more than the allowed force or pressure."""
+    of_limit: Float[Tensor, " runs"]
+    """Largest force or pressure of such a contact, as a fraction of its limit."""
 
     @classmethod
     def joined(cls, parts: Sequence[WorkerRuns]) -> WorkerRuns:
@@ -133,6 +148,7 @@ def run_near_workers(
     config: ArmLoopConfig,
     limit: float,
     report: Callable[[float], None] = lambda fraction: None,
+    trace: list[tuple[Tensor, Tensor]] | None = None,
 ) -> WorkerRuns:
     """Let all arms do their cycle.
 
@@ -142,12 +158,16 @@ def run_near_workers(
         config: Settings of the loop.
         limit: Longest duration of a run [s].
         report: Called now and then with the fraction of the runs that have ended.
+        trace: Receives the true joint positions of all arms [rad], and a mask of those that
+            hold the object, at each step.
     """
     batch = _Batch(job, reaction, config)
     for step in range(round(limit / config.dt)):
         if not len(batch.live):
             break
         batch.step(step)
+        if trace is not None:
+            trace.append(batch.now)
         if step % 100 == 0:
             report(1 - len(batch.live) / len(job.cycle))
     report(1.0)
@@ -161,7 +181,17 @@ class _Batch:
         self._job, self._reaction = job, reaction
         self._load = job.cycles[0].load
         safety = job.sizes.plant(config.safety)
-        self._separation = safety.separation
+        self._separation = replace(safety.separation, mode=reaction.mode)
+        safety = replace(safety, separation=self._separation)
+        self._regions = region_numbers(REGIONS)
+        self._limits = self._true_limits = None
+        if reaction.mode != "ssm":
+            boxes, config_used = job.workplace.scene.boxes(), self._separation.contact
+            whole = replace(self._separation, contact=replace(config_used, used=1.0))
+            self._limits, self._true_limits = (
+                ContactLimits(job.arm, separation, boxes)
+                for separation in (self._separation, whole)
+            )
         constraints = NEAR_PEOPLE if reaction.stop_distance is None else None
         self._config = replace(
             config,
@@ -188,6 +218,7 @@ class _Batch:
         # At rest where the encoders read the start of the path.
         self._q = begin - job.encoder_offset
         self._v = torch.zeros_like(self._q)
+        self._holds = torch.zeros(runs, dtype=torch.bool)
         acceleration = panda.limits.acceleration.numpy()
         # The jitter of commands is the same for all arms, whatever the batch.
         drawn = job.sizes.draw(np.random.default_rng(0))
@@ -212,6 +243,10 @@ class _Batch:
             present=zeros.clone(),
             off_path=zeros.clone(),
             unsolved=count.clone(),
+            touches=count.clone(),
+            run_into=count.clone(),
+            exceedances=count.clone(),
+            of_limit=zeros.clone(),
         )
 
     def step(self, step: int) -> None:
@@ -229,6 +264,11 @@ class _Batch:
             self.found.cycle_time[self.live[ended]] = step * self._config.dt
             self.live = self.live[~ended]
             self._state = _pytree.tree_map(lambda x: x[~ended], self._state)
+
+    @property
+    def now(self) -> tuple[Tensor, Tensor]:
+        """True joint positions of all arms, and a mask of those that hold the object."""
+        return self._q.float(), self._holds.clone()
 
     def _move(self, step: int, command: Tensor) -> None:
         """Let the arms follow for a step."""
@@ -288,23 +328,32 @@ class _Batch:
         shape = (len(age), self._watch.pairs)
         distance = measured.new_full(shape, _FAR)
         gradient, approach = measured.new_zeros(*shape, 7), measured.new_zeros(shape)
+        touch = measured.new_zeros(shape)
         for rows, found, columns in self._near(measured, holding, seen, bound, relevant):
+            contact, load = None, bool(holding[rows[0]])
+            if self._limits is not None:
+                regions = self._regions[columns]
+                contact = self._limits.speeds(found, measured[rows], regions, load)
             observed = (
                 found,
                 seen.velocity[rows.unsqueeze(-1), columns],
                 age[rows],
                 self._separation,
                 self._watch,
+                contact,
             )
             part = urgent_distances(*observed)
             scale[rows] = person_speed_scale(*observed)
             distance[rows] = part.distance
             gradient[rows], approach[rows] = part.gradient, part.approach_speed
+            if part.contact_speed is not None:
+                touch[rows] = part.contact_speed
         distances = Distances(
             distance=distance,
             gradient=gradient,
             approach_speed=approach,
             person=torch.ones(shape, dtype=torch.bool),
+            contact_speed=touch,
         )
         return distances, scale, stop
 
@@ -381,6 +430,7 @@ class _Batch:
         found.present[live] += there * dt
         cycle, progress = self._progress()
         holding = self._holding[cycle, progress.long()]
+        self._holds[live] = holding
         self._measure_deviation(q, cycle, progress)
         bound = self._bound(q, holding, workers)
         stop = replace(self._separation, reaction_time=0.0, clearance=0.0)
@@ -393,7 +443,11 @@ class _Batch:
         elbow = [k for k, link in enumerate(self._job.arm.links) if link in _ELBOW_LINKS]
         for rows, near, columns in self._near(q, holding, workers, bound, relevant):
             speed = workers.velocity[rows.unsqueeze(-1), columns]
-            spare = margin_to_stop(near, v[rows], speed, self._separation)
+            contact = None
+            if self._true_limits is not None:
+                regions, load = self._regions[columns], bool(holding[rows[0]])
+                contact = self._true_limits.speeds(near, q[rows], regions, load)
+            spare = margin_to_stop(near, v[rows], speed, self._separation, contact)
             margin, runs = spare.amin((-2, -1)), live[rows]
             closing = near.distance.masked_fill(spare.isinf(), torch.inf)
             least = near.distance.amin((-2, -1))

@@ -4,7 +4,8 @@ way saves, compared with arms that stop and wait.
 Another worker comes in each run, puts something on the table, reaches for markers under the arm
 and walks away. The arms keep the protective distance of ISO 10218-2:2025 from what a tracker
 sees, and their null space makes way or not; others stop and wait while the worker is nearer
-than a fixed distance. The exit status is 1 if an arm that keeps the distance violated it.
+than a fixed distance. The exit status is 1 if an arm that keeps the distance violated it, or
+touched a worker with more than the allowed force or pressure.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import Literal
 import matplotlib
 import numpy as np
 import torch
+from contact_forces import Motion, contacts
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -35,6 +37,7 @@ from worker_tables import WorkerTables
 from hrc_learn import cli
 from hrc_learn.controller import WayMakingConfig
 from hrc_learn.controller.arm_loop_state import ArmLoopConfig
+from hrc_learn.controller.contact_limits import PersonMode
 from hrc_learn.sim import (
     Imperfections,
     Worker,
@@ -79,6 +82,9 @@ _COLUMNS = (
     ("x undis-\nturbed", "over_undisturbed", "{:.2f}"),
     ("waited\n[s]", "waited_s", "{:.1f}"),
     ("off path\np95", "off_path_p95_mm", "{:.1f}"),
+    ("con-\ntacts", "contacts", "{:.0f}"),
+    ("over\nlimit", "exceedances", "{:.0f}"),
+    ("of\nlimit", "force_of_limit_max", "{:.2f}"),
     ("less, same\ndistance", "shorter_at_same_distance", "{:.1%}"),
     ("less,\nsafe stop", "shorter_than_safe_stop", "{:.1%}"),
 )
@@ -98,6 +104,9 @@ class Args:
     """Seed of workers, trackers, encoders and objects."""
     modes: tuple[Mode, ...] = MODES
     """Sources of null-space motion to compare."""
+    people: tuple[PersonMode, ...] = ("ssm",)
+    """Reactions to people to compare, each with every source of null-space motion: separation
+    monitoring, power and force limiting, or both."""
     stop_distances: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.8)
     """Distances within which arms stop and wait [m]."""
     cycles: int = 24
@@ -138,6 +147,7 @@ def main(args: Args) -> int:
             cycles,
             config,
             modes=args.modes,
+            people=args.people,
             stop_distances=args.stop_distances,
             report=report,
         )
@@ -149,7 +159,12 @@ def main(args: Args) -> int:
             draw(folder / "worker.png", study)
     if args.json is not None:
         cli.write_json(args.json, figures)
-    return int(any(bool(runs.violations.any()) for runs in study.making_way.values()))
+    return int(
+        any(
+            bool((runs.violations > 0).any() | (runs.exceedances > 0).any())
+            for runs in study.making_way.values()
+        )
+    )
 
 
 def show(study: WorkerStudy, figures: dict[str, float]) -> None:
@@ -240,6 +255,7 @@ def draw_job(
         cycles=cycles,
         cycle=torch.tensor([run % len(cycles) for run in runs]),
         workers=WorkerTables.of(visits, sizes, chances, dt),
+        bodies=[visit.worker.config for visit in visits],
         pulls=[expert_pull(visit) for visit in visits],
         encoder_offset=torch.from_numpy(np.stack(offset)),
         encoder_noise=torch.from_numpy(np.stack(noise)),
@@ -266,8 +282,9 @@ def expert_pull(visit: WorkerVisit) -> ScriptedForce:
 class WorkerStudy:
     """Runs with each reaction."""
 
-    making_way: Mapping[Mode, WorkerRuns]
-    """Runs by the source of null-space motion; all of them keep the protective distance."""
+    making_way: Mapping[str, WorkerRuns]
+    """Runs by the source of null-space motion, and the reaction to people if that is not "ssm"
+    (`key`)."""
     stopping: Mapping[float, WorkerRuns]
     """Runs of arms that stop and wait, by the distance within which they rest [m]."""
 
@@ -315,6 +332,40 @@ class WorkerStudy:
         return {key: value for key, value in figures.items() if np.isfinite(value)}
 
 
+def measure_contacts(
+    job: Job, trace: Sequence[tuple[Tensor, Tensor]], runs: WorkerRuns, dt: float
+) -> None:
+    """Force and pressure of the contacts of each run, by an evaluator of its own.
+
+    Args:
+        job: Task of the arms, and the workers near them.
+        trace: Positions of the arms, and which of them hold the object, at each step.
+        runs: Receives the figures.
+        dt: Control step [s].
+    """
+    scene = job.workplace.scene
+    for run, body in enumerate(job.bodies):
+        steps = min(len(trace), round(float(runs.cycle_time[run]) / dt)) if len(trace) else 0
+        number = torch.tensor([run])
+        motion = Motion(
+            dt=dt,
+            joints=np.stack([q[run].double().numpy() for q, _ in trace[:steps]]),
+            holding=np.array([bool(held[run]) for _, held in trace[:steps]]),
+            ends=np.stack([job.workers.truth(k, number).ends[0].numpy() for k in range(steps)]),
+        )
+        found = contacts(motion, scene, body, load=scene.objects[0].mass)
+        moved = [contact for contact in found if contact.by_arm]
+        runs.touches[run] = len(moved)
+        runs.run_into[run] = len(found) - len(moved)
+        runs.exceedances[run] = sum(contact.of_limit > 1 for contact in moved)
+        runs.of_limit[run] = max((contact.of_limit for contact in moved), default=0.0)
+
+
+def key(mode: Mode, person: PersonMode) -> str:
+    """Name of a reaction, and the begin of the names of its figures."""
+    return mode if person == "ssm" else f"{mode}_{person.replace('+', '_')}"
+
+
 def smallest_distance(runs: WorkerRuns) -> float:
     """5 % quantile over the runs of the distance that was closed in on [m]."""
     return float(runs.closing.quantile(0.05))
@@ -348,6 +399,10 @@ def summary(runs: WorkerRuns) -> dict[str, float]:
         "off_path_p95_mm": 1e3 * quantile(runs.off_path, 0.95),
         "unfinished": float(runs.cycle_time.isinf().sum()),
         "unsolved_steps": float(runs.unsolved.sum()),
+        "contacts": float(runs.touches.sum()),
+        "run_into": float(runs.run_into.sum()),
+        "exceedances": float(runs.exceedances.sum()),
+        "force_of_limit_max": float(runs.of_limit.amax()),
     }
 
 
@@ -357,6 +412,7 @@ def run_study(
     config: WorkerStudyConfig,
     *,
     modes: Sequence[Mode] = MODES,
+    people: Sequence[PersonMode] = ("ssm",),
     stop_distances: Sequence[float] = (),
     report: Callable[[str, float], None] = lambda name, done: None,
 ) -> WorkerStudy:
@@ -367,12 +423,16 @@ def run_study(
         cycles: Cycles of the job, done in turn.
         config: Settings of the runs.
         modes: Sources of null-space motion.
+        people: Reactions to people.
         stop_distances: Distances of stop-and-wait [m].
         report: Called with a reaction and the number of its runs that have ended.
     """
     reactions: dict[str, Reaction] = {
-        mode: Reaction(way_making=WayMakingConfig(mode=mode)) for mode in modes
+        key(mode, person): Reaction(way_making=WayMakingConfig(mode=mode), mode=person)
+        for person in people
+        for mode in modes
     }
+    ways = list(reactions)
     stops = {f"stop at {d:g} m": d for d in sorted(stop_distances)}
     still = WayMakingConfig(mode="none")
     for name, distance in stops.items():
@@ -386,12 +446,13 @@ def run_study(
             def ended(fraction: float, name: str = name, batch: range = batch) -> None:
                 report(name, batch.start + fraction * len(batch))
 
-            parts[name].append(
-                run_near_workers(job, reaction, config.cell, config.limit, ended)
-            )
+            trace: list[tuple[Tensor, Tensor]] = []
+            runs = run_near_workers(job, reaction, config.cell, config.limit, ended, trace)
+            measure_contacts(job, trace, runs, config.cell.dt)
+            parts[name].append(runs)
     joined = {name: WorkerRuns.joined(part) for name, part in parts.items()}
     return WorkerStudy(
-        making_way={mode: joined[mode] for mode in modes},
+        making_way={name: joined[name] for name in ways},
         stopping={distance: joined[name] for name, distance in stops.items()},
     )
 
