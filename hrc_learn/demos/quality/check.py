@@ -244,13 +244,15 @@ def _usual_motion(
 
 def _is_sound(frames: RawFrames, mapping: ColumnMapping) -> bool:
     """True if all columns of the quantities exist and are finite."""
-    columns = [column for s in mapping.selections.values() for column in s.columns]
+    columns: dict[str, list[int]] = {}
+    for key, index in (column for s in mapping.selections.values() for column in s.columns):
+        columns.setdefault(key, []).append(index)
     return all(
         key in frames
         and len(frames[key]) > 1
-        and index < frames[key].shape[1]
-        and np.isfinite(frames[key][:, index].astype(float)).all()
-        for key, index in columns
+        and max(indices) < frames[key].shape[1]
+        and np.isfinite(frames[key][:, indices].astype(float)).all()
+        for key, indices in columns.items()
     )
 
 

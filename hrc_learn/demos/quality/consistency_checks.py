@@ -12,6 +12,8 @@ from hrc_learn.demos.read.columns import ColumnMapping
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.naming import is_hand, meaning_of_component
 from hrc_learn.demos.read.profiles import (
+    FOLLOWS,
+    PROMPT,
     ColumnProfile,
     EpisodeProfile,
     Tracking,
@@ -34,13 +36,11 @@ _MOST_NAMED = 6
 """Components named in a message."""
 _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
-# R squared above which a state follows its command, and below which it does not.
-_FOLLOWS, _LOST = 0.8, 0.4
+_LOST = 0.4
+"""R squared below which a state does not follow its command."""
 _OFFSET = 0.1
 """Distance between command and state at rest that is reported, relative to the joint's range:
 hobby servos stop within a few degrees under load."""
-_PROMPT = 0.2
-"""Delay within which an arm follows [s]; a slow motion resembles its own rate later."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -358,7 +358,7 @@ def command_tracking(
     trackings = [p.tracking["command_position"] for p in known]
     usual_fit = _median([t.fit for t in trackings])
     yield from _velocity_commands(folder.fps, key, names, profiles, usual_fit)
-    follow = usual_fit > _FOLLOWS
+    follow = usual_fit > FOLLOWS
     if not follow.any():
         return
     usual_slope = _median([t.slope for t in trackings])
@@ -442,7 +442,7 @@ def _component_tracking(
 ) -> Iterator[tuple[str, Literal["error", "warning"]]]:
     """Components that follow their command in the other episodes, but not in this one."""
     fit, slope, partner = tracking.fit, tracking.slope, tracking.partner
-    follows = follow & (fit > _FOLLOWS)
+    follows = follow & (fit > FOLLOWS)
     lost = np.flatnonzero(follow & ~(fit > _LOST) & ~np.isnan(fit))
     # The slope equals minus the usual one, within half of it.
     opposite = np.abs(slope + usual_slope) < 0.5 * np.abs(usual_slope)
@@ -486,10 +486,10 @@ def _velocity_commands(
         abs(float(np.median([t.delay for t in group]))) / fps for group in (rates, positions)
     )
     # If both readings fit a smooth motion, the one without a long delay is meant.
-    prompt = rate_delay <= _PROMPT < position_delay
+    prompt = rate_delay <= PROMPT < position_delay
     fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
     # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
-    speeds = (fit > _FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
+    speeds = (fit > FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
     speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
     if speeds.sum() > len(speeds) / 2:
         yield Issue(

@@ -151,9 +151,9 @@ def indices(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> It
             text = f"is {frames[key][k, 0]:g}, expected {values[k]:g}"
             yield entry.fault(f"{text}; frames were lost, repeated or moved", frame=k, key=key)
     if "task_index" in frames and folder.tasks:
-        known = np.isin(frames["task_index"][:, 0], list(folder.tasks))
-        if not known.all():
-            k = int(known.argmin())
+        tasks = frames["task_index"][:, 0].tolist()
+        if unknown := {*tasks} - folder.tasks.keys():
+            k = next(k for k, task in enumerate(tasks) if task in unknown)
             text = f"task {frames['task_index'][k, 0]:g} is not in the list of tasks"
             yield entry.fault(text, frame=k, key="task_index")
 
