@@ -391,6 +391,15 @@ def test_dimensions_that_never_change_or_saturate(tmp_path):
     assert find(report.warnings, "end of its range").message.endswith("c.pos")
 
 
+@pytest.mark.parametrize(("count", "warnings"), [(6, 6), (7, 1), (300, 1)])
+def test_many_constant_features_are_one_warning(tmp_path, count, warnings):
+    still = {f"observation.f{k}": np.full((60, 1), k) for k in range(count)}
+    root = write_folder(tmp_path / "set", [columns(0) | still], {STATE: NAMES, "action": NAMES})
+    found = [w for w in check_dataset(root).warnings if "never change" in w.message]
+    assert len(found) == warnings
+    assert warnings > 1 or found[0].message.startswith(f"{count} features never change: ")
+
+
 def test_actions_of_some_joints_only(tmp_path):
     q = joint_path()
     names = {STATE: NAMES, "action": NAMES[:2]}

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -63,6 +64,11 @@ class FeatureProfiles:
     def median(self, name: str) -> Float64[np.ndarray, " components"]:
         """Usual value of one statistic of each component."""
         return np.median(self.stack(name), axis=0)
+
+    @cached_property
+    def constant(self) -> Bool[np.ndarray, " components"]:
+        """Mask of components that have one value in all episodes."""
+        return self.stack("low").min(0) == self.stack("high").max(0)
 
     def named(self, chosen: Bool[np.ndarray, " components"]) -> str:
         """Names of the chosen components."""
@@ -136,10 +142,14 @@ def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
 
 def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
     """Components that change, and do not stay at an end of their range."""
+    still = [feature.key for feature in features if feature.constant.all()]
+    if len(still) > _MOST_NAMED:
+        text = f"{len(still)} features never change: {_listed(still, range(len(still)))}, ..."
+        yield warning(message=text)
+    said = {*still} if len(still) > _MOST_NAMED else set()
     for feature in features:
-        low, high = feature.stack("low"), feature.stack("high")
-        constant = low.min(0) == high.max(0)
-        if constant.any():
+        low, high, constant = feature.stack("low"), feature.stack("high"), feature.constant
+        if constant.any() and feature.key not in said:
             text = f"never changes: {feature.named(constant)}"
             yield warning(message=text, key=feature.key)
         ends = feature.stack("at_ends")

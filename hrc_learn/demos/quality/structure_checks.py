@@ -4,6 +4,7 @@
 report the faults on the way; the other functions are checks, listed in `check`.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import pairwise
@@ -85,7 +86,8 @@ def _sound_keys(
     report.attempt(lambda: require_rows(file, entries, rows, folder.promised_rows[file]))
     report.run(_column_faults, folder, file, schema, report)
     numeric = [key for key, feature in folder.features.items() if feature.numeric]
-    return [key for key in numeric if schema.names.count(key) == 1], rows
+    counts = Counter(schema.names)
+    return [key for key in numeric if counts[key] == 1], rows
 
 
 def _sound_columns(
@@ -106,9 +108,10 @@ def _column_faults(
     folder: DatasetFolder, file: str, schema: pa.Schema, report: ValidationReport
 ) -> Iterator[Issue]:
     """Columns of a file that are missing, repeated or of another type than declared."""
-    missing = [key for key in INDEX_KEYS if key not in {*folder.features, *schema.names}]
+    counts = Counter(schema.names)  # Arrow makes a new list at each access
+    missing = [key for key in INDEX_KEYS if key not in folder.features and not counts[key]]
     for key, feature in folder.features.items():
-        count = schema.names.count(key)
+        count = counts[key]
         if feature.dtype == "video":
             continue
         if count > 1:
