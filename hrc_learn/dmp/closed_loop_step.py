@@ -17,6 +17,7 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import fits_numpy, readable
 from hrc_learn.dmp.dynamics import SpringDamper, approach_state
 from hrc_learn.dmp.response import Response
+from hrc_learn.geometry import minimum_jerk
 
 RESONANCE = 1e-3
 """Smallest distance of a goal filter from a mode of the spring, relative to the stiffness. The
@@ -152,7 +153,11 @@ def numpy_step(
 
 
 def uncoupled_step(
-    state: DMPState, dt: float, response: Response, weights: Float[Tensor, "*batch D N"]
+    state: DMPState,
+    dt: float,
+    target: Float[Tensor, "*batch D"],
+    response: Response,
+    weights: Float[Tensor, "*#batch D N"],
 ) -> DMPState | None:
     """`step` of one motion without coupling, in NumPy: a third of the time.
 
@@ -163,35 +168,47 @@ def uncoupled_step(
         batch, on another device or not in float64.
     """
     tensors = (
-        *(weights, state.position, state.rate, state.target, state.forced),
-        *(state.s, state.duration, state.pace),
+        *(weights, state.position, state.rate, target, state.forced),
+        *(state.s, state.duration, state.pace, state.displacement),
     )
-    if response.approach or weights.ndim != 2 or weights.dtype is not torch.float64:
+    if weights.ndim != 2 or weights.dtype is not torch.float64:
         return None
     if state.s.ndim or state.duration.ndim or state.pace.ndim or not fits_numpy(*tensors):
         return None
-    ds = dt / state.duration.item()
-    now = state.s.item() + ds
+    begin, ds = state.s.item(), dt / state.duration.item()
+    now = begin + ds
     after = response.forced.at(now).dot(weights.detach().numpy().T)
     if coast := response.coasting(now):
         after = response.spring.propagator(coast).numpy().dot(after)
-    before = state.forced.numpy()
+    before, forced = state.forced.numpy(), after
+    if response.approach:
+        displacement = state.displacement.numpy()
+        before = before + numpy_approach(begin, response.approach, displacement)
+        after = after + numpy_approach(now, response.approach, displacement)
     y = np.empty_like(before)
     y[0], y[1] = state.position.numpy(), state.rate.numpy()
     E = response.spring.propagator(ds).numpy()
-    y = numpy_step(E, y, before, after, state.target.numpy())
+    y = numpy_step(E, y, before, after, target.numpy())
     return DMPState(
         position=torch.from_numpy(y[0]),
         rate=torch.from_numpy(y[1]),
         start=state.start,
-        goal=state.target,
+        goal=target,
         displacement=state.displacement,
-        target=state.target,
+        target=target,
         duration=state.duration,
         pace=_FULL_PACE,
         s=torch.from_numpy(np.array(now)),
-        forced=torch.from_numpy(after),
+        forced=torch.from_numpy(forced),
     )
+
+
+def numpy_approach(
+    s: float, fraction: float, displacement: Float64[np.ndarray, "D"]
+) -> Float64[np.ndarray, "2 D"]:
+    """`approach_state` of one motion, times its displacement."""
+    m, slope = minimum_jerk(s / fraction)
+    return np.multiply.outer([m - 1.0, slope / fraction], displacement)
 
 
 def _propagators(

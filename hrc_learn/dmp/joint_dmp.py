@@ -47,9 +47,9 @@ class FitOptions(TypedDict, total=False):
     method: str
     """`"trajectory"` (default), least squares on the positions, the closest reproduction;
     `"ridge"`, regression on the force; `"lwr"`, the paper's method."""
-    approach: float | int
-    """Fraction of the motion, 0 to 1, over which it moves smoothly to a new start and goal;
-    0 (default): at once, as in the paper."""
+    approach: float | int | None
+    """Fraction of the motion, 0 to 1, over which it moves smoothly to a new start and goal; 0:
+    at once, as in the paper. None (default): 1, but 0 for rhythms and the scaling `"paper"`."""
     basis: Basis | None
     """Basis of the forcing term; `n_basis` Gaussians by default."""
     spring: SpringDamper | None
@@ -66,7 +66,8 @@ def _fit(
     n_basis: int | None,
     *,
     method: str = "trajectory",
-    approach: float | int = 0.0,
+    scaling: str,
+    approach: float | int | None = None,
     basis: Basis | None = None,
     spring: SpringDamper | None = None,
     regularization: float = REGULARIZATION,
@@ -82,6 +83,8 @@ def _fit(
     chosen = n_basis is not None or basis is not None
     if basis is None:
         basis = GaussianBasis(count=DEFAULT_COUNT if n_basis is None else n_basis)
+    if approach is None:
+        approach = 0.0 if basis.periodic or scaling == "paper" else 1.0
     response = response_of(spring or SpringDamper(), basis, float(approach))
     samples, noise = recorded, None
     if smooth or (smooth is None and not chosen):
@@ -166,7 +169,9 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
         time, mask, (position, velocity) = padded(time, mask, position, velocity)
         recorded = check_samples(time, position, velocity, mask)
         check_names(joint_names, recorded.position.shape[1])
-        response, samples, noise, weights, rate = _fit(recorded, n_basis, **options)
+        response, samples, noise, weights, rate = _fit(
+            recorded, n_basis, scaling=scaling.name, **options
+        )
         weights = _unscaled(weights, samples, recorded, scaling, joint_names)
         ends = torch.stack([rate, samples.first.double(), samples.last.double()], dim=-1)
         dmp = cls.from_coordinates(
@@ -326,7 +331,7 @@ def fit_shared(
     """
     if not len(demonstrations):
         raise ValueError("there are no demonstrations to learn from")
-    response = response_of(SpringDamper(), GaussianBasis(count=n_basis))
+    response = response_of(SpringDamper(), GaussianBasis(count=n_basis), 1.0)
     products, sums, rows = _accumulate(demonstrations, response)
     # The start velocity is one more unknown after the weights.
     n = n_basis + 1

@@ -388,18 +388,20 @@ class LinearPrimitive(nn.Module):
         if not isinstance(dt, float):
             dt = to_tensor(dt, torch.float64, state.duration.device)
         check_not_negative("dt", dt)
-        if (
-            isinstance(dt, float)
-            and goal is goal_filter is external_acceleration is None
-            and phase_stopping is forcing_gain is None
-            and self.scaling == "none"
-        ):
-            fast = closed_loop_step.uncoupled_step(state, dt, self.response, self.weights)
-            if fast is not None:
-                return fast
         target = state.target
         if goal is not None:
             target = checked_vector("goal", goal, state.goal).expand_as(state.goal)
+        if (
+            isinstance(dt, float)
+            and goal_filter is external_acceleration is None
+            and phase_stopping is forcing_gain is None
+            and self.scaling == "none"
+        ):
+            fast = closed_loop_step.uncoupled_step(
+                state, dt, target, self.response, self.weights
+            )
+            if fast is not None:
+                return fast
         # Duration of the motion at the pace of this step.
         duration, pace = state.duration, torch.ones_like(state.pace)
         if phase_stopping is not None:

@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from hrc_learn.dmp.closed_loop_step import numpy_step
+from hrc_learn.dmp.closed_loop_step import numpy_approach, numpy_step
 from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.pose_dmp import BODY, ERROR, POSITION, PoseDMP
 from hrc_learn.dmp.response import PiecewisePolynomial
-from hrc_learn.geometry import Pose, minimum_jerk
+from hrc_learn.geometry import Pose
 
 Vector = Float64[np.ndarray, "D"]
 Pair = Float64[np.ndarray, "2 D"]
@@ -220,8 +220,8 @@ class Stepper:
         if scale is not None:
             before, after = before.dot(scale), after.dot(scale)
         if self._approach:
-            before = before + self._approach_state(s, displacement)
-            after = after + self._approach_state(now, displacement)
+            before = before + numpy_approach(s, self._approach, displacement)
+            after = after + numpy_approach(now, self._approach, displacement)
         rest = goal_columns
         if coupling is not None:
             # At the equilibrium the spring balances the push.
@@ -262,10 +262,6 @@ class Stepper:
         if not self._scaling.depends_on_boundary:
             return None
         return self._scaling.scale(np.eye(len(start)), start, goal, self._shown, np)
-
-    def _approach_state(self, s: float, displacement: Vector) -> Pair:
-        m, slope = minimum_jerk(s / self._approach)
-        return np.stack([(m - 1.0) * displacement, slope / self._approach * displacement])
 
     def _forced(self, s: float) -> Pair:
         """State (y, dy/ds) caused by the forcing term, by the table and the spring after it."""

@@ -103,7 +103,7 @@ def test_a_constant_push_shifts_the_resting_point():
 def primitive():
     """One joint that moves for 2 s, with rough weights and a moving start."""
     time, position = arm_motion(n_joints=1, duration=2.0, moving_start=True)
-    dmp = JointDMP.fit(time, position, n_basis=15)
+    dmp = JointDMP.fit(time, position, n_basis=15, approach=0)
     rng = torch.Generator().manual_seed(0)
     noise = 200 * torch.randn(dmp.weights.shape, generator=rng, dtype=torch.float64)
     dmp.weights.data += noise
@@ -162,7 +162,7 @@ def test_coupling_sampled_at_the_start_of_a_step_is_of_first_order():
 def test_a_filtered_goal_solves_the_equation(n_steps, spring):
     """As a push of alpha beta (g - target), with g in closed form."""
     time, position = arm_motion(n_joints=1, duration=2.0)
-    dmp = JointDMP.fit(time, position, n_basis=15, spring=spring)
+    dmp = JointDMP.fit(time, position, n_basis=15, spring=spring, approach=0)
     start, goal = dmp.start.item(), dmp.goal.item()
     expected = exact(
         dmp,
@@ -209,7 +209,7 @@ SPRINGS = [
 @pytest.mark.parametrize("spring", SPRINGS)
 def test_a_step_alone_is_that_of_a_batch(spring):
     """From before the end of the forcing to long after it; a batch is never read."""
-    dmp = JointDMP.fit(*arm_motion(moving_start=True), 20, spring=spring)
+    dmp = JointDMP.fit(*arm_motion(moving_start=True), 20, spring=spring, approach=0)
     one, many = dmp.initial_state(), dmp.initial_state(duration=dmp.duration[None])
     for dt in (1e-3, 1.3, 1.3, 0.8, 0.0, 4.0):
         one, many = dmp.step(one, dt), dmp.step(many, dt)
@@ -220,7 +220,7 @@ def test_a_step_alone_is_that_of_a_batch(spring):
 
 def test_derivatives_by_times_are_kept():
     """Backward, forward and mapped, all through one step of one motion."""
-    dmp = JointDMP.fit(*arm_motion(), 12)
+    dmp = JointDMP.fit(*arm_motion(), 12, approach=0)
     state = dmp.step(dmp.initial_state(), 0.4)
 
     def position(dt):

@@ -69,7 +69,7 @@ STIFFNESS, GAIN = 1000.0, 0.01  # N/m, m/s/N
 def test_a_force_loop_solves_the_printed_equations_to_first_order(lead):
     """Always in contact with an elastic wall, so that the equation is smooth."""
     time, position = arm_motion(n_joints=1, duration=TAU, moving_start=True)
-    dmp = JointDMP.fit(time, 0.05 * position, n_basis=15)
+    dmp = JointDMP.fit(time, 0.05 * position, n_basis=15, approach=0)
     goal = dmp.goal.numpy() + 0.03
 
     def couple(k, state):
@@ -142,7 +142,7 @@ def two_arms():
     start = torch.tensor([[0.0, 0.0], [0.3, 0.4]], dtype=torch.float64)
     position = start[:, None] + minimum_jerk(S)[:, None] * way[:, None]
     position = position + 0.05 * torch.sin(torch.pi * S).square()[:, None]
-    return JointDMP.fit(TAU * S, position, n_basis=15, units="m")
+    return JointDMP.fit(TAU * S, position, n_basis=15, units="m", approach=0)
 
 
 def mirrored(error, rate):

@@ -12,7 +12,9 @@ START, GOAL = torch.tensor([[0.2, -0.4, 0.1], [0.9, 0.3, -0.6]], dtype=torch.flo
 
 
 def primitive(**kwargs):
-    return JointDMP.fit(*arm_motion(n_joints=3, moving_start=True), n_basis=15, **kwargs)
+    return JointDMP.fit(
+        *arm_motion(n_joints=3, moving_start=True), n_basis=15, **({"approach": 0} | kwargs)
+    )
 
 
 @pytest.mark.parametrize("approach", [0.0, 0.8])

@@ -22,7 +22,7 @@ TURN_RATE = torch.tensor([1.5, -2.0, 0.5], dtype=torch.float64)
 
 @pytest.fixture
 def dmp():
-    return OrientationDMP.fit(*turning_motion(), n_basis=15, formulation="ude")
+    return OrientationDMP.fit(*turning_motion(), n_basis=15, formulation="ude", approach=0)
 
 
 def printed(dmp, start, velocity, goal, duration, times):

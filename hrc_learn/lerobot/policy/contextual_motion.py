@@ -203,6 +203,7 @@ def _fit_each(
         mask=frame < lengths[:, None],
         basis=response.basis,
         spring=response.spring,
+        approach=response.approach,
     )
     each = dmp.coordinates()
     each[..., :-3] /= response.spring.stiffness
