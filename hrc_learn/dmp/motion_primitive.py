@@ -483,7 +483,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
             ValueError: The kind of primitive does not have one of them.
         """
         options = {name: value for name, value in options.items() if value is not None}
-        if unknown := options.keys() - self.options:
+        if unknown := [name for name in options if name not in self.options]:
             raise ValueError(f"this kind of primitive has no {', '.join(sorted(unknown))}")
         return options
 

@@ -30,10 +30,10 @@ CHOICE = "prediction.json"
 """File in a model's folder that names the model of each channel."""
 MODELS = ("mean", "contextual", "nearest")
 """Candidates, the simplest first."""
-LINEAR = ("joint", "position")
-"""Channels whose models are compared."""
 FEWEST = 4
 """Smallest number of demonstrations whose held-out errors distinguish models."""
+LINEAR = ("joint", "position")
+"""Channels whose models are compared."""
 _WORTH = 0.9
 """Largest error, relative to a simpler model, that justifies a less simple one."""
 _REGULARIZATIONS = (1e-6, 1e-3, 1e-1, 1.0)

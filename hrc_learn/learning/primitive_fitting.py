@@ -44,6 +44,9 @@ CLASSES = {
 }
 EACH = "each"
 """Folder of the primitives of single demonstrations."""
+_APPROACH = 0.6
+"""Fraction of a motion that takes up a new goal: the rest, such as an insertion, keeps its
+shape."""
 _LEAST_MOTION = 1e-4
 """Smallest motion above the noise of encoders and trackers [rad, m, quaternion components]."""
 
@@ -312,6 +315,8 @@ def fit_primitives(
     channels = select_channels(motions, channels)
     # Without smoothing the fit would follow the noise of encoders and trackers.
     options = {"method": method, "smooth": True, **options}
+    if "scaling" not in options:
+        options.setdefault("approach", _APPROACH)
     selection = None
     if n_basis is None:
         selection = _select(motions, channels[0], candidates, options)

@@ -4,7 +4,7 @@ from demo_motions import arm_motion, minimum_jerk
 from dmp_oracle import solve
 from torch.autograd.functional import jvp
 
-from hrc_learn.dmp import JointDMP, OrientationDMP, fit_rhythmic
+from hrc_learn.dmp import JointDMP, OrientationDMP, PeriodicBasis, fit_rhythmic, fit_shared
 from hrc_learn.dmp.dynamics import minimum_jerk_curve as approach_curve
 from hrc_learn.geometry import quaternion
 
@@ -75,3 +75,44 @@ def test_impossible_approaches_are_refused():
             spring=rhythm.spring,
             approach=0.5,
         )
+
+
+REACH = torch.stack([0.5 * minimum_jerk(S), -0.3 * minimum_jerk(S)], -1)
+
+
+def by_default(kind):
+    if kind == "shared":
+        return fit_shared([(2 * S, REACH), (2 * S, REACH)]).primitive
+    return JointDMP.fit(2 * S, REACH, **{"scaling": kind})
+
+
+@pytest.mark.parametrize("kind", ["none", "amplitude", "rotation", "shared"])
+@pytest.mark.parametrize("change", ["near", "far", "closer", "mirrored"])
+def test_by_default_a_new_goal_is_as_gentle_as_the_demonstration(kind, change):
+    """Ten times the distance needs ten times the acceleration, and no more."""
+    dmp = by_default(kind)
+    factor = {"near": 1.2, "far": 10.0, "closer": 0.1, "mirrored": -1.0}[change]
+    goal = factor * torch.tensor([0.5, -0.3], dtype=dmp.goal.dtype)
+    shown, made = dmp.rollout(dt=0.01), dmp.rollout(goal=goal, dt=0.01)
+    peak = shown.acceleration.abs().max()
+    if kind != "rotation":  # the demonstrated acceleration at the start grows with it
+        assert made.acceleration[0].abs().max() < 0.1 * peak
+    assert made.acceleration.abs().max() < 1.05 * max(abs(factor), 1.0) * peak
+    ends = torch.stack([dmp.start, goal])
+    margin = 0.02 * (goal - dmp.start).abs() + 1e-3
+    assert (made.position > ends.amin(0) - margin).all()
+    assert (made.position < ends.amax(0) + margin).all()
+
+
+def test_a_new_start_is_as_gentle():
+    dmp = by_default("none")
+    made = dmp.rollout(start=dmp.start + 0.1, dt=0.01)
+    assert made.acceleration[0].abs().max() < 0.1 * dmp.rollout(dt=0.01).acceleration.max()
+
+
+def test_the_papers_form_is_kept_by_name_and_for_rhythms():
+    assert JointDMP.fit(2 * S, REACH, approach=0).response.approach == 0
+    assert JointDMP.fit(2 * S, REACH, scaling="paper").response.approach == 0
+    wave = torch.sin(12 * S)[:, None]
+    assert JointDMP.fit(2 * S, wave, basis=PeriodicBasis(count=8)).response.approach == 0
+    assert fit_rhythmic(2 * S, wave, 8).response.approach == 0
