@@ -306,7 +306,10 @@ def solutions_from(
 
 
 def follow_poses(
-    chain: SerialChain, path: Pose, start: Float[Tensor, "*rows joints"]
+    chain: SerialChain,
+    path: Pose,
+    start: Float[Tensor, "*rows joints"],
+    wish: Float[Tensor, "steps *rows joints"] | None = None,
 ) -> tuple[Float[Tensor, "steps *rows joints"], Float[Tensor, "steps *rows"]]:
     """Joint positions along a path of the tool, by differential inverse kinematics.
 
@@ -317,6 +320,7 @@ def follow_poses(
         chain: The arm.
         path: Poses of the tool centre point, (steps, *#rows).
         start: Joint positions at the first pose [rad, m].
+        wish: Posture that the null space takes at each pose [rad, m]; None: none.
 
     Returns:
         Joint positions, and how far the tool is from each pose: the larger one of distance [m]
@@ -329,8 +333,9 @@ def follow_poses(
             path.position[k].expand(*rows, 3).reshape(-1, 3),
             path.orientation[k].expand(*rows, 4).reshape(-1, 4),
         )
+        near = None if wish is None else wish[k].reshape(q.shape)
         for _ in range(_CORRECTIONS):
-            q, _ = _step(chain, goal, q, "nearest pose")
+            q, _ = _step(chain, goal, q, "nearest pose", near)
         left, _ = task_error_and_jacobian(chain, q, goal)
         positions.append(q.reshape(start.shape))
         errors.append(left.unflatten(-1, (2, 3)).norm(dim=-1).amax(-1).reshape(rows))

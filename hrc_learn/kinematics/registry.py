@@ -84,8 +84,12 @@ def maker_of(name: str) -> str:
 def arm_of_robot(robot_type: str | None) -> Arm | None:
     """Registered arm of a LeRobot `robot_type`, such as so101_follower; None if unknown.
 
-    None as well if the package with its description is not installed.
+    Our simulated robots, such as mujoco_ur5e, carry the hand of the work cell. None as well if
+    the package with its description is not installed.
     """
+    simulated = (robot_type or "").removeprefix("mujoco_")
+    if simulated != robot_type and simulated in registered_arms():
+        return ArmChoice(simulated).work_arm()
     name = _plain(_ROLES.sub("", (robot_type or "").lower().replace("_", "").replace("-", "")))
     known = {_plain(registered): registered for registered in registered_arms()}
     found = known.get(name) or _OTHER_NAMES.get(name)

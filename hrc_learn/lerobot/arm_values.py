@@ -21,6 +21,7 @@ HAND = tuple(f"ee.{axis}.pos" for axis in ("x", "y", "z", "wx", "wy", "wz"))
 GRIPPER = "gripper.pos"
 PIXELS = ("object.u.pos", "object.v.pos")
 MARKER = ("marker.u.pos", "marker.v.pos", "marker.seen.pos")
+OBJECT = tuple(f"object.{axis}.pos" for axis in ("x", "y", "z", "wx", "wy", "wz"))
 
 ActionSpace = Literal["joint", "ee"]
 """Positions of the joints, or of the end effector; the gripper's opening in either case."""

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from lerobot.robots import RobotConfig
 from torch import Tensor
 
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
-from hrc_learn.lerobot.arm_values import DOWN, MARKER, PIXELS
+from hrc_learn.lerobot.arm_values import DOWN, MARKER, OBJECT, PIXELS
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.protocols import Arm
 from hrc_learn.teleoperation.scenarios import check_scenario, make_scenario
@@ -74,6 +75,10 @@ class WorkplaceConfig:
     marker: bool = False
     """Observe the present pixel of the tool's marker in the fixed camera, and its visibility;
     used to detect that the camera has moved.
+    """
+    object_pose: bool = False
+    """Observe the present pose of the object, as position and rotation vector; `hrc multiply`
+    needs it.
     """
     moved_camera: MovedCameraConfig = field(default_factory=MovedCameraConfig)
     """Displacement of the fixed camera from its pose in the demonstrations."""
@@ -152,6 +157,8 @@ class MujocoArmRobot(ArmRobot):
             features |= dict.fromkeys(PIXELS, float)
         if self.config.marker:
             features |= dict.fromkeys(MARKER, float)
+        if self.config.object_pose:
+            features |= dict.fromkeys(OBJECT, float)
         if images.kind != "none":
             features[CAMERA] = (images.height, images.width, 3)
         return features
@@ -213,6 +220,10 @@ class MujocoArmRobot(ArmRobot):
             values |= zip(PIXELS, map(float, self.run.object_pixel()), strict=True)
         if self.config.marker:
             values |= zip(MARKER, self._look_at_marker(), strict=True)
+        if self.config.object_pose:
+            name = self.run.scenario.workplace.scene.objects[0].name
+            pose = Pose.from_matrix(self.world.object_pose(name))
+            values |= zip(OBJECT, pose.vector().tolist(), strict=True)
         for name, camera in self.cameras.items():
             values[name] = camera.read()
         return values

@@ -1,0 +1,449 @@
+"""New motions from a few demonstrations: object-centred segments, joined in new scenes.
+
+A demonstration is cut where the gripper, or another switch, begins to move. Each segment becomes
+a pose primitive in the frame in which the ends of all demonstrations agree best: that of an
+object, of its position alone, or of the base. In a new scene the primitives of a mixture of the
+demonstrations are moved with their frames. Each begins at the pose and velocity at which the
+one before it ended and approaches its own path along a minimum-jerk curve.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hrc_learn.demos import Demonstration
+from hrc_learn.dmp import PoseDMP
+from hrc_learn.dmp.probabilistic_dmp import with_common_reference
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.kinematics import Arm
+from hrc_learn.kinematics.inverse import follow_poses
+
+BASE, POSITION_ONLY = "base", " position"
+"""Name of the frame of the base, and end of the name of an object's frame that does not turn."""
+# Smallest number of frames of a segment: fewer do not determine a primitive.
+_SHORTEST = 6
+# Range of a signal below which it does not switch, relative to its largest value, and step
+# between frames, relative to its range, from which on it is moving.
+_CONSTANT, _MOVING = 0.05, 0.02
+# Length that converts an angle [m/rad], and spread by which a frame may be worse than the best
+# and still be preferred for being nearer [m]: the tremor of a hand.
+_LEVER, _TREMOR = 0.1, 1e-3
+# Frames of a demonstration for each basis function, and the limits of their number.
+_PER_FUNCTION, _FEWEST, _MOST = 3, 8, 50
+# Iterations from a given posture to the first pose of a path.
+_FIRST = 12
+# Largest error of inverse kinematics: 1 mm or 1 mrad.
+_REACHED = 1e-3
+# Fraction of the limits that a motion may use, and attempts to slow it down until it does.
+_USABLE, _SLOWER = 0.95, 3
+# Every so many frames are checked for collisions.
+_CHECKED = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segmentation:
+    """Segments of demonstrations; it may be corrected in a file."""
+
+    frames: tuple[str, ...]
+    """Frame of each segment: "base", an object, or "OBJECT position" for one that does not
+    turn with the object."""
+    cuts: dict[int, tuple[int, ...]]
+    """First frame of each segment and last frame of the last one, by episode."""
+
+    def rows(self, demos: Sequence[Demonstration]) -> list[tuple[str, ...]]:
+        """Table of the segments with its header: frame, and times by episode [s]."""
+        header = ("segment", "frame", *(f"episode {demo.episode}" for demo in demos))
+        rows = [header]
+        for k, frame in enumerate(self.frames):
+            spans = [demo.time[list(self.cuts[demo.episode][k : k + 2])] for demo in demos]
+            rows.append((str(k), frame, *(f"{a:.2f} .. {b:.2f} s" for a, b in spans)))
+        return rows
+
+    def check(self, demos: Sequence[Demonstration], objects: Mapping[str, Pose]) -> None:
+        """Refuse segments that are not those of the demonstrations.
+
+        Raises:
+            ValueError: A frame or an episode is unknown, or cuts do not increase.
+        """
+        for frame in self.frames:
+            if frame != BASE and frame.removesuffix(POSITION_ONLY) not in objects:
+                known = ", ".join([BASE, *objects])
+                raise ValueError(f"segments: no frame {frame!r}; there are {known}")
+        for demo in demos:
+            cuts = self.cuts.get(demo.episode, ())
+            if len(cuts) != len(self.frames) + 1 or cuts[-1] >= len(demo):
+                raise ValueError(
+                    f"segments: episode {demo.episode} needs {len(self.frames) + 1} cuts below "
+                    f"{len(demo)}, has {list(cuts)}"
+                )
+            if min(np.diff(cuts)) < _SHORTEST:
+                raise ValueError(
+                    f"segments: those of episode {demo.episode} need {_SHORTEST} frames or "
+                    f"more each, but are cut at {list(cuts)}"
+                )
+
+
+def find_segments(
+    demos: Sequence[Demonstration],
+    objects: Mapping[str, Pose],
+    signals: Sequence[Sequence[Float[np.ndarray, " frames"]]],
+    tool: Sequence[Pose],
+) -> Segmentation:
+    """Cut demonstrations where a signal begins to switch, and choose the frames.
+
+    Args:
+        demos: Demonstrations of one task.
+        objects: Poses of each object at the start of each demonstration, (n).
+        signals: Signals of each demonstration, such as its gripper's opening.
+        tool: Poses of the tool along each demonstration.
+
+    Raises:
+        ValueError: The demonstrations differ in the number of their switches.
+    """
+    cuts: dict[int, tuple[int, ...]] = {}
+    pooled = [np.concatenate(values) for values in zip(*signals, strict=True)]
+    for demo, own in zip(demos, signals, strict=True):
+        found = {0, len(demo) - 1}
+        for values, of_all in zip(own, pooled, strict=True):
+            found |= set(_switches(values, float(of_all.min()), float(of_all.max())))
+        kept: list[int] = []
+        for cut in sorted(found):
+            if not kept or cut - kept[-1] >= _SHORTEST:
+                kept.append(cut)
+        kept[-1] = len(demo) - 1
+        cuts[demo.episode] = tuple(kept)
+    counts = {episode: len(each) - 2 for episode, each in cuts.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"episode {episode}: {n}" for episode, n in counts.items())
+        raise ValueError(
+            f"the demonstrations differ in the number of switches of the gripper ({listed}): "
+            "leave episodes out, or correct the cuts in a file of segments"
+        )
+    frames = []
+    for k in range(1, min(map(len, cuts.values()))):
+        ends = [pose[cuts[demo.episode][k]] for demo, pose in zip(demos, tool, strict=True)]
+        frames.append(_best_frame(stacked(ends), objects))
+    return Segmentation(frames=tuple(frames), cuts=cuts)
+
+
+def _switches(values: Float[np.ndarray, " frames"], low: float, high: float) -> list[int]:
+    """Frames at which a signal of two levels begins to go from one to the other."""
+    if high - low <= _CONSTANT * max(abs(low), abs(high)):
+        return []
+    level = (values - low) / (high - low)
+    crossed = np.flatnonzero(np.diff(level > 0.5))
+    begun = []
+    for k in crossed.tolist():
+        while k > 0 and abs(level[k] - level[k - 1]) > _MOVING:
+            k -= 1
+        begun.append(k)
+    return begun
+
+
+def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
+    """Frame in which the ends of all demonstrations agree; of several the nearest object's."""
+    names = [*objects, *(f"{name}{POSITION_ONLY}" for name in objects), BASE]
+    spread: dict[str, float] = {}
+    distance: dict[str, float] = {}
+    for name in names:
+        local = frame_of(objects, name, ends).inverse() @ ends
+        middle = Pose(local.position.mean(0), quaternion.mean(local.orientation))
+        apart = middle.twist_to(local).square().mean(0)
+        spread[name] = float((apart[:3].sum() + _LEVER**2 * apart[3:].sum()).sqrt())
+        distance[name] = math.inf if name == BASE else float(local.position.norm(dim=-1).mean())
+    good = [name for name in names if spread[name] <= 1.5 * min(spread.values()) + _TREMOR]
+    # Of equal ones the first: an object's own frame before that of its position.
+    return min(good, key=lambda name: round(distance[name], 6))
+
+
+def frame_of(objects: Mapping[str, Pose], name: str, like: Pose) -> Pose:
+    """Pose of a frame in the base frame, for each element of a batch of poses."""
+    if name == BASE:
+        place, turned = torch.zeros_like(like.position), None
+    else:
+        pose = objects[name.removesuffix(POSITION_ONLY)]
+        place, turned = pose.position, pose.orientation
+    if turned is None or name.endswith(POSITION_ONLY):
+        turned = torch.zeros_like(like.orientation)
+        turned[..., 0] = 1.0
+    return Pose(place, turned)
+
+
+def stacked(poses: Sequence[Pose]) -> Pose:
+    """Poses as one batch."""
+    positions = torch.stack([pose.position for pose in poses])
+    return Pose(positions, torch.stack([pose.orientation for pose in poses]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Draws:
+    """Random choices of B new motions."""
+
+    scene: Mapping[str, Pose]
+    """Pose of each object, (B)."""
+    weights: Float[Tensor, "B n"]
+    """Weights of the demonstrations in each motion, which add up to one."""
+    speed: Float[Tensor, "B"]
+    """Speed relative to the demonstrations."""
+    start: Float[Tensor, "B 3"]
+    """Displacement of the first position [m]."""
+
+    def __getitem__(self, index: Tensor) -> Draws:
+        """Part of the motions."""
+        scene = {name: pose[index] for name, pose in self.scene.items()}
+        rest = {name: getattr(self, name)[index] for name in ("weights", "speed", "start")}
+        return Draws(scene=scene, **rest)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NewMotions:
+    """B motions of an arm at one frame rate, padded with their last sample."""
+
+    joints: Float[Tensor, "B T joints"]
+    """Joint positions [rad]."""
+    length: Int[Tensor, "B"]
+    """Number of frames of each."""
+    phase: Float[Tensor, "B T"]
+    """Frame of the main demonstration, with fractions, that corresponds to each frame."""
+    source: Int[Tensor, "B"]
+    """Number of the main demonstration of each."""
+    reasons: list[str]
+    """Reason for which a motion is impossible, empty for the others."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Segment:
+    """One segment of all demonstrations in its frame."""
+
+    frame: str
+    dmp: PoseDMP
+    """Primitives (n), with the joint positions as body if the arm is the demonstrated one."""
+    first: Float[Tensor, "n"]
+    last: Float[Tensor, "n"]
+
+    def mixed(self, weights: Float[Tensor, "B n"], speed: Float[Tensor, "B"]) -> PoseDMP:
+        """Primitives with mixed coordinates and durations."""
+        motion = self.dmp.motion
+        x = torch.einsum("bn,ndm->bdm", weights, motion.coordinates().detach())
+        mixed = motion.with_coordinates(
+            x,
+            (weights @ motion.duration) / speed,
+            amplitude=weights @ motion.amplitude,
+            timestamps=torch.linspace(0, 1, 2).to(motion.timestamps),
+        )
+        return self.dmp.with_motion(mixed, self.dmp.reference[:1].expand(len(x), 4))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionSource:
+    """Demonstrations as object-centred primitives, from which new motions are made."""
+
+    robot: Arm
+    fps: float
+    objects: Mapping[str, Pose]
+    """Poses of each object at the start of each demonstration, (n)."""
+    start: Pose
+    """First pose of the tool in each demonstration, (n)."""
+    near: Float[Tensor, "n joints"]
+    """Joint positions near the first pose [rad]."""
+    segments: tuple[_Segment, ...] = field(repr=False)
+    obstacles: Float[Tensor, "boxes 6"]
+    """Centre and half edges of boxes to keep clear of [m]."""
+
+    @classmethod
+    def fit(
+        cls,
+        demos: Sequence[Demonstration],
+        tool: Sequence[Pose],
+        objects: Mapping[str, Pose],
+        segmentation: Segmentation,
+        robot: Arm,
+        near: Sequence[Float[Tensor, "frames joints"]] | Float[Tensor, " joints"],
+        obstacles: Float[Tensor, "boxes 6"] | None = None,
+    ) -> MotionSource:
+        """Fit the primitives.
+
+        Args:
+            demos: Demonstrations of one task.
+            tool: Poses of the tool along each.
+            objects: Poses of each object at the start of each demonstration, (n).
+            segmentation: Segments and their frames.
+            robot: Arm that will carry out the motions.
+            near: Joint positions along each demonstration [rad] if the arm demonstrated them:
+                its posture is carried along. Else joint positions near the first pose.
+            obstacles: Boxes that the arm keeps clear of.
+
+        Raises:
+            ValueError: The segmentation is not that of the demonstrations.
+        """
+        segmentation.check(demos, objects)
+        segments = []
+        for k, frame in enumerate(segmentation.frames):
+            spans = [segmentation.cuts[demo.episode][k : k + 2] for demo in demos]
+            parts = [slice(a, b + 1) for a, b in spans]
+            local = [
+                frame_of({name: pose[i] for name, pose in objects.items()}, frame, whole[0])
+                .inverse()
+                @ whole[part]
+                for i, (whole, part) in enumerate(zip(tool, parts, strict=True))
+            ]
+            count = min(b - a for a, b in spans) // _PER_FUNCTION
+            body = None if isinstance(near, Tensor) else [
+                q[part] for q, part in zip(near, parts, strict=True)
+            ]
+            times = [torch.from_numpy(d.time[p]) for d, p in zip(demos, parts, strict=True)]
+            dmp = PoseDMP.fit(
+                times,
+                [pose.position for pose in local],
+                [pose.orientation for pose in local],
+                min(max(count, _FEWEST), _MOST),
+                body=body,
+                smooth=True,
+                approach=1.0,
+            )
+            first, last = torch.tensor(spans, dtype=torch.float64).unbind(-1)
+            segments.append(
+                _Segment(frame=frame, dmp=with_common_reference(dmp), first=first, last=last)
+            )
+        posture = (
+            near.expand(len(demos), -1)
+            if isinstance(near, Tensor)
+            else torch.stack([q[0] for q in near])
+        )
+        return cls(
+            robot=robot,
+            fps=demos[0].fps,
+            objects=objects,
+            start=stacked([pose[0] for pose in tool]),
+            near=posture,
+            segments=tuple(segments),
+            obstacles=torch.zeros(0, 6).double() if obstacles is None else obstacles,
+        )
+
+    @torch.no_grad()
+    def motions(self, draws: Draws) -> NewMotions:
+        """Motions in new scenes, slowed down to the limits of the arm, and checked."""
+        found = self._joint_paths(draws)
+        for _ in range(_SLOWER):
+            factor, _ = self._too_fast(found)
+            slow = factor > 1
+            if not bool(slow.any()):
+                break
+            draws = replace(draws, speed=draws.speed / torch.where(slow, 1.02 * factor, 1.0))
+            found = self._joint_paths(draws)
+        factor, limit = self._too_fast(found)
+        clear = self._clearance(found)
+        reasons = list(found.reasons)
+        for k in range(len(reasons)):
+            if not reasons[k] and float(factor[k]) > 1:
+                reasons[k] = f"beyond the limit of {limit[k]}"
+            if not reasons[k] and clear[k]:
+                reasons[k] = clear[k]
+        return replace(found, reasons=reasons)
+
+    def poses(self, draws: Draws) -> tuple[Pose, Tensor | None, Tensor, Tensor, Tensor]:
+        """Poses of the tool in the base frame, (B, T).
+
+        Returns:
+            The poses, the joint positions carried along or None, the phase, the number of
+            frames of each motion, and the number of its main demonstration. Gradients flow to
+            the scene.
+        """
+        main = draws.weights.argmax(-1)
+        start = Pose(draws.weights @ self.start.position + draws.start, self.start[main].orientation)
+        mixed = [segment.mixed(draws.weights, draws.speed) for segment in self.segments]
+        total = torch.stack([dmp.duration for dmp in mixed]).sum(0)
+        length = (total * self.fps - 1e-9).ceil().long() + 1
+        ticks = torch.arange(int(length.max()), dtype=torch.float64) / self.fps
+        begin = torch.zeros_like(total)
+        twist, posture, made = torch.zeros(len(total), 6).double(), None, []
+        for segment, dmp in zip(self.segments, mixed, strict=True):
+            frame = frame_of(draws.scene, segment.frame, start)
+            back = frame.inverse()
+            turned = quaternion.rotate(back.orientation[:, None], twist.unflatten(-1, (2, 3)))
+            ends = {} if posture is None else {"start_body": posture}
+            options = {"start": back @ start, "start_velocity": turned.flatten(-2), **ends}
+            clock = torch.minimum((ticks - begin[:, None]).clamp(min=0), dmp.duration[:, None])
+            path = dmp.rollout(clock, **options)
+            last = dmp.rollout(dmp.duration[:, None], **options)
+            poses, body = frame[:, None] @ path.pose, path.body
+            span = (segment.last - segment.first)[main, None]
+            phase = segment.first[main, None] + span * clock / dmp.duration[:, None]
+            made.append((ticks >= begin[:, None], poses, body, phase))
+            start, posture = frame @ last.pose[:, 0], last.body[:, 0]
+            turned = quaternion.rotate(
+                frame.orientation[:, None], last.twist[:, 0].unflatten(-1, (2, 3))
+            )
+            twist, begin = turned.flatten(-2), begin + dmp.duration
+        _, poses, body, phase = made[0]
+        for begun, later, later_body, later_phase in made[1:]:
+            wide = begun[..., None]
+            poses = Pose(
+                torch.where(wide, later.position, poses.position),
+                torch.where(wide, later.orientation, poses.orientation),
+            )
+            body = torch.where(wide, later_body, body)
+            phase = torch.where(begun, later_phase, phase)
+        return poses, body if body.shape[-1] else None, phase, length, main
+
+    def _joint_paths(self, draws: Draws) -> NewMotions:
+        """Inverse kinematics along the poses, near the posture carried along."""
+        poses, body, phase, length, main = self.poses(draws)
+        lead = Pose(
+            torch.cat([poses.position[:, :1].expand(-1, _FIRST, 3), poses.position], 1),
+            torch.cat([poses.orientation[:, :1].expand(-1, _FIRST, 4), poses.orientation], 1),
+        )
+        wish = None if body is None else torch.cat([body[:, :1].expand(-1, _FIRST, -1), body], 1)
+        start = self.near[main] if body is None else body[:, 0]
+        q, error = follow_poses(
+            self.robot,
+            Pose(lead.position.transpose(0, 1), lead.orientation.transpose(0, 1)),
+            start,
+            wish=None if wish is None else wish.transpose(0, 1),
+        )
+        q, error = q[_FIRST:].transpose(0, 1), error[_FIRST:].transpose(0, 1)
+        inside = torch.arange(q.shape[1]) < length[:, None]
+        error = torch.where(inside, error, 0.0)
+        last = q[torch.arange(len(q)), length - 1]
+        q = torch.where(inside[..., None], q, last[:, None])
+        worst, at = error.max(-1)
+        reasons = [
+            f"not reached: {1e3 * e:.0f} mm or mrad off at {k / n:.0%}" if e > _REACHED else ""
+            for e, k, n in zip(worst.tolist(), at.tolist(), length.tolist(), strict=True)
+        ]
+        return NewMotions(joints=q, length=length, phase=phase, source=main, reasons=reasons)
+
+    def _too_fast(self, made: NewMotions) -> tuple[Float[Tensor, "B"], list[str]]:
+        """Factor by which each motion is too fast, and the limit that it breaks most.
+
+        Motions that do not reach their poses have the factor 1: slower ones would not either.
+        """
+        limits, q = self.robot.limits, made.joints
+        factors, names = [], []
+        for order, kind in enumerate(("velocity", "acceleration", "jerk"), 1):
+            rate = torch.diff(q, n=order, dim=1).abs() * self.fps**order
+            ratio = (rate / (_USABLE * getattr(limits, kind))).amax(1)
+            factors.append(ratio ** (1 / order))
+            names += [f"{kind} of {joint}" for joint in self.robot.joint_names]
+        worst, at = torch.cat(factors, -1).max(-1)
+        possible = torch.tensor([not reason for reason in made.reasons])
+        return torch.where(possible, worst, 1.0), [names[k] for k in at.tolist()]
+
+    def _clearance(self, made: NewMotions) -> list[str]:
+        """Collision of each motion with the arm itself or a box, in words; empty if clear."""
+        q, centre, half = made.joints[:, ::_CHECKED], *self.obstacles.split(3, dim=-1)
+        frames = self.robot.link_frames(q)
+        least = {"the arm itself": self.robot.whole.self_distance(q, frames).amin(-1)}
+        if len(centre):
+            least["an obstacle"] = self.robot.body.box_distance(q, centre, half, frames).amin(-1)
+        return [
+            next((f"collides with {name}" for name, d in least.items() if d[k] < 0), "")
+            for k in range(len(q))
+        ]
