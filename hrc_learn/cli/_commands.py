@@ -56,6 +56,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "evaluate": Command("model_commands.evaluate", arguments.Evaluate, ("model", "dataset")),
     "play": Command("play_command.play", arguments.Play, ("model",)),
+    "multiply": Command("multiply_command.multiply", arguments.Multiply, ("dataset",)),
     "smooth": Command("model_commands.smooth", arguments.Smooth, ("checkpoint",)),
     "report": Command("dashboard_commands.report", arguments.Report, ("runs",)),
     "page": Command("loop_commands.page", arguments.ServePage),

@@ -637,6 +637,29 @@ class Record(WithRobot, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Multiply(OnDataset):
+    """Make hundreds of judged demonstrations from a few, in new scenes or for another arm.
+
+    Each demonstration is cut where the gripper moves, and each segment follows the object that
+    it is about. Motions that miss their poses, break limits, collide or fail in physics are
+    left out, with the reason. An interrupted run is continued by the same command.
+
+        hrc multiply five --episodes 1000 --out thousand
+        hrc multiply five --episodes 500 --out ur --robot ur5e
+    """
+
+    episodes: int
+    """Number of new demonstrations. 0: list the segments and write nothing else."""
+    out: Path
+    """Folder of the new dataset, which must not exist."""
+    robot: str = ""
+    """Arm of the new motions, by name or file. Default: that of the dataset."""
+    config: tuple[str, ...] = ()
+    """Scenes, variation and judge as NAME=VALUE or TOML files, such as
+    objects.object.yaw=[-0.5,0.5] or judge.scene=none. `--config help` lists them."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ServePage(WithDriver):
     """Guide the arm in a browser and record demonstrations.
 

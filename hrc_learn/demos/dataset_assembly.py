@@ -131,6 +131,8 @@ class _EpisodeList:
             row |= self._place_video(key, segment)
         for key, statistics in staged.statistics.items():
             row |= {f"stats/{key}/{name}": values for name, values in statistics.items()}
+        if staged.provenance:
+            row["provenance"] = staged.provenance
         row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         self._rows.append(row)
         self.episodes += 1

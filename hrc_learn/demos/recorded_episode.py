@@ -248,6 +248,8 @@ class EpisodeDescription:
     tasks: list[str]
     """Texts of its tasks, at least one."""
     statistics: Statistics
+    provenance: str = ""
+    """Origin of an episode that was made from others, as JSON."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,7 +271,9 @@ def episode_number(path: Path) -> int:
 
 def write_episode(path: Path, episode: StagedEpisode) -> None:
     """Write one episode; `path` exists only once it is complete and on disk."""
-    described = {name: getattr(episode, name) for name in ("header", "tasks", "statistics")}
+    described = {
+        name: getattr(episode, name) for name in ("header", "tasks", "statistics", "provenance")
+    }
     metadata = {_METADATA_KEY: json.dumps(described, default=asdict)}
     with new_file(path) as part:
         write_parquet(episode.table.replace_schema_metadata(metadata), part)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -48,8 +48,6 @@ class Replay:
 
     joints: Float[np.ndarray, "T joints"]
     """Measured joint positions [rad]."""
-    velocity: Float[np.ndarray, "T joints"]
-    """Measured joint velocities [rad/s]."""
     sent: Float[np.ndarray, "T joints"]
     """Commanded joint positions, to be reached when the next frame is due [rad]."""
     gripper: Float[np.ndarray, " T"] | None
@@ -58,14 +56,6 @@ class Replay:
     """Pose of each object."""
     failure: str = ""
     """Reason of a failure, empty after a success."""
-
-
-class Judge(Protocol):
-    """Carries out motions and judges them."""
-
-    def replay(self, trial: Trial) -> Replay:
-        """Carry out a motion."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +77,7 @@ class JudgeConfig:
     processes: int = 2
     """Processes that judge."""
 
-    def open(self, robot: ArmChoice, fps: float, widest: float) -> Judge:
+    def open(self, robot: ArmChoice, fps: float, widest: float) -> "CellJudge | SceneJudge":
         """The judge for an arm.
 
         Args:
@@ -120,8 +110,8 @@ class CellJudge:
         if self._holds:
             world.hold(item, trial.joints[0])
         else:
-            pose = Pose(trial.objects[name][:3], trial.objects[name][3:]).matrix().numpy()
-            world.reset(trial.joints[0], {item: pose})
+            at = torch.from_numpy(trial.objects[name])
+            world.reset(trial.joints[0], {item: Pose(at[:3], at[3:]).matrix().numpy()})
         self.run.servo.restart()
         states, sent, poses, failure = [], [], [], ""
         ahead = np.concatenate([trial.joints[1:], trial.joints[-1:]])
@@ -143,7 +133,6 @@ class CellJudge:
         still = {key: np.tile(at, (len(poses), 1)) for key, at in trial.objects.items()}
         return Replay(
             joints=np.stack([state.joint_position for state in states]),
-            velocity=np.stack([state.joint_velocity for state in states]),
             sent=np.stack(sent),
             gripper=np.array([state.gripper_width for state in states]),
             objects=still | ({name: moved} if name else {}),
@@ -170,7 +159,7 @@ class SceneJudge:
         if missing := [name for name in names if name not in known]:
             raise ValueError(f"{config.scene} has no joints {', '.join(missing)}")
         ids = [known[name] for name in names]
-        self._q, self._v = self.model.jnt_qposadr[ids], self.model.jnt_dofadr[ids]
+        self._q = self.model.jnt_qposadr[ids]
         drives = {
             int(self.model.actuator_trnid[a, 0]): a
             for a in range(self.model.nu)
@@ -179,7 +168,9 @@ class SceneJudge:
         if undriven := [n for n, i in zip(names, ids, strict=True) if i not in drives]:
             raise ValueError(f"{config.scene}: no actuator moves {', '.join(undriven)}")
         self._arm = [drives[i] for i in ids]
-        if any(self.model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_AFFINE for a in self._arm):
+        if any(
+            self.model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_AFFINE for a in self._arm
+        ):
             raise ValueError(f"{config.scene}: the arm needs position actuators")
         rest = [a for a in range(self.model.nu) if a not in self._arm]
         self._hand = [self.model.actuator(config.gripper).id] if config.gripper else rest[:1]
@@ -192,12 +183,11 @@ class SceneJudge:
         for name, pose in trial.objects.items():
             self._put(name, pose)
         mujoco.mj_forward(model, data)
-        joints, velocity, ahead = [], [], np.concatenate([trial.joints[1:], trial.joints[-1:]])
+        joints, ahead = [], np.concatenate([trial.joints[1:], trial.joints[-1:]])
         places: dict[str, list[np.ndarray]] = {name: [] for name in trial.objects}
         low, high = model.actuator_ctrlrange[self._hand].T
         for wanted, width in zip(ahead, trial.gripper, strict=True):
             joints.append(data.qpos[self._q].copy())
-            velocity.append(data.qvel[self._v].copy())
             for name, found in places.items():
                 body = data.body(name)
                 found.append(np.concatenate([body.xpos - self._config.base, body.xquat]))
@@ -207,7 +197,6 @@ class SceneJudge:
         done = bool(self.succeeded(model, data))
         return Replay(
             joints=np.stack(joints),
-            velocity=np.stack(velocity),
             sent=ahead,
             gripper=None,
             objects={name: np.stack(found) for name, found in places.items()},
@@ -250,7 +239,7 @@ def _function(text: str) -> Callable[[Any, Any], bool]:
         sys.path.pop(0)
 
 
-_JUDGE: list[Judge] = []
+_JUDGE: list[CellJudge | SceneJudge] = []
 """Judge of this process."""
 
 

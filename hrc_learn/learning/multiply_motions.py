@@ -1,10 +1,10 @@
 """New motions from a few demonstrations: object-centred segments, joined in new scenes.
 
-A demonstration is cut where the gripper, or another switch, begins to move. Each segment becomes
-a pose primitive in the frame in which the ends of all demonstrations agree best: that of an
-object, of its position alone, or of the base. In a new scene the primitives of a mixture of the
-demonstrations are moved with their frames. Each begins at the pose and velocity at which the
-one before it ended and approaches its own path along a minimum-jerk curve.
+A demonstration is cut where the gripper begins to move. Each segment becomes a pose primitive
+in the frame in which the ends of all demonstrations agree best: that of an object, of its
+position alone, or of the base. In a new scene the primitives of a mixture of the demonstrations
+are moved with their frames. Each begins at the pose and velocity at which the one before it
+ended, and joins its own path along a minimum-jerk curve until the demonstrations agree.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from hrc_learn.kinematics import Arm
 from hrc_learn.kinematics.inverse import follow_poses
 
 BASE, POSITION_ONLY = "base", " position"
-"""Name of the frame of the base, and end of the name of an object's frame that does not turn."""
+"""Frame of the base, and end of the name of an object's frame that does not turn."""
 # Smallest number of frames of a segment: fewer do not determine a primitive.
 _SHORTEST = 6
 # Range of a signal below which it does not switch, relative to its largest value, and step
@@ -37,12 +38,17 @@ _CONSTANT, _MOVING = 0.05, 0.02
 _LEVER, _TREMOR = 0.1, 1e-3
 # Frames of a demonstration for each basis function, and the limits of their number.
 _PER_FUNCTION, _FEWEST, _MOST = 3, 8, 50
+# Times at which demonstrations are compared, and the fraction of a segment that is free if they
+# do not differ.
+_COMPARED, _USUALLY_FREE = 50, 0.6
 # Iterations from a given posture to the first pose of a path.
 _FIRST = 12
 # Largest error of inverse kinematics: 1 mm or 1 mrad.
 _REACHED = 1e-3
 # Fraction of the limits that a motion may use, and attempts to slow it down until it does.
 _USABLE, _SLOWER = 0.95, 3
+# Largest factor by which a motion is slowed down at once.
+_JUMP = 3.0
 # Every so many frames are checked for collisions.
 _CHECKED = 3
 
@@ -60,7 +66,7 @@ class Segmentation:
     def rows(self, demos: Sequence[Demonstration]) -> list[tuple[str, ...]]:
         """Table of the segments with its header: frame, and times by episode [s]."""
         header = ("segment", "frame", *(f"episode {demo.episode}" for demo in demos))
-        rows = [header]
+        rows: list[tuple[str, ...]] = [header]
         for k, frame in enumerate(self.frames):
             spans = [demo.time[list(self.cuts[demo.episode][k : k + 2])] for demo in demos]
             rows.append((str(k), frame, *(f"{a:.2f} .. {b:.2f} s" for a, b in spans)))
@@ -203,19 +209,29 @@ class Draws:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class NewMotions:
-    """B motions of an arm at one frame rate, padded with their last sample."""
+class NewMotion:
+    """One motion of an arm."""
 
-    joints: Float[Tensor, "B T joints"]
+    joints: Float[Tensor, "T joints"]
     """Joint positions [rad]."""
-    length: Int[Tensor, "B"]
-    """Number of frames of each."""
-    phase: Float[Tensor, "B T"]
+    phase: Float[Tensor, "T"]
     """Frame of the main demonstration, with fractions, that corresponds to each frame."""
-    source: Int[Tensor, "B"]
-    """Number of the main demonstration of each."""
-    reasons: list[str]
-    """Reason for which a motion is impossible, empty for the others."""
+    source: int
+    """Number of the main demonstration."""
+    reason: str
+    """Reason for which it is impossible, or empty."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Poses:
+    """B motions of the tool, padded with their last sample."""
+
+    pose: Pose
+    """In the base frame, (B, T)."""
+    body: Float[Tensor, "B T joints"] | None
+    """Joint positions carried along [rad]."""
+    phase: Float[Tensor, "B T"]
+    length: Int[Tensor, "B"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -239,6 +255,21 @@ class _Segment:
             timestamps=torch.linspace(0, 1, 2).to(motion.timestamps),
         )
         return self.dmp.with_motion(mixed, self.dmp.reference[:1].expand(len(x), 4))
+
+
+@torch.no_grad()
+def _free_fraction(dmp: PoseDMP) -> float:
+    """Fraction of a segment after which the demonstrations agree in its frame.
+
+    Until then they come from different places, so that a new motion may as well.
+    """
+    s = torch.linspace(0, 1, _COMPARED, dtype=torch.float64)
+    position = dmp.rollout(s * dmp.duration[:, None]).position
+    spread = (position - position.mean(0)).square().sum(-1).mean(0).sqrt()
+    apart = spread > torch.maximum(spread[-1], 0.05 * spread[0]) + _TREMOR
+    if not bool(apart.any()):
+        return _USUALLY_FREE
+    return min(max(float(s[apart.nonzero().max()]), 0.2), 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -289,25 +320,23 @@ class MotionSource:
             spans = [segmentation.cuts[demo.episode][k : k + 2] for demo in demos]
             parts = [slice(a, b + 1) for a, b in spans]
             local = [
-                frame_of({name: pose[i] for name, pose in objects.items()}, frame, whole[0])
-                .inverse()
+                frame_of(
+                    {name: pose[i] for name, pose in objects.items()}, frame, whole[0]
+                ).inverse()
                 @ whole[part]
                 for i, (whole, part) in enumerate(zip(tool, parts, strict=True))
             ]
             count = min(b - a for a, b in spans) // _PER_FUNCTION
-            body = None if isinstance(near, Tensor) else [
-                q[part] for q, part in zip(near, parts, strict=True)
-            ]
-            times = [torch.from_numpy(d.time[p]) for d, p in zip(demos, parts, strict=True)]
-            dmp = PoseDMP.fit(
-                times,
-                [pose.position for pose in local],
-                [pose.orientation for pose in local],
-                min(max(count, _FEWEST), _MOST),
-                body=body,
-                smooth=True,
-                approach=1.0,
+            body = (
+                None
+                if isinstance(near, Tensor)
+                else [q[part] for q, part in zip(near, parts, strict=True)]
             )
+            times = [torch.from_numpy(d.time[p]) for d, p in zip(demos, parts, strict=True)]
+            options: Any = {"n_basis": min(max(count, _FEWEST), _MOST), "smooth": True}
+            parts = times, [p.position for p in local], [p.orientation for p in local]
+            dmp = PoseDMP.fit(*parts, **options)
+            dmp = PoseDMP.fit(*parts, body=body, approach=_free_fraction(dmp), **options)
             first, last = torch.tensor(spans, dtype=torch.float64).unbind(-1)
             segments.append(
                 _Segment(frame=frame, dmp=with_common_reference(dmp), first=first, last=last)
@@ -319,7 +348,7 @@ class MotionSource:
         )
         return cls(
             robot=robot,
-            fps=demos[0].fps,
+            fps=float(demos[0].fps),
             objects=objects,
             start=stacked([pose[0] for pose in tool]),
             near=posture,
@@ -328,36 +357,44 @@ class MotionSource:
         )
 
     @torch.no_grad()
-    def motions(self, draws: Draws) -> NewMotions:
+    def motions(self, draws: Draws) -> list[NewMotion]:
         """Motions in new scenes, slowed down to the limits of the arm, and checked."""
-        found = self._joint_paths(draws)
-        for _ in range(_SLOWER):
-            factor, _ = self._too_fast(found)
-            slow = factor > 1
-            if not bool(slow.any()):
+        made: dict[int, NewMotion] = {}
+        left = torch.arange(len(draws.speed))
+        for turn in range(_SLOWER + 1):
+            part = draws[left]
+            poses = self.poses(part)
+            q, missed = self._joint_paths(part, poses)
+            factor, limit = self._too_fast(q)
+            # What cannot be reached is tried once at a lower speed, at which joints jump less.
+            again = (factor > 1) & (turn < _SLOWER) & ((missed == 0) | (turn == 0))
+            where = self._collisions(q[~again])
+            for k in (~again).nonzero()[:, 0].tolist():
+                hit, reason = where.pop(0), ""
+                if missed[k] > 0:
+                    reason = "not reached, or only beyond the range of a joint"
+                elif factor[k] > 1:
+                    reason = f"beyond the limit of {limit[k]}"
+                n = int(poses.length[k])
+                made[int(left[k])] = NewMotion(
+                    joints=q[k, :n],
+                    phase=poses.phase[k, :n],
+                    source=int(part.weights[k].argmax()),
+                    reason=reason or hit,
+                )
+            left = left[again]
+            draws = replace(draws, speed=draws.speed.clone())
+            draws.speed[left] /= 1.02 * factor[again]
+            if not len(left):
                 break
-            draws = replace(draws, speed=draws.speed / torch.where(slow, 1.02 * factor, 1.0))
-            found = self._joint_paths(draws)
-        factor, limit = self._too_fast(found)
-        clear = self._clearance(found)
-        reasons = list(found.reasons)
-        for k in range(len(reasons)):
-            if not reasons[k] and float(factor[k]) > 1:
-                reasons[k] = f"beyond the limit of {limit[k]}"
-            if not reasons[k] and clear[k]:
-                reasons[k] = clear[k]
-        return replace(found, reasons=reasons)
+        return [made[k] for k in sorted(made)]
 
-    def poses(self, draws: Draws) -> tuple[Pose, Tensor | None, Tensor, Tensor, Tensor]:
-        """Poses of the tool in the base frame, (B, T).
-
-        Returns:
-            The poses, the joint positions carried along or None, the phase, the number of
-            frames of each motion, and the number of its main demonstration. Gradients flow to
-            the scene.
-        """
+    def poses(self, draws: Draws) -> _Poses:
+        """Poses of the tool in new scenes; gradients flow to the scene."""
         main = draws.weights.argmax(-1)
-        start = Pose(draws.weights @ self.start.position + draws.start, self.start[main].orientation)
+        start = Pose(
+            draws.weights @ self.start.position + draws.start, self.start[main].orientation
+        )
         mixed = [segment.mixed(draws.weights, draws.speed) for segment in self.segments]
         total = torch.stack([dmp.duration for dmp in mixed]).sum(0)
         length = (total * self.fps - 1e-9).ceil().long() + 1
@@ -391,59 +428,47 @@ class MotionSource:
             )
             body = torch.where(wide, later_body, body)
             phase = torch.where(begun, later_phase, phase)
-        return poses, body if body.shape[-1] else None, phase, length, main
+        carried = body if body.shape[-1] else None
+        return _Poses(pose=poses, body=carried, phase=phase, length=length)
 
-    def _joint_paths(self, draws: Draws) -> NewMotions:
-        """Inverse kinematics along the poses, near the posture carried along."""
-        poses, body, phase, length, main = self.poses(draws)
-        lead = Pose(
-            torch.cat([poses.position[:, :1].expand(-1, _FIRST, 3), poses.position], 1),
-            torch.cat([poses.orientation[:, :1].expand(-1, _FIRST, 4), poses.orientation], 1),
+    def _joint_paths(
+        self, draws: Draws, poses: _Poses
+    ) -> tuple[Float[Tensor, "B T joints"], Float[Tensor, "B"]]:
+        """Inverse kinematics near the posture carried along; and errors that are too large."""
+        order = torch.arange(-_FIRST, poses.phase.shape[1]).clamp(min=0)
+        path, wish, start = poses.pose[:, order], None, self.near[draws.weights.argmax(-1)]
+        if poses.body is not None:
+            wish, start = poses.body[:, order].transpose(0, 1), poses.body[:, 0]
+        path = Pose(path.position.transpose(0, 1), path.orientation.transpose(0, 1))
+        q, error = (
+            x[_FIRST:].transpose(0, 1) for x in follow_poses(self.robot, path, start, wish)
         )
-        wish = None if body is None else torch.cat([body[:, :1].expand(-1, _FIRST, -1), body], 1)
-        start = self.near[main] if body is None else body[:, 0]
-        q, error = follow_poses(
-            self.robot,
-            Pose(lead.position.transpose(0, 1), lead.orientation.transpose(0, 1)),
-            start,
-            wish=None if wish is None else wish.transpose(0, 1),
-        )
-        q, error = q[_FIRST:].transpose(0, 1), error[_FIRST:].transpose(0, 1)
-        inside = torch.arange(q.shape[1]) < length[:, None]
-        error = torch.where(inside, error, 0.0)
-        last = q[torch.arange(len(q)), length - 1]
+        inside = torch.arange(q.shape[1]) < poses.length[:, None]
+        last = q[torch.arange(len(q)), poses.length - 1]
+        worst = torch.where(inside, error, 0.0).amax(-1)
         q = torch.where(inside[..., None], q, last[:, None])
-        worst, at = error.max(-1)
-        reasons = [
-            f"not reached: {1e3 * e:.0f} mm or mrad off at {k / n:.0%}" if e > _REACHED else ""
-            for e, k, n in zip(worst.tolist(), at.tolist(), length.tolist(), strict=True)
-        ]
-        return NewMotions(joints=q, length=length, phase=phase, source=main, reasons=reasons)
+        return q, torch.where(worst > _REACHED, worst, 0.0)
 
-    def _too_fast(self, made: NewMotions) -> tuple[Float[Tensor, "B"], list[str]]:
-        """Factor by which each motion is too fast, and the limit that it breaks most.
-
-        Motions that do not reach their poses have the factor 1: slower ones would not either.
-        """
-        limits, q = self.robot.limits, made.joints
+    def _too_fast(self, q: Float[Tensor, "B T joints"]) -> tuple[Float[Tensor, "B"], list[str]]:
+        """Factor by which each motion is too fast, and the limit that it breaks most."""
         factors, names = [], []
         for order, kind in enumerate(("velocity", "acceleration", "jerk"), 1):
             rate = torch.diff(q, n=order, dim=1).abs() * self.fps**order
-            ratio = (rate / (_USABLE * getattr(limits, kind))).amax(1)
+            ratio = (rate / (_USABLE * getattr(self.robot.limits, kind))).amax(1)
             factors.append(ratio ** (1 / order))
             names += [f"{kind} of {joint}" for joint in self.robot.joint_names]
         worst, at = torch.cat(factors, -1).max(-1)
-        possible = torch.tensor([not reason for reason in made.reasons])
-        return torch.where(possible, worst, 1.0), [names[k] for k in at.tolist()]
+        # Of one that does not reach its poses the joints may jump, at any speed.
+        return worst.clamp(max=_JUMP), [names[k] for k in at.tolist()]
 
-    def _clearance(self, made: NewMotions) -> list[str]:
+    def _collisions(self, q: Float[Tensor, "B T joints"]) -> list[str]:
         """Collision of each motion with the arm itself or a box, in words; empty if clear."""
-        q, centre, half = made.joints[:, ::_CHECKED], *self.obstacles.split(3, dim=-1)
+        q, (centre, half) = q[:, ::_CHECKED], self.obstacles.split(3, dim=-1)
         frames = self.robot.link_frames(q)
-        least = {"the arm itself": self.robot.whole.self_distance(q, frames).amin(-1)}
-        if len(centre):
-            least["an obstacle"] = self.robot.body.box_distance(q, centre, half, frames).amin(-1)
-        return [
-            next((f"collides with {name}" for name, d in least.items() if d[k] < 0), "")
-            for k in range(len(q))
-        ]
+        hit = (self.robot.whole.self_distance(q, frames) < 0).any(-1)
+        reasons = ["collides with the arm itself" if each else "" for each in hit.tolist()]
+        if len(centre) and len(q):
+            near = self.robot.body.box_distance(q, centre, half, frames).amin(-1) < 0
+            for k in near.nonzero()[:, 0].tolist():
+                reasons[k] = reasons[k] or "collides with an obstacle"
+        return reasons

@@ -366,6 +366,16 @@ class DemonstrationSource(Sequence[Demonstration]):
         return self._dataset.folder
 
     @property
+    def columns(self) -> ColumnMapping:
+        """Columns of each quantity."""
+        return self._dataset.columns
+
+    @property
+    def entries(self) -> Sequence[EpisodeEntry]:
+        """Episodes of the sequence, as the metadata list them."""
+        return self._entries
+
+    @property
     def units(self) -> Mapping[str, UnitDecision]:
         """Unit on disk of each quantity, and its evidence."""
         return self._decisions

@@ -1,0 +1,321 @@
+"""`hrc multiply`: many judged demonstrations from a few."""
+
+import itertools
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.progress import Progress
+
+from hrc_learn.cli._run import with_settings, write_values
+from hrc_learn.cli.arguments import Multiply
+from hrc_learn.demos import open_demos
+from hrc_learn.demos.dataset_arm import arm_of_dataset
+from hrc_learn.demos.issues import aligned
+from hrc_learn.experiments.motion_judge import JudgeConfig, Judges, Replay, Trial
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.kinematics import ArmChoice
+from hrc_learn.learning.multiply_dataset import MultipliedColumns, MultipliedWriter, pose_of
+from hrc_learn.learning.multiply_motions import (
+    Draws,
+    MotionSource,
+    NewMotion,
+    Segmentation,
+    find_segments,
+    stacked,
+)
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.store import read_json, write_json
+from hrc_learn.teleoperation.scenarios import SHELVES, make_scenario
+
+# Motions that are made at a time.
+_CHUNK = 50
+# Attempts after which fewer successes than this fraction end the work.
+_ENOUGH, _FEW = 100, 0.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectConfig:
+    """An object, or another place that the task is about."""
+
+    columns: str = ""
+    """Columns of its pose, such as "observation.state[8:14]": x, y, z [m] and perhaps a
+    rotation vector [rad] or a quaternion (w, x, y, z). Default: columns named NAME.x and so
+    on."""
+    pose: tuple[float, ...] = ()
+    """Its pose in all demonstrations, if no column holds it."""
+    x: tuple[float, float] | None = None
+    """Range of its position in new scenes [m]. Default: that of the demonstrations."""
+    y: tuple[float, float] | None = None
+    """[m]"""
+    z: tuple[float, float] | None = None
+    """[m]"""
+    yaw: tuple[float, float] = (0.0, 0.0)
+    """Range of its turn about the vertical from the demonstrated orientation [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MultiplyConfig:
+    """Variation of the motions."""
+
+    seed: int = 0
+    """Seed of all random choices."""
+    style: float = 0.3
+    """Fraction of a random mixture of all demonstrations in each motion; 0: one alone."""
+    speed: tuple[float, float] = (0.9, 1.1)
+    """Range of the speed, relative to the demonstrations."""
+    start: float = 0.01
+    """Largest displacement of the first position along each axis [m]."""
+    shift: tuple[float, float, float] | None = None
+    """Displacement of scene and start for another arm [m]. Default: that between the arms' work
+    cells, or none."""
+    segments: str = ""
+    """JSON file of the segments. With --episodes 0 it is written, to be corrected."""
+    demonstrations: tuple[int, ...] = ()
+    """Episodes to learn from. Default: all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All settings of `hrc multiply`."""
+
+    multiply: MultiplyConfig = field(default_factory=MultiplyConfig)
+    judge: JudgeConfig = field(default_factory=JudgeConfig)
+    objects: dict[str, ObjectConfig] = field(default_factory=dict)
+
+
+def multiply(args: Multiply) -> int:
+    """Write new demonstrations; exit status 1 if hardly any motion succeeds.
+
+    Raises:
+        ValueError: A setting or the dataset cannot be used.
+    """
+    if args.episodes < 0:
+        raise ValueError(f"--episodes must not be negative, but is {args.episodes}.")
+    job = _Job(args, with_settings(args.config, Settings()))
+    print(*aligned(job.segmentation.rows(job.demos[:3])), sep="\n")
+    if not args.episodes:
+        if file := job.config.segments:
+            write_json(Path(file), job.segmentation)
+        return 0
+    print(f"judged by {job.judged_by}", flush=True)
+    try:
+        failures = job.run()
+    except RuntimeError as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    for reason, count in failures.most_common():
+        print(f"{count:6d} motions left out: {reason}")
+    attempts = args.episodes + failures.total()
+    rate = args.episodes / attempts
+    print(f"{args.episodes} of {attempts} motions succeeded ({rate:.0%}): {args.out}")
+    values = {"episodes": args.episodes, "attempts": attempts, "success_rate": rate}
+    write_values(args.json, values)
+    return 0
+
+
+class _Job:
+    """Everything that is known before the first motion is made."""
+
+    def __init__(self, args: Multiply, settings: Settings):
+        self.args, self.settings, self.config = args, settings, settings.multiply
+        self.source = open_demos(args.dataset, self.config.demonstrations or None)
+        self.demos = [*self.source]
+        taught = arm_of_dataset(self.source)
+        kind = self.source.folder.robot_type or ""
+        cell = kind.startswith("mujoco_")
+        self.choice = ArmChoice(args.robot or taught.arm.name)
+        self.robot = self.choice.work_arm() if cell else self.choice.arm()
+        same = self.robot.name == taught.arm.name
+        self.kind = kind if same else f"{'mujoco_' * cell}{self.robot.name}"
+        self.judge = _judge(settings.judge, self.demos[0].task if cell else "")
+        given = {n: o.columns for n, o in settings.objects.items() if o.columns}
+        self.columns = MultipliedColumns(self.source, taught, self.robot, given)
+        objects = self.columns.objects | {
+            name: pose_of(torch.tensor([o.pose] * len(self.demos), dtype=torch.float64))
+            for name, o in settings.objects.items()
+            if o.pose
+        }
+        shown = [d.joint_position for d in self.demos if d.joint_position is not None]
+        joints = [torch.from_numpy(taught.positions(q)) for q in shown]
+        tool = [taught.arm.forward(q) for q in joints]
+        if Path(self.config.segments).is_file():
+            file = Path(self.config.segments)
+            self.segmentation = read_json(file, Segmentation, "correct it")
+        else:
+            signals = [[d.gripper] if d.gripper is not None else [] for d in self.demos]
+            self.segmentation = find_segments(self.demos, objects, signals, tool)
+        in_cell = self.judge.scene in ("grasping", "placing")
+        if not same:
+            shift = self.config.shift or (
+                _between_cells(taught.arm, self) if in_cell else (0, 0, 0)
+            )
+            moved = torch.tensor(shift, dtype=torch.float64)
+            tool = [Pose(pose.position + moved, pose.orientation) for pose in tool]
+            objects = {n: Pose(p.position + moved, p.orientation) for n, p in objects.items()}
+        self.objects, obstacles = objects, None
+        if in_cell:
+            boxes = Workplace.of(self.robot).scene.boxes()
+            obstacles = torch.tensor([[*b.centre, *b.half_size] for b in boxes]).double()
+        near = joints if same else self.robot.inverse(tool[0][0], near=self.robot.ready)
+        self.motions = MotionSource.fit(
+            self.demos, tool, objects, self.segmentation, self.robot, near, obstacles
+        )
+
+    @property
+    def judged_by(self) -> str:
+        """Judge in words."""
+        if self.judge.scene:
+            return f"physics: {self.judge.scene}"
+        return "kinematics alone (reach, limits, collisions of the arm), without physics"
+
+    def run(self) -> Counter[str]:
+        """Write the episodes that are missing; returns the number of failures by reason.
+
+        Raises:
+            RuntimeError: Hardly any motion succeeds.
+        """
+        wanted, settings = self.args.episodes, self.settings
+        made_by = {"dataset": str(self.args.dataset), "robot": self.robot.name}
+        made_by |= asdict(replace(settings, judge=replace(settings.judge, processes=1)))
+        writer = MultipliedWriter(self.args.out, self.kind, self.columns, self.source, made_by)
+        widths = [float(demo.gripper.max()) for demo in self.demos if demo.gripper is not None]
+        physics = nullcontext()
+        if self.judge.scene:
+            widest = max(widths, default=1.0)
+            physics = Judges(self.judge, self.choice, self.source.fps, widest)
+        with writer, physics as judges, Progress(transient=True) as progress:
+            bar, done = progress.add_task("Multiplying", total=wanted), len(writer.provenance)
+            first = 1 + writer.provenance[-1]["attempt"] if done else 0
+            failed: dict[int, str] = {}
+            attempts = itertools.chain.from_iterable(
+                self._attempts(range(at, at + _CHUNK), judges)
+                for at in itertools.count(first, _CHUNK)
+            )
+            while len(writer.provenance) < wanted:
+                attempt, made = next(attempts)
+                if isinstance(made, str):
+                    failed[attempt] = made
+                    if attempt >= _ENOUGH and len(writer.provenance) < _FEW * attempt:
+                        most = Counter(failed.values()).most_common(3)
+                        listed = ", ".join(f"{reason} ({n})" for reason, n in most)
+                        raise RuntimeError(f"hardly any motion succeeds: {listed}")
+                    continue
+                values, task, origin = made
+                writer.write(values, task, origin | {"failed": failed})
+                failed = {}
+                progress.update(bar, completed=len(writer.provenance))
+        return Counter(r for each in writer.provenance for r in each["failed"].values())
+
+    def _attempts(
+        self, attempts: range, judges: Judges | None
+    ) -> Iterator[tuple[int, tuple[dict, str, dict[str, Any]] | str]]:
+        """Columns, task and origin of each episode, or the reason why a motion failed."""
+        draws = self._draw(attempts)
+        made = self.motions.motions(draws)
+        trials = [self._trial(draws, motion, k) for k, motion in enumerate(made)]
+        good = [t for t, motion in zip(trials, made, strict=True) if not motion.reason]
+        replays = map(self._planned, good) if judges is None else judges.replays(good)
+        for k, attempt in enumerate(attempts):
+            replay = None if made[k].reason else next(replays)
+            if replay is None or replay.failure:
+                yield attempt, made[k].reason if replay is None else replay.failure
+                continue
+            main, demo = made[k].source, self.demos[made[k].source]
+            origin = {
+                "attempt": attempt,
+                "episode": demo.episode,
+                "weights": [round(w, 4) for w in draws.weights[k].tolist()],
+                "speed": round(float(draws.speed[k]), 4),
+                "scene": {name: at.tolist() for name, at in trials[k].objects.items()},
+                "seed": self.config.seed,
+                "judged_by": self.judged_by,
+            }
+            phase = made[k].phase.numpy()
+            values = self.columns.values(
+                main, phase, replay.joints, replay.sent, replay.gripper, replay.objects
+            )
+            yield attempt, (values, demo.task, origin)
+
+    def _draw(self, attempts: range) -> Draws:
+        """Random choices; each attempt has a generator of its own."""
+        config, n, rows = self.config, len(self.demos), []
+        for attempt in attempts:
+            rng = np.random.default_rng([config.seed, attempt])
+            main = rng.integers(n)
+            weights = config.style * rng.dirichlet(np.ones(n))
+            weights[main] += 1 - weights.sum()
+            scene = {}
+            for name, pose in self.objects.items():
+                ranges = self.settings.objects.get(name, ObjectConfig())
+                low, high = pose.position.amin(0), pose.position.amax(0)
+                for axis, given in enumerate((ranges.x, ranges.y, ranges.z)):
+                    if given is not None:
+                        low[axis], high[axis] = given
+                place = low + (high - low) * torch.from_numpy(rng.random(3))
+                turn = torch.tensor([0.0, 0.0, rng.uniform(*ranges.yaw)]).double()
+                turned = quaternion.multiply(quaternion.exp(turn), pose.orientation[main])
+                scene[name] = Pose(place, turned)
+            start = config.start * rng.uniform(-1, 1, 3)
+            rows.append((scene, weights, rng.uniform(*config.speed), start))
+        scenes, weights, speed, start = zip(*rows, strict=True)
+        return Draws(
+            scene={name: stacked([scene[name] for scene in scenes]) for name in self.objects},
+            weights=torch.from_numpy(np.stack(weights)),
+            speed=torch.tensor(speed).double(),
+            start=torch.from_numpy(np.stack(start)),
+        )
+
+    def _trial(self, draws: Draws, made: NewMotion, k: int) -> Trial:
+        return Trial(
+            joints=made.joints.numpy(),
+            gripper=self.columns.gripper(made.source, made.phase.numpy()),
+            objects={
+                name: torch.cat([pose.position[k], pose.orientation[k]]).numpy()
+                for name, pose in draws.scene.items()
+            },
+        )
+
+    def _planned(self, trial: Trial) -> Replay:
+        """Motion as planned: an object moves with the tool while the gripper is closed."""
+        tool = self.robot.forward(torch.from_numpy(trial.joints))
+        closed = trial.gripper < (trial.gripper.min() + trial.gripper.max()) / 2
+        objects = {n: np.tile(at, (len(closed), 1)) for n, at in trial.objects.items()}
+        held, grip = "", Pose(tool.position[0], tool.orientation[0])
+        for k in range(1, len(closed)):
+            if closed[k] and not closed[k - 1] and objects:
+                here = tool.position[k].numpy()
+                held = min(objects, key=lambda n: np.linalg.norm(objects[n][k, :3] - here))
+                grip = tool[k].inverse() @ pose_of(torch.from_numpy(objects[held][k]))
+            if held and closed[k]:
+                moved = tool[k] @ grip
+                objects[held][k:] = torch.cat([moved.position, moved.orientation]).numpy()
+        q = trial.joints
+        sent = np.concatenate([q[1:], q[-1:]])
+        return Replay(joints=q, sent=sent, gripper=None, objects=objects)
+
+
+def _judge(config: JudgeConfig, task: str) -> JudgeConfig:
+    """The judge, by default the scenario of our work cell that a task names."""
+    if config.scene:
+        return replace(config, scene="" if config.scene == "none" else config.scene)
+    for scene, shelf in [("grasping", "middle"), *(("placing", shelf) for shelf in SHELVES)]:
+        if task == make_scenario(scene, shelf, ArmChoice().arm()).task:
+            return replace(config, scene=scene, shelf=shelf)
+    return config
+
+
+def _between_cells(taught: Any, job: _Job) -> Any:
+    """Displacement of a task from the demonstrated work cell to that of another arm [m]."""
+    old, new = Workplace.of(taught), Workplace.of(job.robot)
+    if job.judge.scene == "placing":
+        shelf = job.judge.shelf
+        return (new.shelf(shelf).position - old.shelf(shelf).position).tolist()
+    x, y, _ = (new.hover().position - old.hover().position).tolist()
+    return x, y, 0.0

@@ -1,0 +1,185 @@
+"""New motions: their segments, their ends in new scenes, continuity and limits."""
+
+import numpy as np
+import pytest
+import torch
+from multiply_samples import BLOCKS, END, FPS, GRASP, block, demonstrations
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import panda
+from hrc_learn.learning.multiply_motions import (
+    Draws,
+    MotionSource,
+    Segmentation,
+    find_segments,
+    stacked,
+)
+
+N = len(BLOCKS)
+
+
+@pytest.fixture(scope="module")
+def demos():
+    return demonstrations()
+
+
+@pytest.fixture(scope="module")
+def tool(demos):
+    return [panda.forward(torch.from_numpy(demo.joint_position)) for demo in demos]
+
+
+@pytest.fixture(scope="module")
+def objects():
+    far = [Pose(torch.tensor([0.3, 0.5, 0.2]).double(), BLOCKS[0].orientation)] * N
+    return {"block": stacked(BLOCKS), "shelf": stacked(far)}
+
+
+@pytest.fixture(scope="module")
+def segments(demos, tool, objects):
+    return find_segments(demos, objects, [[demo.gripper] for demo in demos], tool)
+
+
+@pytest.fixture(scope="module")
+def source(demos, tool, objects, segments):
+    joints = [torch.from_numpy(demo.joint_position) for demo in demos]
+    return MotionSource.fit(demos, tool, objects, segments, panda, joints)
+
+
+def draws(blocks, weights=None, speed=1.0, start=(0.0, 0.0, 0.0)):
+    """Choices of one motion for each pose of the block, the weights in turn one and zero."""
+    B = len(blocks)
+    weights = torch.eye(N).double()[torch.arange(B) % N] if weights is None else weights
+    shelf = Pose(torch.tensor([[0.3, 0.5, 0.2]]).double(), BLOCKS[0].orientation[None])
+    return Draws(
+        scene={"block": stacked(blocks), "shelf": shelf[[0] * B]},
+        weights=weights,
+        speed=torch.full((B,), float(speed)).double(),
+        start=torch.tensor(start).double().expand(B, 3),
+    )
+
+
+def test_segments_begin_where_the_gripper_moves_and_follow_the_block(segments):
+    assert segments.frames == ("block", "block")
+    for cuts in segments.cuts.values():
+        assert cuts[0] == 0
+        assert cuts[-1] == END - 1
+        assert abs(cuts[1] - GRASP) <= 2
+
+
+def test_a_motion_that_does_not_turn_with_its_object_follows_its_position(demos, tool):
+    """The demonstrations agree where the block is, not in how it is turned."""
+    turned = [
+        block(*at.position[:2].tolist(), yaw) for at, yaw in zip(BLOCKS, (2, 0, 1), strict=True)
+    ]
+    own = [at.inverse() @ pose for at, pose in zip(BLOCKS, tool, strict=True)]
+    upright = [
+        Pose(at.position, torch.tensor([1.0, 0, 0, 0]).double()) @ pose
+        for at, pose in zip(BLOCKS, own, strict=True)
+    ]
+    signals = [[demo.gripper] for demo in demos]
+    found = find_segments(demos, {"block": stacked(turned)}, signals, upright)
+    assert found.frames == ("block position", "block position")
+
+
+def test_a_motion_that_ends_where_no_object_is_stays_in_the_base(demos):
+    fixed = Pose(torch.tensor([0.4, -0.3, 0.3]).double(), BLOCKS[2].orientation)
+    still = (
+        [fixed[[0] * END] for _ in demos]
+        if False
+        else [
+            Pose(fixed.position.expand(END, 3), fixed.orientation.expand(END, 4)) for _ in demos
+        ]
+    )
+    found = find_segments(demos, {"block": stacked(BLOCKS)}, [[] for _ in demos], still)
+    assert found.frames == ("base",)
+
+
+def test_new_motions_grasp_the_block_as_demonstrated(source, tool):
+    """At the cut the tool has the demonstrated pose relative to the block, wherever it is."""
+    blocks = [block(0.48, 0.15, 0.8), block(0.6, -0.05, -0.7), block(0.4, -0.12, 0.1)]
+    made = source.motions(draws(blocks, start=(0.02, -0.03, 0.01)))
+    assert [motion.reason for motion in made] == ["", "", ""]
+    for k, at in enumerate(blocks):
+        grasp = int(torch.where(made[k].phase >= GRASP)[0][0])
+        found = panda.forward(made[k].joints[grasp])
+        T, shown = at.matrix().numpy(), np.linalg.inv(BLOCKS[k].matrix().numpy())
+        expected = T @ shown @ tool[k][GRASP].matrix().numpy()
+        assert np.abs(found.matrix().numpy() - expected)[:3, 3].max() < 1.5e-3
+        assert np.abs(found.matrix().numpy() - expected)[:3, :3].max() < 5e-3
+
+
+def test_the_demonstrated_scene_gives_the_demonstration(source, demos):
+    made = source.motions(draws(BLOCKS))
+    for k, demo in enumerate(demos):
+        assert len(made[k].joints) == END
+        # Smoothing and the basis leave a few milliradians.
+        assert np.abs(made[k].joints.numpy() - demo.joint_position).max() < 0.02
+
+
+def test_segments_are_joined_with_continuous_velocity(source):
+    """No step of the velocity between frames is larger at the cut than elsewhere."""
+    made = source.motions(draws([block(0.48, 0.2, 1.0), block(0.6, -0.2, -0.9)]))
+    for k in range(2):
+        q = made[k].joints.numpy()
+        steps = np.abs(np.diff(q, n=2, axis=0)).max(-1) * FPS
+        grasp = int(torch.where(made[k].phase >= GRASP)[0][0])
+        assert (
+            steps[grasp - 3 : grasp + 3].max()
+            <= np.delete(steps, range(grasp - 3, grasp + 3)).max()
+        )
+
+
+def test_fast_motions_are_slowed_down_to_the_limits(source):
+    made = source.motions(draws(BLOCKS, speed=12.0))
+    assert [motion.reason for motion in made] == ["", "", ""]
+    for k in range(N):
+        q = made[k].joints
+        for order, limit in enumerate((panda.limits.velocity, panda.limits.acceleration), 1):
+            rate = torch.diff(q, n=order, dim=0).abs() * FPS**order
+            assert bool((rate <= limit).all())
+
+
+def test_what_cannot_be_reached_says_so(source):
+    made = source.motions(draws([block(1.4, 0.0, 0.0), BLOCKS[1]]))
+    assert made[0].reason.startswith("not reached")
+    assert made[1].reason == ""
+
+
+def test_obstacles_are_found(demos, tool, objects, segments):
+    joints = [torch.from_numpy(demo.joint_position) for demo in demos]
+    wall = torch.tensor([[0.3, 0.0, 0.5, 0.05, 0.5, 0.3]]).double()
+    source = MotionSource.fit(demos, tool, objects, segments, panda, joints, wall)
+    found = {motion.reason for motion in source.motions(draws(BLOCKS))}
+    assert found == {"collides with an obstacle"}
+
+
+def test_gradients_flow_to_the_scene(source):
+    given = draws(BLOCKS)
+    place = given.scene["block"].position.clone().requires_grad_()
+    scene = {**given.scene, "block": Pose(place, given.scene["block"].orientation)}
+    poses = source.poses(
+        Draws(scene=scene, weights=given.weights, speed=given.speed, start=given.start)
+    )
+    poses.pose.position[0, -1, 0].backward()
+    assert place.grad is not None
+    assert place.grad[0, 0].item() == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("frames", "cuts", "message"),
+    [
+        (("lid", "block"), (0, 40, 63), "no frame 'lid'"),
+        (("block", "block"), (0, 63), "needs 3 cuts"),
+        (("block", "block"), (0, 61, 63), "6 frames or more"),
+    ],
+)
+def test_wrong_segments_are_refused(demos, objects, frames, cuts, message):
+    wrong = Segmentation(frames=frames, cuts={demo.episode: cuts for demo in demos})
+    with pytest.raises(ValueError, match=message):
+        wrong.check(demos, objects)
+
+
+def test_demonstrations_with_other_switches_are_refused(demos, tool, objects):
+    signals = [[demo.gripper] for demo in demos[:-1]] + [[np.full(END, 0.08)]]
+    with pytest.raises(ValueError, match="episode 2: 0"):
+        find_segments(demos, objects, signals, tool)
