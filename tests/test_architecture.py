@@ -105,7 +105,8 @@ LIBRARIES: dict[str, set[str]] = {
     # Of franky-sim one module makes a robot, imported when one is served.
     "hardware": {"torch", "jaxtyping", "numpy", "franky_sim"},
     "teleoperation": {"torch", "jaxtyping", "numpy", "scipy", "msgspec"},
-    "experiments": {"torch", "jaxtyping", "numpy", "matplotlib"},
+    # Of its modules one judges motions in MuJoCo scenes that users bring.
+    "experiments": {"torch", "jaxtyping", "numpy", "matplotlib", "mujoco"},
     "lerobot": {
         *("torch", "jaxtyping", "numpy", "safetensors"),
         *("lerobot", "gymnasium", "draccus"),
