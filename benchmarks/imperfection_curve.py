@@ -53,9 +53,10 @@ def main(args: Args) -> int:
     for size in args.sizes:
         folder = args.out / f"size_{size:g}"
         words = ["run", args.experiment, "--out", str(folder), "--trials", str(args.trials)]
-        words += ["--imperfections", str(size), "--processes", str(args.processes)]
+        words += ["--imperfections", str(size)]
         # Exit status 1 only says that a bound was missed, as expected for large sizes.
-        command = [sys.executable, "-m", "hrc_learn.cli", *words, "--overwrite", "--no-film"]
+        command = [sys.executable, "-m", "hrc_learn.cli", *words, "--overwrite", "--config"]
+        command += ["film=false", f"processes={args.processes}"]
         subprocess.run(command, check=False)
         lines = (folder / "trials.jsonl").read_text(encoding="utf-8").splitlines()
         # The first line holds the settings.

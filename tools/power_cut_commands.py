@@ -60,7 +60,7 @@ CASES = {
         datasets=("out",),
     ),
     "record expert": Case(
-        "--out out --episodes 2 --task grasping --json j.json", datasets=("out",)
+        "--out out --episodes 2 --scenario grasping --json j.json", datasets=("out",)
     ),
     "import": Case(
         "{inputs}/x.npz {inputs}/x.npz --out out --joints q --time t --json j.json",
@@ -90,7 +90,7 @@ CASES = {
         resumed=("out.*.jsonl",),
     ),
     "report": Case("{inputs}/run --out page.html --json j.json"),
-    "serve": Case("--step eager --rate 100 --duration 1 --json j.json"),
+    "serve": Case("--config step=eager --rate 100 --duration 1 --json j.json"),
     "run collaboration": Case(
         "--placing {inputs}/placing --aiming {inputs}/aiming --out out --camera synthetic "
         "--json j.json",

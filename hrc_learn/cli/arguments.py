@@ -272,9 +272,7 @@ class Show(Measured):
     episodes: tuple[int, ...] = ()
     """Episodes to show. Default: all, or 200 of a larger dataset."""
     robot: str = ""
-    """Arm to draw, by name, or its URDF or MJCF file. Default: by the dataset's robot type."""
-    tip: str = ""
-    """Flange link in such a file, or BASE:TIP. Default: from the root to the only end."""
+    """Arm to draw, as in `hrc demo`. Default: by the dataset's robot type."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -412,7 +410,7 @@ class Play(Written):
     start: tuple[str, ...] = ()
     """The same for the start, or the start of a demonstration. Default: the model's."""
     robot: str = ""
-    """Arm by name, or its URDF or MJCF file. Default: none."""
+    """Arm, as in `hrc demo`. Default: none."""
     duration: float | None = None
     """Duration [s]. Default: the model's."""
     out: Path | None = None
@@ -475,9 +473,8 @@ class WithRobot(Measured):
     """A command for any arm."""
 
     robot: str = "panda"
-    """Arm by name, or its URDF or MJCF file."""
-    tip: str = ""
-    """Flange link in such a file, or BASE:TIP. Default: from the root to the only end."""
+    """Arm by name, or its URDF or MJCF file: FILE, FILE:TIP or FILE:BASE:TIP, with the flange
+    link TIP where the file has several ends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -564,7 +561,7 @@ class Run(WithImperfections, WithDriver, Written):
     the run failed or a target was missed.
 
         hrc run collaboration --trials 10 --pulls random --worker
-        hrc run grasping --config experiment.scene.random_camera=true
+        hrc run grasping --config experiment.scene.random_camera=true processes=4 film=false
     """
 
     experiment: Literal["placing", "grasping", "collaboration"]
@@ -580,8 +577,6 @@ class Run(WithImperfections, WithDriver, Written):
     """Seed of the run, and the first one of its trials."""
     trials: int = 0
     """Number of repetitions with random conditions, for statistics."""
-    processes: int = 1
-    """Processes that run the trials."""
     camera: str = "auto"
     """Simulated camera: "egl" renders, "synthetic" only draws markers, "auto" renders if it
     can. For a real arm: device number or path, URL of a stream, or a video file."""
@@ -599,8 +594,6 @@ class Run(WithImperfections, WithDriver, Written):
     """Serve a page to watch, draw targets and pull at the elbow."""
     serve: bool = False
     """Serve the dashboard in the browser during the run."""
-    film: bool = True
-    """Make a film of the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -627,8 +620,6 @@ class Record(WithRobot, Written):
     """Seed of initial positions, tremor and image noise. Default: 0, of servoing 1."""
     shelf: Shelf = "middle"
     """Shelf to place on."""
-    camera: Literal["auto", "egl", "synthetic"] = "synthetic"
-    """Camera for servoing: "egl" renders, "synthetic" only draws markers."""
     scenario: Literal["placing", "grasping"] = "placing"
     """Scenario of the expert, as `--robot.scenario` of LeRobot's commands."""
     config: tuple[str, ...] = ()
@@ -675,8 +666,6 @@ class ServePage(WithDriver):
     """Port of the page. Default: the first free one from 8080."""
     host: str = "127.0.0.1"
     """Address to serve at. 0.0.0.0 serves the network, by TLS and with a token."""
-    task: str = "put the object on the middle shelf"
-    """Task in words. It can be changed on the page."""
     device: Literal["none", "gamepad", "keyboard", "haptic"] = "none"
     """Additional device that moves the end effector."""
     duration: float | None = None
@@ -689,13 +678,11 @@ class Serve(WithDriver):
 
     The arm servoes to a marker that a simulated camera sees at 31 Hz; a real arm does move.
     Reported are the time from reading the joints to the command, the delay of each tick, and
-    the ticks that were missed.
+    the ticks that were missed. The first start compiles the step, in a minute or two, if there
+    is a C++ compiler (`--config step=eager`: not).
     """
 
     duration: float = 8.0
     """Duration [s]."""
     rate: float = 500.0
     """Control rate [1/s]."""
-    step: Literal["fastest", "eager"] = "fastest"
-    """Compile the step ahead of time if there is a C++ compiler, or do not. The first start
-    compiles, in a minute or two."""

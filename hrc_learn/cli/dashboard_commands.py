@@ -127,7 +127,7 @@ def _shown(args: Show) -> "ShownDataset":
         usual = sorted(source.lengths)[len(source) // 2]
         demos = source.spread(min(_SHOWN, max(1, _SHOWN_FRAMES // usual)))
     try:
-        arm = arm_of_dataset(source, args.robot, args.tip)
+        arm = arm_of_dataset(source, args.robot)
     except DatasetError as error:
         if args.robot:
             raise

@@ -75,6 +75,10 @@ class _Settings:
     experiment: Experiment[Any]
     site: ArmSite = field(default_factory=ArmSite)
     serving: LiveViewConfig = field(default_factory=LiveViewConfig)
+    processes: int = 1
+    """Processes that run the trials."""
+    film: bool = True
+    """True to make a film of the run."""
 
 
 def run(args: Run) -> int:
@@ -98,10 +102,10 @@ def run(args: Run) -> int:
         out=_folder(args),
         seed=args.seed,
         trials=args.trials,
-        processes=args.processes,
+        processes=settings.processes,
         serve=args.serve,
         serving=settings.serving,
-        film=args.film,
+        film=settings.film,
         overwrite=args.overwrite,
         json=args.json,
     )
@@ -164,7 +168,7 @@ def _model(folder: Path | None) -> Path:
 
 
 def _choice(args: WithRobot) -> ArmChoice:
-    return ArmChoice(args.robot, tip=args.tip)
+    return ArmChoice(args.robot)
 
 
 def _possible_pulls(args: Run) -> Pulls:
@@ -252,7 +256,6 @@ def demo(args: Demo) -> int:
             aiming=args.out / "aiming",
             shelf=(args.shelf,),
             robot=args.robot,
-            tip=args.tip,
             out=args.out / "run",
             seed=args.seed,
             imperfections=args.imperfections,
@@ -291,7 +294,7 @@ def learn(
     with suppress(OSError, ValueError):
         done = read_json(ledger)
     code = _digest(Path(__file__).parents[1], "*.py")
-    made_of = [software_versions(), code, robot.robot, robot.tip]
+    made_of = [software_versions(), code, robot.robot]
     for number, step in enumerate(_learning_steps(out, robot), start=1):
         title, work, folders = step
         name, digest = folders[-1].name, [*made_of, *map(_digest, folders)]
@@ -323,7 +326,7 @@ def _learning_steps(
     from hrc_learn.cli.record_command import record
 
     def demonstrate(scenario: Any, folder: Path) -> None:
-        chosen = {"robot": robot.robot, "tip": robot.tip, "overwrite": True}
+        chosen = {"robot": robot.robot, "overwrite": True}
         if record(Record(demonstration=scenario, out=folder, **chosen)):
             raise RuntimeError(f"the scripted expert failed to demonstrate {scenario}")
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -97,6 +98,8 @@ class _PageSettings:
     """Settings of the page, the recording session and a real arm."""
 
     page: PageConfig
+    task: str = "put the object on the middle shelf"
+    """Task in words, which can be changed on the page."""
     session: PageSessionConfig = field(default_factory=PageSessionConfig)
     site: ArmSite = field(default_factory=ArmSite)
 
@@ -108,7 +111,7 @@ def page(args: ServePage) -> None:
     guiding = settings.session.guiding
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    robot, console = ArmChoice(args.robot, tip=args.tip).work_arm(), Console()
+    robot, console = ArmChoice(args.robot).work_arm(), Console()
     workplace = Workplace.of(robot)
     world = World(workplace.scene)
     connect, safety = _access(args, settings.site, world, guiding.safety)
@@ -136,7 +139,7 @@ def page(args: ServePage) -> None:
             config = replace(settings.session, guiding=replace(guiding, safety=safety))
             with (
                 _opened_device(args.device, robot.chain) as devices,
-                Page(robot.chain, drawn, stands, settings.page, task=args.task) as page,
+                Page(robot.chain, drawn, stands, settings.page, task=settings.task) as page,
             ):
                 session = PageSession(
                     workplace,
@@ -202,9 +205,11 @@ def _run_page(
 
 @dataclass(frozen=True, kw_only=True)
 class _ServeSettings:
-    """Settings of a real arm."""
+    """Settings of a real arm and of the step."""
 
     site: ArmSite = field(default_factory=ArmSite)
+    step: Literal["fastest", "eager"] = "fastest"
+    """Compile the step ahead of time if there is a C++ compiler, or do not."""
 
 
 def serve(args: Serve) -> None:
@@ -217,15 +222,15 @@ def serve(args: Serve) -> None:
         )
     torch.set_num_threads(1)
     dt = 1 / args.rate
-    site = with_settings(args.config, _ServeSettings()).site
-    camera, robot = _camera(), ArmChoice(args.robot, tip=args.tip).work_arm()
+    settings = with_settings(args.config, _ServeSettings())
+    camera, robot = _camera(), ArmChoice(args.robot).work_arm()
     scene = SceneConfig(timestep=dt)
     world = World(replace(scene, arm=replace(scene.arm, robot=robot)))
     world.reset(robot.chain.ready.numpy())
-    connect, safety = _access(args, site, world, SafetyConfig())
+    connect, safety = _access(args, settings.site, world, SafetyConfig())
     controller, observation = _controller(robot.chain, camera, dt, safety)
     began = time.perf_counter()
-    if args.step == "eager":
+    if settings.step == "eager":
         runner = EagerRunner(controller, observation)
     else:
         runner = open_step(controller, observation)

@@ -20,7 +20,7 @@ from hrc_learn.hardware import ending_at_rest
 from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.hardware.lerobot_device import GRIPPER, LeaderArm
 from hrc_learn.kinematics import Arm, ArmChoice
-from hrc_learn.sim import PhysicsError, World, open_camera
+from hrc_learn.sim import CameraKind, PhysicsError, World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.skills.marker_sensor import MarkerSensor
@@ -49,6 +49,8 @@ class _Settings[Config]:
     """Settings of the demonstrations."""
 
     demonstration: Config
+    camera: CameraKind = "synthetic"
+    """Camera for servoing: "egl" renders, "synthetic" only draws markers."""
 
 
 def record(args: Record) -> int:
@@ -99,9 +101,11 @@ def _record_placing(args: Record, episodes: int, seed: int) -> None:
 def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     """Visual servoing to an object with an uncalibrated camera."""
     settings = _Settings(demonstration=ServoDemonstrationConfig())
-    config = with_settings(args.config, settings).demonstration
+    settings = with_settings(args.config, settings)
+    config = settings.demonstration
     workplace, world, rng = _work_cell(args, seed)
-    sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
+    camera = open_camera(world, settings.camera, rng=rng)
+    sensor = MarkerSensor(camera, workplace.scene.marker_ids)
     visible = []
 
     def demonstrate() -> list[Frame]:
@@ -117,7 +121,7 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
 
 
 def _work_cell(args: Record, seed: int) -> tuple[Workplace, World, np.random.Generator]:
-    workplace = Workplace.of(ArmChoice(args.robot, tip=args.tip).work_arm())
+    workplace = Workplace.of(ArmChoice(args.robot).work_arm())
     return workplace, World(workplace.scene), np.random.default_rng(seed)
 
 
@@ -158,7 +162,6 @@ def _record_expert(args: Record, episodes: int, seed: int) -> None:
 
     default = MujocoArmRobotConfig(
         arm=args.robot,
-        tip=args.tip,
         scenario=args.scenario,
         shelf=args.shelf,
         fps=20.0,
@@ -207,7 +210,7 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
         raise ValueError("demonstration.duration must be positive, and pause not negative.")
     refuse_existing(args.out, False)
     site = replace(settings.site, driver="lerobot")
-    robot = ArmChoice(args.robot, tip=args.tip).arm()
+    robot = ArmChoice(args.robot).arm()
     names = robot.chain.joint_names
     writer = DatasetWriter(
         args.out,

@@ -66,15 +66,14 @@ class DatasetArm:
         return np.clip(demo.gripper / (width or max(demo.gripper.max(), 1e-9)), 0.0, 1.0)
 
 
-def arm_of_dataset(source: DemonstrationSource, robot: str = "", tip: str = "") -> DatasetArm:
+def arm_of_dataset(source: DemonstrationSource, robot: str = "") -> DatasetArm:
     """The arm of a dataset's demonstrations.
 
     Joints are found by their names, else by their order if there are as many as the arm has.
 
     Args:
         source: The opened dataset.
-        robot: Name or file of the arm; empty: by the dataset's `robot_type`.
-        tip: Flange link of a file, or BASE:TIP.
+        robot: Arm as in `ArmChoice.name`; empty: by the dataset's `robot_type`.
 
     Raises:
         DatasetError: The robot type is no registered arm, the dataset has no joint positions,
@@ -82,7 +81,7 @@ def arm_of_dataset(source: DemonstrationSource, robot: str = "", tip: str = "") 
         ValueError: There is no such arm.
     """
     kind = source.folder.robot_type
-    arm = ArmChoice(robot, tip=tip).arm() if robot else arm_of_robot(kind)
+    arm = ArmChoice(robot).arm() if robot else arm_of_robot(kind)
     if "joint_position" not in source.units:
         raise DatasetError("the dataset has no joint positions")
     if arm is None:

@@ -258,8 +258,8 @@ class Description:
         if base is None and len(self.roots) > 1:
             raise ValueError(
                 f"{self.path} is in several pieces, since no joint carries the links "
-                f"{', '.join(self.roots)}: add a joint, or say which is the base (base=, --tip "
-                "BASE:TIP)"
+                f"{', '.join(self.roots)}: add a joint, or say which is the base (base=, "
+                "FILE:BASE:TIP)"
             )
         base = self.roots[0] if base is None else base
         ends, fingers = self._ends(base)
@@ -271,7 +271,7 @@ class Description:
             if joint is None:
                 raise ValueError(
                     f"{self.path}: link {tip!r} does not hang on {base!r}, but on {link!r}: "
-                    "name another base or tip (base=, tip=; --tip BASE:TIP)"
+                    "name another base or tip (base=, tip=; FILE:BASE:TIP)"
                 )
             joints.insert(0, joint)
             link = joint.parent
@@ -289,7 +289,7 @@ class Description:
             if joint.kind not in (*MOVING, "fixed"):
                 raise ValueError(
                     f"{self.path}: joint {joint.name} is {joint.kind}, which no serial "
-                    f"chain has: name a base or a tip (base=, tip=; --tip BASE:TIP) so that it "
+                    f"chain has: name a base or a tip (base=, tip=; FILE:BASE:TIP) so that it "
                     f"is outside (its parent is {joint.parent}, its child {joint.child})"
                 )
             if joint.follows is not None:
@@ -297,7 +297,7 @@ class Description:
                 raise ValueError(
                     f"{self.path}: joint {joint.name} "
                     + (f"only follows {leader}" if leader else f"is held at {offset:g}")
-                    + f": end the chain before it (tip=, --tip), at {joint.parent!r}"
+                    + f": end the chain before it (tip=, FILE:TIP), at {joint.parent!r}"
                 )
         if not any(joint.kind in MOVING for joint in joints):
             raise ValueError(f"{self.path}: no joint moves between {base!r} and {tip!r}")
@@ -309,7 +309,7 @@ class Description:
             raise ValueError(f"{self.path}: no joint moves a link that hangs on {base!r}")
         if len(frames) > 1:
             raise ValueError(
-                f"{self.path} has several ends; say which is the tool (tip=, --tip), the "
+                f"{self.path} has several ends; say which is the tool (tip=, FILE:TIP), the "
                 f"likeliest first: {', '.join(frames)}"
             )
         if fingers:

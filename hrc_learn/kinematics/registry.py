@@ -271,16 +271,17 @@ class ArmChoice:
     """An arm by its name or file, as configurations keep it."""
 
     name: str = "panda"
-    """Registered name, or a URDF or MJCF file."""
+    """Registered name, or a URDF or MJCF file, also as FILE:TIP or FILE:BASE:TIP."""
     base: str = ""
     """Base link of a file; empty: its root."""
     tip: str = ""
-    """Flange link of a file, or BASE:TIP; empty: its only end."""
+    """Flange link of a file; empty: its only end."""
 
     def arm(self) -> Arm:
         """The arm as its description has it."""
-        base, _, tip = self.tip.rpartition(":")
-        return arm(self.name, base=base or self.base or None, tip=tip or None)
+        name, _, links = self.name.partition(":")
+        base, _, tip = links.rpartition(":")
+        return arm(name, base=base or self.base or None, tip=tip or self.tip or None)
 
     def work_arm(self) -> Arm:
         """The arm with the hand of our work cell: two parallel fingers, as the Franka hand.

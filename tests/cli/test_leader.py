@@ -88,7 +88,7 @@ def test_a_leader_that_is_not_there_is_one_line(tmp_path):
     assert "--teleop.type=so101_leader cannot be reached at /dev/nothing" in asked.error
     assert asked.error.count("\n") == 1
     assert not (tmp_path / "set").exists()
-    asked = hrc("serve", "--arm", "lerobot", "--robot.type=nothing", "--step", "eager")
+    asked = hrc("serve", "--arm", "lerobot", "--robot.type=nothing", "--config", "step=eager")
     assert asked.status == 1
     assert "--robot.type=nothing: LeRobot has no such type" in asked.error
     assert asked.error.count("\n") == 1

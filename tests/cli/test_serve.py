@@ -35,7 +35,15 @@ def check(figures: dict[str, float], steps: int) -> None:
 
 def test_it_reports_latencies_and_interventions(tmp_path):
     outcome = hrc(
-        "serve", "--step", "eager", "--rate", "100", "--duration", "1", "--json", tmp_path / "j"
+        "serve",
+        "--config",
+        "step=eager",
+        "--rate",
+        "100",
+        "--duration",
+        "1",
+        "--json",
+        tmp_path / "j",
     )
     assert outcome.status == 0, outcome.error
     check(json.loads((tmp_path / "j").read_text()), steps=100)
@@ -46,8 +54,8 @@ def test_it_controls_an_arm_of_another_description(tmp_path):
     six = bare().chain
     file = tmp_path / "cut.urdf"
     file.write_text(to_urdf(six, "cut"), encoding="utf-8")
-    options = ("--tip", "flange", "--step", "eager", "--rate", "100", "--duration", "1")
-    outcome = hrc("serve", "--robot", file, *options, "--json", tmp_path / "j")
+    options = ("--config", "step=eager", "--rate", "100", "--duration", "1")
+    outcome = hrc("serve", "--robot", f"{file}:flange", *options, "--json", tmp_path / "j")
     assert outcome.status == 0, outcome.error
     check(json.loads((tmp_path / "j").read_text()), steps=100)
 
@@ -55,7 +63,7 @@ def test_it_controls_an_arm_of_another_description(tmp_path):
 def test_a_driver_of_another_arm_is_bad_input(tmp_path):
     file = tmp_path / "cut.urdf"
     file.write_text(to_urdf(bare().chain, "cut"), encoding="utf-8")
-    outcome = hrc("serve", "--robot", file, "--tip", "flange", "--arm", "franky", "--ip", "sim")
+    outcome = hrc("serve", "--robot", f"{file}:flange", "--arm", "franky", "--ip", "sim")
     assert outcome.status == 2
     assert "--arm franky drives Franka arms only, not the cut" in outcome.error
 

@@ -136,7 +136,7 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
         *("--config", "experiment.config.interaction=2.5"),
         "experiment.disturbances.occlusions=[{start=0, duration=1.5}]",
         "experiment.cell.latency={delay=0.04, frame_loss=0.1}",
-        *("--imperfections", 0.5, "--worker", "--no-film"),
+        *("--imperfections", 0.5, "--worker", "--config", "film=false"),
     )
     ((shelves, scenario, options),) = asked
     assert (shelves, scenario.camera, options["seed"]) == (("upper",), "synthetic", 3)

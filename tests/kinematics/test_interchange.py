@@ -9,7 +9,7 @@ from sampling import generator
 from torch.testing import assert_close
 from urdf_text import to_urdf
 
-from hrc_learn.kinematics import JointLimits, SerialChain, arm, panda
+from hrc_learn.kinematics import ArmChoice, JointLimits, SerialChain, arm, panda
 
 # Axes along x, -z and a slant, a fixed joint in the middle and one at the end.
 ODD_ARM = """
@@ -65,6 +65,9 @@ def test_axes_of_any_direction_move_as_in_pytorch_kinematics(tmp_path):
     peer = pytorch_kinematics.build_serial_chain_from_urdf(ODD_ARM.encode(), "tip")
     peer = peer.to(dtype=torch.float64)
     assert robot.joint_names == ("one", "two", "three")
+    for choice in (f"{tmp_path}/odd.urdf:tip", f"{tmp_path}/odd.urdf:base:tip"):
+        assert ArmChoice(choice).arm().joint_names == robot.joint_names
+    assert ArmChoice(f"{tmp_path}/odd.urdf:a:tip").arm().joint_names == ("two", "three")
     assert robot.limits.velocity.tolist() == [3, 5, 7]
     q = torch.randn(20, 3, generator=generator(4), dtype=torch.float64)
     pose, J = robot.forward_and_jacobian(q)

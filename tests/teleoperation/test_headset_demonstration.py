@@ -184,7 +184,7 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
     program("datasets/check_dataset.py", demos)
     program("training/fit_dmp.py", "--dataset", demos, "--out", tmp_path / "model")
     outcome = tmp_path / "measured"
-    run = ("--placing", tmp_path / "model", "--out", tmp_path / "run", "--no-film")
+    run = ("--placing", tmp_path / "model", "--out", tmp_path / "run", "--config", "film=false")
     run += ("--trials", PLACINGS)
     program("control/run_placing.py", *run, "--json", outcome, status=(0, 1))
     measured = json.loads(outcome.read_text("utf-8"))

@@ -65,7 +65,7 @@ def main(args: Args) -> None:
     if args.film is not None:
         film = read_report(args.film).film
         if film is None:
-            raise ValueError(f"{args.film} has no film: run it without --no-film.")
+            raise ValueError(f"{args.film} has no film: run it without film=false.")
         pictures["film.webp"] = animation(film.mp4)
     for kind, report in reports.items():
         pictures |= shown_pictures(kind, report, text)
