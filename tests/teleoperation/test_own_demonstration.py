@@ -112,16 +112,10 @@ def test_ones_own_demonstration_is_recorded_learned_and_run(tmp_path):
     assert np.sqrt(np.square(error).mean()) < 0.02
     assert np.abs(error[-1]).max() < 0.01
     # Nobody shaped the body, so that other shelves may be missed.
-    options = (
-        "--out",
-        tmp_path / "run",
-        "--config",
-        "film=false",
-        "--json",
-        tmp_path / "measured",
-    )
+    figures = tmp_path / "measured"
+    options = ("--out", tmp_path / "run", "--config", "film=false", "--json", figures)
     run("control/run_placing.py", "--placing", model, *options, status=(0, 1))
-    measured = json.loads(measured.read_text())
+    measured = json.loads(figures.read_text())
     assert measured["joint_space_middle_shelf_placed"] == 1
     assert measured["middle_shelf_placed"] == 1
     assert measured["middle_shelf_contacts"] == 0
