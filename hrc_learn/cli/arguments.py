@@ -464,7 +464,7 @@ class Report(Measured):
 
 Shelf = Literal["lower", "middle", "upper"]
 """Shelves of `hrc_learn.sim.workplace.Workplace`."""
-ArmDriver = Literal["sim", "franky", "franka", "lerobot"]
+ArmDriver = Literal["sim", "franky", "franka", "lerobot", "ros2"]
 """The simulated arm, and `hrc_learn.experiments.real_arm.Driver`."""
 
 
@@ -482,8 +482,9 @@ class WithDriver(WithRobot):
     """A command for a simulated or a real arm."""
 
     arm: ArmDriver = "sim"
-    """Driver: simulated, the package franky, our own loop at 1 kHz (franka), or a robot of
-    LeRobot, with its options: --robot.type=so101_follower --robot.port=/dev/ttyACM0."""
+    """Driver: simulated, the package franky, our own loop at 1 kHz (franka), a robot of
+    LeRobot, with its options: --robot.type=so101_follower --robot.port=/dev/ttyACM0, or topics
+    of ROS 2, which --config site.ros2.* names."""
     ip: str = ""
     """Address of the arm's control box. "sim" serves the simulated arm there."""
     config: tuple[str, ...] = ()
@@ -500,8 +501,9 @@ class WithDriver(WithRobot):
             ValueError: An address without a driver, a driver without an address, or an option
                 of the simulated work cell.
         """
-        if self.arm == "lerobot":
-            refuse_given(self, ["ip"], "is for Franka arms: LeRobot's have --robot.port")
+        if self.arm in ("lerobot", "ros2"):
+            text = "is for Franka arms: LeRobot's have --robot.port, ROS 2 has ROS_DOMAIN_ID"
+            refuse_given(self, ["ip"], text)
             refuse_given(self, simulated_only, "is for simulated arms, not for a real one")
             return True
         if self.arm == "sim":

@@ -221,7 +221,7 @@ def _run_on_arm(args: Run, site: ArmSite, workplace: Workplace, task: Task) -> i
             on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
         )
     folder = _folder(args)
-    done.save(folder, f"{args.arm} at {args.ip}", asdict(args))
+    done.save(folder, f"{args.arm} at {args.ip or 'its topics'}", asdict(args))
     console.print(done.failure or "done", style="red" if done.failure else "green")
     print(f"Dashboard: {show_command(folder)}")
     return int(bool(done.failure))

@@ -5,6 +5,7 @@ that the robot itself measures. A simulated world of the assumed surroundings ch
 and follows the arm for the recording.
 """
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -26,8 +27,11 @@ from hrc_learn.hardware import (
     FrankyConfig,
     LeRobotArm,
     LeRobotConfig,
+    Ros2Arm,
+    Ros2Config,
 )
 from hrc_learn.hardware.driver_process import StoppableArm
+from hrc_learn.hardware.ros2_topics import ros2_origin
 from hrc_learn.kinematics import SerialChain, fr3, panda
 from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World
@@ -42,9 +46,9 @@ from hrc_learn.store import new_folder, write_json
 from hrc_learn.teleoperation import ScriptedDrawing, Touch
 from hrc_learn.viz.run_dashboard import record_run
 
-Driver = Literal["franky", "franka", "lerobot"]
-"""Driver of a real arm: the package franky, our loop at 1 kHz through pylibfranka, or a robot
-of LeRobot."""
+Driver = Literal["franky", "franka", "lerobot", "ros2"]
+"""Driver of a real arm: the package franky, our loop at 1 kHz through pylibfranka, a robot of
+LeRobot, or topics of ROS 2."""
 
 _SILENCE = 0.15
 """Silence of the loop after which the arm is stopped [s], as in `franka_panda`."""
@@ -73,6 +77,8 @@ class ArmSite:
     """LeRobot's settings of the teleoperator, which `--teleop.NAME=VALUE` sets."""
     lerobot: LeRobotConfig = field(default_factory=LeRobotConfig)
     """Settings of LeRobot's robot as our driver leads it."""
+    ros2: Ros2Config = field(default_factory=Ros2Config)
+    """Topics of an arm over ROS 2."""
     camera_delay: float = 0.0
     """Delay from exposure to arrival of an image [s]: `hrc_learn.hardware.measure_delay`."""
     realtime: bool = True
@@ -117,14 +123,19 @@ def opened_arm(site: ArmSite, chain: SerialChain | None = None) -> Iterator[Stop
 
     Args:
         site: Arm and driver.
-        chain: Kinematics of a robot of LeRobot; None: a Franka arm's.
+        chain: Kinematics of a robot of LeRobot or ROS 2; None: a Franka arm's.
 
     Raises:
         ValueError: If the site has no address.
         DriverError: If the arm cannot be reached; says why.
     """
-    if site.driver == "lerobot":
-        opened = partial(LeRobotArm, site.device, chain or site.chain, site.lerobot)
+    if site.driver in ("lerobot", "ros2"):
+        opened: Callable[[], StoppableArm] = partial(
+            LeRobotArm, site.device, chain or site.chain, site.lerobot
+        )
+        if site.driver == "ros2":
+            print(ros2_origin(), file=sys.stderr)
+            opened = partial(Ros2Arm, chain or site.chain, site.ros2)
         with ArmProcess(opened, timeout=_SILENCE) as arm:
             yield arm
         return

@@ -21,3 +21,5 @@ from hrc_learn.hardware.lerobot_arm import LeRobotArm as LeRobotArm
 from hrc_learn.hardware.lerobot_arm import LeRobotConfig as LeRobotConfig
 from hrc_learn.hardware.opencv_cameras import CameraError as CameraError
 from hrc_learn.hardware.opencv_cameras import CaptureCamera as CaptureCamera
+from hrc_learn.hardware.ros2_arm import Ros2Arm as Ros2Arm
+from hrc_learn.hardware.ros2_arm import Ros2Config as Ros2Config

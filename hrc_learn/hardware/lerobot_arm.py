@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -144,18 +144,7 @@ class LeRobotArm:
             ValueError: They are not finite, or beyond the limits of the arm's description.
             ArmFaultError: The arm has stopped, or its bus is silent.
         """
-        velocity = np.asarray(joint_velocity, dtype=float)
-        if velocity.shape != (len(self._names),) or not np.isfinite(velocity).all():
-            raise ValueError(
-                f"joint_velocity must be {len(self._names)} finite numbers, but is {velocity}."
-            )
-        beyond = np.abs(velocity) > self._fastest * (1 + 1e-6)
-        if beyond.any():
-            i = int(beyond.argmax())
-            raise ValueError(
-                f"{self._names[i]}: {velocity[i]:.3f} rad/s is beyond its limit of "
-                f"{self._fastest[i]:.3f} rad/s."
-            )
+        velocity = checked_velocity(joint_velocity, self._names, self._fastest)
         with self._lock:
             self._refuse_silence()
             if self._fault:
@@ -273,9 +262,7 @@ class LeRobotArm:
         elapsed = max(0.0, until - self._moved_at)
         here, lag = self._readings[-1][1], self.config.lag
         goal = self._goal + (0.0 if self._fault else elapsed) * self._velocity
-        # An arm that starts beyond an end may move back, but not further out.
-        lower, upper = np.minimum(self._lower, here), np.maximum(self._upper, here)
-        self._goal = np.clip(np.clip(goal, here - lag, here + lag), lower, upper)
+        self._goal = led_goal(goal, here, lag, self._lower, self._upper)
         self._moved_at = now
 
     def _judge(self, alarm: str) -> None:
@@ -301,6 +288,40 @@ class LeRobotArm:
                 f"no reading of the arm for {silent:.2f} s{why}: its servos hold the last "
                 "positions. Check cable and power, and connect again."
             )
+
+
+def checked_velocity(
+    velocity: Float[np.ndarray, "..."], names: Sequence[str], fastest: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Joint velocities to command [rad/s].
+
+    Raises:
+        ValueError: They are not finite, or beyond the limits of the arm's description.
+    """
+    velocity = np.asarray(velocity, dtype=float)
+    if velocity.shape != (len(names),) or not np.isfinite(velocity).all():
+        raise ValueError(
+            f"joint_velocity must be {len(names)} finite numbers, but is {velocity}."
+        )
+    for i in np.flatnonzero(np.abs(velocity) > fastest * (1 + 1e-6))[:1]:
+        text = f"{names[i]}: {velocity[i]:.3f} rad/s is beyond its limit"
+        raise ValueError(f"{text} of {fastest[i]:.3f} rad/s.")
+    return velocity
+
+
+def led_goal(
+    goal: Float[np.ndarray, " n"],
+    here: Float[np.ndarray, " n"],
+    lag: float,
+    lower: Float[np.ndarray, " n"],
+    upper: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, " n"]:
+    """Commanded positions, no further than `lag` from the measured ones and within the ends.
+
+    An arm that starts beyond an end may move back, but not further out.
+    """
+    goal = np.clip(goal, here - lag, here + lag)
+    return np.clip(goal, np.minimum(lower, here), np.maximum(upper, here))
 
 
 def _text(error: BaseException) -> str:

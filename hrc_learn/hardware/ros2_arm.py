@@ -1,0 +1,330 @@
+"""An arm behind topics of ROS 2: joint states in, commands of its stock controllers out.
+
+Run over real middleware against our simulated arm; NOT RUN ON HARDWARE. ROS 2 is that of the
+system where its set-up has been sourced, or that of the wheels of `hrc-learn[ros2]`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import math
+import subprocess
+import threading
+import time
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.hardware.franky_arm import ArmFaultError
+from hrc_learn.hardware.lerobot_arm import checked_velocity, led_goal
+from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of, start_guard
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.protocols import ArmState
+from hrc_learn.watchdog import Watchdog
+
+_CLOCK_RESET = 1.0
+"""Step back of the stamps beyond which a clock was set anew, not a message reordered [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ros2Config:
+    """Topics of an arm, and how it is led."""
+
+    joint_states: str = "/joint_states"
+    """Topic of the joint states. Joints are found by name."""
+    command: str = "/forward_velocity_controller/commands"
+    """Topic of the controller."""
+    interface: Literal["velocity", "position", "trajectory"] = "velocity"
+    """Commands: velocities or positions (Float64MultiArray), or short trajectories that end at
+    rest (JointTrajectory)."""
+    timeout: float = 0.15
+    """Longest time that a velocity holds without another command [s]."""
+    silence: float = 0.2
+    """Largest age of the newest joint state [s]."""
+    startup: float = 10.0
+    """Longest wait for the first one [s]."""
+    lag: float = 0.35
+    """Largest distance of commanded positions from the measured ones [rad]."""
+    wrench: str = ""
+    """Topic of the force and torque at the tool, in its frame; empty: none."""
+    gripper: str = ""
+    """Topic of a gripper's position controller (Float64MultiArray); empty: no gripper."""
+    gripper_joint: str = ""
+    """Joint of the gripper in the joint states."""
+    opening: float = 0.08
+    """Opening of the gripper [m] at `gripper_open`."""
+    gripper_open: float = 0.04
+    """Position of its joint when open."""
+    gripper_closed: float = 0.0
+    """Position of its joint when closed."""
+
+    def __post_init__(self) -> None:
+        for name in ("timeout", "silence", "startup", "lag"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        if bool(self.gripper) != bool(self.gripper_joint):
+            raise ValueError(
+                "gripper and gripper_joint belong together: give both, or neither."
+            )
+
+
+class Ros2Arm:
+    """An arm of ros2_control, or any with its topics, driven by velocities.
+
+    A velocity holds for at most the config's `timeout`. Joint states that are old, reordered
+    or incomplete are not used; once the newest is older than `silence`, every call raises
+    `ArmFaultError` until they come again. A trajectory ends at rest by itself, and a position
+    is held. A velocity controller would hold its last command for ever if this process died:
+    a guard, in a process of its own, then sends zeros.
+
+    Attributes:
+        session: The node.
+        ignored: Number of joint states that were reordered or incomplete.
+    """
+
+    def __init__(self, chain: SerialChain, config: Ros2Config | None = None):
+        """Wait for the joint states.
+
+        Args:
+            chain: Kinematics and limits of the arm.
+            config: Topics.
+
+        Raises:
+            ModuleNotFoundError: ROS 2 is not installed.
+            ConnectionError: No joint state with all joints has come.
+        """
+        self.config = config = config or Ros2Config()
+        self._chain, self._names, self.ignored = chain, chain.joint_names, 0
+        self.session = Ros2Session("hrc_arm")
+        from geometry_msgs.msg import WrenchStamped
+        from sensor_msgs.msg import JointState
+        from std_msgs.msg import Float64MultiArray
+        from trajectory_msgs.msg import JointTrajectory
+
+        self._lock, self._changed = threading.Lock(), threading.Condition()
+        self._state: ArmState | None = None
+        self._offset, self._received, self._seen = math.inf, -math.inf, ()
+        self._wrench: np.ndarray | None = None
+        self._velocity = np.zeros(len(self._names))
+        self._goal: np.ndarray | None = None
+        self._commanded_at = -math.inf
+        node, kind = self.session.node, config.interface
+        form = JointTrajectory if kind == "trajectory" else Float64MultiArray
+        self._commands = node.create_publisher(form, config.command, quality(reliable=True))
+        self._hand = (
+            node.create_publisher(Float64MultiArray, config.gripper, quality(reliable=True))
+            if config.gripper
+            else None
+        )
+        if config.wrench:
+            node.create_subscription(WrenchStamped, config.wrench, self._on_wrench, quality())
+        node.create_subscription(JointState, config.joint_states, self._on_state, quality())
+        self._guard: subprocess.Popen | None = None
+        self._dog = Watchdog(config.timeout, self.stop)
+        try:
+            self._await_state()
+            if kind == "velocity":
+                longest = 1.5 * config.timeout
+                self._guard = start_guard(node, config.command, len(self._names), longest)
+        except BaseException:
+            self.session.close()
+            raise
+        self._dog.start()
+        atexit.register(self.close)
+
+    def _await_state(self) -> None:
+        with self._changed:
+            if self._changed.wait_for(lambda: self._state is not None, self.config.startup):
+                return
+        topic, why = (
+            self.config.joint_states,
+            "is its driver running, and ROS_DOMAIN_ID the same?",
+        )
+        if self._seen:
+            missing = ", ".join(sorted({*self._names} - {*self._seen}))
+            why = f"{missing} are not among {', '.join(self._seen)}"
+        longest = self.config.startup
+        raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
+
+    def _on_wrench(self, message: Any) -> None:
+        force, torque = message.wrench.force, message.wrench.torque
+        both = (force.x, force.y, force.z, torque.x, torque.y, torque.z)
+        self._wrench = np.array(both)
+
+    def _on_state(self, message: Any) -> None:
+        names, now = message.name, time.monotonic()
+        self._seen = names
+        places = {name: i for i, name in enumerate(names)}
+        if not {*self._names} <= places.keys():
+            return
+        order = [places[name] for name in self._names]
+        position = np.array(message.position, float)[order]
+        stamp, last = stamp_of(message) or now, self._state
+        reordered = last is not None and stamp <= last.time
+        if reordered and last is not None and last.time - stamp > _CLOCK_RESET:
+            reordered, self._offset, last = False, math.inf, None
+        if reordered or not np.isfinite(position).all():
+            self.ignored += 1
+            return
+        velocity = np.array(message.velocity, float)
+        if len(velocity) == len(names) and np.isfinite(velocity[order]).all():
+            velocity = velocity[order]
+        elif last is None:
+            velocity = np.zeros(len(order))
+        else:
+            velocity = (position - last.joint_position) / (stamp - last.time)
+        config, width = self.config, 0.0
+        if config.gripper_joint in places:
+            moved = message.position[places[config.gripper_joint]] - config.gripper_closed
+            width = config.opening * moved / (config.gripper_open - config.gripper_closed)
+        elif last is not None:
+            width = last.gripper_width
+        state = ArmState(
+            time=stamp,
+            joint_position=position,
+            joint_velocity=velocity,
+            gripper_width=float(width),
+            external_torque=self._torque(position),
+        )
+        with self._changed:
+            # The quickest message so far tells how the robot's clock differs from ours.
+            self._offset = min(self._offset, now - stamp)
+            self._state, self._received = state, now
+            self._changed.notify_all()
+
+    def _torque(self, position: np.ndarray) -> np.ndarray | None:
+        """External torques that the wrench at the tool stands for [N m]."""
+        if self._wrench is None:
+            return None
+        J = self._chain.jacobian(position).numpy()
+        R = self._chain.forward(position).matrix()[:3, :3].numpy()
+        return J.T @ np.concatenate([R @ self._wrench[:3], R @ self._wrench[3:]])
+
+    def read(self) -> ArmState:
+        """Return the newest state; `time` is that of its message [s].
+
+        Raises:
+            ArmFaultError: It is older than the config's `silence`.
+        """
+        with self._changed:
+            state, offset = self._state, self._offset
+        assert state is not None
+        age = time.monotonic() - (state.time + offset)
+        if age > self.config.silence:
+            raise ArmFaultError(
+                f"the newest joint state on {self.config.joint_states} is {age:.2f} s old: the "
+                "arm is stopped. Check its driver and the network."
+            )
+        return state
+
+    def wait(self, after: float, timeout: float) -> bool:
+        """Wait for a newer state than one of a time; False after the timeout [s]."""
+        with self._changed:
+            newer = lambda: self._state is not None and self._state.time > after  # noqa: E731
+            return self._changed.wait_for(newer, timeout)
+
+    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
+        """Set the joint velocities to hold [rad/s].
+
+        Raises:
+            ValueError: They are not finite, or beyond the limits of the arm's description.
+            ArmFaultError: The joint states are too old.
+        """
+        velocity = checked_velocity(
+            joint_velocity, self._names, self._chain.limits.velocity.numpy()
+        )
+        try:
+            state = self.read()
+        except ArmFaultError:
+            self.stop()
+            raise
+        self._dog.feed()
+        with self._lock:
+            self._send(velocity, state)
+
+    def _send(self, velocity: np.ndarray, state: ArmState) -> None:
+        from std_msgs.msg import Float64MultiArray
+
+        now, config = time.monotonic(), self.config
+        elapsed = min(now - self._commanded_at, config.timeout)
+        self._commanded_at, self._velocity = now, velocity
+        here, limits = state.joint_position, self._chain.limits
+        goal = here if self._goal is None else self._goal + elapsed * velocity
+        lower, upper = limits.lower.numpy(), limits.upper.numpy()
+        self._goal = goal = led_goal(goal, here, config.lag, lower, upper)
+        if config.interface == "trajectory":
+            self._commands.publish(self._trajectory(goal, velocity, elapsed))
+        else:
+            values = velocity if config.interface == "velocity" else goal
+            self._commands.publish(Float64MultiArray(data=values.tolist()))
+
+    def _trajectory(self, goal: np.ndarray, velocity: np.ndarray, elapsed: float) -> Any:
+        """Trajectory that goes on with the velocity and ends at rest."""
+        from builtin_interfaces.msg import Duration
+        from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+        step, rest = max(elapsed, 1e-3), self.config.timeout
+        points = [
+            (step, goal, velocity),
+            (step + rest, goal + 0.5 * rest * velocity, 0 * velocity),
+        ]
+        message, made = JointTrajectory(joint_names=list(self._names)), []
+        message.header.stamp = self.session.node.get_clock().now().to_msg()
+        for at, position, speed in points:
+            since = Duration(sec=int(at), nanosec=int(at % 1 * 1e9))
+            made.append(
+                JointTrajectoryPoint(
+                    positions=position.tolist(),
+                    velocities=speed.tolist(),
+                    time_from_start=since,
+                )
+            )
+        message.points = made
+        return message
+
+    def move(self, width: float) -> None:
+        """Set the opening of the gripper [m], if there is one."""
+        from std_msgs.msg import Float64MultiArray
+
+        config = self.config
+        if self._hand is None:
+            return
+        share = float(np.clip(width / config.opening, 0.0, 1.0))
+        travel = config.gripper_open - config.gripper_closed
+        self._hand.publish(Float64MultiArray(data=[config.gripper_closed + share * travel]))
+
+    def stop(self) -> None:
+        """Bring the arm to rest: by zero velocities, or by the last position."""
+        with self._lock:
+            state = self._state
+            if state is not None:
+                self._send(np.zeros(len(self._names)), state)
+
+    def recover(self) -> None:
+        """Go on from where the arm is, once joint states come again.
+
+        Raises:
+            ArmFaultError: They do not.
+        """
+        self.read()
+        with self._lock:
+            self._goal = None
+
+    def close(self) -> None:
+        """Stop the arm and leave the graph."""
+        atexit.unregister(self.close)
+        self._dog.close()
+        self.stop()
+        time.sleep(0.05)  # for the last message to leave
+        if self._guard is not None:
+            self._guard.kill()
+            self._guard.wait()
+        self.session.close()
+
+    def __enter__(self) -> Ros2Arm:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

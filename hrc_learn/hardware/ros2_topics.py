@@ -1,0 +1,171 @@
+"""The graph of ROS 2: which installation is used, a node of our own, qualities of service.
+
+Run as a program, it guards a velocity controller: see `guard_velocities`. So it imports nothing
+of this package: the guard is ready in half a second.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import subprocess
+import sys
+import sysconfig
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+_STARTUP = 10.0
+"""Longest wait for a description of the robot, and for the guard [s]."""
+
+
+def ros2_origin() -> str:
+    """One line that says which ROS 2 is used."""
+    import rclpy
+
+    place = Path(rclpy.__file__).parents[1]
+    wheels = place in map(Path, (sysconfig.get_path("purelib"), sysconfig.get_path("platlib")))
+    distribution = os.environ.get("ROS_DISTRO", "")
+    name = "the wheels' rclpy" if wheels else f"the system's rclpy {distribution}".rstrip()
+    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    return f"ROS 2: {name} in {place}, domain {domain}"
+
+
+class Ros2Session:
+    """A node with a thread of its own that takes the messages.
+
+    Attributes:
+        node: The node.
+    """
+
+    def __init__(self, name: str, make: Callable[..., Any] | None = None):
+        """Join the graph.
+
+        Args:
+            name: Name of the node.
+            make: Creates another node than a plain one.
+        """
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.signals import SignalHandlerOptions
+
+        self._context = rclpy.Context()
+        # Signals belong to the program: it brings the arm to rest first.
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self.node = (make or rclpy.create_node)(name, context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._thread = threading.Thread(target=self._spin, name=name, daemon=True)
+        self._thread.start()
+        atexit.register(self.close)  # the middleware aborts a process that leaves it open
+
+    def _spin(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        with suppress(ExternalShutdownException):
+            self._executor.spin()
+
+    def close(self) -> None:
+        """Leave the graph."""
+        atexit.unregister(self.close)
+        self._executor.shutdown(timeout_sec=1.0)
+        self._context.try_shutdown()
+        self._thread.join(2.0)
+
+
+def quality(*, reliable: bool = False, latched: bool = False) -> Any:
+    """Quality of service with the newest message alone.
+
+    Args:
+        reliable: Repeat lost messages, as for commands. States are best effort, which takes
+            both kinds of publishers: a repeated state would be an old one.
+        latched: Keep the last message for those that come later, as for descriptions.
+    """
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+    policy = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+    return QoSProfile(depth=1, reliability=policy, durability=durability)
+
+
+def read_description(topic: str = "/robot_description", timeout: float = _STARTUP) -> str:
+    """Description (URDF) that a robot publishes.
+
+    Raises:
+        ConnectionError: None has come within the time [s].
+    """
+    from std_msgs.msg import String
+
+    session, came, found = Ros2Session("hrc_description"), threading.Event(), []
+
+    def take(message: Any) -> None:
+        found.append(message.data)
+        came.set()
+
+    session.node.create_subscription(String, topic, take, quality(reliable=True, latched=True))
+    there = came.wait(timeout)
+    session.close()
+    if not there:
+        text = f"no description on {topic} for {timeout:g} s: is robot_state_publisher running"
+        raise ConnectionError(f"{text}, and is ROS_DOMAIN_ID the same?")
+    return found[0]
+
+
+def stamp_of(message: Any) -> float:
+    """Time in the header of a message [s]; 0 without one."""
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def start_guard(node: Any, topic: str, joints: int, timeout: float) -> subprocess.Popen:
+    """The process of `guard_velocities`, once it watches.
+
+    Args:
+        node: Node of this process.
+        topic: Topic of the velocity controller.
+        joints: Number of its joints.
+        timeout: Longest silence after a velocity [s].
+
+    Raises:
+        ConnectionError: It does not start.
+    """
+    words = [sys.executable, str(Path(__file__)), topic, str(joints), str(timeout)]
+    process = subprocess.Popen(words)
+    name, end = f"hrc_guard_{process.pid}", time.monotonic() + _STARTUP
+    while name not in node.get_node_names():
+        if process.poll() is not None or time.monotonic() > end:
+            process.kill()
+            raise ConnectionError(
+                f"the guard of {topic} does not start: velocities are not safe"
+            )
+        time.sleep(0.02)
+    return process
+
+
+def guard_velocities(topic: str, joints: int, timeout: float) -> None:
+    """Send zeros once a velocity was the last command for too long.
+
+    It ends with the process that started it, but not before the arm is at rest.
+    """
+    from std_msgs.msg import Float64MultiArray
+
+    session, parent = Ros2Session(f"hrc_guard_{os.getpid()}"), os.getppid()
+    newest = {"moving": 0.0, "time": 0.0}
+
+    def take(message: Any) -> None:
+        newest.update(moving=float(any(message.data)), time=time.monotonic())
+
+    session.node.create_subscription(Float64MultiArray, topic, take, quality(reliable=True))
+    zeros = session.node.create_publisher(Float64MultiArray, topic, quality(reliable=True))
+    while os.getppid() == parent or newest["moving"]:
+        time.sleep(timeout / 5)
+        if newest["moving"] and time.monotonic() - newest["time"] > timeout:
+            zeros.publish(Float64MultiArray(data=[0.0] * joints))
+    session.close()
+
+
+if __name__ == "__main__":
+    with suppress(KeyboardInterrupt):
+        guard_velocities(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]))
