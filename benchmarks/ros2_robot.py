@@ -29,6 +29,7 @@ class Ros2Robot:
         world: The world.
         violations: Number of steps in which a joint was beyond its limits of position or speed.
         commands: Number of commands received.
+        state: Newest reading; the world's own must not be read while it is stepped.
         late: Delay of the last step behind real time [s].
     """
 
@@ -46,7 +47,7 @@ class Ros2Robot:
 
         self.world, self._config = world, config or Ros2Config()
         self._rate, self.violations, self.commands = rate, 0, 0
-        self.late = 0.0
+        self.late, self.state = 0.0, world.arm.read()
         self._chain = world.arm.robot.chain
         self._velocity = np.zeros(len(self._chain.joint_names))
         self._path: tuple[np.ndarray, np.ndarray] | None = None
@@ -108,7 +109,7 @@ class Ros2Robot:
             velocity = np.clip(_GAIN * (np.array(ahead) - q), -fastest, fastest)
         arm.command(velocity)
         self.world.advance(1 / self._rate)
-        state = arm.read()
+        self.state = state = arm.read()
         fast = np.abs(state.joint_velocity) > 1.02 * limits.velocity.numpy()
         low = state.joint_position < limits.lower.numpy() - 1e-3
         high = state.joint_position > limits.upper.numpy() + 1e-3

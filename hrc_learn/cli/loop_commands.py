@@ -73,7 +73,7 @@ def _access(
     Returns:
         Function that connects, and the configuration of the safety filter for this arm.
     """
-    if args.drives_real_arm():
+    if args.arm == "lerobot" or args.arm == "ros2" or args.drives_real_arm():
         site = replace(site, driver=args.arm, ip=args.ip)
         return partial(_real_arm, site, world, world.arm.robot.chain), site.cell_config().safety
     access = access_by(args.arm, world.arm.robot)

@@ -58,10 +58,10 @@ def rests(robot, within):
     """Seconds until the robot is at rest."""
     began = time.monotonic()
     while time.monotonic() - began < within:
-        if np.abs(robot.world.arm.read().joint_velocity).max() < 0.01:
+        if np.abs(robot.state.joint_velocity).max() < 0.01:
             return time.monotonic() - began
         time.sleep(0.005)
-    velocity, late = robot.world.arm.read().joint_velocity, robot.late
+    velocity, late = robot.state.joint_velocity, robot.late
     raise AssertionError(f"the arm moves by {velocity} after {within} s, {late:.2f} s late")
 
 
@@ -73,11 +73,14 @@ def test_each_controller_moves_the_arm_and_a_silent_loop_stops_it(world, interfa
     with Ros2Robot(world, config) as robot, Ros2Arm(panda.chain, config) as arm:
         velocity = np.zeros(7)
         velocity[0] = 0.3
-        start = arm.read()
+        start = robot.state
         arm.move(0.05)
         drive(arm, velocity, 0.8)
-        moved = arm.read().joint_position - start.joint_position
-        assert moved[0] == pytest.approx(0.8 * 0.3, abs=0.06)
+        end = robot.state
+        moved = end.joint_position - start.joint_position
+        # By the robot's own clock: it falls behind on a busy machine.
+        assert moved[0] == pytest.approx(0.3 * (end.time - start.time), abs=0.06)
+        assert moved[0] > 0.05
         np.testing.assert_allclose(moved[1:], 0, atol=5e-3)
         assert rests(robot, 1.0) > 0.05
         assert arm.read().gripper_width == pytest.approx(0.05, abs=5e-3)
@@ -190,7 +193,7 @@ def test_a_killed_node_leaves_the_arm_at_rest(world):
         assert node.stdout is not None
         assert node.stdout.readline() == "ready\n"
         time.sleep(0.3)
-        assert world.arm.read().joint_velocity[0] > 0.2
+        assert robot.state.joint_velocity[0] > 0.2
         node.send_signal(signal.SIGKILL)
         node.wait()
         assert rests(robot, 2.0) < 1.0
@@ -207,13 +210,13 @@ def test_a_short_job_runs_over_topics():
         plan = joint_plan(cell, cell.joints, torch.from_numpy(goal))
         check(plan)
         # On a busy machine the loop comes late: half a second at the end makes up for it.
-        cell.follow_path(torch.cat([plan.path, plan.path[-1:].expand(50, -1)]))
+        cell.follow_path(np.concatenate([plan.path, np.repeat(plan.path[-1:], 50, axis=0)]))
         return ""
 
     with Ros2Robot(world) as robot:
         done = run_on_arm(ArmSite(driver="ros2", touch=False), workplace, task)
         assert done.failure == ""
-        np.testing.assert_allclose(world.arm.read().joint_position, goal, atol=0.02)
+        np.testing.assert_allclose(robot.state.joint_position, goal, atol=0.02)
         assert robot.violations == 0
         assert rests(robot, 1.0) < 0.5
 
