@@ -262,7 +262,7 @@ class Ros2Arm:
 
     def _trajectory(self, goal: np.ndarray, velocity: np.ndarray, elapsed: float) -> Any:
         """Trajectory that goes on with the velocity and ends at rest."""
-        from builtin_interfaces.msg import Duration
+        from rclpy.duration import Duration
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
         step, rest = max(elapsed, 1e-3), self.config.timeout
@@ -273,7 +273,7 @@ class Ros2Arm:
         message, made = JointTrajectory(joint_names=list(self._names)), []
         message.header.stamp = self.session.node.get_clock().now().to_msg()
         for at, position, speed in points:
-            since = Duration(sec=int(at), nanosec=int(at % 1 * 1e9))
+            since = Duration(seconds=at).to_msg()
             made.append(
                 JointTrajectoryPoint(
                     positions=position.tolist(),
