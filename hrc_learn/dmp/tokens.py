@@ -1,0 +1,395 @@
+"""Tokens of motions: short sequences of integers, all of which decode to a bounded motion.
+
+Networks that write language also write motions, as tokens. The components of a motion are
+rounded to multiples of one step, so that those of less variance take fewer bits, which loses
+the least (reverse water-filling: Cover and Thomas, "Elements of information theory", section
+10.3). `TokenCode` turns these integers into tokens, the first components first.
+
+Columns of grippers that open and close are steps: their integers say when they switch.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from hrc_learn.dmp._arguments import Points, Times, Vectors, checked_vector, seconds, to_tensor
+from hrc_learn.dmp.motion_components import MARGIN, MotionComponents
+from hrc_learn.dmp.samples import Samples, check_samples, padded
+from hrc_learn.dmp.token_code import END, TokenCode
+from hrc_learn.model_files import SavedModel, write_model
+
+PRICE = 0.1155
+"""Price of a bit in squared steps: (ln 4) / 12, at which the error of fine steps falls with
+their bits."""
+REPRESENTED = 1 / 3
+"""Largest error of the splines relative to that of the tokens: it adds 5 % to the total."""
+ROUNDS = 6
+"""Repetitions in which step and probabilities adapt to each other."""
+SMALLEST, LARGEST = 16, 2**15
+"""Bounds of the vocabulary."""
+STEP_LEVELS, SWITCHES, MOST_SLOTS = 4, 4, 64
+"""Largest number of values of a column of steps, number of its switches in a motion (later ones
+are left out), and largest number of times at which it can switch."""
+KIND = "MotionTokenizer"
+
+
+class MotionTokenizer(nn.Module):
+    """Map between motions of D columns and tokens 0 ... vocabulary_size - 1.
+
+    Token 0 ends and pads sequences. Every sequence decodes to a motion within the demonstrated
+    range and a tenth of it to either side, and its first tokens to a coarser one.
+    """
+
+    end = END
+    """Token that ends and pads sequences."""
+    levels: Tensor
+    """Values of each column of steps in order, the last one repeated, (steps, L)."""
+
+    def __init__(
+        self,
+        config: dict[str, Any],
+        components: MotionComponents,
+        code: TokenCode,
+        levels: Tensor,
+    ):
+        """Join the parts; `fit` makes them.
+
+        Args:
+            config: `steps` (columns), `slots` (times at which they may switch), `step` (of the
+                components) and `shift` (of their mean beyond an integer, in steps).
+            components: Components of all other columns.
+            code: Code of the integers.
+            levels: (steps, L).
+        """
+        super().__init__()
+        self.config, self.components, self._code = config, components, code
+        self.steps: list[int] = config["steps"]
+        """Columns of steps."""
+        self.columns = len(components.start) + len(self.steps)
+        self._smooth = [i for i in range(self.columns) if i not in self.steps]
+        self._own = len(self.steps) * SWITCHES
+        self.register_buffer("levels", levels)
+
+    @property
+    def vocabulary_size(self) -> int:
+        """Number of tokens."""
+        return self._code.vocabulary_size
+
+    @property
+    def duration(self) -> float:
+        """Duration of a motion [s]; the mean where durations differ."""
+        return self.components.duration
+
+    @classmethod
+    def fit(
+        cls,
+        time: Times | Sequence[Times],
+        motions: Points | Sequence[Points],
+        vocabulary_size: int = 1024,
+        *,
+        start_velocity: Vectors | None = None,
+        start_known: bool = True,
+        tolerance: float = 0.01,
+        steps: Iterable[int] | None = None,
+    ) -> "MotionTokenizer":
+        """Learn components and the probabilities of their values from motions.
+
+        Args:
+            time: [s], (T,), (N, T) or a list of (T_i,). Durations that differ by more than 1 %
+                are encoded.
+            motions: (N, T, D) or a list of (T_i, D); the first sample is the start.
+            vocabulary_size: Number of tokens.
+            start_velocity: Velocity at the start [1/s], (N, D), if it will be known whenever a
+                motion is encoded or decoded: it saves about 7 % of the tokens.
+            start_known: False: tokens determine the start, too.
+            tolerance: Root mean square error of decoded motions, relative to the range of each
+                column between its quantiles of 1 and 99 %.
+            steps: Columns that jump between a few values, as those of grippers; by default
+                those with 2 to 4 values.
+
+        Raises:
+            ValueError: Fewer than two motions, shapes that differ, or values out of range.
+        """
+        if not SMALLEST <= vocabulary_size <= LARGEST:
+            raise ValueError(
+                f"vocabulary_size must be {SMALLEST} to {LARGEST}, got {vocabulary_size}"
+            )
+        if not 0 < tolerance < 1:
+            raise ValueError(f"tolerance must lie between 0 and 1, got {tolerance}")
+        samples = _samples(time, motions)
+        if len(samples.s) < 2:
+            raise ValueError("motions must be (N, T, D) with N of 2 or more: one does not vary")
+        y = samples.position.mT
+        seen = y[samples.mask].numpy()
+        chosen, levels = _levels(seen, steps)
+        smooth = [i for i in range(y.shape[-1]) if i not in chosen]
+        velocity = None
+        if start_velocity is not None:
+            velocity = checked_vector("start_velocity", start_velocity, y[:, 0])[:, smooth]
+        parts = replace(samples, position=samples.position[:, smooth])
+        accuracy = REPRESENTED * tolerance
+        units = _units(seen[:, smooth])
+        components = MotionComponents.fit(parts, units, velocity, start_known, accuracy)
+        config: dict[str, Any] = {"steps": chosen, "slots": min(y.shape[1] - 1, MOST_SLOTS)}
+        reference = (y[:, 0] if start_known else y[:, 0].mean(0).expand(len(y), -1))[:, chosen]
+        switches = _switches(samples, reference, chosen, levels, config["slots"])
+        z = components.encode(parts, velocity) * components.spread
+        # Errors of all columns add up.
+        aim = tolerance * max(len(smooth), 1) ** 0.5
+        step, bits = aim, None
+        for _ in range(ROUNDS):
+            q = _rounded(z / step, bits)
+            code = TokenCode.fit(torch.cat([switches, q], 1).long().numpy(), vocabulary_size)
+            bits = code.bits()[switches.shape[1] :]
+            shift = float((z.abs() / step - q.abs())[q != 0].mean().nan_to_num())
+            config |= {"step": step, "shift": shift}
+            error = z - (q + shift * q.sign()) * step
+            step *= float(aim / error.square().sum(-1).mean().sqrt().clamp(min=aim / 4))
+        used = switches.shape[1] + int(q.any(0).nonzero().amax() + 1 if q.any() else 0)
+        return cls(config, components, TokenCode(vocabulary_size, code.table[:used]), levels)
+
+    def parameters(
+        self, time: Times, motion: Points, start_velocity: Vectors | None = None
+    ) -> Float[Tensor, "*batch P"]:
+        """Parameters of recorded motions as `components` takes them, without rounding."""
+        return self._encoded(_samples(time, motion), start_velocity)
+
+    def encode(
+        self,
+        time: Times,
+        motion: Points,
+        start_velocity: Vectors | None = None,
+        *,
+        length: int | None = None,
+    ) -> Int[Tensor, "*batch L"]:
+        """Tokens of recorded motions, padded with token 0.
+
+        Args:
+            time: [s], (T,) or (*batch, T).
+            motion: (*batch, T, D), from the start on.
+            start_velocity: Velocity at the start [1/s], (*batch, D), if the tokenizer was
+                fitted with it; zero by default.
+            length: Length L of all sequences; longer ones are cut, which makes motions coarser.
+
+        Raises:
+            ValueError: Shapes that differ from the fit's, or values that are not finite.
+        """
+        samples = _samples(time, motion)
+        z = self._encoded(samples, start_velocity).reshape(len(samples.s), -1)
+        bits, config = self._code.bits()[self._own :], self.config
+        z = (z * self.components.spread)[:, : len(bits)]
+        start = samples.position[..., 0] if self.components.known else self._start()
+        start = start.expand(len(z), -1)[:, self.steps]
+        switches = _switches(samples, start, self.steps, self.levels, config["slots"])
+        integers = torch.cat([switches, _rounded(z / config["step"], bits)], 1)
+        rows = [self._code.encode(row) for row in integers.long().tolist()]
+        L = max(map(len, rows), default=0) if length is None else length
+        ids = [row[:L] + [END] * (L - len(row)) for row in rows]
+        return torch.tensor(ids, dtype=torch.long).reshape(*samples.batch, L)
+
+    def decode(
+        self,
+        ids: Int[Tensor, "*batch L"] | Sequence[Any] | np.ndarray,
+        time: Times,
+        start: Vectors | None = None,
+        start_velocity: Vectors | None = None,
+        *,
+        order: int = 0,
+    ) -> Float[Tensor, "*batch T D"]:
+        """Motions of any sequences of tokens.
+
+        A motion begins with exactly the given state. It stays in the demonstrated range and a
+        tenth of it to either side; a start beyond that moves the limit.
+
+        Args:
+            ids: Tokens, (*batch, L) or a list of lists; what follows token 0 is ignored.
+            time: Time since the start [s], (T,) or (*batch, T), at any rate. After its end, a
+                motion rests.
+            start: (*batch, D); by default the mean start, or the encoded one.
+            start_velocity: Velocity at the start [1/s], (*batch, D). None: zero if the
+                tokenizer was fitted with velocities, otherwise the encoded one.
+            order: Derivative with respect to time, 0, 1 or 2; zero for steps.
+
+        Raises:
+            ValueError: Tokens that are not in the vocabulary, or shapes that do not match.
+        """
+        integers = self._integers(ids)
+        q = integers[..., self._own :]
+        z = (q + self.config["shift"] * q.sign()) * self.config["step"]
+        z = z / self.components.spread[: q.shape[-1]]
+        state: list[Tensor | None] = [None, None]
+        for i, given in enumerate((start, start_velocity)):
+            if given is not None:
+                name = ("start", "start_velocity")[i]
+                state[i] = checked_vector(name, given, self._start())[..., self._smooth]
+        y = self.components(z, time, *state, order=order)
+        if not self.steps:
+            return y
+        _, duration = self.components.polygon(z, *state)
+        s = seconds(time, y.device) / duration[..., None]
+        first = self._start() if start is None else to_tensor(start).to(y)
+        stepped = self._stepped(integers[..., : self._own], s, first[..., self.steps])
+        whole = y.new_zeros(*y.shape[:-1], self.columns)
+        whole[..., self._smooth] = y
+        if order == 0:
+            whole[..., self.steps] = stepped
+        return whole
+
+    def complete(self, ids: Sequence[int]) -> bool:
+        """True if no token that follows these changes the motion."""
+        return self._code.decode([int(i) for i in ids])[1]
+
+    def save(self, folder: str | Path) -> None:
+        """Write or replace a folder with `config.json` and `model.safetensors`."""
+        config = {"vocabulary_size": self.vocabulary_size, "tokens": self.config}
+        config |= {"components": self.components.config}
+        tensors = dict(self.state_dict()) | {"code": torch.from_numpy(self._code.table)}
+        write_model(folder, KIND, config, tensors)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "MotionTokenizer":
+        """Read a saved tokenizer.
+
+        Raises:
+            FileNotFoundError: There is none.
+            ValueError: A file is not valid.
+        """
+        saved = SavedModel(folder, KIND)
+        parts = {name: saved.tensor(name) for name in saved.tensors}
+        buffers = {k.partition(".")[2]: v for k, v in parts.items() if k.startswith("compo")}
+        try:
+            return cls(
+                saved.get("tokens", dict),
+                MotionComponents(saved.get("components", dict), buffers),
+                TokenCode(saved.get("vocabulary_size", int), saved.tensor("code").numpy()),
+                saved.tensor("levels"),
+            )
+        except (KeyError, TypeError, IndexError) as error:
+            raise saved.invalid(f"not a complete tokenizer ({error}): fit it again") from None
+
+    def _encoded(self, samples: Samples, start_velocity: Vectors | None) -> Tensor:
+        """Parameters of recorded motions, (*batch, P)."""
+        if samples.position.shape[1] != self.columns:
+            raise ValueError(
+                f"motion must have {self.columns} columns, got {samples.position.shape[1]}"
+            )
+        velocity = None
+        if start_velocity is not None:
+            velocity = checked_vector("start_velocity", start_velocity, self._start())
+            velocity = velocity.expand(*samples.batch, -1)[..., self._smooth]
+        parts = replace(samples, position=samples.position[:, self._smooth])
+        return self.components.encode(parts, velocity).reshape(*samples.batch, -1)
+
+    def _start(self) -> Float[Tensor, "D"]:
+        """Mean start, the first value for steps."""
+        mean = self.levels.new_empty(self.columns)
+        mean[self._smooth] = self.components.start
+        mean[self.steps] = self.levels[:, 0]
+        return mean
+
+    def _integers(self, ids: Any) -> Float[Tensor, "*batch K"]:
+        """Integers of sequences of tokens.
+
+        Raises:
+            ValueError: A token that is not in the vocabulary.
+        """
+        if isinstance(ids, Sequence) and any(isinstance(row, Sequence) for row in ids):
+            rows, batch = [[int(i) for i in row] for row in ids], (len(ids),)
+        else:
+            tokens = to_tensor(ids).long()
+            batch = tokens.shape[:-1]
+            rows = tokens.reshape(batch.numel(), tokens.shape[-1]).tolist()
+        wrong = {i for row in rows for i in row if not 0 <= i < self.vocabulary_size}
+        if wrong:
+            raise ValueError(f"token {min(wrong)} is not in 0 to {self.vocabulary_size - 1}")
+        integers = torch.zeros(len(rows), self._code.size, dtype=torch.float64)
+        for i, row in enumerate(rows):
+            for k, sign, low, _ in self._code.decode(row)[0]:
+                integers[i, k] = sign * low
+        return integers.reshape(*batch, -1)
+
+    def _stepped(self, jumps: Tensor, s: Tensor, start: Tensor) -> Float[Tensor, "*batch T S"]:
+        """Columns of steps at normalised times."""
+        jumps = jumps.unflatten(-1, (-1, SWITCHES))[..., None, :, :]
+        at = (jumps.abs() - 1) / self.config["slots"]
+        # Rounding of a time that equals a slot does not delay the switch.
+        now = (jumps != 0) & (s[..., None, None] >= at - 1e-9)
+        index = _nearest(start, self.levels)[..., None, :] + (now * jumps.sign()).sum(-1).long()
+        index = index.clamp(0, self.levels.shape[1] - 1)
+        reached = self.levels[torch.arange(len(self.levels)), index]
+        return torch.where(now.any(-1), reached, start[..., None, :])
+
+
+def _samples(time: Any, motions: Any) -> Samples:
+    time, mask, (motions,) = padded(time, None, motions)
+    return check_samples(time, to_tensor(motions).double(), mask=mask, name="motions")
+
+
+def _units(seen: Float[np.ndarray, "n D"]) -> dict[str, Tensor]:
+    """Centre, scale and limits of columns."""
+    low, high = seen.min(0), seen.max(0)
+    bottom, top = np.quantile(seen, (0.01, 0.99), axis=0)
+    scale = np.where(top > bottom, top - bottom, high - low)
+    margin = MARGIN * (high - low) * (1 - 1e-9)
+    units = {"centre": (bottom + top) / 2, "scale": np.where(scale > 0, scale, 1.0)}
+    units |= {"low": low - margin, "high": high + margin}
+    return {name: torch.from_numpy(value) for name, value in units.items()}
+
+
+def _levels(
+    seen: Float[np.ndarray, "n D"], steps: Iterable[int] | None
+) -> tuple[list[int], Float[Tensor, "S L"]]:
+    """Columns of steps, and their values in order."""
+    values = [np.unique(column) for column in seen.T]
+    few = [i for i, found in enumerate(values) if len(found) <= STEP_LEVELS]
+    chosen = [i for i in few if len(values[i]) > 1] if steps is None else sorted(set(steps))
+    if not set(chosen) <= set(few):
+        raise ValueError(f"steps must be columns of {STEP_LEVELS} values or fewer, got {steps}")
+    most = max((len(values[i]) for i in chosen), default=1)
+    rows = [np.pad(values[i], (0, most - len(values[i])), mode="edge") for i in chosen]
+    return chosen, torch.from_numpy(np.array(rows).reshape(-1, most))
+
+
+def _nearest(
+    values: Float[Tensor, "*batch S"], levels: Float[Tensor, "S L"]
+) -> Int[Tensor, "*batch S"]:
+    return (values[..., None] - levels).abs().argmin(-1)
+
+
+def _switches(
+    samples: Samples, start: Float[Tensor, "B S"], steps: list[int], levels: Tensor, slots: int
+) -> Float[Tensor, "B K"]:
+    """Integers of steps: the slots of switches in turn, with the signs of their directions.
+
+    Slot k stands for the time (k - 1) / slots of the duration.
+    """
+    y = torch.cat([start[:, None], samples.position.mT[..., steps].to(start)], 1)
+    changes = _nearest(y, levels).diff(dim=1) * samples.mask[..., None]
+    slot = (samples.s * slots).round().long() + 1
+    found = [[[] for _ in steps] for _ in y]
+    for i, t, c in changes.nonzero().tolist():
+        change = int(changes[i, t, c])
+        found[i][c] += [int(slot[i, t]) * (1 if change > 0 else -1)] * abs(change)
+    return torch.tensor(
+        [[(row + [0] * SWITCHES)[:SWITCHES] for row in rows] for rows in found],
+        dtype=torch.float64,
+    ).reshape(len(y), -1)
+
+
+def _rounded(x: Float[Tensor, "B P"], bits: Tensor | None) -> Float[Tensor, "B P"]:
+    """Integers of least squared error plus the price of their bits, (P, M) by magnitude."""
+    if bits is None:
+        return x.round()
+    size = x.abs()
+    largest = bits.isfinite().sum(-1) - 1
+    choices = torch.stack([torch.zeros_like(x), size.floor(), size.ceil()])
+    choices = torch.minimum(choices, largest)
+    prices = bits.expand(*choices.shape, -1).gather(-1, choices.long()[..., None])[..., 0]
+    best = ((choices - size).square() + PRICE * prices).argmin(0, keepdim=True)
+    return choices.gather(0, best)[0] * x.sign()

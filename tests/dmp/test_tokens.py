@@ -1,0 +1,317 @@
+"""Tokens of motions against what encodes, bounds and joins them in other ways."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+
+from hrc_learn.dmp.motion_components import spline
+from hrc_learn.dmp.token_code import TokenCode
+from hrc_learn.dmp.tokens import MotionTokenizer
+
+TIME = torch.linspace(0, 1, 21, dtype=torch.float64)
+VOCABULARY = 64
+
+
+def motions(count: int, seed: int = 0, columns: int = 3) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sums of three oscillations, (count, 21, columns), and their start velocities."""
+    rng = torch.Generator().manual_seed(seed)
+    drawn = torch.rand(3, 3, count, columns, generator=rng, dtype=torch.float64)
+    amplitude, phase = drawn[0], 2 * torch.pi * drawn[1]
+    rate = torch.tensor([1.0, 3.0, 9.0], dtype=torch.float64)[:, None, None]
+    rate = rate * (1 + 0.2 * drawn[2])
+    amplitude = amplitude / rate
+    angle = rate[..., None] * TIME + phase[..., None]
+    position = (amplitude[..., None] * angle.sin()).sum(0).mT
+    return position, (amplitude * rate * phase.cos()).sum(0)
+
+
+@pytest.fixture(scope="module")
+def tokenizer() -> MotionTokenizer:
+    position, velocity = motions(400)
+    return MotionTokenizer.fit(TIME, position, VOCABULARY, start_velocity=velocity)
+
+
+@pytest.fixture(scope="module")
+def gripping() -> tuple[MotionTokenizer, torch.Tensor]:
+    """Tokenizer of two columns and a gripper between them, and motions that it has not seen."""
+    position, _ = motions(300, columns=2)
+    rng = torch.Generator().manual_seed(3)
+    at = torch.randint(1, 40, (300, 1), generator=rng)
+    opened = torch.rand(300, 1, generator=rng) < 0.5
+    gripper = (opened ^ (torch.arange(21) >= at)).double() * 0.08
+    whole = torch.stack([position[..., 0], gripper, position[..., 1]], -1)
+    return MotionTokenizer.fit(TIME, whole[:250], VOCABULARY, start_known=True), whole[250:]
+
+
+def limits(position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    low, high = position.amin((0, 1)), position.amax((0, 1))
+    return low - 0.1 * (high - low), high + 0.1 * (high - low)
+
+
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_splines_equal_scipy(order):
+    count, knots = 9, np.concatenate([[0, 0, 0], np.linspace(0, 1, 7), [1, 1, 1]])
+    one = BSpline(knots, np.eye(count), 3)
+    expected = (one.derivative(order) if order else one)(TIME.numpy())
+    assert np.abs(spline(TIME, count, order).numpy() - expected).max() < 1e-11
+
+
+def test_unseen_motions_decode_to_the_tolerance(tokenizer):
+    position, velocity = motions(100, seed=1)
+    ids = tokenizer.encode(TIME, position, velocity)
+    made = tokenizer.decode(ids, TIME, position[:, 0], velocity)
+    seen = motions(400)[0].reshape(-1, 3).numpy()
+    scale = torch.from_numpy(np.quantile(seen, 0.99, axis=0) - np.quantile(seen, 0.01, axis=0))
+    error = ((made - position) / scale).square().mean().sqrt()
+    assert 0.004 < error < 0.013  # 0.01, and some more for motions that were not seen
+
+
+def test_a_smaller_tolerance_takes_more_tokens():
+    position, _ = motions(200)
+    counts = []
+    for tolerance in (0.05, 0.02, 0.005):
+        tokenizer = MotionTokenizer.fit(TIME, position, VOCABULARY, tolerance=tolerance)
+        counts.append((tokenizer.encode(TIME, position) != 0).sum().item())
+    assert counts[0] < 0.8 * counts[1] < 0.64 * counts[2]
+
+
+def test_any_tokens_decode_within_the_demonstrated_range(tokenizer):
+    position, velocity = motions(400)
+    low, high = limits(position)
+    rng = torch.Generator().manual_seed(5)
+    ids = torch.randint(0, VOCABULARY, (400, 12), generator=rng)
+    fine = torch.linspace(0, 1.2, 300, dtype=torch.float64)
+    for start, rate in ((None, None), (position[:, 0], None), (position[:, 0], velocity)):
+        made = tokenizer.decode(ids, fine, start, rate)
+        assert made.isfinite().all()
+        # A start at the limit that moves towards it cannot turn at once.
+        slack = 0.02 if rate is not None else 0.0
+        assert ((made >= low - slack) & (made <= high + slack)).all()
+
+
+def test_a_start_beyond_the_range_moves_the_limit(tokenizer):
+    low, high = limits(motions(400)[0])
+    start = high + 1.0
+    made = tokenizer.decode([[5, 9, 33]], TIME, start)
+    assert (made[0, 0] - start).abs().max() < 1e-12
+    assert (made <= start + (high - low) / 10).all()
+
+
+def test_motions_continue_what_is_executed(tokenizer):
+    position, velocity = motions(50, seed=2)
+    rng = torch.Generator().manual_seed(6)
+    ids = torch.randint(0, VOCABULARY, (50, 9), generator=rng)
+    # Another motion takes over at 0.37 s.
+    now = torch.tensor([0.37], dtype=torch.float64)
+    at, rate = (
+        tokenizer.decode(ids, now, position[:, 0], velocity, order=order)[:, 0]
+        for order in (0, 1)
+    )
+    zero = torch.zeros(1, dtype=torch.float64)
+    following = ids.flip(0)
+    for order, state in ((0, at), (1, rate)):
+        made = tokenizer.decode(following, zero, at, rate, order=order)[:, 0]
+        assert (made - state).abs().max() < 1e-12
+
+
+def test_derivatives_are_those_of_the_motion(tokenizer):
+    position, velocity = motions(5, seed=4)
+    ids = tokenizer.encode(TIME, position, velocity)
+    h = 1e-5
+    for order in (0, 1):
+        a, b = (
+            tokenizer.decode(ids, TIME[1:-1] + x, position[:, 0], velocity, order=order)
+            for x in (-h, h)
+        )
+        exact = tokenizer.decode(ids, TIME[1:-1], position[:, 0], velocity, order=order + 1)
+        # Differences of a second derivative with kinks are accurate to the step.
+        assert torch.allclose((b - a) / (2 * h), exact, atol=1e-3)
+
+
+def test_prefixes_decode_to_coarser_motions(tokenizer):
+    position, velocity = motions(100, seed=1)
+    errors = []
+    for length in (0, 1, 2, 4, 8):
+        ids = tokenizer.encode(TIME, position, velocity, length=length)
+        assert ids.shape == (100, length)
+        made = tokenizer.decode(ids, TIME, position[:, 0], velocity)
+        errors.append((made - position).square().mean().item())
+    assert all(fine < coarse for coarse, fine in pairwise(errors))
+    assert errors[-1] < 0.01 * errors[0]
+
+
+def test_a_motion_decodes_at_any_rate(tokenizer):
+    position, velocity = motions(10, seed=1)
+    ids = tokenizer.encode(TIME, position, velocity)
+    fine = torch.linspace(0, 1, 201, dtype=torch.float64)
+    state = position[:, 0], velocity
+    assert torch.allclose(
+        tokenizer.decode(ids, fine, *state)[:, ::10], tokenizer.decode(ids, TIME, *state)
+    )
+    late = torch.tensor([1.0, 5.0], dtype=torch.float64)
+    rest = tokenizer.decode(ids, late, *state)
+    assert torch.equal(rest[:, 0], rest[:, 1])
+    assert (tokenizer.decode(ids, late, *state, order=1)[:, 1] == 0).all()
+
+
+def test_grippers_switch_without_ramps(gripping):
+    tokenizer, position = gripping
+    assert tokenizer.steps == [1]
+    ids = tokenizer.encode(TIME, position)
+    made = tokenizer.decode(ids, TIME, position[:, 0])
+    assert torch.equal(made[..., 1], position[..., 1])
+    fine = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    levels = tokenizer.decode(ids, fine, position[:, 0])[..., 1].unique()
+    assert set(levels.tolist()) <= {0.0, 0.08}
+    assert (tokenizer.decode(ids, TIME, position[:, 0], order=1)[..., 1] == 0).all()
+
+
+def test_any_tokens_leave_grippers_on_their_levels(gripping):
+    tokenizer, position = gripping
+    rng = torch.Generator().manual_seed(5)
+    ids = torch.randint(0, VOCABULARY, (50, 10), generator=rng)
+    made = tokenizer.decode(ids, TIME, position[:, 0])
+    assert set(made[..., 1].unique().tolist()) <= {0.0, 0.08}
+
+
+def test_durations_are_encoded():
+    position, _ = motions(100)
+    duration = torch.linspace(0.7, 1.4, 100, dtype=torch.float64)[torch.randperm(100)]
+    time = list(TIME * duration[:, None])
+    tokenizer = MotionTokenizer.fit(time, list(position), VOCABULARY)
+    ids = tokenizer.encode(torch.stack(time), position)
+    made = tokenizer.decode(ids, torch.stack(time), position[:, 0])
+    assert (made - position).square().mean().sqrt() < 0.03
+    # Without its last sample, the same motion is cut, not stretched.
+    short = tokenizer.decode(ids, torch.stack(time)[:, :-5], position[:, 0])
+    assert torch.allclose(short, made[:, :-5])
+
+
+def test_starts_are_encoded_on_demand():
+    position, _ = motions(300)
+    tokenizer = MotionTokenizer.fit(TIME, position, VOCABULARY, start_known=False)
+    unseen = motions(50, seed=1)[0]
+    ids = tokenizer.encode(TIME, unseen)
+    assert (tokenizer.decode(ids, TIME) - unseen).square().mean().sqrt() < 0.03
+    start = unseen[:, 0] + 0.1
+    joined = tokenizer.decode(ids, TIME, start, torch.zeros(50, 3))
+    assert (joined[:, 0] - start).abs().max() < 1e-12
+
+
+def test_parameters_restore_motions_and_have_gradients(tokenizer):
+    position, velocity = motions(20, seed=1)
+    z = tokenizer.parameters(TIME, position, velocity).requires_grad_()
+    made = tokenizer.components(z, TIME, position[:, 0], velocity)
+    assert (made - position).abs().max() < 0.01
+    assert z.detach().std(0)[:3].sub(1).abs().max() < 0.5  # of unit variance
+    (gradient,) = torch.autograd.grad(made.sum(), z)
+    assert gradient.abs().sum() > 0
+
+
+def test_saved_tokenizers_decode_alike(gripping, tmp_path):
+    tokenizer, position = gripping
+    tokenizer.save(tmp_path / "tokens")
+    loaded = MotionTokenizer.load(tmp_path / "tokens")
+    ids = loaded.encode(TIME, position)
+    assert torch.equal(ids, tokenizer.encode(TIME, position))
+    made = tokenizer.decode(ids, TIME, position[:, 0])
+    assert torch.equal(loaded.decode(ids, TIME, position[:, 0]), made)
+
+
+def test_batches_equal_single_motions(gripping):
+    tokenizer, position = gripping
+    ids = tokenizer.encode(TIME, position[:6].reshape(2, 3, 21, 3))
+    made = tokenizer.decode(ids, TIME, position[:6, 0].reshape(2, 3, 3))
+    for i in range(6):
+        one = tokenizer.encode(TIME, position[i])
+        whole = ids.reshape(6, -1)[i]
+        assert one.tolist() == whole[: len(one)].tolist()
+        assert (whole[len(one) :] == 0).all()
+        alone = tokenizer.decode(one, TIME, position[i, 0])
+        assert torch.allclose(alone, made.reshape(6, 21, 3)[i], atol=1e-12)
+
+
+def test_tokens_after_the_end_change_nothing(tokenizer):
+    position, velocity = motions(1, seed=1)
+    ids = tokenizer.encode(TIME, position, velocity)[0].tolist()
+    assert tokenizer.complete(ids)
+    assert not tokenizer.complete(ids[:1])
+    made = tokenizer.decode([[*ids, 0, 7, 8], ids], TIME, position[0, 0], velocity[0])
+    assert torch.allclose(made[0], made[1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("ids", "words"), [([3, 64], "token 64 is not in 0 to 63"), ([-1], "token -1")]
+)
+def test_tokens_beyond_the_vocabulary_are_refused(tokenizer, ids, words):
+    with pytest.raises(ValueError, match=words):
+        tokenizer.decode(ids, TIME)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"vocabulary_size": 8}, "vocabulary_size must be 16 to 32768, got 8"),
+        ({"tolerance": 0.0}, "tolerance must lie between 0 and 1"),
+        ({"motions": motions(1)[0]}, "N of 2 or more"),
+        ({"motions": motions(3)[0] * torch.nan}, "motions"),
+        ({"time": TIME.flip(0)}, "time"),
+        ({"steps": [0]}, "steps must be columns of 4 values or fewer"),
+        ({"start_velocity": torch.zeros(3, 2)}, "start_velocity must have shape"),
+    ],
+)
+def test_bad_arguments_of_a_fit_are_named(change, words):
+    with pytest.raises(ValueError, match=words):
+        MotionTokenizer.fit(**{"time": TIME, "motions": motions(3)[0], **change})
+
+
+def test_another_number_of_columns_is_refused(tokenizer):
+    with pytest.raises(ValueError, match="motion must have 3 columns, got 2"):
+        tokenizer.encode(TIME, motions(2, columns=2)[0])
+
+
+class TestCode:
+    """The code of integers alone."""
+
+    def code(self, vocabulary: int = 32) -> tuple[TokenCode, np.ndarray]:
+        rng = np.random.default_rng(0)
+        scale = 6.0 * 0.8 ** np.arange(30)
+        values = np.round(rng.laplace(scale=scale, size=(500, 30))).astype(int)
+        return TokenCode.fit(values, vocabulary), values
+
+    @pytest.mark.parametrize("vocabulary", [16, 32, 1024])
+    def test_vectors_are_restored(self, vocabulary):
+        code, values = self.code(vocabulary)
+        for row in values[:100]:
+            found, complete = code.decode(code.encode(row.tolist()))
+            assert complete
+            restored = np.zeros(30, int)
+            for index, sign, low, high in found:
+                assert low == high
+                restored[index] = sign * low
+            assert (restored == row).all()
+
+    def test_tokens_carry_nearly_the_most_information(self):
+        code, values = self.code(1024)
+        bits = np.mean([10 * len(code.encode(row.tolist())) for row in values])
+        entropy = sum(
+            -(p * np.log2(p)).sum()
+            for k in range(30)
+            for p in [np.unique(values[:, k], return_counts=True)[1] / len(values)]
+        )
+        assert entropy < bits < 1.15 * entropy + 10
+
+    def test_first_tokens_are_about_equally_frequent(self):
+        code, values = self.code(32)
+        firsts = [code.encode(row.tolist())[0] for row in values]
+        counts = np.bincount(firsts, minlength=32)[1:]
+        assert counts.max() < 2.5 * len(values) / 31
+        assert (counts > 0).all()
+
+    def test_one_token_ends_zeros(self):
+        code, _ = self.code(16)
+        assert len(code.encode([0] * 30)) == 1
+        assert code.encode([3] + [0] * 29)[-1] == 0
