@@ -460,6 +460,8 @@ class Report(Measured):
     """Folders of runs, in the order of the page. Each holds a report.json."""
     out: Path
     """HTML file to write. Replaces an older one."""
+    evidence: bool = False
+    """Write the requirements of ISO 10218:2025 near people, with the measured values."""
 
 
 Shelf = Literal["lower", "middle", "upper"]

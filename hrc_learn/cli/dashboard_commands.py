@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from hrc_learn.cli._run import has_screen, write_values
 from hrc_learn.cli.arguments import Report, Show
 from hrc_learn.store import write_text
+from hrc_learn.viz.evidence import evidence_page
 from hrc_learn.viz.report import read_report, reports_page
 
 if TYPE_CHECKING:
@@ -173,7 +174,8 @@ def report(args: Report) -> None:
         raise ValueError("name at least one folder with a report.json")
     reports = [read_report(run) for run in args.runs]
     title = reports[0].title if len(reports) == 1 else "Runs"
-    write_text(args.out, reports_page(title, reports))
+    page = evidence_page(reports) if args.evidence else reports_page(title, reports)
+    write_text(args.out, page)
     print(f"{args.out}: {', '.join(report.title for report in reports)}")
     values = {
         f"{run.resolve().name}_{m.key}": m.value

@@ -103,6 +103,8 @@ _SAFETY: Sequence[Metric[CollaborationRun]] = (
     Metric("contacts with the worker", lambda run: _worker_contacts(run)),
     Metric("min distance", lambda run: _min_distance(run), "mm"),
     never("separation violations", lambda run: _violations(run)),
+    Metric("force of contacts, of the limit", lambda run: _contact_force(run)),
+    never("contacts over the limit", lambda run: _too_hard(run)),
     Metric(
         "waited for the worker",
         lambda run: (
@@ -226,8 +228,24 @@ def _worker_contacts(run: CollaborationRun) -> int | None:
 
 def _violations(run: CollaborationRun) -> int | None:
     """Steps in which the arm could not have stopped before the worker; None without one."""
-    margin = run.separation_margin
-    return None if margin is None else int((margin < 0).sum())
+    near = run.near_worker
+    return None if near is None else int((near.margin < 0).sum())
+
+
+def _contact_force(run: CollaborationRun) -> float | None:
+    """Largest force or pressure of a contact with the worker, as a fraction of its limit; None
+    without a worker.
+    """
+    near = run.near_worker
+    return None if near is None else float(near.force.max(initial=0.0))
+
+
+def _too_hard(run: CollaborationRun) -> int | None:
+    """Steps with more force than allowed; None unless the arm may touch people."""
+    near = run.near_worker
+    if near is None or run.cell.config.safety.separation.mode == "ssm":
+        return None
+    return int((near.force > 1).sum())
 
 
 def _min_distance(run: CollaborationRun) -> float | None:

@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from hrc_learn.experiments.run_measures import PullEffect, pull_effects
 from hrc_learn.experiments.simulated_cell import (
@@ -19,11 +18,12 @@ from hrc_learn.experiments.simulated_cell import (
 )
 from hrc_learn.experiments.surroundings import (
     GivingPerson,
+    NearWorker,
     check_shelves,
     draw_object_poses,
     draw_visit,
+    near_worker,
     points_to_see,
-    separation_margin,
     shown_hand_overs,
     waiting_pose,
 )
@@ -152,12 +152,12 @@ class CollaborationRun:
         return pull_effects(self.cell.log, self.pulls, self.workplace.robot.chain, offset)
 
     @cached_property
-    def separation_margin(self) -> Float[np.ndarray, " steps"] | None:
-        """Separation margin from the worker at each step [m]; None without a worker."""
+    def near_worker(self) -> NearWorker | None:
+        """Margin of the distance from the worker, and force of contacts; None without one."""
         if self.visit is None:
             return None
         log = self.cell.log
-        return separation_margin(
+        return near_worker(
             log,
             self.visit,
             whole_arm(self.world.config.arm),

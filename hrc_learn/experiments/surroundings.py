@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -290,7 +291,17 @@ def margin_to_stop(
     return torch.where((closing > _AT_REST) & ~gentle, spare, torch.inf)
 
 
-def separation_margin(
+class NearWorker(NamedTuple):
+    """Measures of an arm near a worker, a value for each step."""
+
+    margin: Float[np.ndarray, " steps"]
+    """Smallest margin of the distance over the stopping distance [m]."""
+    force: Float[np.ndarray, " steps"]
+    """Peak force or pressure of a contact into which the arm moves, as a fraction of its limit;
+    zero without one, infinite where none is allowed."""
+
+
+def near_worker(
     log: LoggedSteps,
     visit: WorkerVisit,
     arm: CapsuleArm,
@@ -299,13 +310,14 @@ def separation_margin(
     encoder_offset: Float[np.ndarray, " joints"],
     loads: Mapping[str, tuple[GraspedBox, Bool[np.ndarray, " steps"]]],
     furniture: Sequence[Box] = (),
-) -> Float[np.ndarray, " steps"]:
-    """Margin of the true distance from the worker over the stopping distance, at each step [m].
+) -> NearWorker:
+    """Margin of the true distance from the worker over the stopping distance, and the force of
+    contacts, at each step.
 
     The stopping distance is v_h v/a + v^2/(2 a), for a part of the arm that approaches a part
     of the worker at speed v while that comes at v_h: the protective distance without reaction
-    time and uncertainty. The result is the smallest margin over all parts, infinite while the
-    arm approaches none, and for contacts within the limits of power and force limiting.
+    time and uncertainty. It is the smallest margin over all parts, infinite while the arm
+    approaches none, and for contacts within the limits of power and force limiting.
 
     Args:
         log: Log of the run.
@@ -316,26 +328,27 @@ def separation_margin(
         loads: Objects in the gripper, and the steps in which they were.
         furniture: Boxes against which the arm may clamp the worker.
     """
-    limits = None
-    if config.mode != "ssm":
-        whole = replace(config, contact=replace(config.contact, used=1.0))
-        limits = ContactLimits(arm, whole, furniture)
+    whole = replace(config, contact=replace(config.contact, used=1.0))
+    limits = ContactLimits(arm, whole, furniture)
     regions = region_numbers(REGIONS)
     time = log["time"]
     q = torch.from_numpy(log["joint_position"] - encoder_offset)
     v = torch.from_numpy(log["joint_velocity"])
-    margin = np.full(len(time), np.inf)
+    margin, force = np.full(len(time), np.inf), np.zeros(len(time))
 
     def measure(steps: np.ndarray, load: GraspedBox | None) -> None:
         there = visit.capsules_at(time[steps])
         ends, speed = torch.from_numpy(there.ends), torch.from_numpy(there.velocity)
         radius = torch.from_numpy(there.radius).expand(len(steps), -1)
         found = separation(arm, q[steps], ends, radius, load)
-        contact = None
-        if limits is not None:
-            contact = limits.speeds(found, q[steps], regions, load is not None)
+        contact = limits.speeds(found, q[steps], regions, load is not None)
         spare = margin_to_stop(found, v[steps], speed, config, contact)
         margin[steps] = spare.amin((-2, -1)).numpy()
+        pushes = -found.rate(v[steps], torch.zeros_like(speed)) > _AT_REST
+        # The force grows with the relative speed.
+        part = -found.rate(v[steps], speed).clamp(max=0) / contact
+        part = torch.where(pushes & (found.distance <= 0), part.nan_to_num(nan=torch.inf), 0.0)
+        force[steps] = part.amax((-2, -1)).numpy()
 
     rest = np.ones(len(time), dtype=bool)
     for load, held in [*loads.values(), (None, rest)]:
@@ -343,7 +356,7 @@ def separation_margin(
         rest[steps] = False
         for k in range(0, len(steps), _BLOCK):
             measure(steps[k : k + _BLOCK], load)
-    return margin
+    return NearWorker(margin, force)
 
 
 class GivingPerson:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from hrc_learn.store import new_file, read_json, write_json
 from hrc_learn.viz.report_content import Film as Film
@@ -42,30 +42,38 @@ def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = 
     Raises:
         ValueError: If there is no report.
     """
-    # Used only here; it takes some hundredths of a second to import.
-    from jinja2 import Environment, PackageLoader
-
     if not reports:
         raise ValueError("a page needs at least one report.")
     tables = [{m.name: m for m in report.table} for report in reports]
     common = [name for name, n in Counter(n for t in tables for n in t).items() if n > 1]
     compared = [i for i, table in enumerate(tables) if table.keys() & set(common)]
-    pages = Environment(
+    return (
+        page_templates()
+        .get_template("report.html")
+        .render(
+            title=title,
+            reports=reports,
+            linked=linked if len(reports) == 1 else (),
+            common={name: [tables[i].get(name) for i in compared] for name in common},
+            compared=[i + 1 for i in compared],
+            style=files(__package__).joinpath("report.css").read_text(encoding="utf-8"),
+            base64=lambda content: base64.b64encode(content).decode("ascii"),
+            leading=leading,
+            flatten=flatten,
+        )
+    )
+
+
+def page_templates() -> Any:
+    """Templates of pages, in this folder."""
+    # Used only here; it takes some hundredths of a second to import.
+    from jinja2 import Environment, PackageLoader
+
+    return Environment(
         loader=PackageLoader("hrc_learn.viz", ""),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
-    )
-    return pages.get_template("report.html").render(
-        title=title,
-        reports=reports,
-        linked=linked if len(reports) == 1 else (),
-        common={name: [tables[i].get(name) for i in compared] for name in common},
-        compared=[i + 1 for i in compared],
-        style=files(__package__).joinpath("report.css").read_text(encoding="utf-8"),
-        base64=lambda content: base64.b64encode(content).decode("ascii"),
-        leading=leading,
-        flatten=flatten,
     )
 
 

@@ -301,7 +301,7 @@ def test_what_the_camera_cannot_see_is_reported(skills, shift, reason):
     assert all("(not box)" in fault for fault in evaluation.faults)
     # No worker comes without the option.
     assert job.visit is None
-    assert job.separation_margin is None
+    assert job.near_worker is None
     assert "separation_violations" not in evaluation.values
     # There is a report of it all the same.
     recording = record("failed", job.cell, job.world, job.motion, cameras=job.cameras)
@@ -325,7 +325,7 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     assert np.isfinite(log["person_distance"]).all()
     assert (log["person_age"] >= 0).all()
     np.testing.assert_array_equal(log["time"], job.cell.log["time"])
-    assert job.separation_margin.shape == (steps,)
+    assert job.near_worker.margin.shape == (steps,)
     run = record("test", job.cell, job.world, job.motion)
     assert {"worker_head", "worker_hand_left", "worker_item"} <= {b.name for b in run.bodies}
     np.testing.assert_array_equal(run.worker_distance["true"], distance)
@@ -345,7 +345,7 @@ def test_a_job_beside_a_worker_keeps_its_distance_and_is_done(skills):
     assert verdict(job) == ""
     distance = worker_distance(job.motion, len(job.cell.log))
     assert distance.max() > 1.0
-    assert job.separation_margin.min() > 0
+    assert job.near_worker.margin.min() > 0
     assert job.cell.log["pace"].min() < 0.5
     assert job.cell.time > job.cell.task_time + 0.5
     seen = job.cell.log["person_distance"]

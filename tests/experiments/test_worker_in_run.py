@@ -9,7 +9,7 @@ import torch
 from hrc_learn.controller import SeparationConfig
 from hrc_learn.experiments.surroundings import (
     draw_visit,
-    separation_margin,
+    near_worker,
     worker_contacts,
 )
 from hrc_learn.kinematics import panda, separation
@@ -66,9 +66,9 @@ def test_the_margin_is_what_both_would_still_go_while_the_arm_stops():
     log = StepLog()
     for k in range(steps):
         log.append(time=time[k], joint_position=q[k] + offset, joint_velocity=v[k])
-    found = separation_margin(
+    found = near_worker(
         log, VISIT, arm, config, encoder_offset=offset, loads={"box": (box, held)}
-    )
+    ).margin
     expected = []
     for k in range(steps):
         load = box if held[k] else None
@@ -100,7 +100,7 @@ def test_contacts_within_the_limits_need_no_margin_those_of_the_head_do():
             patch.setattr("hrc_learn.experiments.surroundings.REGIONS", regions)
             config = SeparationConfig(mode=mode)
             zero = np.zeros(7)
-            return separation_margin(log, VISIT, arm, config, encoder_offset=zero, loads={})
+            return near_worker(log, VISIT, arm, config, encoder_offset=zero, loads={}).margin
 
     apart, both = margins("ssm"), margins("ssm+pfl")
     assert (both >= apart).all()

@@ -1,0 +1,93 @@
+"""Evidence page: requirements of safety standards beside the values that runs have measured.
+
+`evidence.toml` holds the requirements. The page claims no certification.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.resources import as_file, files
+from typing import Any
+
+from hrc_learn.store import read_toml
+from hrc_learn.viz.report import flatten, page_templates
+from hrc_learn.viz.report_content import Report
+
+
+@dataclass(frozen=True, kw_only=True)
+class Clause:
+    """A requirement and how it is kept."""
+
+    standard: str
+    """Standard with its edition, and the topic or annex."""
+    requirement: str
+    kept: str
+    """Measure that keeps it."""
+    parameters: Sequence[Any]
+    """Ends of the names of settings; on a page each with the values of the runs."""
+    test: str
+    """File of the test that shows it."""
+    measured: Sequence[Any]
+    """Names of the metrics; on a page the measurements of each run."""
+    outside: str
+    """Part of the requirement that this package cannot meet."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Clauses:
+    clause: list[Clause]
+
+
+def clauses() -> list[Clause]:
+    """All requirements."""
+    with as_file(files(__package__) / "evidence.toml") as path:
+        return read_toml(path, _Clauses).clause
+
+
+def evidence_page(reports: Sequence[Report]) -> str:
+    """Page of all requirements with the values of one or several runs, as HTML.
+
+    Args:
+        reports: Reports of the runs, in order; that of a batch holds the values of all trials.
+
+    Raises:
+        ValueError: No run was made near a person.
+    """
+    if not any(m.name == "separation violations" for r in reports for m in r.table):
+        raise ValueError(
+            "none of these runs measured its distance from a person: name runs of "
+            "`hrc run collaboration --worker`."
+        )
+    return (
+        page_templates()
+        .get_template("evidence.html")
+        .render(
+            title="Work near people: requirements and evidence",
+            reports=reports,
+            clauses=[_filled(clause, reports) for clause in clauses()],
+            style=(files(__package__) / "report.css").read_text(encoding="utf-8"),
+        )
+    )
+
+
+def _filled(clause: Clause, reports: Sequence[Report]) -> Clause:
+    """The requirement with the parameters and measurements of the runs."""
+    settings = [flatten(report.configuration) for report in reports]
+    parameters = [
+        (name, list(dict.fromkeys(str(v) for s in settings for v in _ending(s, name))))
+        for name in clause.parameters
+    ]
+    measured = [
+        (
+            number,
+            [m for m in report.table if m.name in clause.measured],
+        )
+        for number, report in enumerate(reports, start=1)
+    ]
+    return replace(clause, parameters=parameters, measured=measured)
+
+
+def _ending(settings: dict[str, Any], name: str) -> list[Any]:
+    """Values of the settings of the work cell, or of any part, whose names end in a name."""
+    found = {key: value for key, value in settings.items() if f".{key}".endswith(f".{name}")}
+    cell = [value for key, value in found.items() if "cell." in key]
+    return cell or list(found.values())

@@ -1,0 +1,61 @@
+"""The page of requirements: what it names exists, and what was measured stands on it."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
+from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
+from hrc_learn.viz.evidence import clauses, evidence_page
+from hrc_learn.viz.report import Measurement, Report
+from hrc_learn.viz.report_content import flatten
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(**changes):
+    values = {
+        "title": "A worker & an arm",
+        "summary": "",
+        "table": [
+            Measurement(name="separation violations", value=0, target=0),
+            Measurement(name="force of contacts, of the limit", value=0.41, target=1.0),
+            Measurement(name="trials, cycle time (median)", value=38.2, unit="s"),
+        ],
+        "configuration": {"cell": {"safety": {"separation": {"mode": "ssm+pfl"}}}},
+        "command": "hrc run collaboration --worker",
+    }
+    return Report(**values | changes)
+
+
+def test_tests_and_settings_and_metrics_exist():
+    settings = flatten(asdict(CollaborationExperiment(aiming=ROOT, placing=ROOT)))
+    measured = {metric.name for metric in collaboration_metrics(1, 0.0)}
+    for clause in clauses():
+        assert (ROOT / clause.test).is_file(), clause.test
+        for name in clause.parameters:
+            assert any(f".{key}".endswith(f".{name}") for key in settings), name
+        assert set(clause.measured) <= measured
+        assert "2025" in clause.standard
+        assert clause.outside
+
+
+def test_the_page_shows_values_settings_and_what_is_outside():
+    page = evidence_page([run(), run(title="Second", table=run().table[:1])])
+    assert "This is no certificate" in page
+    assert "<code>safety.separation.mode</code> = ssm+pfl" in page
+    assert "force of contacts, of the limit 0.41" in page
+    assert "Run 2" in page
+    assert "A worker &amp; an arm" in page
+    assert "emergency stop" in page
+    assert "http" not in page.replace("http-equiv", "")
+    table = [Measurement(name="separation violations", value=3, target=0)]
+    missed = evidence_page([run(table=table)])
+    assert "separation violations 3 (target ≤ 0: missed)" in missed
+
+
+def test_a_run_without_people_is_no_evidence():
+    alone = run(table=[Measurement(name="cycle time", value=3.0)])
+    with pytest.raises(ValueError, match="hrc run collaboration --worker"):
+        evidence_page([alone])
