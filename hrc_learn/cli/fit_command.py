@@ -124,7 +124,7 @@ _SAMPLE_NOTE = (
 
 
 def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
-    """The demonstrations, and notes on those left out.
+    """The demonstrations, and notes on what is left out.
 
     Raises:
         DatasetError: The dataset cannot be read, or a unit is doubtful.
@@ -146,8 +146,17 @@ def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
         where=moves,
         refuse_doubt=True,
     )
-    one_frame = "episodes of a single frame are left out: "
-    return source, [one_frame + ", ".join(map(str, left_out))] if left_out else []
+    notes = []
+    if left_out:
+        notes.append(
+            f"episodes of a single frame are left out: {', '.join(map(str, left_out))}"
+        )
+    if "gripper" in source.units:
+        text = (
+            "no primitive is fitted to the gripper; the policy of --as-lerobot-policy moves it"
+        )
+        notes.append(text)
+    return source, notes
 
 
 def _fit_streamed(args: FitPrimitives) -> None:

@@ -85,7 +85,7 @@ class ImportPlan:
             units = ", ".join(dict.fromkeys(decision.units or (decision.unit,)))
             sure, why = f"{100 * decision.confidence:.0f} %", decision.evidence
             text = f"{role} of {len(selection.columns)}"
-            given = "given" if role in self.options.units else "by its name"
+            given = "given" if role in self.options.units else "declared"
             rows.append(
                 (", ".join(self._tokens(selection.columns)), text, units, sure, why or given)
             )

@@ -139,6 +139,9 @@ def test_commands_and_gripper_are_named_on_the_command_line(tmp_path):
     (demo,) = load_demos(tmp_path / "set")
     np.testing.assert_allclose(demo.command_position, q + 0.01, atol=1e-6)
     np.testing.assert_allclose(demo.gripper, 0.08 * (q[:, 0] > 0), atol=1e-6)
+    fitted = hrc("fit", tmp_path / "set", "--n-basis", 10)
+    assert fitted.status == 0, fitted.error
+    assert "no primitive is fitted to the gripper" in " ".join(fitted.output.split())
 
 
 def test_an_existing_dataset_is_not_touched(recording, tmp_path):

@@ -171,7 +171,7 @@ def test_a_fit_shows_few_rows_with_units(poses, tmp_path):
     assert "< 0.01 %" in row
     assert "ok" in row
     (row,) = [line for line in output.splitlines() if "median NRMSE" in line]
-    assert f"{100 * metrics['mean_position_nrmse_median']:.2f} %" in row
+    assert f"{100 * metrics['mean_position_nrmse_median']:.3g} %" in row
     rows = [line for line in output.splitlines() if line.startswith("│")]
     assert 4 <= len(rows) <= 8
     assert f"{len(metrics) - len(rows)} more" in output

@@ -288,3 +288,12 @@ def test_fit_evaluate_and_repair_report_that_data_changed(root, tmp_path):
 def test_fit_does_not_touch_the_dataset(root, tmp_path):
     done("fit", "--dataset", root, "--out", tmp_path / "model", "--n-basis", 10)
     assert not (root / SIDECAR_PATH).exists()
+
+
+def test_what_only_names_tell_is_not_called_declared(tmp_path):
+    names = ["ee.x", "ee.y", "ee.z", "ee.qw", "ee.qx", "ee.qy", "ee.qz"]
+    pose = np.concatenate([joint_path(240, 3), np.tile([1.0, 0.0, 0.0, 0.0], (240, 1))], axis=1)
+    contract = kept(write_folder(tmp_path / "set", [{STATE: pose}], {STATE: names}, fps=FPS))
+    part = named(contract, STATE, "ee.qw")
+    assert (part.role, part.evidence) == ("quaternion_wxyz", "by its name")
+    assert part.confidence < 1

@@ -204,8 +204,8 @@ def decide_units(
             decisions[role] = UnitDecision(
                 role=role,
                 unit=ROLES[role].unit,
-                confidence=0.8 if assumed else 1.0,
-                evidence=assumed,
+                confidence=0.8 if assumed else 0.95,
+                evidence=assumed or "by its name",
             )
     return decisions
 
