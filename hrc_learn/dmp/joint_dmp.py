@@ -259,6 +259,7 @@ def select_basis_count(
     Raises:
         ValueError: Bad samples or arguments; the message names them.
     """
+    time, mask, (position,) = padded(time, mask, position)
     samples = check_samples(time, position, mask=mask)
     if not candidates or n_folds < 2:
         raise ValueError(f"needs candidates and at least 2 folds, got {candidates}, {n_folds}")

@@ -131,6 +131,11 @@ class FramedDMP:
         dmps = JointDMP.fit(
             time, position, n_basis, mask=mask, joint_names=joint_names, units=units, **options
         )
+        return cls.of(dmps, frames, tolerance)
+
+    @classmethod
+    def of(cls, dmps: JointDMP, frames: Frames, tolerance: float | None = None) -> "FramedDMP":
+        """Learn from primitives (n) of demonstrations; arguments as for `fit`."""
         x = dmps.coordinates().detach().double()
         if x.ndim != 3 or len(x) < 2:
             raise ValueError("frames need a batch of 2 demonstrations or more")

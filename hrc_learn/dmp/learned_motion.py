@@ -1,0 +1,427 @@
+"""Learning without choices: the model of several demonstrations that predicts each best.
+
+A motion is linear in the coordinates x_j of the primitives of n demonstrations, and each model
+is a sum x(c) = sum_j w_j(c) x_j with sum_j w_j = 1: the mean, the nearest demonstration, means
+weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge regression on
+contexts. Without demonstration i the weights are closed form, for the regression by its hat
+matrix (PRESS; Allen 1974), so no model is fitted again. All are shrunk towards the straight
+minimum-jerk motion by the factor that predicts best, from 1 to 0.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp._arguments import to_tensor
+from hrc_learn.dmp.joint_dmp import JointDMP, select_basis_count
+from hrc_learn.dmp.motion_primitive import MotionPrimitive
+from hrc_learn.dmp.orientation_dmp import OrientationDMP
+from hrc_learn.dmp.orientation_error import nearest_turn, to_error
+from hrc_learn.dmp.pose_dmp import PoseDMP
+from hrc_learn.dmp.probabilistic_dmp import mean_primitive, with_common_reference
+from hrc_learn.dmp.task_dmp import FramedDMP, Frames
+from hrc_learn.geometry import Pose
+from hrc_learn.model_files import SavedModel, write_model
+
+KINDS = {kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP)}
+BASIS_COUNTS = (10, 20, 30, 50, 100)
+"""Numbers of basis functions compared."""
+APPROACHES = (1.0, 0.6)
+"""Approaches compared: the smoothest, and one that keeps the end of the path."""
+WIDTHS = (2.0, 1.0, 0.5, 0.25)
+"""Widths of kernels, relative to the spread of the contexts."""
+PENALTIES = (1.0, 0.1, 1e-2, 1e-3, 1e-6)
+"""Ridges relative to the data; the largest is nearly the mean."""
+FEWEST = 4
+"""Smallest number of demonstrations that distinguish a regression from the mean."""
+CLEARLY, DEVIATIONS = 0.02, 0.8
+"""Decrease of the mean error, relative to it and in standard errors, above which a less simple
+model is preferred: on seven sets the predictions of unseen demonstrations were best with 0.5 to
+1 standard errors (`benchmarks/bench_learn.py`)."""
+GRID = 101
+"""Times at which motions are compared."""
+CONSTANT = 1e-9
+"""Spread, relative to the size, below which a context counts as constant."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidate:
+    """A model and its errors."""
+
+    family: str
+    """`"kernel"`, `"ridge"` or `"frames"`."""
+    strength: float
+    """Width of the kernel, infinite for the mean and 0 for the nearest; or the ridge."""
+    approach: float
+    shrinkage: float
+    """Factor on the deviation from the straight motion: 0 leaves nothing else."""
+    error: Float[Tensor, "n"]
+    """Root mean square error of each demonstration predicted from all others, relative to its
+    largest range."""
+
+    @property
+    def name(self) -> str:
+        """Model in words."""
+        if self.shrinkage == 0:
+            return "straight line"
+        names = {("kernel", math.inf): "mean", ("kernel", 0.0): "nearest demonstration"}
+        plain = {"kernel": f"kernel of width {self.strength:g}", "frames": "frames"}
+        plain["ridge"] = f"regression with ridge {self.strength:g}"
+        name = names.get((self.family, self.strength), plain[self.family])
+        shrunk = "" if self.shrinkage == 1 else f", shrunk to {self.shrinkage:.2f}"
+        return f"{name}{shrunk}, approach {self.approach:g}"
+
+
+def learn(
+    demonstrations: Sequence[Any],
+    *,
+    context: Any = None,
+    frames: Frames | None = None,
+    n_basis: int | None = None,
+    approach: float | None = None,
+    **options: Any,
+) -> "LearnedMotion":
+    """Learn a motion from demonstrations, with basis, approach and model by held-out error.
+
+    Args:
+        demonstrations: Demonstrations with `time` and `joint_position`, `position` or
+            `orientation`, as from `load_demos`; or pairs of times (T,) [s] and joints (T, D),
+            unit quaternions in a `Pose` with positions, or other coordinates.
+        context: (n, C) known before the motion. None: start and goal.
+        frames: (n, F) frames of each demonstration, for positions in space.
+        n_basis: N. None: the smallest of `BASIS_COUNTS` with the least error on held-out
+            samples.
+        approach: As in `FitOptions`. None: one of `APPROACHES`.
+        options: Further options of `fit` of the kind of primitive.
+
+    Raises:
+        ValueError: No demonstrations, bad samples, or contexts or frames of another number.
+    """
+    if not len(demonstrations):
+        raise ValueError("there are no demonstrations to learn from")
+    times, values = zip(*map(_samples, demonstrations), strict=True)
+    fit, linear = _fit_of(times, values)
+    if n_basis is None:
+        n_basis = _basis_count(times, linear)
+    options = {"smooth": True, **options}
+    fits = [fit(n_basis, approach=b, **options) for b in _given(approach, APPROACHES)]
+    return choose(fits, context, frames)
+
+
+def choose(
+    fits: Sequence[MotionPrimitive], context: Any = None, frames: Frames | None = None
+) -> "LearnedMotion":
+    """Model of least held-out error, among primitives fitted with different options.
+
+    Args:
+        fits: Primitives (n) of the same demonstrations, fitted with `scaling="none"`.
+        context: (n, C) known before the motion. None: start and goal, in columns.
+        frames: (n, F) frames of each demonstration; joint primitives only.
+    """
+    fits = [with_common_reference(each) for each in fits]
+    x = _coordinates(fits[0])
+    n = len(x)
+    given = torch.cat([x[..., -2], x[..., -1]], dim=-1)
+    if context is not None:
+        given = to_tensor(context, torch.float64).reshape(n, -1)
+        if not given.isfinite().all():
+            raise ValueError("context must be finite")
+    found = [c for each in fits for c in _candidates(each, given, frames)]
+    best = found[0]
+    for candidate in found[1:] if n > 1 else ():
+        better = best.error - candidate.error
+        chance = DEVIATIONS * better.std() / n**0.5
+        if better.mean() > max(CLEARLY * best.error.mean(), chance):
+            best = candidate
+    each = next(f for f in fits if f.motion.response.approach == best.approach)
+    return LearnedMotion(
+        each=each,
+        context=given,
+        by_ends=context is None,
+        frames=frames if best.family == "frames" else None,
+        chosen=best,
+        candidates=tuple(found),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LearnedMotion:
+    """Motion as a function of start, goal, and a context or frames, by the best model."""
+
+    each: MotionPrimitive
+    """Primitives (n) of the demonstrations, with one reference of orientations."""
+    context: Float[Tensor, "n C"]
+    by_ends: bool
+    """True if the context is start and goal in columns."""
+    frames: Frames | None
+    """Frames (n, F) if the model is one of frames."""
+    chosen: Candidate
+    candidates: tuple[Candidate, ...] = ()
+    """All models compared; none after loading."""
+
+    def at(
+        self,
+        start: Any = None,
+        goal: Any = None,
+        duration: Any = None,
+        *,
+        context: Any = None,
+        frames: Frames | None = None,
+    ) -> Any:
+        """Primitive for a start, goal and duration, by default those that the model predicts.
+
+        Args:
+            start: Start of one motion, as `rollout` of the primitives takes it.
+            goal: Goal.
+            duration: [s].
+            context: (C,) if contexts were given to learn from.
+            frames: (F,) if the model is one of frames.
+
+        Raises:
+            ValueError: A context or frames are missing, or have another size.
+        """
+        reference = getattr(self.each, "reference", None)
+        reference = None if reference is None else reference.reshape(-1, 4)[0]
+        like = self.each.with_motion(mean_primitive(self.each).motion, reference)
+        if self.by_ends:
+            asked = _ends(like, like.with_boundary(start, goal)).reshape(1, -1)
+        elif context is None and self.chosen.family != "frames":
+            raise ValueError(f"give the context of the motion, {self.context.shape[1]} numbers")
+        else:
+            asked = to_tensor(0.0 if context is None else context, torch.float64).reshape(1, -1)
+        if self.chosen.family == "frames":
+            assert self.frames is not None
+            if frames is None:
+                raise ValueError(f"give the {self.frames.b.shape[-2]} frames of the motion")
+            x = FramedDMP.of(cast(JointDMP, self.each), self.frames).at(frames).coordinates()
+            w = x.new_full((1, len(self.context)), 1 / len(self.context))
+        else:
+            if asked.shape[-1] != self.context.shape[-1]:
+                raise ValueError(
+                    f"context must have {self.context.shape[-1]} numbers, got {asked.shape[-1]}"
+                )
+            w = _weights(self.chosen.family, self.chosen.strength, self.context, asked)
+            x = torch.einsum("n,ndm->dm", w[0], _coordinates(self.each))
+        lasting = (w @ self.each.motion.duration.detach().double().log()).exp()[0]
+        x = _shrunk(x.detach(), self.chosen.shrinkage)
+        motion = like.motion.with_coordinates(x, lasting)
+        return like.with_motion(motion, reference).with_boundary(start, goal, duration)
+
+    def rollout(self, time: Any = None, *arguments: Any, **options: Any) -> Any:
+        """Motion at times [s]; other arguments as for `at`."""
+        return self.at(*arguments, **options).rollout(time)
+
+    @property
+    def reasons(self) -> str:
+        """The chosen model, its held-out error, and those of the usual ones, in a few lines."""
+        each, known = self.each.motion, {"chosen": self.chosen}
+        for candidate in self.candidates:
+            name = candidate.name.split(",")[0]
+            if name in ("mean", "nearest demonstration", "straight line"):
+                known.setdefault(name, candidate)
+        lines = [
+            f"{name}: {100 * c.error.median():.2f} % median, "
+            f"{100 * c.error.quantile(0.9):.2f} % at the 90th percentile"
+            for name, c in known.items()
+        ]
+        about = f"{self.chosen.name}, {each.basis.count} basis functions"
+        return "\n".join([f"{about}; held-out error relative to the range:", *lines])
+
+    def save(self, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+        tensors = self.each.tensors() | {"context": self.context, "error": self.chosen.error}
+        if self.frames is not None:
+            tensors |= {"frames.A": self.frames.A, "frames.b": self.frames.b}
+        own = {k: v for k, v in vars(self.chosen).items() if k != "error"}
+        # JSON has no infinite numbers.
+        own["strength"] = None if math.isinf(self.chosen.strength) else self.chosen.strength
+        own |= {"by_ends": self.by_ends, "primitive": type(self.each).__name__}
+        config = self.each.motion.config() | {"learned": own}
+        write_model(folder, type(self).__name__, config, tensors)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "LearnedMotion":
+        """Read a motion that `save` wrote.
+
+        Raises:
+            FileNotFoundError: The folder holds no saved motion.
+            ValueError: A wrong field; the message names the file and the field.
+        """
+        saved = SavedModel(folder, cls.__name__)
+        own = dict(saved.get("learned", dict))
+        try:
+            kind, by_ends = KINDS[own.pop("primitive")], bool(own.pop("by_ends"))
+            own["strength"] = math.inf if own["strength"] is None else float(own["strength"])
+            chosen = Candidate(**own, error=saved.tensor("error"))
+        except (KeyError, TypeError, ValueError) as error:
+            raise saved.invalid_field("learned", error) from None
+        frames = None
+        if chosen.family == "frames":
+            frames = Frames(saved.tensor("frames.A"), saved.tensor("frames.b"))
+        each, context = kind.restore(saved), saved.tensor("context")
+        return cls(each=each, context=context, by_ends=by_ends, frames=frames, chosen=chosen)
+
+
+def _samples(demonstration: Any) -> tuple[Tensor, Any]:
+    """Times and values of one demonstration."""
+    if not hasattr(demonstration, "time"):
+        time, values = demonstration
+        if isinstance(values, Pose):
+            return to_tensor(time), values
+        values = to_tensor(values)
+        return to_tensor(time), values[:, None] if values.ndim == 1 else values
+    time = to_tensor(demonstration.time)
+    for name in ("joint_position", "position"):
+        values = getattr(demonstration, name, None)
+        turned = getattr(demonstration, "orientation", None)
+        if values is not None and name == "position" and turned is not None:
+            return time, Pose(to_tensor(values), to_tensor(turned))
+        if values is not None:
+            return time, to_tensor(values)
+    raise ValueError("a demonstration has neither joint positions nor positions")
+
+
+def _fit_of(
+    times: Sequence[Tensor], values: Sequence[Any]
+) -> tuple[Callable[..., MotionPrimitive], list[Tensor]]:
+    """Fit of the kind of primitive, and the coordinates by which the basis is chosen."""
+    if isinstance(values[0], Pose):
+        position = [pose.position for pose in values]
+        turned = [pose.orientation for pose in values]
+        return partial(PoseDMP.fit, list(times), position, turned), position
+    return partial(JointDMP.fit, list(times), list(values)), list(values)
+
+
+def _basis_count(times: Sequence[Tensor], values: Sequence[Tensor]) -> int:
+    """Smallest number of functions with the least error on held-out samples."""
+    shortest = min(map(len, times))
+    possible = [n for n in BASIS_COUNTS if 2 * n <= shortest]
+    if len(possible) < 2:
+        return BASIS_COUNTS[0]
+    return select_basis_count(list(times), list(values), possible, n_folds=3, smooth=True).count
+
+
+def _given[T](value: T | None, usual: Sequence[T]) -> Sequence[T]:
+    return usual if value is None else (value,)
+
+
+def _coordinates(each: MotionPrimitive) -> Float[Tensor, "n D M"]:
+    x = each.motion.coordinates().detach().double()
+    return x.reshape(-1, *x.shape[-2:])
+
+
+def _ends(like: Any, moved: Any) -> Float[Tensor, "2 D"]:
+    """Start and goal of a primitive in the columns of another."""
+    ends = torch.stack([moved.motion.start, moved.motion.goal])
+    if (errors := like.error_columns) is not None:
+        turned = [getattr(end, "orientation", end) for end in (moved.start, moved.goal)]
+        usual = torch.stack([like.motion.start, like.motion.goal])[:, errors]
+        error = to_error(torch.stack(turned), like.reference)
+        ends[:, errors] = nearest_turn(error, usual)
+    return ends
+
+
+def _shrunk(x: Float[Tensor, "*batch D M"], factor: float) -> Float[Tensor, "*batch D M"]:
+    """Coordinates between the straight motion from start to goal, and these."""
+    return torch.cat([factor * x[..., :-2], x[..., -2:]], dim=-1)
+
+
+def _candidates(
+    each: MotionPrimitive, context: Float[Tensor, "n C"], frames: Frames | None
+) -> list[Candidate]:
+    """Models of primitives, the simplest first, each with and without shrinkage."""
+    x, response = _coordinates(each), each.motion.response
+    n, make = len(x), partial(Candidate, approach=response.approach)
+    if n == 1:
+        zero = torch.zeros(1, dtype=torch.float64)
+        return [make(family="kernel", strength=math.inf, shrinkage=1.0, error=zero)]
+    models = [("kernel", width) for width in (math.inf, *WIDTHS, 0.0)]
+    models += [("ridge", penalty) for penalty in PENALTIES if n >= FEWEST]
+    held = [
+        (family, strength, torch.einsum("in,ndm->idm", w, x))
+        for family, strength in models
+        for w in [_weights(family, strength, context)]
+    ]
+    if frames is not None:
+        held.append(("frames", 1.0, _from_frames(cast(JointDMP, each), frames)))
+    rows = response.evaluate(torch.linspace(0, 1, GRID).to(x))[:, 0]
+    shown, found = x @ rows.mT, []
+    scale = _scale(each, shown)
+    for family, strength, made in held:
+        made = torch.cat([made[..., :-2], x[..., -2:]], dim=-1)
+        straight = _shrunk(made, 0.0) @ rows.mT / scale
+        bent, wanted = made @ rows.mT / scale - straight, shown / scale - straight
+        factor = (bent * wanted).sum() / bent.square().sum().clamp(min=1e-30)
+        for shrinkage in (1.0, float(factor.clamp(0, 1)), 0.0):
+            error = (shrinkage * bent - wanted).square().mean((-2, -1)).sqrt()
+            found.append(
+                make(family=family, strength=strength, shrinkage=shrinkage, error=error)
+            )
+    return found
+
+
+def _scale(each: MotionPrimitive, shown: Float[Tensor, "n D T"]) -> Float[Tensor, "n D 1"]:
+    """Unit of the error of each column: the largest range among columns of its kind.
+
+    Positions, orientation errors and bodies are of different kinds; one that does not move has
+    the unit one.
+    """
+    span = shown.amax(-1) - shown.amin(-1)
+    errors = each.error_columns
+    parts = [slice(None)]
+    if errors is not None:
+        parts = [slice(0, errors.start), errors, slice(errors.stop, None)]
+    for part in parts:
+        if span[:, part].numel():
+            largest = span[:, part].amax(1, keepdim=True)
+            span[:, part] = torch.where(largest > CONSTANT, largest, 1.0)
+    return span[..., None]
+
+
+def _from_frames(each: JointDMP, frames: Frames) -> Float[Tensor, "n D M"]:
+    """Coordinates of each demonstration, predicted from its frames and all others."""
+    n, made = len(each), []
+    for i in range(n):
+        rest = torch.arange(n) != i
+        model = FramedDMP.of(each[rest], Frames(frames.A[rest], frames.b[rest]))
+        made.append(model.at(Frames(frames.A[i], frames.b[i])).coordinates().detach().double())
+    return torch.stack(made)
+
+
+def _weights(
+    family: str,
+    strength: float,
+    known: Float[Tensor, "n C"],
+    asked: Float[Tensor, "q C"] | None = None,
+) -> Float[Tensor, "q n"]:
+    """Weights w(c) of the demonstrations, for contexts or, held out, for each of their own."""
+    held_out, n = asked is None, len(known)
+    query = known if asked is None else asked.to(known)
+    spread = known.std(0) if n > 1 else torch.zeros_like(known[0])
+    varies = spread > CONSTANT * (1 + known.abs().amax(0))
+    middle, spread = known.mean(0), torch.where(varies, spread, math.inf)
+    a, b = (query - middle) / spread, (known - middle) / spread
+    if family == "kernel":
+        distance = torch.cdist(a, b) / max(int(varies.sum()), 1) ** 0.5
+        if math.isinf(strength):
+            distance, strength = torch.zeros_like(distance), 1.0
+        if held_out:
+            distance.fill_diagonal_(math.inf)
+        if strength == 0:
+            return torch.nn.functional.one_hot(distance.argmin(1), n).to(known)
+        return torch.softmax(-((distance / strength) ** 2) / 2, dim=1)
+    A, Q = (torch.nn.functional.pad(z, (1, 0), value=1.0) for z in (b, a))
+    penalty = n * strength * torch.eye(A.shape[1]).to(A)
+    penalty[0, 0] = 0  # the constant is not penalised
+    hat = Q @ torch.linalg.solve(A.mT @ A + penalty, A.mT)
+    if not held_out:
+        return hat
+    own = hat.diagonal().clone()
+    return (hat - torch.diag(own)) / (1 - own)[:, None].clamp(min=1e-12)
