@@ -446,7 +446,7 @@ class _Batch:
             contact = None
             if self._true_limits is not None:
                 regions, load = self._regions[columns], bool(holding[rows[0]])
-                contact = self._true_limits.speeds(near, q[rows], regions, load)
+                contact = self._true_limits.speeds(near, q[rows], regions, load).first
             spare = margin_to_stop(near, v[rows], speed, self._separation, contact)
             margin, runs = spare.amin((-2, -1)), live[rows]
             closing = near.distance.masked_fill(spare.isinf(), torch.inf)

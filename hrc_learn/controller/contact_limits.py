@@ -146,6 +146,15 @@ def contact_speed(
     return torch.where(clamped, torch.minimum(held, free), free)
 
 
+class ContactSpeeds(NamedTuple):
+    """Highest relative speeds of contacts [m/s]; zero where none is allowed."""
+
+    first: Float[Tensor, "*batch C H"]
+    """Speeds at which arm and person may meet."""
+    lasting: Float[Tensor, "*batch C H"]
+    """Speeds that keep quasi-static limits, for contacts that last."""
+
+
 def contact_speeds(
     found: Separation,
     mass: Float[Tensor, "*#batch joints joints"],
@@ -154,7 +163,7 @@ def contact_speeds(
     config: ContactConfig,
     reaction_time: float,
     deceleration: float,
-) -> Float[Tensor, "*batch C H"]:
+) -> ContactSpeeds:
     """`contact_speed` of all parts of an arm with all parts of a person [m/s].
 
     Args:
@@ -171,7 +180,11 @@ def contact_speeds(
     inverse_mass = (whitened * whitened).sum(-2).unflatten(-1, found.distance.shape[-2:])
     region = region.unsqueeze(-2)
     held = clamped(found, furniture, _TABLE.like(mass)[region][..., -1])
-    return contact_speed(inverse_mass, region, held, config, reaction_time, deceleration)
+
+    def speeds(held: Tensor) -> Tensor:
+        return contact_speed(inverse_mass, region, held, config, reaction_time, deceleration)
+
+    return ContactSpeeds(speeds(held), speeds(torch.ones_like(held)))
 
 
 def clamped(

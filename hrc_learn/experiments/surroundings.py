@@ -341,7 +341,7 @@ def near_worker(
         ends, speed = torch.from_numpy(there.ends), torch.from_numpy(there.velocity)
         radius = torch.from_numpy(there.radius).expand(len(steps), -1)
         found = separation(arm, q[steps], ends, radius, load)
-        contact = limits.speeds(found, q[steps], regions, load is not None)
+        contact = limits.speeds(found, q[steps], regions, load is not None).first
         spare = margin_to_stop(found, v[steps], speed, config, contact)
         margin[steps] = spare.amin((-2, -1)).numpy()
         pushes = -found.rate(v[steps], torch.zeros_like(speed)) > _AT_REST

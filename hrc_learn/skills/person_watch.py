@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hrc_learn.controller import ConstraintConfig, Distances, SeparationConfig
-from hrc_learn.controller.contact_limits import contact_speeds, region_numbers
+from hrc_learn.controller.contact_limits import ContactSpeeds, contact_speeds, region_numbers
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.kinematics.inertia import MassMatrix
@@ -44,7 +44,8 @@ class PersonWatchConfig:
     urgent ones."""
     contact: float = 0.03
     """Observed distance below which a person may touch the arm [m], three standard deviations
-    of a tracker's noise. The arm stops, as the direction away from the person is not known."""
+    of a tracker's noise. The arm stops, as the direction away from the person is not known;
+    where contact is allowed it only stops to approach the person."""
     fastest: float = 1.0
     """Highest speed of a part of the arm [m/s]: the default of `SafetyConfig.tcp_speed`. A
     person who may be touched slows the arm down to this times the speed scale."""
@@ -178,8 +179,8 @@ class ContactLimits:
         joints: Float[Tensor, "*batch joints"],
         regions: Int[Tensor, "*#batch H"],
         holds: bool,
-    ) -> Float[Tensor, "*batch C H"]:
-        """Highest relative speeds of contacts [m/s], zero where none is allowed.
+    ) -> ContactSpeeds:
+        """Highest relative speeds of contacts.
 
         Args:
             found: Distances between arm and person.
@@ -205,7 +206,7 @@ def urgent_distances(
     age: Float[Tensor, "*batch"],
     separation: SeparationConfig,
     config: PersonWatchConfig,
-    contact: Float[Tensor, "*batch C H"] | None = None,
+    contact: ContactSpeeds | None = None,
 ) -> Distances:
     """Distances of the most urgent pairs, for people observed some time ago.
 
@@ -215,22 +216,26 @@ def urgent_distances(
         age: Age of the observation [s].
         separation: Protective distance, by which the urgency of pairs is judged.
         config: Assumptions about people.
-        contact: Highest relative speeds of contacts [m/s]; None: no contact is allowed.
+        contact: Highest relative speeds of contacts; None: no contact is allowed.
 
     Returns:
         The distances, reduced by the distance that people may have moved since. NaN where they
-        may touch the arm.
+        may touch the arm and must not.
     """
     # Speed that people may have gained since, and gain until the arm reacts.
     gain = (config.acceleration * (age + separation.reaction_time))[..., None, None]
     towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten(-2)
     distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
-    speed = None if contact is None else contact.flatten(-2)
+    # A contact that has begun may last, so that quasi-static limits hold.
+    near, speed = found.distance < config.contact, None
+    if contact is not None:
+        speed = torch.where(near, contact.lasting, contact.first).flatten(-2)
+        near = near & (contact.first <= 0)
     allowed = separation.allowed_speed(distance, towards, speed)
     # Among pairs that allow no approach the nearest are the most urgent.
     number = min(config.pairs, distance.shape[-1])
     _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
-    touching = found.distance.flatten(-2).amin(-1, keepdim=True) < config.contact
+    touching = near.flatten(-2).any(-1, keepdim=True)
     return Distances(
         distance=distance.gather(-1, urgent).masked_fill(touching, _NAN),
         gradient=found.gradient_of(urgent),
@@ -246,7 +251,7 @@ def person_speed_scale(
     age: Float[Tensor, "*batch"],
     separation: SeparationConfig,
     config: PersonWatchConfig,
-    contact: Float[Tensor, "*batch C H"] | None = None,
+    contact: ContactSpeeds | None = None,
 ) -> Float[Tensor, "*batch"]:
     """Speed scale imposed on the arm by approaching people, 0 to 1.
 
@@ -263,7 +268,7 @@ def person_speed_scale(
         age: Age of the observation [s].
         separation: Protective distance, for the reaction time of the arm.
         config: Assumptions about people.
-        contact: Highest relative speeds of contacts [m/s]; None: no contact is allowed.
+        contact: Highest relative speeds of contacts; None: no contact is allowed.
     """
     coming = (-found.person_rate(velocity)).clamp(min=0)
     # The root t of  coming t + a t^2/2 = distance.
@@ -274,5 +279,7 @@ def person_speed_scale(
     late = (age + separation.reaction_time)[..., None, None]
     scale = ((arrival - late) / _COMING_TO_REST).clamp(0, 1)
     if contact is not None:
-        scale = scale.maximum(((contact - coming - a * late) / config.fastest).clamp(0, 1))
+        scale = scale.maximum(
+            ((contact.first - coming - a * late) / config.fastest).clamp(0, 1)
+        )
     return scale.amin((-2, -1))

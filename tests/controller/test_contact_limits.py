@@ -121,7 +121,7 @@ def test_the_mass_behind_a_contact_is_that_of_the_arm_at_its_posture(load):
     matrix = MassMatrix(panda, 0.1)
     speeds = contact_speeds(
         found, matrix(q, load), region_numbers(["hand"] * 3), (), ContactConfig(used=1.0), T, A
-    )
+    ).first
     region, h = BODY_REGIONS["hand"], 1e-6
     M = matrix(q, load).numpy()
     for c, p in product((3, 6, 9, -1), range(3)):
@@ -148,7 +148,7 @@ def test_a_load_makes_contacts_slower():
     light, heavy = (
         contact_speeds(
             found, matrix(q, load), region_numbers(["chest"]), (), ContactConfig(), T, A
-        )[-1]
+        ).first[-1]
         for load in (0.0, 3.0)
     )
     assert (heavy < 0.95 * light).all()
@@ -181,7 +181,7 @@ def test_only_what_lies_between_arm_and_furniture_is_clamped():
             ContactConfig(),
             T,
             A,
-        )
+        ).first
         for near in ([], [TABLE])
     )
     assert squeezed[hand, 0] < 0.1 * free[hand, 0]
