@@ -1,7 +1,7 @@
 """`hrc record`: demonstrations by a scripted expert in simulation, or by a leader arm."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -21,6 +21,7 @@ from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.hardware.lerobot_device import GRIPPER, LeaderArm
 from hrc_learn.kinematics import Arm, ArmChoice
 from hrc_learn.sim import CameraKind, PhysicsError, World, open_camera
+from hrc_learn.sim.unmarked_scene import UnmarkedLook, unmarked
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.skills.marker_sensor import MarkerSensor
@@ -33,12 +34,15 @@ from hrc_learn.skills.visual_skill import (
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import Frame
 from hrc_learn.teleoperation.scripted_demonstrations import (
+    FILM,
     PlacingDemonstrationConfig,
     ServoDemonstrationConfig,
     demonstrate_placing_without_contact,
     demonstrate_servoing,
+    film_servoing,
     write_demonstrations,
 )
+from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 _DEFAULTS = {"placing": (3, 0), "servoing": (8, 1), "expert": (10, 0), "leader": (5, 0)}
 """Number of episodes and seed by kind of demonstration."""
@@ -103,6 +107,8 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     settings = _Settings(demonstration=ServoDemonstrationConfig())
     settings = with_settings(args.config, settings)
     config = settings.demonstration
+    if config.markerless:
+        return _film_servoing(args, config, episodes, seed)
     workplace, world, rng = _work_cell(args, seed)
     camera = open_camera(world, settings.camera, rng=rng)
     sensor = MarkerSensor(camera, workplace.scene.marker_ids)
@@ -120,6 +126,28 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     write_values(args.json, {"episodes": episodes, "marker_seen_min": min(visible)})
 
 
+def _film_servoing(
+    args: Record, config: ServoDemonstrationConfig, episodes: int, seed: int
+) -> None:
+    """Visual servoing without markers: joints, poses and the camera's video."""
+    workplace, _, rng = _work_cell(args, seed)
+    workplace = replace(workplace, scene=unmarked(workplace.scene, UnmarkedLook(seed=seed)))
+    world = World(workplace.scene)
+    sensor = MarkerSensor(open_camera(world, "synthetic", rng=rng), workplace.scene.marker_ids)
+    camera = open_camera(world, "egl", rng=rng)
+    # A finder needs fewer images than a tracker of markers.
+    config = replace(config, record_every=2 * config.record_every)
+
+    def demonstrate() -> Iterator[Frame]:
+        return film_servoing(world, workplace, sensor, camera, config, rng)
+
+    width, height = IMAGE_SIZE
+    cameras = {FILM: (height, width)}
+    _write(args, workplace, demonstrate, "servo to the box", config.fps, cameras=cameras)
+    print(f"{episodes} demonstrations with video in {args.out}")
+    write_values(args.json, {"episodes": episodes})
+
+
 def _work_cell(args: Record, seed: int) -> tuple[Workplace, World, np.random.Generator]:
     workplace = Workplace.of(ArmChoice(args.robot).work_arm())
     return workplace, World(workplace.scene), np.random.default_rng(seed)
@@ -128,10 +156,11 @@ def _work_cell(args: Record, seed: int) -> tuple[Workplace, World, np.random.Gen
 def _write(
     args: Record,
     workplace: Workplace,
-    demonstrate: Callable[[], list[Frame]],
+    demonstrate: Callable[[], Iterable[Frame]],
     task: str,
     fps: float,
     features: Mapping[str, Sequence[str]] | None = None,
+    cameras: Mapping[str, tuple[int, int]] | None = None,
 ) -> None:
     """Record the demonstrations into the dataset, one after another."""
     assert args.episodes is not None
@@ -143,6 +172,7 @@ def _write(
         fps,
         robot=workplace.robot,
         features=features,
+        cameras=cameras,
         details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
         overwrite=args.overwrite,
     )

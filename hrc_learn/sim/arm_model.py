@@ -54,19 +54,24 @@ class Plate:
     """Orientation of the plate's frame (wxyz): x along the marker's top edge, y up its side."""
     solid: bool = True
     """True if the plate collides with objects; a sticker on a box does not."""
+    printed: bool = True
+    """False: there is no plate; its frame stays, as a true place to measure against."""
 
 
 def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
     """Add a plate to a body: geom `name` (picture), site `name` (frame of the marker)."""
     half = plate.marker.plate_size / 2
-    _add_picture(spec, name, marker_texture(plate.marker.id, _TEXELS))
+    pose = {"pos": plate.position, "quat": plate.orientation}
+    body.add_site(name=name, group=4, **pose)  # groups above 2 are not drawn
+    if not plate.printed:
+        return
+    add_picture(spec, name, np.repeat(marker_texture(plate.marker.id, _TEXELS)[..., None], 3, 2))
     mesh = spec.add_mesh(name=name)
     mesh.uservert = [-half, -half, 0, half, -half, 0, half, half, 0, -half, half, 0]
     mesh.userface = [0, 1, 2, 0, 2, 3]
     mesh.usertexcoord = [0, 1, 1, 1, 1, 0, 0, 0]
     mesh.userfacetexcoord = [0, 1, 2, 0, 2, 3]
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    pose = {"pos": plate.position, "quat": plate.orientation}
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_MESH,
@@ -77,7 +82,6 @@ def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
         mass=0.0,
         **pose,
     )
-    body.add_site(name=name, group=4, **pose)  # groups above 2 are not drawn
     if plate.solid:
         normal = np.zeros(3)
         mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), np.array(plate.orientation))
@@ -110,7 +114,8 @@ def add_capsule(body, name: str, capsule: Capsule, colour):
     )
 
 
-def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
+def add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
+    """Add a material that shows an RGB picture."""
     texture = spec.add_texture(
         name=name,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -118,7 +123,7 @@ def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
         height=pixels.shape[0],
         nchannel=3,
     )
-    texture.data = np.repeat(pixels[..., None], 3, axis=-1).tobytes()
+    texture.data = pixels.tobytes()
     material = spec.add_material(name=name, specular=0.0, shininess=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
@@ -219,7 +224,7 @@ def whole_arm(config: ArmModelConfig) -> CapsuleArm:
     closed fingers by up to 43 mm and beyond the plate by 11 mm.
     """
     plate, robot = config.marker, config.robot
-    if plate is None:
+    if plate is None or not plate.printed:
         return robot.whole
     R = quaternion.to_matrix(torch.tensor(plate.orientation, dtype=torch.float64)).numpy()
     half = plate.marker.plate_size / 2

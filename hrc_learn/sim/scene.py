@@ -164,6 +164,14 @@ def _marked_arm() -> ArmModelConfig:
     return ArmModelConfig(robot=panda, marker=marked_plate())
 
 
+class Look:
+    """Look of a scene beyond its plain colours."""
+
+    def apply(self, spec: mujoco.MjSpec, config: "SceneConfig") -> None:
+        """Change the description of a scene."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
     """Everything that stands in the workplace."""
@@ -177,6 +185,8 @@ class SceneConfig:
     """Obstacles that people put in the way and take away again (`World.move_obstacle`)."""
     worker: WorkerConfig | None = None
     """Worker at the table (`World.move_worker`); None: no worker."""
+    look: Look | None = None
+    """Look without markers (`unmarked_scene`); None: plain colours, and markers."""
     timestep: float = 0.002
     """Physics step [s]."""
 
@@ -202,12 +212,14 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
     for obstacle in config.obstacles:
         _add_box(spec, obstacle).mocap = True
     for item in config.objects:
-        _add_object(spec, item)
+        _add_object(spec, item, printed=config.look is None)
     # A board that may be held in front of the camera; nothing can touch it.
     board = spec.worldbody.add_body(name=OCCLUDER, pos=NOWHERE, mocap=True)
     add_box(board, OCCLUDER, OCCLUDER_HALF_SIZE, OCCLUDER_COLOUR, contype=0, conaffinity=0)
     if config.worker is not None:
         _add_worker(spec, Worker(config.worker), config.objects)
+    if config.look is not None:
+        config.look.apply(spec, config)
     return spec
 
 
@@ -260,7 +272,7 @@ def _add_box(spec: mujoco.MjSpec, box: Box):
     return body
 
 
-def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
+def _add_object(spec: mujoco.MjSpec, item: ObjectConfig, printed: bool) -> None:
     body = spec.worldbody.add_body(name=item.name, pos=(0.22, 0.5, item.half_size[2]))
     body.add_freejoint(name=item.name)
     friction = (1.0, 0.02, 0.001)  # sliding, about the normal [m], rolling [m]
@@ -268,7 +280,10 @@ def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
         body, item.name, item.half_size, item.colour, mass=item.mass, friction=friction, **FIRM
     )
     top = Plate(
-        marker=item.marker, position=(0.0, 0.0, item.half_size[2] + 0.0005), solid=False
+        marker=item.marker,
+        position=(0.0, 0.0, item.half_size[2] + 0.0005),
+        solid=False,
+        printed=printed,
     )
     add_plate(spec, body, f"{item.name}_marker", top)
 

@@ -15,9 +15,10 @@ from jaxtyping import Float
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import Arm, SerialChain, coarse_orientation, gripper_down
-from hrc_learn.protocols import Human, OpenedArm
+from hrc_learn.protocols import Camera, Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
@@ -93,12 +94,13 @@ def guided_frames(
 
 def write_demonstrations(
     path: Path,
-    demonstrations: Iterable[Sequence[Frame]],
+    demonstrations: Iterable[Iterable[Frame]],
     task: str,
     fps: float,
     *,
     robot: Arm,
     features: Mapping[str, Sequence[str]] | None = None,
+    cameras: Mapping[str, tuple[int, int]] | None = None,
     details: Mapping[str, object] | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -111,6 +113,7 @@ def write_demonstrations(
         fps: Frames per second.
         robot: The arm.
         features: Columns beyond the usual ones: key, and names of the components.
+        cameras: Height and width of the images [px] that frames have, by camera.
         details: Anything else worth keeping with the dataset.
         overwrite: Replace an older dataset in that folder.
 
@@ -125,6 +128,7 @@ def write_demonstrations(
             robot_type=robot.name,
             joint_names=robot.chain.joint_names,
             features=features,
+            cameras=cameras,
             frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
             details=details,
         ) as writer,
@@ -132,7 +136,7 @@ def write_demonstrations(
         for frames in demonstrations:
             writer.start_episode(task)
             for frame in frames:
-                writer.add_frame(images=None, **frame)
+                writer.add_frame(**frame)
             writer.save_episode()
 
 
@@ -154,6 +158,12 @@ class ServoDemonstrationConfig(DemonstrationConfig):
     """Amplitude of small rotations on the way, which show their effect in the image [rad]."""
     record_every: int = 4
     """Control steps from one recorded frame, and image, to the next."""
+    markerless: bool = False
+    """Film a scene without markers in place of recording their pixels."""
+
+
+FILM = "front"
+"""Name of the camera that films demonstrations."""
 
 
 def servo_expert(
@@ -218,6 +228,78 @@ def demonstrate_servoing(
     Raises:
         ValueError: If the camera does not see the object anywhere.
     """
+    expert, target = _arranged(world, workplace, sensor, config, rng)
+    last = np.zeros((4, 2))
+
+    def observe() -> Frame:
+        nonlocal last
+        corners = sensor.corners().get(HAND_MARKER)
+        last = last if corners is None else corners
+        return {
+            "feature": centre(last) if last.any() else last[0],
+            "feature_visible": corners is not None,
+            OBJECT_FEATURE: np.array([*centre(target), 1.0]),
+            ANGLE_FEATURE: np.array([angle(last), angle(target)]),
+        }
+
+    with open_arm(world) as opened:
+        return list(guided_frames(world.arm.robot.chain, opened, expert, config, observe))
+
+
+def film_servoing(
+    world: World,
+    workplace: Workplace,
+    sensor: MarkerSensor,
+    camera: Camera,
+    config: ServoDemonstrationConfig,
+    rng: np.random.Generator,
+) -> Iterator[Frame]:
+    """Demonstrate one motion that ends above an object, and film it.
+
+    Args:
+        world: Reset for the demonstration.
+        workplace: Workplace of the demonstration.
+        sensor: Tells where an object is in view; no pixel of it is recorded.
+        camera: Camera that films.
+        config: Timing and heights.
+        rng: Source of objects, paths and tremor.
+
+    Yields:
+        A frame with the camera's image.
+    """
+    expert, _ = _arranged(world, workplace, sensor, config, rng)
+    chain, name = world.arm.robot.chain, workplace.scene.objects[0].name
+    pose, dt = world.object_pose(name), 1 / config.fps
+    start = torch.from_numpy(world.arm.read().joint_position)
+    # On the way from home the camera sees the object.
+    path = joint_line(workplace.home_joints(), start, _LEAD_SPEED, dt).numpy()
+    for k, (q, velocity) in enumerate(zip(path, np.gradient(path, dt, axis=0), strict=True)):
+        world.reset(q, {name: pose})
+        tool = chain.forward(q)
+        yield {
+            "time": k * dt,
+            "joint_position": q,
+            "joint_velocity": velocity,
+            "position": tool.position.numpy(),
+            "orientation": tool.orientation.numpy(),
+            "gripper": world.arm.read().gripper_width,
+            "human_effort": 0 * q,
+            "command_velocity": velocity,
+            "images": {FILM: camera.read()},
+        }
+    shift = len(path) * dt - world.time
+    for frame in guided_frames(chain, world.opened_arm, expert, config):
+        yield {**frame, "time": frame["time"] + shift, "images": {FILM: camera.read()}}
+
+
+def _arranged(
+    world: World,
+    workplace: Workplace,
+    sensor: MarkerSensor,
+    config: ServoDemonstrationConfig,
+    rng: np.random.Generator,
+) -> tuple[ScriptedExpert, Float[np.ndarray, "4 2"]]:
+    """The expert of a demonstration whose world it has reset, and the object's corners."""
     item, home = workplace.scene.objects[0], workplace.home_joints().numpy()
     for _ in range(_DRAWS):
         pose = workplace.random_object_pose(workplace.scaled(config.reach), rng, config.yaw)
@@ -236,21 +318,7 @@ def demonstrate_servoing(
     goal = Pose(start, expert.orientation(start, 0.0))
     q = workplace.robot.inverse(goal, near=workplace.hover_joints())
     world.reset(q.numpy(), {item.name: pose})
-    last = np.zeros((4, 2))
-
-    def observe() -> Frame:
-        nonlocal last
-        corners = sensor.corners().get(HAND_MARKER)
-        last = last if corners is None else corners
-        return {
-            "feature": centre(last) if last.any() else last[0],
-            "feature_visible": corners is not None,
-            OBJECT_FEATURE: np.array([*centre(target), 1.0]),
-            ANGLE_FEATURE: np.array([angle(last), angle(target)]),
-        }
-
-    with open_arm(world) as opened:
-        return list(guided_frames(world.arm.robot.chain, opened, expert, config, observe))
+    return expert, target
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
@@ -263,6 +331,8 @@ def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
 # Places for the object before it is said that the camera sees none: a camera that sees half the
 # table shows one of twenty but once in a million.
 _DRAWS = 20
+# Speed of the fastest joint on the way to a filmed demonstration [rad/s].
+_LEAD_SPEED = 1.2
 # Demonstrations begun before one without contact is given up.
 _ATTEMPTS = 3
 # From its place on the shelf, where a demonstration has arrived [m]: ten times what tremor and

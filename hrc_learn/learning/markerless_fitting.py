@@ -1,0 +1,481 @@
+"""Tool and object of demonstrations, found in their video: no marker, no calibration.
+
+The arm moves, so its pixels differ from the usual ones. Features of these pixels are followed
+through frames of all demonstrations. Every point fixed to a link of the arm moves as the
+kinematics say, seen by one unknown camera: a camera fitted to one such track (`fit_camera`)
+predicts all others of that link, and the camera that explains most tracks is right. These
+tracks become the points of the tool. The object is what changed its place between the
+demonstrations and lies where their motion ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
+from hrc_learn.demos.dataset_arm import arm_of_dataset
+from hrc_learn.demos.images import ImageReader
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import CameraFit, ImageDemonstration, fit_camera
+from hrc_learn.jacobian.perspective import FOCAL, ROTATION, SHIFT, marker_pixels
+from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
+from hrc_learn.vision.landmarks import (
+    FEWEST_POINTS,
+    RATIO,
+    Features,
+    Finding,
+    LandmarkDetector,
+    Landmarks,
+    Object,
+    Tool,
+    match_view,
+    nearest,
+)
+
+# Frames of all demonstrations that are searched for tracks; those among them from whose
+# features tracks start; and those of which the usual image is the median.
+_FRAMES, _STARTS, _USUAL = 96, 12, 39
+# Grey levels by which a pixel differs from the usual one, and reach about such pixels [px].
+_CHANGED, _GROWN = 14, 9
+# Fewest frames of a track; least spread of its pixels [px of 1440]; tracks to which cameras are
+# fitted; tracks after which no further camera is tried; and largest error of a point that moves
+# with its link [px of 1440].
+_SHORTEST, _STILL, _TRIED, _ENOUGH, _AGREES = 10, 20.0, 12, 150, 4.0
+# Largest distance of a point from the origin of its link [m].
+_NEAR = 0.35
+# Frames of all demonstrations in which the tool is looked for at last.
+_FOLLOWED = 500
+# Length of the line below the tool on which the object lies at the end [m]; images without the
+# arm before the object; least area of an object, as a fraction of the image; and its largest
+# distance from that line, as a fraction of the image's width.
+_DEEPEST, _CLEAR, _SMALLEST, _ASIDE = 0.25, 7, 3e-4, 0.06
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerlessFit:
+    """Demonstrations with what was found in their video."""
+
+    demos: DemonstrationSet
+    """Demonstrations with image features, in place of those recorded."""
+    landmarks: Landmarks
+    """Tool and object, to be found at run time."""
+    camera: CameraFit
+    """Camera that explains the motion of the tool."""
+    carrier: str
+    """Link whose points were found: the tool, or the link before the last joint."""
+    tracks: int
+    """Tracks that move with it."""
+    seen: float
+    """Fraction of the frames in which the tool was found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Link:
+    """Poses of a link in the searched frames, and the line on which the place lies."""
+
+    name: str
+    pose: Pose
+    axis: Float[np.ndarray, "3"] | None
+    """Point of the last joint's axis in the link's frame, along its z axis of the joint [m]."""
+    direction: Float[np.ndarray, "3"] | None
+
+
+def find_landmarks(source: DemonstrationSource, camera: str = "") -> MarkerlessFit:
+    """Find tool and object in the video of demonstrations.
+
+    Args:
+        source: Demonstrations that end above an object, with video.
+        camera: Name of the camera; empty: the only one.
+
+    Raises:
+        ValueError: There is no video, no pose, or nothing moves as the arm does.
+    """
+    reader = ImageReader(source.folder)
+    key = _camera_key(reader, camera, source.source)
+    demos = _with_poses(source, source.load())
+    height, width = reader.size(key)
+    search = _Search(reader, key, demos, (width, height))
+    links = list(_links(source, demos, search.picked))
+    features = search.features()
+    tracks = _tracks(features, width)
+    best: tuple[int, _Link, CameraFit] | None = None
+    for fit in _cameras(tracks, links, (width, height)):
+        for link in links:
+            count = int(_points(tracks, link.pose, fit.camera, width)[1].sum())
+            if best is None or count > best[0]:
+                best = (count, link, fit)
+        if best is not None and best[0] >= _ENOUGH:
+            break
+    if best is None or best[0] < FEWEST_POINTS:
+        raise ValueError(
+            f"{source.source}, {key}: nothing in the video moves as the arm's kinematics say "
+            f"({0 if best is None else best[0]} points, {FEWEST_POINTS} wanted). See that this "
+            "camera stands still, the gripper is in its view, and joints and images belong "
+            "to the same time."
+        )
+    _, link, fit = best
+    tool = _tool(tracks, link, fit.camera, width)
+    # The place on the tool, from all points at once, is seen better than one point.
+    fit = fit_camera([_seen_place(tool, features, _poses(demos, search.picked), width)], (width, height))
+    tool = _tool(tracks, link, fit.camera, width)
+    landmarks = Landmarks(tool=tool, image_size=(width, height))
+    found = search.follow(landmarks)
+    item = search.object(found, fit.camera)
+    landmarks = replace(landmarks, objects={} if item is None else {"object": item[0]})
+    return MarkerlessFit(
+        demos=_described(demos, found, None if item is None else item[1]),
+        landmarks=landmarks,
+        camera=fit,
+        carrier=link.name,
+        tracks=best[0],
+        seen=float(np.mean([finding is not None for demo in found for finding in demo])),
+    )
+
+
+class _Search:
+    """Frames of all demonstrations in which tool and object are looked for."""
+
+    def __init__(
+        self,
+        reader: ImageReader,
+        key: str,
+        demos: DemonstrationSet,
+        size: tuple[int, int],
+    ):
+        self._reader, self._key, self._demos, self._size = reader, key, demos, size
+        each = max(2, -(-_FRAMES // len(demos)))
+        self.picked = [np.unique(np.linspace(0, len(d) - 1, each).astype(int)) for d in demos]
+
+    def features(self) -> list[Features]:
+        """Features of the picked frames where they differ from the usual image."""
+        images = [image for rows in self._pictures(self.picked) for image in rows]
+        stride = max(1, len(images) // _USUAL)
+        usual = np.median(np.stack(images[::stride]), axis=0).astype(np.uint8)
+        return [_changed_features(image, usual) for image in images]
+
+    def _pictures(self, rows: Sequence[Sequence[int]]) -> Iterator[list[np.ndarray]]:
+        """Grey images of some frames, demonstration by demonstration."""
+        for demo, frames in zip(self._demos, rows, strict=True):
+            wanted = [int(k) for k in frames]
+            shown = self._reader.stream(demo.episode, self._key, wanted)
+            yield [np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for _, image in shown]
+
+    def follow(self, landmarks: Landmarks) -> list[list[Finding | None]]:
+        """The tool in frames of every demonstration; None where it was not looked for, too."""
+        found: list[list[Finding | None]] = []
+        stride = max(1, sum(map(len, self._demos)) // _FOLLOWED)
+        for demo in self._demos:
+            detector, row = LandmarkDetector(landmarks), [None] * len(demo)
+            # From the last frame back, at which the target is learned.
+            wanted = list(range(len(demo) - 1, -1, -stride))[::-1]
+            for k, image in self._reader.stream(demo.episode, self._key, wanted):
+                row[k] = detector.find(image, ["tool"]).get("tool")
+            found.append(row)
+        return found
+
+    def object(
+        self, found: Sequence[Sequence[Finding | None]], camera: Float[Tensor, "13"]
+    ) -> tuple[Object, list[Finding | None]] | None:
+        """Views of the object, and its place in each demonstration; None: there is none."""
+        below = [_below(demo, camera) for demo in self._demos]
+        rows = []
+        for seen, line in zip(found, below, strict=True):
+            away = [0.0 if f is None else np.linalg.norm(f.pixel - line, axis=1).min() for f in seen]
+            rows.append(sorted(np.argsort(away)[-_CLEAR:].tolist()))
+        views = [np.median(np.stack(p), axis=0).astype(np.uint8) for p in self._pictures(rows)]
+        usual = np.median(np.stack(views), axis=0).astype(np.uint8)
+        seen = [_object_features(v, usual, line) for v, line in zip(views, below, strict=True)]
+        return _common_object(seen, self._size[0])
+
+
+def _changed(image: np.ndarray, usual: np.ndarray) -> Bool[np.ndarray, "height width"]:
+    """True about pixels that differ from the usual image."""
+    different = (cv2.absdiff(image, usual) > _CHANGED).astype(np.uint8)
+    # Single pixels are noise of sensor and video.
+    kernel = np.ones((3, 3), np.uint8)
+    opened = cv2.morphologyEx(different, cv2.MORPH_OPEN, kernel)
+    return np.asarray(cv2.dilate(opened, np.ones((_GROWN, _GROWN), np.uint8))) > 0
+
+
+def _changed_features(image: np.ndarray, usual: np.ndarray) -> Features:
+    mask = _changed(image, usual)
+    if not mask.any():
+        return Features.of(image[:0])
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    box = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    seen = Features.of(image, box)
+    u, v = np.rint(seen.pixels).astype(int).T
+    return seen.chosen(mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tracks:
+    """Features followed through the searched frames."""
+
+    pixels: Float[np.ndarray, "tracks frames 2"]
+    """(u, v) [px]; NaN: not seen."""
+    descriptors: UInt8[np.ndarray, "tracks 128"]
+
+
+def _tracks(features: Sequence[Features], width: int) -> _Tracks:
+    """Features of some frames with their matches in all frames, those that moved."""
+    tracks, descriptors = [], []
+    starts = np.unique(np.linspace(0, len(features) - 1, _STARTS).astype(int))
+    for start in starts:
+        own = features[start]
+        pixels = np.full((len(own.pixels), len(features), 2), np.nan)
+        for k, other in enumerate(features):
+            if min(len(own.pixels), len(other.pixels)) < 2:
+                continue
+            index, distance = nearest(own.descriptors, other.descriptors, 2)
+            clear = distance[:, 0] < RATIO * distance[:, 1]
+            pixels[clear, k] = other.pixels[index[clear, 0]]
+        kept = np.isfinite(pixels[..., 0]).sum(1) >= _SHORTEST
+        pixels = pixels[kept]
+        apart = np.linalg.norm(pixels - np.nanmedian(pixels, axis=1, keepdims=True), axis=-1)
+        moved = np.nanmedian(apart, axis=1) > _STILL * width / 1440
+        tracks.append(pixels[moved])
+        descriptors.append(own.descriptors[kept][moved])
+    return _Tracks(pixels=np.concatenate(tracks), descriptors=np.concatenate(descriptors))
+
+
+def _cameras(
+    tracks: _Tracks, links: Sequence[_Link], image_size: tuple[int, int]
+) -> Iterator[CameraFit]:
+    """Cameras fitted to single tracks, the longest first, as points of each link."""
+    pixels = tracks.pixels
+    chosen: list[np.ndarray] = []
+    for k in np.argsort(-np.isfinite(pixels[..., 0]).sum(1)):
+        apart = [np.nanmedian(np.linalg.norm(pixels[k] - other, axis=-1)) for other in chosen]
+        # Starts in several frames give the same point again.
+        if len(chosen) < _TRIED and all(not a < _STILL * image_size[0] / 1440 for a in apart):
+            chosen.append(pixels[k])
+            for link in links:
+                yield fit_camera([_as_demonstration(pixels[k], link.pose)], image_size)
+
+
+def _as_demonstration(pixels: Float[np.ndarray, "frames 2"], pose: Pose) -> ImageDemonstration:
+    feature = torch.from_numpy(pixels)
+    return ImageDemonstration(
+        pose=pose, feature=feature.nan_to_num(0.0), visible=feature.isfinite().all(-1)
+    )
+
+
+def _points(
+    tracks: _Tracks, pose: Pose, camera: Float[Tensor, "13"], width: int
+) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " tracks"]]:
+    """Place of each track in the frame of a link [m], and True if it moves with the link.
+
+    Robust least squares: a point m is seen along xi, so (x - xi z) = 0 for x = R (p + T m) + t.
+    """
+    world = quaternion.to_matrix(quaternion.exp(camera[ROTATION]))
+    turn = (world @ quaternion.to_matrix(pose.orientation)).numpy()
+    shift = (pose.position @ world.T + camera[SHIFT]).numpy()
+    xi = _undistorted(camera, tracks.pixels)
+    seen = np.isfinite(xi[..., 0])
+    xi = np.where(seen[..., None], xi, 0.0)
+    design = turn[:, :2] - xi[..., None] * turn[:, 2:]
+    right = xi * shift[:, 2:] - shift[:, :2]
+    scale = float(camera[FOCAL].exp()) / np.maximum(shift[:, 2], 0.05)
+    most = _AGREES * width / 1440
+    weight, point = seen.astype(float), np.zeros((len(xi), 3))
+    agrees = seen
+    for reach in (16, 8, 4, 2, 1, 1, 1, 1):
+        weighted = (weight * scale**2)[..., None, None] * design
+        gram = np.einsum("tfij,tfik->tjk", weighted, design) + 1e-6 * np.eye(3)
+        towards = np.einsum("tfij,tfi->tj", weighted, right)
+        point = np.linalg.solve(gram, towards[..., None])[..., 0]
+        error = np.einsum("tfij,tj->tfi", design, point) - right
+        size = scale * np.linalg.norm(error, axis=-1)
+        weight = seen / (1 + (size / (reach * most)) ** 2) ** 2
+        agrees = seen & (size < most)
+    count = agrees.sum(1)
+    good = (count >= _SHORTEST) & (count > 0.5 * seen.sum(1))
+    return point, good & (np.linalg.norm(point, axis=1) < _NEAR)
+
+
+def _undistorted(
+    camera: Float[Tensor, "13"], pixels: Float[np.ndarray, "*batch 2"]
+) -> Float[np.ndarray, "*batch 2"]:
+    """Normalised points (x / z, y / z) seen at pixels."""
+    f, u, v, k = float(camera[FOCAL].exp()), *camera[1:4].tolist()
+    distorted = (pixels - (u, v)) / f
+    xi = distorted
+    for _ in range(10):
+        xi = distorted / (1 + k * (xi**2).sum(-1, keepdims=True))
+    return xi
+
+
+def _tool(
+    tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], width: int
+) -> Tool:
+    """The points that move with a link, and the place on it that stands for the tool."""
+    points, agrees = _points(tracks, link.pose, camera, width)
+    points = points[agrees]
+    place = np.median(points, axis=0)
+    if link.axis is not None and link.direction is not None:
+        # On the axis of the last joint, which turns about it, near the points.
+        place = link.axis + ((place - link.axis) @ link.direction) * link.direction
+    f, (u, v, k) = float(camera[FOCAL].exp()), camera[1:4].tolist()
+    return Tool(
+        points=points,
+        descriptors=tracks.descriptors[agrees],
+        place=place,
+        optics=(f, u, v, k),
+    )
+
+
+def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> DemonstrationSet:
+    """Demonstrations with the tool's pose, computed from joints where it is not recorded."""
+    if all(d.position is not None and d.orientation is not None for d in demos):
+        return demos
+    arm = arm_of_dataset(source)
+
+    def posed(demo: Demonstration) -> Demonstration:
+        assert demo.joint_position is not None
+        tool = arm.arm.forward(arm.positions(demo.joint_position))
+        position, orientation = tool.position.numpy(), tool.orientation.numpy()
+        return replace(demo, position=position, orientation=orientation)
+
+    return demos.map(posed)
+
+
+def _poses(demos: DemonstrationSet, picked: Sequence[np.ndarray]) -> Pose:
+    """Poses of the tool in picked frames of all demonstrations."""
+    rows = list(zip(demos, picked, strict=True))
+    position = np.concatenate([d.position[k] for d, k in rows if d.position is not None])
+    turn = np.concatenate([d.orientation[k] for d, k in rows if d.orientation is not None])
+    return Pose(torch.from_numpy(position), torch.from_numpy(turn))
+
+
+def _links(
+    source: DemonstrationSource, demos: DemonstrationSet, picked: Sequence[np.ndarray]
+) -> Iterator[_Link]:
+    """The tool, and the link before the last joint where the joints are known."""
+    yield _Link(name="tool", pose=_poses(demos, picked), axis=None, direction=None)
+    joints = [d.joint_position for d in demos]
+    if any(q is None for q in joints):
+        return
+    try:
+        arm = arm_of_dataset(source)
+    except ValueError:
+        return
+    rows = [q[k] for q, k in zip(joints, picked, strict=True) if q is not None]
+    links = arm.arm.link_poses(arm.positions(np.concatenate(rows)))
+    wrist, last = links[:, arm.arm.joints - 2], links[0, arm.arm.joints - 1]
+    turn = quaternion.to_matrix(wrist.orientation[0]).mT
+    yield _Link(
+        name="wrist",
+        pose=wrist,
+        axis=(turn @ (last.position - wrist.position[0])).numpy(),
+        direction=(turn @ quaternion.to_matrix(last.orientation)[:, 2]).numpy(),
+    )
+
+
+def _seen_place(
+    tool: Tool, features: Sequence[Features], pose: Pose, width: int
+) -> ImageDemonstration:
+    """The tool's place in the searched frames."""
+    found = [tool.find(seen, width) for seen in features]
+    nowhere = np.full(2, np.nan)
+    pixels = np.array([nowhere if f is None else f.pixel for f in found])
+    return _as_demonstration(pixels, pose)
+
+
+def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray, "points 2"]:
+    """Pixels of the line along which the tool points at the end of a demonstration."""
+    assert demo.position is not None and demo.orientation is not None
+    position, orientation = map(torch.from_numpy, (demo.position[-1], demo.orientation[-1]))
+    depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)
+    along = torch.zeros(len(depth), 3, dtype=torch.float64)
+    along[:, 2] = depth
+    points = position + quaternion.rotate(orientation, along)
+    # A camera whose marker is at the origin of a frame that stands at each point.
+    bare = torch.cat([camera[:10], camera.new_zeros(3)])
+    pixels, _ = marker_pixels(bare, Pose(points, orientation.expand(len(depth), 4)))
+    return pixels.numpy()
+
+
+def _object_features(
+    view: np.ndarray, usual: np.ndarray, line: Float[np.ndarray, "points 2"]
+) -> tuple[Features, Float[np.ndarray, "2"]]:
+    """Features and middle of what lies at the end of a demonstration and not in others.
+
+    Args:
+        view: Grey image without the arm before the object.
+        usual: The same without the object.
+        line: Pixels at which it may lie.
+    """
+    count, labels, stats, middles = cv2.connectedComponentsWithStats(
+        _changed(view, usual).astype(np.uint8)
+    )
+    least = _SMALLEST * view.size
+    best, nearest_to = 0, np.inf
+    for k in range(1, count):
+        if stats[k, cv2.CC_STAT_AREA] >= least:
+            v, u = np.nonzero(labels == k)
+            apart = np.linalg.norm(np.column_stack([u, v])[:, None] - line, axis=-1).min()
+            if apart < nearest_to:
+                best, nearest_to = k, apart
+    if not best or nearest_to > _ASIDE * view.shape[1]:
+        return Features.of(view[:0]), np.full(2, np.nan)
+    x, y, w, h = stats[best, :4].tolist()
+    seen = Features.of(view, (x, y, x + w, y + h))
+    u, v = seen.pixels.astype(int).T
+    return seen.chosen(labels[v, u] == best), middles[best]
+
+
+def _common_object(
+    seen: Sequence[tuple[Features, Float[np.ndarray, "2"]]], width: int
+) -> tuple[Object, list[Finding | None]] | None:
+    """The object in the view with most features, matched in all others."""
+    features, middle = max(seen, key=lambda one: len(one[0].pixels))
+    if len(features.pixels) < FEWEST_POINTS:
+        return None
+    first = replace(features, pixels=features.pixels - middle)
+    found = [match_view(first, other, width) for other, _ in seen]
+    views = []
+    for (other, _), finding in zip(seen, found, strict=True):
+        if finding is not None:
+            c, s = finding.scale * np.cos(finding.angle), finding.scale * np.sin(finding.angle)
+            back = np.linalg.inv([[c, -s], [s, c]])
+            views.append(replace(other, pixels=(other.pixels - finding.pixel) @ back.T))
+    return Object(views=tuple(views)), found
+
+
+def _described(
+    demos: DemonstrationSet,
+    tools: Sequence[Sequence[Finding | None]],
+    objects: Sequence[Finding | None] | None,
+) -> DemonstrationSet:
+    """Demonstrations with columns of what was found, as markers would have given them."""
+    result = []
+    for k, (demo, found) in enumerate(zip(demos, tools, strict=True)):
+        visible = np.array([f is not None for f in found])
+        pixels = np.array([np.zeros(2) if f is None else f.pixel for f in found])
+        extra = dict(demo.extra)
+        item = None if objects is None else objects[k]
+        if item is not None:
+            ones = np.ones((len(demo), 1))
+            extra[OBJECT_FEATURE] = ones * (*item.pixel, 1.0)
+            extra[ANGLE_FEATURE] = ones * (np.nan, item.angle)
+        result.append(replace(demo, feature=pixels, feature_visible=visible, extra=extra))
+    return DemonstrationSet(
+        result, notes=demos.notes, source=demos.source, joint_unit=demos.joint_unit
+    )
+
+
+def _camera_key(reader: ImageReader, camera: str, source: str) -> str:
+    """Feature of the named camera, or of the only one."""
+    keys = [k for k in reader.cameras if camera in ("", k, k.removeprefix("observation.images."))]
+    if len(keys) != 1:
+        known = ", ".join(reader.cameras) or "none: record with video"
+        raise ValueError(f"{source}: name one camera (--config markerless.camera=NAME), of {known}.")
+    return keys[0]
