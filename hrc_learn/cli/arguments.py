@@ -353,13 +353,16 @@ class FitImageJacobian(Fit):
     is resumed. Under torchrun each process reads a part of the demonstrations.
 
         hrc fit image-jacobian grasping --marker 3 --camera front
+        hrc fit image-jacobian --dataset grasping --markerless
     """
 
     marker: int | None = None
     """Marker on the end effector, by its number in OpenCV's ArUco dictionary 4x4_50. Default:
     pixels are in the dataset or were found earlier."""
+    markerless: bool = False
+    """Find tool and object in the videos without any marker."""
     camera: str | None = None
-    """Camera of --marker. May be left out if there is only one."""
+    """Camera of --marker or --markerless. May be left out if there is only one."""
 
     neurons: Literal["around", "grid"] = "around"
     """Thirteen neurons around the demonstrated poses, or the paper's grid over x and y."""
@@ -551,6 +554,8 @@ class Demo(WithImperfections, WithRobot, Written):
     """Shelf for the object. The middle one is demonstrated."""
     seed: int = 0
     """Seed of the object's place and of image noise."""
+    markerless: bool = False
+    """Learn from video and see without any marker; needs EGL."""
     overwrite: bool = False
     """Record and learn again, even if models are up to date."""
 
@@ -584,6 +589,8 @@ class Run(WithImperfections, WithDriver, Written):
     camera: str = "auto"
     """Simulated camera: "egl" renders, "synthetic" only draws markers, "auto" renders if it
     can. For a real arm: device number or path, URL of a stream, or a video file."""
+    markerless: bool = False
+    """See gripper and object without any marker, among clutter and shadows; needs EGL."""
     shelf: tuple[Shelf, ...] = ("middle",)
     """Shelf for the object. Two or three shelves: as many objects."""
     pulls: Literal["scripted", "random", "none"] = "scripted"

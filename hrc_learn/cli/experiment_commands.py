@@ -45,6 +45,7 @@ from hrc_learn.experiments.surroundings import workplace_for
 from hrc_learn.hardware import CaptureCamera
 from hrc_learn.kinematics import ArmChoice, panda
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections
+from hrc_learn.sim.unmarked_scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -59,13 +60,22 @@ _APPLIES = {
     "aiming": ("grasping", "collaboration"),
     "camera": ("grasping", "collaboration"),
     "page": ("grasping", "collaboration"),
+    "markerless": ("grasping", "collaboration"),
     "pulls": ("collaboration",),
     "camera_moved": ("collaboration",),
     "worker": ("collaboration",),
     "handover": ("collaboration",),
 }
 """Experiments that an option belongs to."""
-_SIMULATED_ONLY = ("trials", "serve", "page", "camera_moved", "worker", "handover")
+_SIMULATED_ONLY = (
+    "markerless",
+    "trials",
+    "serve",
+    "page",
+    "camera_moved",
+    "worker",
+    "handover",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,6 +141,7 @@ def _experiment(args: Run) -> Experiment[Any]:
         "aiming": _model(args.aiming),
         "camera": _simulated_camera(args),
         "page": PageConfig() if args.page else None,
+        "look": UnmarkedLook() if args.markerless else None,
     }
     if args.experiment == "grasping":
         return GraspingExperiment(**common)
@@ -231,7 +242,8 @@ def _with_models(args: Run) -> Run:
     """Fill in the demo's models where none are given; make them if they are missing."""
     needed = [name for name in ("placing", "aiming") if args.experiment in _APPLIES[name]]
     missing = [name for name in needed if getattr(args, name) is None]
-    if any(not (MODELS / name).is_dir() for name in missing):
+    folders = {"placing": MODELS / "placing", "aiming": MODELS / _aiming(args.markerless)}
+    if any(not folders[name].is_dir() for name in missing):
         console = Console()
         console.print(f"note: no model given and none in {MODELS}: it is learned first")
         if args.robot != "panda":
@@ -239,21 +251,28 @@ def _with_models(args: Run) -> Run:
                 f"the models in {MODELS} are a Panda's: make those of the {args.robot} by "
                 f"`hrc demo --robot {args.robot} --out FOLDER`, and name them."
             )
-        learn(MODELS, console)
-    return replace(args, **{name: MODELS / name for name in missing})
+        learn(MODELS, console, markerless=args.markerless)
+    return replace(args, **{name: folders[name] for name in missing})
+
+
+def _aiming(markerless: bool) -> str:
+    """Folder of the demo's visual-servoing skill."""
+    return "aiming_markerless" if markerless else "aiming"
 
 
 def demo(args: Demo) -> int:
     """Carry out the whole job, command after command in one process."""
     console = Console()
-    learn(args.out, console, steps=5, robot=args, again=args.overwrite)
+    markerless = args.markerless
+    learn(args.out, console, 5, robot=args, again=args.overwrite, markerless=markerless)
     write_json(args.out / "configuration.json", asdict(args))
     _announce(console, 5, 5, "Grasping near a person, carrying, placing")
     return run(
         Run(
             experiment="collaboration",
             placing=args.out / "placing",
-            aiming=args.out / "aiming",
+            aiming=args.out / _aiming(markerless),
+            markerless=markerless,
             shelf=(args.shelf,),
             robot=args.robot,
             out=args.out / "run",
@@ -272,6 +291,7 @@ def learn(
     steps: int = 4,
     robot: WithRobot | None = None,
     again: bool = False,
+    markerless: bool = False,
 ) -> None:
     """Record demonstrations of placing and servoing, and learn from them.
 
@@ -280,11 +300,12 @@ def learn(
 
     Args:
         out: Folder for `placing_demos`, `aiming_demos` and the models `placing`, `aiming`,
-            which are replaced.
+            which are replaced; without markers for `aiming_films` and `aiming_markerless`.
         console: Console for the progress.
         steps: Number of steps, including those of the caller.
         robot: Options that choose the arm. Default: the Panda.
         again: Repeat every step.
+        markerless: Film the demonstrations of servoing, and find tool and object there.
 
     Raises:
         RuntimeError: The scripted expert fails.
@@ -295,7 +316,7 @@ def learn(
         done = read_json(ledger)
     code = _digest(Path(__file__).parents[1], "*.py")
     made_of = [software_versions(), code, robot.robot]
-    for number, step in enumerate(_learning_steps(out, robot), start=1):
+    for number, step in enumerate(_learning_steps(out, robot, markerless), start=1):
         title, work, folders = step
         name, digest = folders[-1].name, [*made_of, *map(_digest, folders)]
         if not again and done.get(name) == digest:
@@ -318,25 +339,29 @@ def _digest(folder: Path, pattern: str = "*") -> str:
 
 
 def _learning_steps(
-    out: Path, robot: WithRobot
+    out: Path, robot: WithRobot, markerless: bool
 ) -> Iterator[tuple[str, Callable[[], object], list[Path]]]:
     """Title and work of each step, and the folders that it reads, its result last."""
     from hrc_learn.cli.fit_command import fit_primitives
     from hrc_learn.cli.image_jacobian_commands import fit_image_jacobian
     from hrc_learn.cli.record_command import record
 
-    def demonstrate(scenario: Any, folder: Path) -> None:
-        chosen = {"robot": robot.robot, "overwrite": True}
+    def demonstrate(scenario: Any, folder: Path, *config: str) -> None:
+        chosen = {"robot": robot.robot, "overwrite": True, "config": config}
         if record(Record(demonstration=scenario, out=folder, **chosen)):
             raise RuntimeError(f"the scripted expert failed to demonstrate {scenario}")
 
     shown, watched = out / "placing_demos", out / "aiming_demos"
-    placing, aiming = out / "placing", out / "aiming"
+    placing, aiming = out / "placing", out / _aiming(markerless)
+    film = ("demonstration.markerless=true",) if markerless else ()
+    watched = out / "aiming_films" if markerless else watched
     primitives = FitPrimitives(dataset=shown, out=placing, overwrite=True)
-    jacobian = FitImageJacobian(dataset=watched, out=aiming, overwrite=True)
+    jacobian = FitImageJacobian(
+        dataset=watched, out=aiming, overwrite=True, markerless=markerless
+    )
     title = "Demonstrations of servoing with an uncalibrated camera"
     yield "Demonstrations of placing", lambda: demonstrate("placing", shown), [shown]
-    yield title, lambda: demonstrate("servoing", watched), [watched]
+    yield title, lambda: demonstrate("servoing", watched, *film), [watched]
     yield "Movement primitives of placing", lambda: fit_primitives(primitives), [shown, placing]
     yield "Image Jacobian of servoing", lambda: fit_image_jacobian(jacobian), [watched, aiming]
 

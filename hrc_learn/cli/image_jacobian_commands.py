@@ -30,6 +30,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.learning.fit_dashboards import record_learning
+from hrc_learn.learning.markerless_fitting import MarkerlessFit, find_landmarks
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
@@ -74,7 +75,7 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
     refuse_repeats(args.episodes)
     with distributed.processes() as rank:
         console = Console(quiet=rank != 0)
-        demos, searched = _demonstrations(args, console, rank)
+        demos, searched, unmarked = _demonstrations(args, console, rank)
         for note in demos.notes:
             console.print(f"note: {note}")
         if args.learn and len(demos) < learning.hold_out:
@@ -94,32 +95,47 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
                 lambda number, state: status.update(
                     f"Learning, round {number}: held-out error {state.held_out_error:.3f} px"
                 ),
+                None if unmarked is None else unmarked.landmarks,
             )
         if rank == 0:
-            _write(args, skill, demos, searched)
+            _write(args, skill, demos, searched, unmarked)
 
 
-def _demonstrations(
-    args: FitImageJacobian, console: Console, rank: int
-) -> tuple[DemonstrationSource | DemonstrationSet, dict[str, int]]:
-    """Demonstrations with the pixels of `--marker`, and figures of the search for it."""
+type _Searched = tuple[
+    DemonstrationSource | DemonstrationSet, dict[str, float], MarkerlessFit | None
+]
+"""Demonstrations, figures of the search in their video, and what was found without markers."""
+
+
+def _demonstrations(args: FitImageJacobian, console: Console, rank: int) -> _Searched:
+    """Demonstrations with the pixels of `--marker`, or those found without one."""
     demos = open_demos(args.dataset, episodes=args.episodes or None)
+    if args.markerless:
+        refuse_given(args, ["marker"], "is a marker, and --markerless uses none")
+        with console.status(f"Searching the video of {len(demos)} demonstrations"):
+            unmarked = find_landmarks(demos, args.camera or "")
+        console.print(str(unmarked), highlight=False)
+        return unmarked.demos, unmarked.figures(), unmarked
     if args.marker is None:
         refuse_given(args, ["camera"], "is the camera of --marker")
-        return demos, {}
+        return demos, {}, None
     if rank != 0:
         distributed.sum_over_processes(torch.zeros(()))  # the first process searches
     found = _find_marker(args, args.marker, console)
     if rank == 0:
         distributed.sum_over_processes(torch.zeros(()))
-    return attach_features(demos.load(), found.name), {
-        "episodes_searched": found.episodes,
-        "episodes_known_before": found.known,
-        "episodes_left_out": len(found.left_out),
-        "frames_searched": found.frames,
-        "frames_without_image": found.without_image,
-        "frames_with_marker": found.seen,
-    }
+    return (
+        attach_features(demos.load(), found.name),
+        {
+            "episodes_searched": found.episodes,
+            "episodes_known_before": found.known,
+            "episodes_left_out": len(found.left_out),
+            "frames_searched": found.frames,
+            "frames_without_image": found.without_image,
+            "frames_with_marker": found.seen,
+        },
+        None,
+    )
 
 
 def _find_marker(args: FitImageJacobian, marker: int, console: Console) -> Extraction:
@@ -157,7 +173,8 @@ def _write(
     args: FitImageJacobian,
     skill: VisualServoSkill,
     demos: DemonstrationSource | DemonstrationSet,
-    searched: dict[str, int],
+    searched: dict[str, float],
+    unmarked: MarkerlessFit | None,
 ) -> None:
     metrics = skill.metrics()
     with new_folder(args.folder, asdict(args) | {"out": args.folder}, args.overwrite) as folder:
@@ -165,6 +182,8 @@ def _write(
         write_json(folder / "metrics.json", metrics)
         title = f"Image Jacobian from {args.dataset.name}"
         record_learning(folder / "fit.rrd", skill, demos, title)
+        if unmarked is not None:
+            unmarked.save_picture(folder / FOUND)
     rows = [
         Measurement(
             name=name,
@@ -179,11 +198,15 @@ def _write(
     title, more = f"Image Jacobian from {args.dataset}", len(metrics) - len(rows)
     show_measurements(rows, title=title, more=more, elsewhere="metrics.json")
     print(f"Found: {skill.jacobian.camera_fit}.")
+    if unmarked is not None:
+        print(f"Found in the video: {shlex.quote(str(args.folder / FOUND))}")
     print(f"Model in {shlex.quote(str(args.folder))}")
     print(f"Dashboard: {show_command(args.folder)}")
     write_values(args.json, metrics | searched)
 
 
+FOUND = "found.png"
+"""Picture of what was found without markers, in the folder of a model."""
 MOST_ERROR = 0.05
 """Largest median error of an image Jacobian relative to the true one."""
 _TILT = 0.1

@@ -108,7 +108,8 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     settings = with_settings(args.config, settings)
     config = settings.demonstration
     if config.markerless:
-        return _film_servoing(args, config, episodes, seed)
+        _film_servoing(args, config, episodes, seed)
+        return
     workplace, world, rng = _work_cell(args, seed)
     camera = open_camera(world, settings.camera, rng=rng)
     sensor = MarkerSensor(camera, workplace.scene.marker_ids)
@@ -138,7 +139,7 @@ def _film_servoing(
     # A finder needs fewer images than a tracker of markers.
     config = replace(config, record_every=2 * config.record_every)
 
-    def demonstrate() -> Iterator[Frame]:
+    def demonstrate() -> Iterator[dict[str, Any]]:
         return film_servoing(world, workplace, sensor, camera, config, rng)
 
     width, height = IMAGE_SIZE
@@ -156,7 +157,7 @@ def _work_cell(args: Record, seed: int) -> tuple[Workplace, World, np.random.Gen
 def _write(
     args: Record,
     workplace: Workplace,
-    demonstrate: Callable[[], Iterable[Frame]],
+    demonstrate: Callable[[], Iterable[Mapping[str, Any]]],
     task: str,
     fps: float,
     features: Mapping[str, Sequence[str]] | None = None,

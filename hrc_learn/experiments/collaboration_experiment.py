@@ -20,10 +20,11 @@ from hrc_learn.experiments.run_measures import worker_distance
 from hrc_learn.experiments.run_recorder import record, region_of_vision
 from hrc_learn.experiments.run_report import run_sections
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
-from hrc_learn.experiments.surroundings import workplace_for
+from hrc_learn.experiments.surroundings import unmarked_for, workplace_for
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import Imperfections
+from hrc_learn.sim.unmarked_scene import UnmarkedLook
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -72,6 +73,9 @@ class CollaborationExperiment(CollaborationScenario):
     """Driver of the simulated arm: the simulator itself, or a driver of the real arm over its
     network protocol."""
 
+    look: UnmarkedLook | None = None
+    """Look of a scene without markers; None: tool and objects carry markers."""
+
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> CollaborationRun:
         """Do the whole job once; the seed draws object poses, imperfections and image noise."""
         # The same number of images for any number of objects: 200 of them take 1 GB of memory.
@@ -83,12 +87,22 @@ class CollaborationExperiment(CollaborationScenario):
             config=self._job(),
             cell=replace(self.cell, keep_image_every=keep_every),
         )
-        return simulate_collaboration(
+        skill, workplace = (
             VisualServoSkill.load(self.aiming),
+            workplace_for(self.shelves, robot),
+        )
+        if self.look is not None:
+            scene = unmarked_for(workplace.scene, skill, self.look, seed)
+            workplace, scenario = (
+                replace(workplace, scene=scene),
+                replace(scenario, camera="egl"),
+            )
+        return simulate_collaboration(
+            skill,
             PlacingSkill.load(self.placing, robot),
             self.shelves,
             scenario,
-            workplace=workplace_for(self.shelves, robot),
+            workplace=workplace,
             access=access_by(self.arm, robot),
             seed=seed,
             observer=observer,

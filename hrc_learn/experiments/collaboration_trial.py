@@ -46,7 +46,7 @@ from hrc_learn.sim.hand_over import HandOver
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
-from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.marker_sensor import feature_sensor
 from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
 from hrc_learn.skills.pick_and_place import (
     HOME,
@@ -249,7 +249,9 @@ def simulate_collaboration(
     with simulated_cell(
         world,
         human=person,
-        sensor=MarkerSensor(eyes, workplace.scene.marker_ids),
+        sensor=feature_sensor(
+            eyes, aiming.landmarks, workplace.tool_marker, [item.marker.id for item in items]
+        ),
         config=scenario.cell,
         access=access,
         page=scenario.page,

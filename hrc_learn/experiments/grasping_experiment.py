@@ -30,12 +30,14 @@ from hrc_learn.experiments.run_measures import (
 from hrc_learn.experiments.run_recorder import record, region_of_vision
 from hrc_learn.experiments.run_report import run_sections
 from hrc_learn.experiments.simulated_cell import UNOBSERVED, ArmDriver, Observer, access_by
+from hrc_learn.experiments.surroundings import unmarked_for
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian
 from hrc_learn.kinematics import ArmChoice, gripper_down
 from hrc_learn.log import LoggedSteps, RunRecording
 from hrc_learn.sim import CameraKind, Imperfections, Touch
+from hrc_learn.sim.unmarked_scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -271,6 +273,9 @@ class GraspingExperiment:
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Imperfections of arm, calibration, camera and object."""
     camera: CameraKind = "synthetic"
+    look: UnmarkedLook | None = None
+    """Look of a scene without markers, its clutter and light drawn anew by each seed; None:
+    tool and object carry markers."""
     config: GraspingConfig = field(default_factory=GraspingConfig)
     page: PageConfig | None = None
     """Serves a page on which people draw and pull the arm too, in real time; None: no page."""
@@ -283,11 +288,18 @@ class GraspingExperiment:
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> GraspingRun:
         """Grasp once; the seed draws the scene, the imperfections and the image noise."""
         rng = np.random.default_rng(seed)
-        workplace = Workplace.of(self.robot.work_arm())
-        return simulate_grasp(
+        workplace, skill = (
+            Workplace.of(self.robot.work_arm()),
             VisualServoSkill.load(self.aiming),
-            GraspingScene.draw(workplace, self.scene, rng, self.camera, self.imperfections),
-            camera=self.camera,
+        )
+        camera, placed = self.camera, self.camera
+        if self.look is not None:
+            scene = unmarked_for(workplace.scene, skill, self.look, seed)
+            workplace, camera, placed = replace(workplace, scene=scene), "egl", "synthetic"
+        return simulate_grasp(
+            skill,
+            GraspingScene.draw(workplace, self.scene, rng, placed, self.imperfections),
+            camera=camera,
             config=self.config,
             rng=np.random.default_rng([seed, 1]),
             page=self.page,

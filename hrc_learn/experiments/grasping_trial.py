@@ -29,7 +29,7 @@ from hrc_learn.sim.imperfections import DrawnImperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
-from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.marker_sensor import MarkerSensor, feature_sensor
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
@@ -176,7 +176,12 @@ def simulate_grasp(
     with simulated_cell(
         world,
         human=ScriptedDrawing(drawings),
-        sensor=MarkerSensor(eye, workplace.scene.marker_ids),
+        sensor=feature_sensor(
+            eye,
+            aiming.landmarks,
+            workplace.tool_marker,
+            [thing.marker.id for thing in workplace.scene.objects],
+        ),
         access=access,
         page=page,
         title="Grasping",

@@ -19,7 +19,7 @@ from hrc_learn.hardware.protocol_server import ArmServer, ServedArm, serve_world
 from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import Imperfections, MotionLog, World
-from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
+from hrc_learn.skills.marker_sensor import FeatureSensor, LatencyConfig
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
@@ -153,7 +153,7 @@ def simulated_cell(
     world: World,
     *,
     human: Human,
-    sensor: MarkerSensor | None = None,
+    sensor: FeatureSensor | None = None,
     config: WorkCellConfig | None = None,
     access: ArmAccess = SIMULATED,
     page: PageConfig | None = None,
@@ -173,7 +173,7 @@ def simulated_cell(
     Args:
         world: World with arm, camera and objects, at rest.
         human: Scripted person.
-        sensor: Camera with its marker detector; None for tasks without a camera.
+        sensor: Camera that finds tool and objects; None for tasks without a camera.
         config: Configuration of the loop; the delays, losses and braking of the world and of
             the driver are allowed for in it.
         access: Access to the arm.

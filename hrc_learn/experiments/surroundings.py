@@ -13,6 +13,7 @@ from hrc_learn.controller import SeparationConfig
 from hrc_learn.controller.contact_limits import region_numbers
 from hrc_learn.dmp import InteractionPrimitive
 from hrc_learn.geometry import Box, Pose, minimum_jerk, quaternion
+from hrc_learn.jacobian.perspective import MARKER
 from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, panda, separation
 from hrc_learn.log import LoggedSteps
 from hrc_learn.protocols import PersonObservation
@@ -20,6 +21,7 @@ from hrc_learn.sim import (
     Imperfections,
     MotionLog,
     ObjectConfig,
+    SceneConfig,
     Touch,
     Worker,
     WorkerConfig,
@@ -30,11 +32,13 @@ from hrc_learn.sim import (
     whole_arm,
 )
 from hrc_learn.sim.hand_over import HAND_OVER, HandOver, random_hand_over
+from hrc_learn.sim.unmarked_scene import UnmarkedLook, unmarked
 from hrc_learn.sim.worker import IMAGE_RATE, PARTS, REGIONS
 from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace, pose_on_table
 from hrc_learn.skills.person_watch import ContactLimits
 from hrc_learn.skills.receiving import MovementWatch, ReceivingConfig
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.vision import Marker
 
 THREE_OBJECTS = (
@@ -55,6 +59,33 @@ THREE_OBJECTS = (
     ),
 )
 """Three boxes that fit into the gripper."""
+# Added to the seed of a run's look: demonstrations have those of small seeds.
+_OTHER_LOOK = 10_000
+
+
+def unmarked_for(
+    scene: SceneConfig, skill: VisualServoSkill, look: UnmarkedLook, seed: int
+) -> SceneConfig:
+    """Scene without markers for a skill that was learned without them.
+
+    Args:
+        scene: Scene with markers.
+        skill: Skill with landmarks; the place on the tool that it sees is what measures use.
+        look: Look of the scene.
+        seed: Draws clutter and light.
+
+    Raises:
+        ValueError: The skill needs markers.
+    """
+    camera = skill.jacobian.camera
+    if skill.landmarks is None or camera is None:
+        raise ValueError(
+            "--markerless needs a model that was learned without markers: fit one by `hrc fit "
+            "image-jacobian --markerless`, or leave out --aiming to use that of `hrc demo`."
+        )
+    look = replace(look, seed=seed + _OTHER_LOOK)
+    return unmarked(scene, look, camera[MARKER].numpy())
+
 
 OBJECT_REACH = (0.10, 0.08, 0.0)
 """Largest distance of a single object from the middle of the table [m]."""

@@ -10,13 +10,14 @@ demonstrations and lies where their motion ends.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from matplotlib.image import imsave
 from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
@@ -26,6 +27,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraFit, ImageDemonstration, fit_camera
 from hrc_learn.jacobian.perspective import FOCAL, ROTATION, SHIFT, marker_pixels
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
+from hrc_learn.store import new_file
 from hrc_learn.vision.landmarks import (
     FEWEST_POINTS,
     RATIO,
@@ -35,15 +37,17 @@ from hrc_learn.vision.landmarks import (
     Landmarks,
     Object,
     Tool,
+    blob_features,
+    changed_features,
+    draw_finding,
     match_view,
     nearest,
 )
+from hrc_learn.vision.markers import as_grey
 
 # Frames of all demonstrations that are searched for tracks; those among them from whose
 # features tracks start; and those of which the usual image is the median.
-_FRAMES, _STARTS, _USUAL = 96, 12, 39
-# Grey levels by which a pixel differs from the usual one, and reach about such pixels [px].
-_CHANGED, _GROWN = 14, 9
+_FRAMES, _STARTS, _USUAL = 72, 10, 31
 # Fewest frames of a track; least spread of its pixels [px of 1440]; tracks to which cameras are
 # fitted; tracks after which no further camera is tried; and largest error of a point that moves
 # with its link [px of 1440].
@@ -51,11 +55,12 @@ _SHORTEST, _STILL, _TRIED, _ENOUGH, _AGREES = 10, 20.0, 12, 150, 4.0
 # Largest distance of a point from the origin of its link [m].
 _NEAR = 0.35
 # Frames of all demonstrations in which the tool is looked for at last.
-_FOLLOWED = 500
+_FOLLOWED = 320
+# Largest width of a part of the picture of what was found [px].
+_TILE = 720
 # Length of the line below the tool on which the object lies at the end [m]; images without the
-# arm before the object; least area of an object, as a fraction of the image; and its largest
-# distance from that line, as a fraction of the image's width.
-_DEEPEST, _CLEAR, _SMALLEST, _ASIDE = 0.25, 7, 3e-4, 0.06
+# arm before the object.
+_DEEPEST, _CLEAR = 0.25, 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +78,40 @@ class MarkerlessFit:
     tracks: int
     """Tracks that move with it."""
     seen: float
-    """Fraction of the frames in which the tool was found."""
+    """Fraction of the searched frames in which the tool was found."""
+    deviation: float
+    """Median standard deviation of the tool's pixel [px]."""
+    picture: UInt8[np.ndarray, "height width 3"]
+    """Last searched images with what was found drawn over them."""
+
+    def figures(self) -> dict[str, float]:
+        """Measured values by name."""
+        objects = [d for d in self.demos if OBJECT_FEATURE in d.extra]
+        return {
+            "tool_points": len(self.landmarks.tool.points),
+            "tool_seen": self.seen,
+            "tool_pixel_std_px": self.deviation,
+            "objects_found": len(objects),
+        }
+
+    def __str__(self) -> str:
+        """What was found, in words."""
+        figures = self.figures()
+        item = (
+            f"the object in {figures['objects_found']:.0f} of {len(self.demos)} demonstrations"
+            if self.landmarks.objects
+            else "no object that was moved between the demonstrations"
+        )
+        return (
+            f"found without markers: {self.tracks} tracks that move with the {self.carrier}, "
+            f"the tool in {100 * self.seen:.0f} % of the searched frames, within "
+            f"{self.deviation:.1f} px (one standard deviation), and {item}"
+        )
+
+    def save_picture(self, path: Path) -> None:
+        """Write the picture, as PNG."""
+        with new_file(path) as part:
+            imsave(part, self.picture, format="png")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,19 +161,25 @@ def find_landmarks(source: DemonstrationSource, camera: str = "") -> MarkerlessF
     _, link, fit = best
     tool = _tool(tracks, link, fit.camera, width)
     # The place on the tool, from all points at once, is seen better than one point.
-    fit = fit_camera([_seen_place(tool, features, _poses(demos, search.picked), width)], (width, height))
+    fit = fit_camera(
+        [_seen_place(tool, features, _poses(demos, search.picked), width)], (width, height)
+    )
     tool = _tool(tracks, link, fit.camera, width)
     landmarks = Landmarks(tool=tool, image_size=(width, height))
     found = search.follow(landmarks)
     item = search.object(found, fit.camera)
     landmarks = replace(landmarks, objects={} if item is None else {"object": item[0]})
+    sure = [f.deviation for row in found for f in row if f is not None]
+    objects = [None] * len(demos) if item is None else item[1]
     return MarkerlessFit(
-        demos=_described(demos, found, None if item is None else item[1]),
+        demos=_described(demos, found, objects),
         landmarks=landmarks,
         camera=fit,
         carrier=link.name,
         tracks=best[0],
-        seen=float(np.mean([finding is not None for demo in found for finding in demo])),
+        seen=len(sure) / max(1, search.followed),
+        deviation=float(np.median(sure)),
+        picture=search.picture(found, objects),
     )
 
 
@@ -151,6 +195,7 @@ class _Search:
     ):
         self._reader, self._key, self._demos, self._size = reader, key, demos, size
         each = max(2, -(-_FRAMES // len(demos)))
+        self.followed = 0
         self.picked = [np.unique(np.linspace(0, len(d) - 1, each).astype(int)) for d in demos]
 
     def features(self) -> list[Features]:
@@ -158,27 +203,47 @@ class _Search:
         images = [image for rows in self._pictures(self.picked) for image in rows]
         stride = max(1, len(images) // _USUAL)
         usual = np.median(np.stack(images[::stride]), axis=0).astype(np.uint8)
-        return [_changed_features(image, usual) for image in images]
+        return [changed_features(image, usual) for image in images]
 
-    def _pictures(self, rows: Sequence[Sequence[int]]) -> Iterator[list[np.ndarray]]:
+    def _pictures(self, rows: Iterable[Iterable[int]]) -> Iterator[list[np.ndarray]]:
         """Grey images of some frames, demonstration by demonstration."""
         for demo, frames in zip(self._demos, rows, strict=True):
             wanted = [int(k) for k in frames]
             shown = self._reader.stream(demo.episode, self._key, wanted)
-            yield [np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) for _, image in shown]
+            yield [as_grey(image) for _, image in shown]
 
     def follow(self, landmarks: Landmarks) -> list[list[Finding | None]]:
         """The tool in frames of every demonstration; None where it was not looked for, too."""
         found: list[list[Finding | None]] = []
         stride = max(1, sum(map(len, self._demos)) // _FOLLOWED)
         for demo in self._demos:
-            detector, row = LandmarkDetector(landmarks), [None] * len(demo)
+            detector = LandmarkDetector(landmarks)
+            row: list[Finding | None] = [None] * len(demo)
             # From the last frame back, at which the target is learned.
             wanted = list(range(len(demo) - 1, -1, -stride))[::-1]
             for k, image in self._reader.stream(demo.episode, self._key, wanted):
                 row[k] = detector.find(image, ["tool"]).get("tool")
             found.append(row)
+            self.followed += len(wanted)
         return found
+
+    def picture(
+        self, found: Sequence[Sequence[Finding | None]], objects: Sequence[Finding | None]
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Images of some demonstrations with what was found drawn over them."""
+        tiles, middle = [], len(self._demos[0]) // 2
+        smaller = -(-self._size[0] // _TILE)
+        for k in range(min(3, len(self._demos))):
+            seen = [j for j, finding in enumerate(found[k]) if finding is not None]
+            for near in (0, middle, len(found[k])):
+                row = min(seen, key=lambda j: abs(j - near), default=0)
+                shown = self._reader.stream(self._demos[k].episode, self._key, [row])
+                image = np.ascontiguousarray(next(shown)[1])
+                for finding in (found[k][row], objects[k]):
+                    if finding is not None:
+                        draw_finding(image, finding)
+                tiles.append(image[::smaller, ::smaller])
+        return np.vstack([np.hstack(tiles[k : k + 3]) for k in range(0, len(tiles), 3)])
 
     def object(
         self, found: Sequence[Sequence[Finding | None]], camera: Float[Tensor, "13"]
@@ -187,32 +252,14 @@ class _Search:
         below = [_below(demo, camera) for demo in self._demos]
         rows = []
         for seen, line in zip(found, below, strict=True):
-            away = [0.0 if f is None else np.linalg.norm(f.pixel - line, axis=1).min() for f in seen]
+            away = [
+                0.0 if f is None else np.linalg.norm(f.pixel - line, axis=1).min() for f in seen
+            ]
             rows.append(sorted(np.argsort(away)[-_CLEAR:].tolist()))
         views = [np.median(np.stack(p), axis=0).astype(np.uint8) for p in self._pictures(rows)]
         usual = np.median(np.stack(views), axis=0).astype(np.uint8)
-        seen = [_object_features(v, usual, line) for v, line in zip(views, below, strict=True)]
+        seen = [blob_features(v, usual, line) for v, line in zip(views, below, strict=True)]
         return _common_object(seen, self._size[0])
-
-
-def _changed(image: np.ndarray, usual: np.ndarray) -> Bool[np.ndarray, "height width"]:
-    """True about pixels that differ from the usual image."""
-    different = (cv2.absdiff(image, usual) > _CHANGED).astype(np.uint8)
-    # Single pixels are noise of sensor and video.
-    kernel = np.ones((3, 3), np.uint8)
-    opened = cv2.morphologyEx(different, cv2.MORPH_OPEN, kernel)
-    return np.asarray(cv2.dilate(opened, np.ones((_GROWN, _GROWN), np.uint8))) > 0
-
-
-def _changed_features(image: np.ndarray, usual: np.ndarray) -> Features:
-    mask = _changed(image, usual)
-    if not mask.any():
-        return Features.of(image[:0])
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    box = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
-    seen = Features.of(image, box)
-    u, v = np.rint(seen.pixels).astype(int).T
-    return seen.chosen(mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,9 +360,7 @@ def _undistorted(
     return xi
 
 
-def _tool(
-    tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], width: int
-) -> Tool:
+def _tool(tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], width: int) -> Tool:
     """The points that move with a link, and the place on it that stands for the tool."""
     points, agrees = _points(tracks, link.pose, camera, width)
     points = points[agrees]
@@ -391,7 +436,8 @@ def _seen_place(
 
 def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray, "points 2"]:
     """Pixels of the line along which the tool points at the end of a demonstration."""
-    assert demo.position is not None and demo.orientation is not None
+    assert demo.position is not None
+    assert demo.orientation is not None
     position, orientation = map(torch.from_numpy, (demo.position[-1], demo.orientation[-1]))
     depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)
     along = torch.zeros(len(depth), 3, dtype=torch.float64)
@@ -401,35 +447,6 @@ def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray
     bare = torch.cat([camera[:10], camera.new_zeros(3)])
     pixels, _ = marker_pixels(bare, Pose(points, orientation.expand(len(depth), 4)))
     return pixels.numpy()
-
-
-def _object_features(
-    view: np.ndarray, usual: np.ndarray, line: Float[np.ndarray, "points 2"]
-) -> tuple[Features, Float[np.ndarray, "2"]]:
-    """Features and middle of what lies at the end of a demonstration and not in others.
-
-    Args:
-        view: Grey image without the arm before the object.
-        usual: The same without the object.
-        line: Pixels at which it may lie.
-    """
-    count, labels, stats, middles = cv2.connectedComponentsWithStats(
-        _changed(view, usual).astype(np.uint8)
-    )
-    least = _SMALLEST * view.size
-    best, nearest_to = 0, np.inf
-    for k in range(1, count):
-        if stats[k, cv2.CC_STAT_AREA] >= least:
-            v, u = np.nonzero(labels == k)
-            apart = np.linalg.norm(np.column_stack([u, v])[:, None] - line, axis=-1).min()
-            if apart < nearest_to:
-                best, nearest_to = k, apart
-    if not best or nearest_to > _ASIDE * view.shape[1]:
-        return Features.of(view[:0]), np.full(2, np.nan)
-    x, y, w, h = stats[best, :4].tolist()
-    seen = Features.of(view, (x, y, x + w, y + h))
-    u, v = seen.pixels.astype(int).T
-    return seen.chosen(labels[v, u] == best), middles[best]
 
 
 def _common_object(
@@ -453,7 +470,7 @@ def _common_object(
 def _described(
     demos: DemonstrationSet,
     tools: Sequence[Sequence[Finding | None]],
-    objects: Sequence[Finding | None] | None,
+    objects: Sequence[Finding | None],
 ) -> DemonstrationSet:
     """Demonstrations with columns of what was found, as markers would have given them."""
     result = []
@@ -461,7 +478,7 @@ def _described(
         visible = np.array([f is not None for f in found])
         pixels = np.array([np.zeros(2) if f is None else f.pixel for f in found])
         extra = dict(demo.extra)
-        item = None if objects is None else objects[k]
+        item = objects[k]
         if item is not None:
             ones = np.ones((len(demo), 1))
             extra[OBJECT_FEATURE] = ones * (*item.pixel, 1.0)
@@ -474,8 +491,12 @@ def _described(
 
 def _camera_key(reader: ImageReader, camera: str, source: str) -> str:
     """Feature of the named camera, or of the only one."""
-    keys = [k for k in reader.cameras if camera in ("", k, k.removeprefix("observation.images."))]
+    keys = [
+        k for k in reader.cameras if camera in ("", k, k.removeprefix("observation.images."))
+    ]
     if len(keys) != 1:
         known = ", ".join(reader.cameras) or "none: record with video"
-        raise ValueError(f"{source}: name one camera (--config markerless.camera=NAME), of {known}.")
+        raise ValueError(
+            f"{source}: name one camera (--config markerless.camera=NAME), of {known}."
+        )
     return keys[0]

@@ -35,6 +35,7 @@ from hrc_learn.skills.visual_skill import (
     VisualTarget,
 )
 from hrc_learn.vision.camera_model import IMAGE_SIZE
+from hrc_learn.vision.landmarks import Landmarks
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
 """Demonstrations in memory, or read one by one."""
@@ -49,6 +50,7 @@ def fit_visual_servo(
     config: ImageJacobianFitConfig | None = None,
     learning: EvidenceConfig | None = None,
     on_round: Callable[[int, EvidenceRound], None] = lambda number, state: None,
+    landmarks: Landmarks | None = None,
 ) -> VisualServoSkill:
     """Fit the image Jacobian and, if an object was observed, target and approach.
 
@@ -59,12 +61,14 @@ def fit_visual_servo(
         learning: Learning of neurons, noise and prior. None, or too few demonstrations to hold
             one out: they stay as they are.
         on_round: Called after every round of learning.
+        landmarks: Landmarks whose pixels the demonstrations hold; None: those of markers.
 
     Raises:
         ValueError: A demonstration lacks a column; the message names it and the episode.
     """
     watched = feature_trajectories(demos)
-    camera = fit_camera(watched, IMAGE_SIZE)
+    image_size = IMAGE_SIZE if landmarks is None else landmarks.image_size
+    camera = fit_camera(watched, image_size)
     config = config or ImageJacobianFitConfig.of_residual()
     neurons = neurons or RBFCenters.around(watched)
     learned = None
@@ -73,7 +77,7 @@ def fit_visual_servo(
         learned = maximize_evidence(left, neurons, config, learning, on_round)
         neurons, config = learned.neurons, learned.config
     network = RBFImageJacobian.fit(watched, neurons, config, camera)
-    held_out = cross_validate(watched, network, config, IMAGE_SIZE)
+    held_out = cross_validate(watched, network, config, image_size)
     assert network.report is not None
     network.report = replace(
         network.report,
@@ -88,6 +92,7 @@ def fit_visual_servo(
         approach=Approach.fit([end.path for end in ends]) if ends else None,
         angle=None if target is None else _marker_angle(ends, camera.camera, target),
         learned=learned,
+        landmarks=landmarks,
         cells=held_out.by_cell(),
     )
 

@@ -65,7 +65,9 @@ def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
     body.add_site(name=name, group=4, **pose)  # groups above 2 are not drawn
     if not plate.printed:
         return
-    add_picture(spec, name, np.repeat(marker_texture(plate.marker.id, _TEXELS)[..., None], 3, 2))
+    add_picture(
+        spec, name, np.repeat(marker_texture(plate.marker.id, _TEXELS)[..., None], 3, 2)
+    )
     mesh = spec.add_mesh(name=name)
     mesh.uservert = [-half, -half, 0, half, -half, 0, half, half, 0, -half, half, 0]
     mesh.userface = [0, 1, 2, 0, 2, 3]

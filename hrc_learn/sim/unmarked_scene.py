@@ -6,22 +6,18 @@ nothing. Frames of markers stay as sites, true places to measure against.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, replace
 
-import cv2
 import mujoco
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float
 
 from hrc_learn.sim.arm_model import add_box, add_picture
 from hrc_learn.sim.scene import Look, SceneConfig
+from hrc_learn.vision.imaging import carton, wood_grain
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
-
-# Texels along the longer edge of a print, and of the table.
-_PRINT, _WOOD = 512, 1024
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +38,7 @@ class UnmarkedLook(Look):
         rng = np.random.default_rng([self.seed, 54])
         table, (x, y, z) = config.table, config.table.centre
         top = z + table.half_size[2]
-        add_picture(spec, "wood", _wood(rng))
+        add_picture(spec, "wood", wood_grain(rng))
         spec.geom(table.name).material = "wood"
         spec.geom(table.name).rgba = np.append(rng.uniform(0.75, 1.0, 3), 1.0)
         for item in config.objects:
@@ -81,41 +77,23 @@ class UnmarkedLook(Look):
         spec.visual.quality.shadowsize = 2048 if self.shadows else 0
 
 
-def unmarked(scene: SceneConfig, look: UnmarkedLook) -> SceneConfig:
-    """The scene without any marker, with a look in their place."""
-    arm = scene.arm
-    if arm.marker is not None:
-        arm = replace(arm, marker=replace(arm.marker, printed=False))
+def unmarked(
+    scene: SceneConfig, look: UnmarkedLook, place: Float[np.ndarray, "3"] | None = None
+) -> SceneConfig:
+    """The scene without any marker, with a look in their place.
+
+    Args:
+        scene: Scene with markers.
+        look: Look of the scene.
+        place: Place on the tool that stands for it, in the tool's frame [m]: measures refer to
+            it. None: where the marker was.
+    """
+    arm, plate = scene.arm, scene.arm.marker
+    if plate is not None:
+        plate = replace(plate, printed=False)
+        if place is not None:
+            x, y, z = place.tolist()
+            behind = float(arm.robot.tcp[:3, 3].norm())
+            plate = replace(plate, position=(x, y, z + behind))
+        arm = replace(arm, marker=plate)
     return replace(scene, arm=arm, look=look)
-
-
-def carton(
-    name: str, colour: tuple[float, float, float, float]
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Print of a carton: words, stripes, a badge and a table of small print, by its name."""
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
-    base = 255 * np.array(colour[:3])
-    image = np.empty((_PRINT, _PRINT // 2, 3), np.uint8)
-    image[:] = base
-    inks = [rng.uniform(0, 255, 3).tolist() for _ in range(4)] + [(250, 250, 245), (20, 20, 25)]
-    for _ in range(4):
-        a, b = rng.integers(0, _PRINT, 2)
-        ink = inks[rng.integers(len(inks))]
-        cv2.line(image, (0, int(a)), (_PRINT // 2, int(b)), ink, int(rng.integers(4, 24)))
-    middle = (int(rng.integers(60, 200)), int(rng.integers(90, 420)))
-    cv2.circle(image, middle, int(rng.integers(30, 60)), inks[0], -1)
-    cv2.circle(image, middle, int(rng.integers(12, 28)), inks[4], -1)
-    for row in range(5):
-        word = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVXYZ23456789"), 6))
-        place = (int(rng.integers(0, 90)), 60 + 90 * row + int(rng.integers(0, 50)))
-        size = float(rng.uniform(0.6, 1.8))
-        cv2.putText(image, word, place, cv2.FONT_HERSHEY_DUPLEX, size, inks[4 + row % 2], 3)
-    return image
-
-
-def _wood(rng: np.random.Generator) -> UInt8[np.ndarray, "side side 3"]:
-    """Grain along x: noise, drawn out, on the table's colour."""
-    noise = rng.standard_normal((_WOOD, _WOOD)).astype(np.float32)
-    grain = cv2.GaussianBlur(noise, (0, 0), sigmaX=40, sigmaY=1.5)
-    level = 1 + 0.06 * grain / grain.std()
-    return (level[..., None] * (205, 185, 160)).clip(0, 255).astype(np.uint8)

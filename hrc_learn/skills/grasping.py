@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import CameraConfig
 from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.placing import Plan
@@ -55,6 +56,8 @@ _CHECK_EVERY = 5
 _POSTURES = 9
 # Largest distance of a joint from home that counts as at home [rad].
 _AT_HOME = 0.05
+# Features of a tool without markers are found less exactly than corners of a marker.
+_UNMARKED = CameraConfig(pixel_noise=0.6, bump=6.0)
 # Uncertainty of the table height before and after the fingers touch it [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 
@@ -152,7 +155,7 @@ class Grasping:
         self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
         controller = AdaptiveController(
             cell.chain,
-            camera_estimator(skill.jacobian),
+            camera_estimator(skill.jacobian, None if skill.landmarks is None else _UNMARKED),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=replace(config.controller, safety=cell.watchful(cell.config.safety)),
         )

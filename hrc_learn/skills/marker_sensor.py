@@ -1,10 +1,11 @@
-"""A fixed camera as a sensor of markers: detection, delay, loss and occlusion."""
+"""A fixed camera as a sensor of tool and objects, by markers or without; delay and loss."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -16,6 +17,101 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import StepLog
 from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, angle, centre
+from hrc_learn.vision.landmarks import LandmarkDetector, Landmarks
+
+# Standard deviation of a marker's centre [px], in images blurred as cameras blur them.
+_MARKER_NOISE = 0.1
+# Standard deviation beyond which a landmark counts as not found [px].
+_UNSURE = 2.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenFeature:
+    """Pixel of a tool or an object in an image."""
+
+    pixel: Float[np.ndarray, "2"]
+    """(u, v) [px]."""
+    angle: float
+    """Direction in the image [rad]; NaN: none."""
+    covariance: Float[np.ndarray, "2 2"]
+    """Covariance of the pixel [px^2]."""
+
+
+@runtime_checkable
+class FeatureSensor(Protocol):
+    """Camera that finds tool and objects, by the numbers that their markers would have."""
+
+    @property
+    def age(self) -> float:
+        """Age of the newest image when it was read [s]."""
+        ...
+
+    def read(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Take an image, RGB."""
+        ...
+
+    def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
+        """Take an image; what is found in it, by number. What is left out was not found.
+
+        Args:
+            ids: Numbers to search for; None: all.
+        """
+        ...
+
+
+class LandmarkSensor:
+    """Finds tool and objects without markers, from landmarks of demonstrations."""
+
+    def __init__(self, camera: Camera, landmarks: Landmarks, names: Mapping[int, str]):
+        """Set up the search.
+
+        Args:
+            camera: Source of the images.
+            landmarks: What is known of tool and objects.
+            names: Landmark of each number.
+        """
+        self._camera, self._names = camera, dict(names)
+        self._detector = LandmarkDetector(landmarks)
+
+    @property
+    def age(self) -> float:
+        """Age of the newest image when it was read [s]; 0 if the camera has no time stamps."""
+        return _age(self._camera)
+
+    def read(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Take an image, RGB."""
+        return self._camera.read()
+
+    def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
+        """Take an image; landmarks found in it with a certain place, by number."""
+        wanted = [i for i in (self._names if ids is None else ids) if i in self._names]
+        found = self._detector.find(self.read(), [self._names[i] for i in wanted])
+        return {
+            i: SeenFeature(pixel=one.pixel, angle=one.angle, covariance=one.covariance)
+            for i in wanted
+            if (one := found.get(self._names[i])) is not None and one.deviation < _UNSURE
+        }
+
+
+def feature_sensor(
+    camera: Camera, landmarks: Landmarks | None, tool: int, objects: Iterable[int]
+) -> FeatureSensor:
+    """Sensor of markers, or without them if there are landmarks.
+
+    Args:
+        camera: Source of the images.
+        landmarks: Landmarks of a model fitted without markers; None: markers.
+        tool: Number of the end effector.
+        objects: Numbers of the objects; landmarks know one kind of object.
+    """
+    if landmarks is None:
+        return MarkerSensor(camera, [tool, *objects])
+    names = {number: name for number in objects for name in landmarks.objects}
+    return LandmarkSensor(camera, landmarks, {tool: "tool", **names})
+
+
+def _age(camera: Camera) -> float:
+    return camera.age if isinstance(camera, TimedCamera) else 0.0
 
 
 class MarkerSensor:
@@ -34,11 +130,19 @@ class MarkerSensor:
     @property
     def age(self) -> float:
         """Age of the newest image when it was read [s]; 0 if the camera has no time stamps."""
-        return self._camera.age if isinstance(self._camera, TimedCamera) else 0.0
+        return _age(self._camera)
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Take an image, RGB."""
         return self._camera.read()
+
+    def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
+        """Take an image; centre and direction of each marker in it, by number."""
+        covariance = _MARKER_NOISE**2 * np.eye(2)
+        return {
+            id: SeenFeature(pixel=centre(found), angle=angle(found), covariance=covariance)
+            for id, found in self.corners(ids).items()
+        }
 
     def detect(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "2"]]:
         """Take an image; return the pixel (u, v) of each marker in it, by number.
@@ -96,7 +200,7 @@ class DelayedDetection:
 
     def __init__(
         self,
-        sensor: MarkerSensor | None,
+        sensor: FeatureSensor | None,
         latency: LatencyConfig,
         dt: float,
         rng: np.random.Generator,
@@ -132,7 +236,7 @@ class DelayedDetection:
             joints: Present joint positions [rad].
             ids: Markers to search for; None: all.
         """
-        found = {} if self._sensor is None else self._sensor.corners(ids)
+        found = {} if self._sensor is None else self._sensor.features(ids)
         taken = time - (0.0 if self._sensor is None else self._sensor.age)
         # A camera that is slower than the detection returns the same image again.
         if abs(taken - self._taken) > _SAME_IMAGE:
@@ -143,8 +247,8 @@ class DelayedDetection:
             MarkerObservation(
                 time=self._taken,
                 joints=self._joints_at(self._taken, time, joints),
-                pixels={id: centre(corners) for id, corners in found.items()},
-                angles={id: angle(corners) for id, corners in found.items()},
+                pixels={id: seen.pixel for id, seen in found.items()},
+                angles={id: seen.angle for id, seen in found.items()},
             )
         )
 

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
+    CameraConfig,
     CameraEstimator,
     CameraSpread,
     CellErrors,
@@ -37,7 +38,9 @@ from hrc_learn.jacobian.perspective import (
     on_plane,
 )
 from hrc_learn.kinematics.tool_orientation import Approach
+from hrc_learn.model_files import SavedModel, write_model
 from hrc_learn.store import Metres, Pixels, Radians, read_json, write_json
+from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 OBJECT_FEATURE = "observation.object_feature"
 """Dataset column with the object's marker in the image."""
@@ -372,11 +375,13 @@ class VisualServoSkill:
     """Marker direction; None if it was not recorded: the gripper does not turn."""
     learned: EvidenceResult | None = None
     """Learning of RBF centres, noise and prior; None if they were given."""
+    landmarks: Landmarks | None = None
+    """What is found without markers; None: tool and objects carry them."""
     cells: CellErrors | None = None
     """Held-out errors by cell of a grid; None for a loaded skill."""
 
     def save(self, folder: Path) -> None:
-        """Write `jacobian`, `visual_target.json`, `approach.json` and `angle.json`."""
+        """Write the image Jacobian, and whatever else was learned with it."""
         self.jacobian.save(folder / "jacobian")
         if self.target is not None:
             self.target.save(folder / "visual_target.json")
@@ -384,6 +389,8 @@ class VisualServoSkill:
             self.approach.save(folder / "approach.json")
         if self.angle is not None:
             self.angle.save(folder / "angle.json")
+        if self.landmarks is not None:
+            _write_landmarks(self.landmarks, folder / "landmarks")
 
     @classmethod
     def load(cls, folder: Path) -> "VisualServoSkill":
@@ -394,12 +401,13 @@ class VisualServoSkill:
             ValueError: A file has an unknown version or kind.
         """
         target, approach = folder / "visual_target.json", folder / "approach.json"
-        angle = folder / "angle.json"
+        angle, landmarks = folder / "angle.json", folder / "landmarks"
         return cls(
             jacobian=RBFImageJacobian.load(folder / "jacobian"),
             target=VisualTarget.load(target) if target.exists() else None,
             approach=Approach.load(approach) if approach.exists() else None,
             angle=MarkerAngle.load(angle) if angle.exists() else None,
+            landmarks=_read_landmarks(landmarks) if landmarks.exists() else None,
         )
 
     def metrics(self) -> dict[str, float]:
@@ -447,10 +455,55 @@ class VisualServoSkill:
         return values
 
 
-def camera_estimator(learned: RBFImageJacobian) -> CameraEstimator:
+def _write_landmarks(landmarks: Landmarks, folder: Path) -> None:
+    tool = landmarks.tool
+    arrays = {"points": tool.points, "descriptors": tool.descriptors, "place": tool.place}
+    arrays["optics"] = np.array(tool.optics)
+    for name, item in landmarks.objects.items():
+        for k, view in enumerate(item.views):
+            arrays[f"{name}.{k}.pixels"] = view.pixels
+            arrays[f"{name}.{k}.descriptors"] = view.descriptors
+    views = {name: len(item.views) for name, item in landmarks.objects.items()}
+    config = {"image_size": list(landmarks.image_size), "views": views}
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
+    write_model(folder, "Landmarks", config, tensors)
+
+
+def _read_landmarks(folder: Path) -> Landmarks:
+    saved = SavedModel(folder, "Landmarks")
+
+    def array(name: str) -> np.ndarray:
+        return saved.tensor(name).numpy()
+
+    def view(key: str) -> Features:
+        return Features(pixels=array(f"{key}.pixels"), descriptors=array(f"{key}.descriptors"))
+
+    f, u, v, k = array("optics").tolist()
+    width, height = saved.get("image_size", list)
+    tool = Tool(
+        points=array("points"),
+        descriptors=array("descriptors"),
+        place=array("place"),
+        optics=(f, u, v, k),
+    )
+    views = saved.get("views", dict).items()
+    objects = {
+        name: Object(views=tuple(view(f"{name}.{n}") for n in range(count)))
+        for name, count in views
+    }
+    return Landmarks(tool=tool, objects=objects, image_size=(width, height))
+
+
+def camera_estimator(
+    learned: RBFImageJacobian, config: CameraConfig | None = None
+) -> CameraEstimator:
     """Online estimate of a camera that may have been moved since the demonstrations.
+
+    Args:
+        learned: Image Jacobian of the demonstrations with its camera.
+        config: Window, noise and prior.
 
     Raises:
         ValueError: The model has no camera.
     """
-    return CameraEstimator(copy.deepcopy(learned).double())
+    return CameraEstimator(copy.deepcopy(learned).double(), config)

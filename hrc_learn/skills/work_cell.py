@@ -32,9 +32,9 @@ from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import StraightLine
 from hrc_learn.skills.marker_sensor import (
     DelayedDetection,
+    FeatureSensor,
     LatencyConfig,
     MarkerObservation,
-    MarkerSensor,
 )
 from hrc_learn.skills.person_watch import NEAR_PEOPLE, PersonWatch, WatchedPeople
 from hrc_learn.skills.step_report import (
@@ -133,7 +133,7 @@ class WorkCell:
         chain: SerialChain,
         arm: Arm,
         gripper: Gripper,
-        sensor: MarkerSensor | None = None,
+        sensor: FeatureSensor | None = None,
         human: Human,
         advance: Callable[[float], None],
         config: WorkCellConfig | None = None,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -94,7 +95,7 @@ def guided_frames(
 
 def write_demonstrations(
     path: Path,
-    demonstrations: Iterable[Iterable[Frame]],
+    demonstrations: Iterable[Iterable[Mapping[str, Any]]],
     task: str,
     fps: float,
     *,
@@ -253,7 +254,7 @@ def film_servoing(
     camera: Camera,
     config: ServoDemonstrationConfig,
     rng: np.random.Generator,
-) -> Iterator[Frame]:
+) -> Iterator[dict[str, Any]]:
     """Demonstrate one motion that ends above an object, and film it.
 
     Args:

@@ -5,6 +5,7 @@ It renders what matters to visual servoing, in a fraction of a renderer's time: 
 machines without OpenGL use it in place of the simulator's camera.
 """
 
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, replace
 
@@ -128,6 +129,8 @@ MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 _MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)
 # Grey levels of a lit print: white is not 255, black not 0.
 _PAPER, _INK = 235.0, 25.0
+# Texels along the longer edge of a print, and of a table.
+_PRINT, _WOOD = 512, 1024
 # A plate closer to the camera plane than this is not drawn: its projection diverges [m].
 _NEAR = 0.02
 
@@ -266,6 +269,42 @@ def table_top(width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
         light = 1.0 - 0.12 * u - 0.08 * low - 0.1 * (u * u + low * low)
         wood[top : top + _BAND] = np.rint(light * [168.0, 148.0, 124.0]).clip(0, 255)
     return wood
+
+
+def carton(
+    name: str, colour: tuple[float, float, float, float]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Print of a carton: words, stripes, a badge and a table of small print, by its name."""
+    import cv2
+
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    base = 255 * np.array(colour[:3])
+    image = np.empty((_PRINT, _PRINT // 2, 3), np.uint8)
+    image[:] = base
+    inks = [rng.uniform(0, 255, 3).tolist() for _ in range(4)] + [(250, 250, 245), (20, 20, 25)]
+    for _ in range(4):
+        a, b = rng.integers(0, _PRINT, 2)
+        ink = inks[rng.integers(len(inks))]
+        cv2.line(image, (0, int(a)), (_PRINT // 2, int(b)), ink, int(rng.integers(4, 24)))
+    middle = (int(rng.integers(60, 200)), int(rng.integers(90, 420)))
+    cv2.circle(image, middle, int(rng.integers(30, 60)), inks[0], -1)
+    cv2.circle(image, middle, int(rng.integers(12, 28)), inks[4], -1)
+    for row in range(5):
+        word = "".join(rng.choice(list("ABCDEFGHKLMNPRSTUVXYZ23456789"), 6))
+        place = (int(rng.integers(0, 90)), 60 + 90 * row + int(rng.integers(0, 50)))
+        size = float(rng.uniform(0.6, 1.8))
+        cv2.putText(image, word, place, cv2.FONT_HERSHEY_DUPLEX, size, inks[4 + row % 2], 3)
+    return image
+
+
+def wood_grain(rng: np.random.Generator) -> UInt8[np.ndarray, "side side 3"]:
+    """Grain along x: noise, drawn out, on the table's colour."""
+    import cv2
+
+    noise = rng.standard_normal((_WOOD, _WOOD)).astype(np.float32)
+    grain = cv2.GaussianBlur(noise, (0, 0), sigmaX=40, sigmaY=1.5)
+    level = 1 + 0.06 * grain / grain.std()
+    return (level[..., None] * (205, 185, 160)).clip(0, 255).astype(np.uint8)
 
 
 def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:

@@ -10,14 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Literal
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from hrc_learn.store import new_file, read_json, write_json
+from hrc_learn.vision.markers import as_grey
 
 RATIO = 0.8
 """Largest ratio of the distances to the best and to the second best descriptor."""
@@ -33,6 +30,12 @@ _LEAST_NOISE = 0.15
 _SCALES = (0.5, 2.0)
 # Margin about the last finding within which the next is looked for first [px of `_WIDTH`].
 _MARGIN = 70
+
+# Grey levels by which a pixel differs from the usual one, and reach about such pixels [px].
+_CHANGED, _GROWN = 14, 9
+# Least area of an object, as a fraction of the image; and its largest distance from where it is
+# expected, as a fraction of the image's width.
+_SMALLEST, _ASIDE = 3e-4, 0.06
 
 Grey = UInt8[np.ndarray, "height width"]
 
@@ -61,14 +64,15 @@ class Features:
             image: RGB or grey.
             box: Left, top, right, bottom of the part [px]; None: the whole image.
         """
+        import cv2
+
         left, top, right, bottom = box or (0, 0, image.shape[1], image.shape[0])
         part = np.ascontiguousarray(image[top:bottom, left:right])
-        grey = np.asarray(cv2.cvtColor(part, cv2.COLOR_RGB2GRAY)) if part.ndim == 3 else part
         # White arms have little contrast: half of what SIFT asks for by default.
-        found, descriptors = cv2.SIFT_create(0, 3, 0.02).detectAndCompute(grey, None)  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue, reportArgumentType]
+        found, descriptors = cv2.SIFT_create(0, 3, 0.02).detectAndCompute(as_grey(part), None)  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue, reportArgumentType]
         if descriptors is None:
             return cls(pixels=np.zeros((0, 2)), descriptors=np.zeros((0, 128), np.uint8))
-        pixels = np.array([key.pt for key in found]) + (left, top)
+        pixels = np.array([key.pt for key in found]) + np.array([left, top])
         return cls(pixels=pixels, descriptors=descriptors.astype(np.uint8))
 
 
@@ -112,13 +116,17 @@ class Tool:
             seen: Features of the image.
             width: Width of the image [px].
         """
+        import cv2
+
         image, own = self._matches(seen)
         if len(image) < FEWEST_POINTS:
             return None
         f, u, v, k = self.optics
         matrix = np.array([[f, 0, u], [0, f, v], [0, 0, 1]])
         lens = np.array([k, 0.0, 0.0, 0.0])
-        points, pixels, reach = self.points[own], seen.pixels[image], _REACH * width / _WIDTH
+        points: np.ndarray = self.points[own]
+        pixels: np.ndarray = seen.pixels[image]
+        reach = _REACH * width / _WIDTH
         good, turn, shift, inliers = cv2.solvePnPRansac(
             points,
             pixels,
@@ -130,7 +138,7 @@ class Tool:
         )
         if not good or inliers is None or len(inliers) < FEWEST_POINTS:
             return None
-        kept = inliers.ravel()
+        kept: np.ndarray = np.asarray(inliers).ravel()
         for _ in range(3):
             turn, shift = cv2.solvePnPRefineLM(
                 points[kept], pixels[kept], matrix, lens, turn, shift
@@ -169,8 +177,7 @@ class Object:
     def find(self, seen: Features, width: int) -> Finding | None:
         """Pixel and direction among an image's features; None: not found."""
         found = [match_view(view, seen, width) for view in self.views]
-        best = max((f for f in found if f), key=lambda f: len(f.points), default=None)
-        return best
+        return max((f for f in found if f), key=lambda f: len(f.points), default=None)
 
 
 def match_view(view: Features, seen: Features, width: int) -> Finding | None:
@@ -181,6 +188,8 @@ def match_view(view: Features, seen: Features, width: int) -> Finding | None:
         seen: Features of the image.
         width: Width of the image [px].
     """
+    import cv2
+
     if min(len(view.pixels), len(seen.pixels)) < _FEWEST_MATCHES:
         return None
     index, distance = nearest(view.descriptors, seen.descriptors, 2)
@@ -255,15 +264,6 @@ def _propagated(
     return variance * scaled @ inverse @ scaled.T
 
 
-@dataclass(frozen=True)
-class _LandmarksFile:
-    version: Literal[1]
-    image_size: tuple[int, int]
-    place: tuple[float, float, float]
-    optics: tuple[float, float, float, float]
-    objects: dict[str, int]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Landmarks:
     """Everything that is found without markers in the images of one camera."""
@@ -273,57 +273,6 @@ class Landmarks:
     """Objects by name."""
     image_size: tuple[int, int]
     """Width and height of the images [px]."""
-
-    def save(self, folder: Path) -> None:
-        """Write `landmarks.json` and `landmarks.safetensors`."""
-        from safetensors.numpy import save_file
-
-        folder.mkdir(parents=True, exist_ok=True)
-        arrays = {"tool.points": self.tool.points, "tool.descriptors": self.tool.descriptors}
-        for name, item in self.objects.items():
-            for k, view in enumerate(item.views):
-                arrays[f"{name}.{k}.pixels"] = view.pixels
-                arrays[f"{name}.{k}.descriptors"] = view.descriptors
-        with new_file(folder / "landmarks.safetensors") as part:
-            save_file({key: np.ascontiguousarray(a) for key, a in arrays.items()}, part)
-        x, y, z = self.tool.place.tolist()
-        content = _LandmarksFile(
-            version=1,
-            image_size=self.image_size,
-            place=(x, y, z),
-            optics=self.tool.optics,
-            objects={name: len(item.views) for name, item in self.objects.items()},
-        )
-        write_json(folder / "landmarks.json", content)
-
-    @classmethod
-    def load(cls, folder: Path) -> Landmarks:
-        """Read saved landmarks.
-
-        Raises:
-            FileNotFoundError: There are none: the model was fitted to markers.
-            ValueError: A file is damaged or has an unknown version.
-        """
-        from safetensors.numpy import load_file
-
-        content = read_json(folder / "landmarks.json", _LandmarksFile, "fit it again")
-        arrays = load_file(folder / "landmarks.safetensors")
-
-        def view(key: str) -> Features:
-            pixels, descriptors = arrays[f"{key}.pixels"], arrays[f"{key}.descriptors"]
-            return Features(pixels=pixels, descriptors=descriptors)
-
-        tool = Tool(
-            points=arrays["tool.points"],
-            descriptors=arrays["tool.descriptors"],
-            place=np.array(content.place),
-            optics=content.optics,
-        )
-        objects = {
-            name: Object(views=tuple(view(f"{name}.{k}") for k in range(count)))
-            for name, count in content.objects.items()
-        }
-        return cls(tool=tool, objects=objects, image_size=content.image_size)
 
 
 class LandmarkDetector:
@@ -379,3 +328,84 @@ def _about(
     left, top = np.maximum(points.min(axis=0) - margin, 0).astype(int).tolist()
     right, bottom = np.minimum(points.max(axis=0) + margin, size).astype(int).tolist()
     return left, top, right, bottom
+
+
+def draw_finding(image: UInt8[np.ndarray, "height width 3"], finding: Finding) -> None:
+    """Draw features, their outline, the place with two standard deviations, and a direction.
+
+    Args:
+        image: RGB, drawn on in place.
+        finding: What was found in it.
+    """
+    import cv2
+
+    size, green, red = max(1, image.shape[1] // 480), (40, 220, 60), (255, 40, 40)
+    points = np.rint(finding.points).astype(np.int32)
+    cv2.polylines(image, [cv2.convexHull(points)], True, green, size)
+    for u, v in points.tolist():
+        cv2.circle(image, (u, v), size, (255, 220, 0), -1)
+    u, v = np.rint(finding.pixel).astype(int).tolist()
+    cv2.drawMarker(image, (u, v), red, cv2.MARKER_CROSS, 12 * size, size)
+    variance, axes = np.linalg.eigh(finding.covariance)
+    reach = np.maximum(np.rint(2 * np.sqrt(variance.clip(0))), 2 * size).astype(int).tolist()
+    turn = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
+    cv2.ellipse(image, (u, v), (reach[0], reach[1]), turn, 0, 360, red, size)
+    if np.isfinite(finding.angle):
+        end = finding.pixel + 40 * size * np.array(
+            [np.cos(finding.angle), np.sin(finding.angle)]
+        )
+        a, b = np.rint(end).astype(int).tolist()
+        cv2.arrowedLine(image, (u, v), (a, b), (40, 120, 255), size)
+
+
+def changed(image: np.ndarray, usual: np.ndarray) -> Bool[np.ndarray, "height width"]:
+    """True about pixels that differ from the usual image."""
+    import cv2
+
+    different = (cv2.absdiff(image, usual) > _CHANGED).astype(np.uint8)
+    # Single pixels are noise of sensor and video.
+    kernel = np.ones((3, 3), np.uint8)
+    opened = cv2.morphologyEx(different, cv2.MORPH_OPEN, kernel)
+    return np.asarray(cv2.dilate(opened, np.ones((_GROWN, _GROWN), np.uint8))) > 0
+
+
+def changed_features(image: np.ndarray, usual: np.ndarray) -> Features:
+    mask = changed(image, usual)
+    if not mask.any():
+        return Features.of(image[:0])
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    box = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    seen = Features.of(image, box)
+    u, v = np.rint(seen.pixels).astype(int).T
+    return seen.chosen(mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)])
+
+
+def blob_features(
+    view: np.ndarray, usual: np.ndarray, line: Float[np.ndarray, "points 2"]
+) -> tuple[Features, Float[np.ndarray, "2"]]:
+    """Features and middle of what lies at the end of a demonstration and not in others.
+
+    Args:
+        view: Grey image without the arm before the object.
+        usual: The same without the object.
+        line: Pixels at which it may lie.
+    """
+    import cv2
+
+    count, labels, stats, middles = cv2.connectedComponentsWithStats(
+        changed(view, usual).astype(np.uint8)
+    )
+    least = _SMALLEST * view.size
+    best, nearest_to = 0, np.inf
+    for k in range(1, count):
+        if stats[k, cv2.CC_STAT_AREA] >= least:
+            v, u = np.nonzero(labels == k)
+            apart = np.linalg.norm(np.column_stack([u, v])[:, None] - line, axis=-1).min()
+            if apart < nearest_to:
+                best, nearest_to = k, apart
+    if not best or nearest_to > _ASIDE * view.shape[1]:
+        return Features.of(view[:0]), np.full(2, np.nan)
+    x, y, w, h = stats[best, :4].tolist()
+    seen = Features.of(view, (x, y, x + w, y + h))
+    u, v = seen.pixels.astype(int).T
+    return seen.chosen(labels[v, u] == best), middles[best]

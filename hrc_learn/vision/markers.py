@@ -150,14 +150,14 @@ class MarkerDetector:
         reach = 0.5 * np.ptp(last, axis=0).max() + 8  # half a marker of motion a frame
         low = np.maximum(np.floor(last.min(axis=0) - reach).astype(int), 0)
         high = np.ceil(last.max(axis=0) + reach).astype(int)
-        grey = _grey(image[low[1] : high[1], low[0] : high[0]])
+        grey = as_grey(image[low[1] : high[1], low[0] : high[0]])
         rough = self._search(grey, frozenset([id]))
         return {id: _refine(grey, corners) + low for id, corners in rough.items()}
 
     def _search_everywhere(self, image: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
         import cv2
 
-        grey = _grey(image)
+        grey = as_grey(image)
         half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
         found: dict[int, Corners] = {}
         for id, corners in self._search(half, ids).items():
@@ -209,12 +209,6 @@ def angle(corners: Float[np.ndarray, "4 2"]) -> float:
     return float(np.arctan2(v, u))
 
 
-def _grey(image: np.ndarray) -> np.ndarray:
-    import cv2
-
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) if image.ndim == 3 else image
-
-
 def _refine(grey: np.ndarray, corners: Corners) -> Corners:
     """Corners moved to the saddle points of the grey levels.
 
@@ -233,3 +227,12 @@ def _refine(grey: np.ndarray, corners: Corners) -> Corners:
         (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01),
     )
     return refined[:, 0].astype(np.float64)
+
+
+def as_grey(
+    image: UInt8[np.ndarray, "height width 3"] | UInt8[np.ndarray, "height width"],
+) -> UInt8[np.ndarray, "height width"]:
+    """Grey image of an RGB image."""
+    import cv2
+
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) if image.ndim == 3 else image

@@ -28,7 +28,7 @@ class CountingSensor:
     def __init__(self):
         self.asked = []
 
-    def corners(self, ids):
+    def features(self, ids):
         self.asked.append(ids)
         return {}
 
@@ -52,12 +52,12 @@ class SlowCamera:
     def __init__(self, arm):
         self._arm, self.age, self._images = arm, 0.0, []
 
-    def corners(self, ids):
+    def features(self, ids):
         now = self._arm.time
         taken = 0.07 * np.floor((now - 0.05) / 0.07)
         self.age = now - taken + 1e-4 * np.sin(1e3 * now)  # the clocks differ a little
-        square = 1e-3 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        return {7: np.array([taken, 0.0]) + square}
+        pixel = np.array([taken, 0.0])
+        return {7: SeenFeature(pixel=pixel, angle=0.0, covariance=np.eye(2))}
 
     def read(self):
         return np.zeros((2, 2, 3), np.uint8)
