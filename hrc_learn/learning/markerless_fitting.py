@@ -10,7 +10,7 @@ demonstrations and lies where their motion ends.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -196,7 +196,9 @@ class _Search:
         self._reader, self._key, self._demos, self._size = reader, key, demos, size
         each = max(2, -(-_FRAMES // len(demos)))
         self.followed = 0
-        self.picked = [np.unique(np.linspace(0, len(d) - 1, each).astype(int)) for d in demos]
+        self.picked = [
+            np.unique(np.linspace(0, len(d) - 1, each).astype(int)).tolist() for d in demos
+        ]
 
     def features(self) -> list[Features]:
         """Features of the picked frames where they differ from the usual image."""
@@ -205,11 +207,10 @@ class _Search:
         usual = np.median(np.stack(images[::stride]), axis=0).astype(np.uint8)
         return [changed_features(image, usual) for image in images]
 
-    def _pictures(self, rows: Iterable[Iterable[int]]) -> Iterator[list[np.ndarray]]:
+    def _pictures(self, rows: Sequence[Sequence[int]]) -> Iterator[list[np.ndarray]]:
         """Grey images of some frames, demonstration by demonstration."""
         for demo, frames in zip(self._demos, rows, strict=True):
-            wanted = [int(k) for k in frames]
-            shown = self._reader.stream(demo.episode, self._key, wanted)
+            shown = self._reader.stream(demo.episode, self._key, frames)
             yield [as_grey(image) for _, image in shown]
 
     def follow(self, landmarks: Landmarks) -> list[list[Finding | None]]:
@@ -392,7 +393,7 @@ def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> Demonst
     return demos.map(posed)
 
 
-def _poses(demos: DemonstrationSet, picked: Sequence[np.ndarray]) -> Pose:
+def _poses(demos: DemonstrationSet, picked: Sequence[Sequence[int]]) -> Pose:
     """Poses of the tool in picked frames of all demonstrations."""
     rows = list(zip(demos, picked, strict=True))
     position = np.concatenate([d.position[k] for d, k in rows if d.position is not None])
@@ -401,7 +402,7 @@ def _poses(demos: DemonstrationSet, picked: Sequence[np.ndarray]) -> Pose:
 
 
 def _links(
-    source: DemonstrationSource, demos: DemonstrationSet, picked: Sequence[np.ndarray]
+    source: DemonstrationSource, demos: DemonstrationSet, picked: Sequence[Sequence[int]]
 ) -> Iterator[_Link]:
     """The tool, and the link before the last joint where the joints are known."""
     yield _Link(name="tool", pose=_poses(demos, picked), axis=None, direction=None)

@@ -40,10 +40,8 @@ def paste(image, print_, corners):
 
 
 def square(half_width, half_height):
-    return np.array(
-        [[-half_width, half_height, 0], [half_width, half_height, 0]]
-        + [[half_width, -half_height, 0], [-half_width, -half_height, 0]]
-    )
+    signs = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    return signs * (half_width, half_height, 0)
 
 
 @pytest.fixture(scope="module")
@@ -54,20 +52,18 @@ def filmed(tmp_path_factory):
     colour, grey = (0.2, 0.45, 0.7, 1.0), (0.7, 0.7, 0.7, 1.0)
     plate, item = carton("gripper", grey)[:256], carton("object", colour)
     places, table = [], np.full((HEIGHT, WIDTH, 3), 150, np.uint8)
-    paste(table, carton("other", colour), square(0.03, 0.05) + [0.25, 0.2, 0.0])
+    paste(table, carton("other", colour), np.add(square(0.03, 0.05), (0.25, 0.2, 0.0)))
     with DatasetWriter(folder, 10, "hand", cameras={"front": (HEIGHT, WIDTH)}) as writer:
         for _ in range(EPISODES):
             place, yaw = np.array([0.5, 0, 0]) + rng.uniform(-0.15, 0.15, 3), rng.uniform(-2, 2)
             place[2] = 0.05
             turn = Rotation.from_euler("z", yaw).as_matrix()
-            knots = place + rng.uniform(-0.2, 0.2, (4, 3)) + [0, 0, 0.2]
-            knots = np.vstack([[0.1, 0.3, 0.3], knots, place + [0, 0, 0.12]])
+            knots = place + rng.uniform(-0.2, 0.2, (4, 3)) + np.array([0, 0, 0.2])
+            knots = np.vstack([[0.1, 0.3, 0.3], knots, np.add(place, (0, 0, 0.12))])
             writer.start_episode("reach")
             for k in range(FRAMES):
                 s = k / (FRAMES - 1)
-                position = np.array(
-                    [np.interp(5 * s, range(6), knots[:, i]) for i in range(3)]
-                )
+                position = np.array([np.interp(5 * s, range(6), knots[:, i]) for i in range(3)])
                 wobble = 0.25 * np.sin([3 * k, 4 * k + 1, 0]) * (1 - s)
                 tool = Rotation.from_rotvec(wobble) * Rotation.from_euler(
                     "zx", [yaw * s, np.pi]
@@ -127,7 +123,9 @@ def test_an_image_without_them_says_so(fit):
     rng = np.random.default_rng(0)
     detector = LandmarkDetector(fit.landmarks)
     noise = rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    paste(noise, carton("other", (0.2, 0.45, 0.7, 1.0)), square(0.03, 0.05) + [0.5, 0, 0])
+    paste(
+        noise, carton("other", (0.2, 0.45, 0.7, 1.0)), np.add(square(0.03, 0.05), (0.5, 0, 0))
+    )
     assert detector.find(noise, ["tool", "object"]) == {}
 
 
