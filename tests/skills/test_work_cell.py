@@ -13,6 +13,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills.marker_sensor import SeenFeature
 
 pytestmark = pytest.mark.simulation
 
