@@ -47,6 +47,7 @@ class Ros2Robot:
 
         self.world, self._config = world, config or Ros2Config()
         self._rate, self.violations, self.commands = rate, 0, 0
+        self._silent = False
         self.late, self.state = 0.0, world.arm.read()
         self._chain = world.arm.robot.chain
         self._velocity = np.zeros(len(self._chain.joint_names))
@@ -91,6 +92,14 @@ class Ros2Robot:
         positions = np.array([p.positions for p in message.points])[:, order]
         self._path = (begin + np.array(times), positions)
 
+    def pause(self) -> None:
+        """Fall silent: joint states are not published, while the arm goes on."""
+        self._silent = True
+
+    def resume(self) -> None:
+        """Publish joint states again."""
+        self._silent = False
+
     def _run(self) -> None:
         due = time.monotonic()
         while not self._ended.is_set():
@@ -114,7 +123,8 @@ class Ros2Robot:
         low = state.joint_position < limits.lower.numpy() - 1e-3
         high = state.joint_position > limits.upper.numpy() + 1e-3
         self.violations += bool((fast | low | high).any())
-        self._publish(state)
+        if not self._silent:
+            self._publish(state)
 
     def _publish(self, state: ArmState) -> None:
         from sensor_msgs.msg import JointState

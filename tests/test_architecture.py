@@ -115,8 +115,9 @@ LIBRARIES: dict[str, set[str]] = {
 """Libraries that modules of a package may import as soon as they are imported."""
 
 ROS2 = {
-    f"{name}_msgs" for name in ("sensor", "std", "trajectory", "diagnostic", "visualization")
-} | {"geometry_msgs", "rclpy"}
+    f"{name}_msgs"
+    for name in ("sensor", "std", "trajectory", "diagnostic", "visualization", "geometry")
+} | {"rclpy", "rcl_interfaces"}
 """Packages of ROS 2, from the registry or the system."""
 
 LAZY_LIBRARIES: dict[str, set[str]] = {

@@ -8,7 +8,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal
@@ -35,6 +35,7 @@ from hrc_learn.experiments.real_arm import ArmSite, opened_arm
 from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.hardware import DriverError, ending_at_rest
+from hrc_learn.hardware.ros2_topics import found_description, ros2_origin
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
@@ -205,16 +206,19 @@ def _run_page(
 
 @dataclass(frozen=True, kw_only=True)
 class _ServeSettings:
-    """Settings of a real arm and of the step."""
+    """Settings of a real arm, of the step and of a node of ROS 2."""
 
     site: ArmSite = field(default_factory=ArmSite)
     step: Literal["fastest", "eager"] = "fastest"
     """Compile the step ahead of time if there is a C++ compiler, or do not."""
+    autostart: bool = True
+    """Configure and activate the node at once; False: a launch file does."""
 
 
 def serve(args: Serve) -> None:
-    """Run the loop and print its latencies."""
-    if not (args.duration > 0 and args.rate > 0):
+    """Run the loop, or a node of ROS 2, and print the latencies."""
+    duration = 8.0 if args.duration is None else args.duration
+    if not (duration > 0 and args.rate > 0):
         raise ValueError("--duration and --rate must be positive")
     if args.rate < (slowest := SafetyConfig().rate):
         raise ValueError(
@@ -223,7 +227,10 @@ def serve(args: Serve) -> None:
     torch.set_num_threads(1)
     dt = 1 / args.rate
     settings = with_settings(args.config, _ServeSettings())
-    camera, robot = _camera(), ArmChoice(args.robot).work_arm()
+    if args.ros2:
+        _serve_node(args, settings)
+        return
+    camera, robot = _camera(), ArmChoice(found_description(args.robot)).work_arm()
     scene = SceneConfig(timestep=dt)
     world = World(replace(scene, arm=replace(scene.arm, robot=robot)))
     world.reset(robot.chain.ready.numpy())
@@ -236,11 +243,33 @@ def serve(args: Serve) -> None:
         runner = open_step(controller, observation)
     opened = time.perf_counter() - began
     with connect() as arm:
-        steps = round(args.duration * args.rate)
+        steps = round(duration * args.rate)
         measured = _run_serve(runner, arm, robot.chain, camera, dt, steps)
     figures = {"open_s": opened} | measured
     counts = runner.state("safety.counts")
     figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
+    for name, value in figures.items():
+        Console().print(f"{name:22} {value:.4g}", highlight=False)
+    write_values(args.json, figures)
+
+
+def _serve_node(args: Serve, settings: _ServeSettings) -> None:
+    """Run the controller as a node until Ctrl-C, or for the duration that is given."""
+    from hrc_learn.hardware.ros2_node import ControllerNode
+
+    print(ros2_origin(), flush=True)
+    robot = ArmChoice(found_description(args.robot)).arm()
+    safety = replace(settings.site, driver="ros2").cell_config().safety
+    step = EagerRunner if settings.step == "eager" else open_step
+    made = ControllerNode(robot.chain, settings.site.ros2, safety, step)
+    with closing(made) as node:
+        if settings.autostart and not node.start():
+            raise ConnectionError("the node could not be started: its log says why")
+        end = time.monotonic() + (np.inf if args.duration is None else args.duration)
+        with suppress(KeyboardInterrupt), ending_at_rest(node.deactivate):
+            while time.monotonic() < end:
+                time.sleep(0.1)
+        figures = node.figures()
     for name, value in figures.items():
         Console().print(f"{name:22} {value:.4g}", highlight=False)
     write_values(args.json, figures)

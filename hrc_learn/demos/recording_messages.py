@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.recording_files import Field
+from hrc_learn.demos.videos import Image, decode_image
 
 _JOINTS = {"position": "joint_positions", "velocity": "joint_velocities"}
 _JOINTS |= {"effort": "joint_efforts"}
@@ -22,8 +23,8 @@ _VECTORS = {
     ("linear", "angular"): ("vx", "vy", "vz", "wx", "wy", "wz"),
 }
 # Encodings of raw images: channels, and PyAV's name of the format.
-_PIXELS = {"rgb8": (3, "rgb24"), "bgr8": (3, "bgr24"), "8UC3": (3, "bgr24")}
-_PIXELS |= {"mono8": (1, "gray8"), "8UC1": (1, "gray8"), "yuv422_yuy2": (2, "yuyv422")}
+_PIXELS = {"rgb8": (3, "rgb24"), "bgr8": (3, "bgr24"), "8uc3": (3, "bgr24")}
+_PIXELS |= {"mono8": (1, "gray8"), "8uc1": (1, "gray8"), "yuv422_yuy2": (2, "yuyv422")}
 _PIXELS |= {"rgba8": (4, "rgba"), "bgra8": (4, "bgra")}
 _PIXELS |= {f"bayer_{p}8": (1, f"bayer_{p}8") for p in ("rggb", "bggr", "gbrg", "grbg")}
 _CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": "vp9"}
@@ -147,13 +148,12 @@ def image_field(name: str, one: Topic, messages: Messages, notes: list[str]) -> 
     kind = str(getattr(first, "encoding", "") or getattr(first, "format", "")).lower()
     empty = lambda a, b: np.zeros(0)  # noqa: E731
     raw, codec = hasattr(first, "width"), next((c for w, c in _CODECS.items() if w in kind), "")
-    known = {k.lower(): v for k, v in _PIXELS.items()}
     if "depth" in kind or kind in ("16uc1", "32fc1", "mono16"):
         return Field(shape=(count,), kind="depth", read=empty)
-    if raw and not codec and kind not in known:
+    if raw and not codec and kind not in _PIXELS:
         notes.append(f"{name} is left out: images of encoding {kind} are not read")
         return None
-    read = _ImageReader(name, one.received, messages, codec, known.get(kind))
+    read = _ImageReader(name, one.received, messages, codec, _PIXELS.get(kind))
     if not raw and not codec:
         return Field(shape=(count,), kind="encoded", read=read)
     shape = read(0, 1)[0].shape
@@ -210,6 +210,19 @@ class _ImageReader:
                 yield data
             else:
                 yield _rgb(message, data, *self._pixels)
+
+
+def image_of(message: Any) -> Image:
+    """RGB image of a raw or compressed one.
+
+    Raises:
+        DatasetError: Its encoding is not read here, or it is damaged.
+    """
+    if not hasattr(message, "width"):
+        return decode_image(bytes(message.data))
+    if message.encoding.lower() not in _PIXELS:
+        raise DatasetError(f"images of encoding {message.encoding} are not read")
+    return _rgb(message, bytes(message.data), *_PIXELS[message.encoding.lower()])
 
 
 def _rgb(message: Any, data: bytes, channels: int, form: str) -> np.ndarray:

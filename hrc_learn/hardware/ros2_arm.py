@@ -34,6 +34,8 @@ class Ros2Config:
 
     joint_states: str = "/joint_states"
     """Topic of the joint states. Joints are found by name."""
+    base: str = "base_link"
+    """Frame of goals and markers of `hrc serve --ros2`; empty: of any frame."""
     command: str = "/forward_velocity_controller/commands"
     """Topic of the controller."""
     interface: Literal["velocity", "position", "trajectory"] = "velocity"
@@ -82,6 +84,7 @@ class Ros2Arm:
     Attributes:
         session: The node.
         ignored: Number of joint states that were reordered or incomplete.
+        received: Time at which the newest came, by this machine's monotonic clock [s].
     """
 
     def __init__(self, chain: SerialChain, config: Ros2Config | None = None):
@@ -105,7 +108,7 @@ class Ros2Arm:
 
         self._lock, self._changed = threading.Lock(), threading.Condition()
         self._state: ArmState | None = None
-        self._offset, self._received, self._seen = math.inf, -math.inf, ()
+        self._offset, self.received, self._seen = math.inf, -math.inf, ()
         self._wrench: np.ndarray | None = None
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
@@ -125,6 +128,7 @@ class Ros2Arm:
         self._dog = Watchdog(config.timeout, self.stop)
         try:
             self._await_state()
+            self._await_controllers()
             if kind == "velocity":
                 longest = 1.5 * config.timeout
                 self._guard = start_guard(node, config.command, len(self._names), longest)
@@ -147,6 +151,16 @@ class Ros2Arm:
             why = f"{missing} are not among {', '.join(self._seen)}"
         longest = self.config.startup
         raise ConnectionError(f"no joint states of the arm on {topic} for {longest:g} s: {why}")
+
+    def _await_controllers(self) -> None:
+        """Wait until commands arrive somewhere: the first ones would be lost."""
+        end = time.monotonic() + self.config.startup
+        for publisher in filter(None, (self._commands, self._hand)):
+            while not publisher.get_subscription_count():
+                if time.monotonic() > end:
+                    text = f"no controller listens on {publisher.topic_name}: is it active"
+                    raise ConnectionError(f"{text} (ros2 control list_controllers)?")
+                time.sleep(0.02)
 
     def _on_wrench(self, message: Any) -> None:
         force, torque = message.wrench.force, message.wrench.torque
@@ -191,7 +205,7 @@ class Ros2Arm:
         with self._changed:
             # The quickest message so far tells how the robot's clock differs from ours.
             self._offset = min(self._offset, now - stamp)
-            self._state, self._received = state, now
+            self._state, self.received = state, now
             self._changed.notify_all()
 
     def _torque(self, position: np.ndarray) -> np.ndarray | None:

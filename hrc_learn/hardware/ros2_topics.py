@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import sysconfig
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -112,6 +113,20 @@ def read_description(topic: str = "/robot_description", timeout: float = _STARTU
         text = f"no description on {topic} for {timeout:g} s: is robot_state_publisher running"
         raise ConnectionError(f"{text}, and is ROS_DOMAIN_ID the same?")
     return found[0]
+
+
+def found_description(name: str) -> str:
+    """File with the description that a robot publishes on a topic, or the name of an arm.
+
+    Args:
+        name: Topic, such as /robot_description or /robot_description:TIP, or any other name.
+    """
+    topic, colon, links = name.partition(":")
+    if not topic.startswith("/") or Path(topic).exists() or Path(topic).suffix:
+        return name
+    file = Path(tempfile.mkdtemp(prefix="hrc_")) / "robot.urdf"
+    file.write_text(read_description(topic), encoding="utf-8")
+    return f"{file}{colon}{links}"
 
 
 def stamp_of(message: Any) -> float:

@@ -1,0 +1,378 @@
+"""The adaptive controller with its safety filter as a lifecycle node of ROS 2."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from hrc_learn.controller import (
+    INITIAL_IMAGE_JACOBIAN,
+    INTERVENTIONS,
+    AdaptiveController,
+    ControllerConfig,
+    Goals,
+    Observation,
+    SafetyConfig,
+)
+from hrc_learn.demos.recording_messages import image_of
+from hrc_learn.deploy import EagerRunner, StepRunner
+from hrc_learn.hardware.franky_arm import ArmFaultError
+from hrc_learn.hardware.ros2_arm import Ros2Arm, Ros2Config
+from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of
+from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
+from hrc_learn.kinematics import SerialChain
+
+PARAMETERS: dict[str, tuple[float, float, float, str]] = {
+    "linear_speed": (0.1, 0.01, 0.5, "cap on the speed of the task [m/s]"),
+    "angular_speed": (0.5, 0.05, 2.0, "cap on the rotation of the task [rad/s]"),
+    "tcp_speed": (0.25, 0.01, 1.0, "cap on the speed of the tool, elbow included [m/s]"),
+    "null_damping": (3.0, 0.5, 50.0, "push divided by the null-space velocity [N m s/rad]"),
+    "region_size": (0.02, 0.002, 1.0, "half edge of the goal's box [m]"),
+    "heartbeat": (0.0, 0.0, 10.0, "longest silence of ~/heartbeat [s]; 0: not required"),
+    "marker": (-1.0, -1.0, 49.0, "marker in ~/image; -1: features come on ~/feature"),
+}
+"""Parameters of the node, read at `configure`: default, range and meaning."""
+_REPORTS = 0.1
+"""Time between markers, and ten times between diagnostics [s]."""
+_HISTORY = 500
+"""Joint states that are kept to find that of an image."""
+_PATH = 500
+"""Points of the shown path of the tool."""
+
+
+class ControllerNode:
+    """A node that holds the arm's tool in regions of space and image.
+
+    It configures itself on `configure`, holds the tool where it is on `activate`, and brings
+    the arm to rest on `deactivate`. Old joint states, a missing heartbeat and faults of the arm
+    deactivate it; `activate` goes on from where the arm is.
+
+    Attributes:
+        session: The node.
+        stopped: Reason of the last stop; empty while active.
+        latencies: Times from the arrival of a joint state to its command [s].
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        config: Ros2Config | None = None,
+        safety: SafetyConfig | None = None,
+        make_runner: Callable[[AdaptiveController, Observation], StepRunner] = EagerRunner,
+    ):
+        """Create the node, unconfigured.
+
+        Args:
+            chain: Kinematics of the arm.
+            config: Topics of the arm.
+            safety: Limits of the arm, whose cap on the tool's speed is a parameter.
+            make_runner: Makes the step, compiled or not.
+        """
+        from rclpy.lifecycle import LifecycleNode, ManagedEntity, TransitionCallbackReturn
+
+        self._chain, self._config, self._make = chain, config or Ros2Config(), make_runner
+        self._safety, self._done = safety or SafetyConfig(), TransitionCallbackReturn
+        self.session = Ros2Session("hrc_learn", LifecycleNode)
+        self.node: Any = self.session.node
+        self.latencies = deque[float](maxlen=100_000)
+        self._arm: Ros2Arm | None = None
+        self._runner: StepRunner
+        self._active, self.stopped = threading.Event(), ""
+        self._thread: threading.Thread | None = None
+        self._heard, self._shown, self._diagnosed = 0.0, 0.0, 0.0
+        self._states = deque[tuple[float, np.ndarray]](maxlen=_HISTORY)
+        self._path = deque[np.ndarray](maxlen=_PATH)
+        stages = ManagedEntity()
+        for stage in ("configure", "activate", "deactivate", "cleanup", "shutdown"):
+            setattr(stages, f"on_{stage}", self._transition(getattr(self, stage)))
+        self.node.add_managed_entity(stages)
+        self._declare()
+        self._connect()
+
+    def _transition(self, act: Callable[[], None]) -> Callable[[Any], Any]:
+        def carry_out(_state: Any) -> Any:
+            try:
+                act()
+            except (ArmFaultError, ConnectionError, ValueError) as error:
+                self.node.get_logger().error(str(error))
+                return self._done.FAILURE
+            return self._done.SUCCESS
+
+        return carry_out
+
+    def _declare(self) -> None:
+        from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+
+        for name, (value, low, high, text) in PARAMETERS.items():
+            bounds = [FloatingPointRange(from_value=low, to_value=high)]
+            form = ParameterDescriptor(description=text, floating_point_range=bounds)
+            self.node.declare_parameter(name, value, form)
+
+    def _value(self, name: str) -> float:
+        return self.node.get_parameter(name).value
+
+    def _connect(self) -> None:
+        """Topics of tasks, people and monitors."""
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import PointStamped, PoseStamped
+        from sensor_msgs.msg import CompressedImage, Image
+        from std_msgs.msg import Empty, Float64MultiArray
+        from visualization_msgs.msg import Marker, MarkerArray
+
+        once = quality(reliable=True)
+        for kind, topic, take, form in (
+            (PoseStamped, "~/goal", self._on_goal, once),
+            (Marker, "~/region", self._on_region, once),
+            (PointStamped, "~/target", self._on_target, once),
+            (PointStamped, "~/feature", self._on_feature, quality()),
+            (Image, "~/image", self._on_image, quality()),
+            (CompressedImage, "~/image/compressed", self._on_image, quality()),
+            (Float64MultiArray, "~/push", self._on_push, quality()),
+            (Empty, "~/heartbeat", self._on_heartbeat, quality()),
+        ):
+            self.node.create_subscription(kind, topic, take, form)
+        self._diagnostics = self.node.create_publisher(DiagnosticArray, "/diagnostics", once)
+        self._markers = self.node.create_publisher(MarkerArray, "~/markers", once)
+
+    def configure(self) -> None:
+        """Read the parameters, build the controller and wait for the arm."""
+        speed = self._value("tcp_speed")
+        config = ControllerConfig(
+            linear_speed=self._value("linear_speed"),
+            angular_speed=self._value("angular_speed"),
+            null_damping=self._value("null_damping"),
+            safety=replace(self._safety, tcp_speed=speed),
+        )
+        q = self._chain.ready
+        J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
+        estimator = KalmanEstimator(RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1))
+        pose = self._chain.forward(q)
+        pixel, no = q.new_zeros(2) + 100.0, torch.tensor(False)
+        goals = Goals.at(pose.position, pose.orientation, pixel).with_vision(False)
+        controller = AdaptiveController(self._chain, estimator, goals, config=config)
+        observation = Observation(
+            joint_position=q,
+            feature=pixel,
+            feature_visible=no,
+            feature_new=no,
+            feature_age=q.new_zeros(()),
+            image_joint_position=q,
+            nullspace_input=torch.zeros_like(q),
+            goals=goals,
+            dt=q.new_tensor(0.002),
+        )
+        self._runner, self._detector = self._make(controller, observation), None
+        if (marker := round(self._value("marker"))) >= 0:
+            from hrc_learn.vision import MarkerDetector
+
+            self._detector = MarkerDetector([marker])
+        self._runner.step()  # the first step is slower than all others
+        self._arm = Ros2Arm(self._chain, self._config)
+
+    def activate(self) -> None:
+        """Hold the tool where it is, and follow goals from now on.
+
+        Raises:
+            ArmFaultError: The joint states are too old.
+        """
+        assert self._arm is not None
+        self._arm.recover()
+        state, values = self._arm.read(), self._runner.observation
+        pose = self._chain.forward(state.joint_position)
+        values["goals.position.centre"][:] = pose.position.numpy()
+        values["goals.position.half_size"][:] = self._value("region_size")
+        values["goals.orientation.goal"][:] = pose.orientation.numpy()
+        values["goals.vision_enabled"][...] = values["feature_visible"][...] = 0
+        values["nullspace_input"][:] = 0
+        self._runner.start(state.joint_position, state.joint_velocity)
+        self._heard, self.stopped = time.monotonic(), ""
+        self._active.set()
+        self._thread = threading.Thread(target=self._run, name="control", daemon=True)
+        self._thread.start()
+
+    def deactivate(self) -> None:
+        """Bring the arm to rest."""
+        self._active.clear()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(1.0)
+        if self._arm is not None:
+            self._arm.stop()
+
+    def cleanup(self) -> None:
+        """Leave the arm."""
+        self.deactivate()
+        if self._arm is not None:
+            self._arm.close()
+            self._arm = None
+
+    shutdown = cleanup
+
+    def _run(self) -> None:
+        """Answer each joint state with a command, until deactivated."""
+        arm, last = self._arm, 0.0
+        assert arm is not None
+        with torch.inference_mode():
+            while self._active.is_set():
+                try:
+                    arm.wait(last, self._config.silence / 4)
+                    last = self._step(arm, last)
+                except Exception as error:  # of any kind: the arm is to stop
+                    self.stopped = str(error)
+                    self.node.get_logger().error(f"deactivated: {error}")
+                    self._active.clear()
+                    arm.stop()
+                    self._report(time.monotonic())
+                    self.node.trigger_deactivate()
+
+    def _step(self, arm: Ros2Arm, last: float) -> float:
+        state, received, now = arm.read(), arm.received, time.monotonic()
+        limit = self._value("heartbeat")
+        if limit and now - self._heard > limit:
+            raise ArmFaultError(f"no heartbeat for {now - self._heard:.2f} s: send ~/heartbeat")
+        if state.time <= last:
+            return last
+        values = self._runner.observation
+        if last:
+            values["dt"][...] = min(max(state.time - last, 1e-3), self._config.silence)
+        values["joint_position"][:] = state.joint_position
+        arm.command(self._runner.step())
+        self.latencies.append(time.monotonic() - received)
+        values["feature_new"][...] = 0
+        self._states.append((state.time, state.joint_position))
+        self._report(now)
+        return state.time
+
+    def _on_goal(self, message: Any) -> None:
+        base = self._config.base
+        if base and message.header.frame_id not in ("", base):
+            text = f"a goal in frame {message.header.frame_id} is refused: give it in {base}"
+            self.node.get_logger().warning(text)
+            return
+        at, turn = message.pose.position, message.pose.orientation
+        orientation = np.array([turn.w, turn.x, turn.y, turn.z])
+        if not np.isfinite([at.x, at.y, at.z]).all() or not np.linalg.norm(orientation) > 0:
+            self.node.get_logger().warning("a goal with NaN or without orientation is refused")
+            return
+        values = self._runner.observation
+        values["goals.position.centre"][:] = (at.x, at.y, at.z)
+        values["goals.orientation.goal"][:] = orientation / np.linalg.norm(orientation)
+
+    def _on_region(self, message: Any) -> None:
+        size = 0.5 * np.array([message.scale.x, message.scale.y, message.scale.z])
+        if (size > 0).all():
+            at = message.pose.position
+            self._runner.observation["goals.position.centre"][:] = (at.x, at.y, at.z)
+            self._runner.observation["goals.position.half_size"][:] = size
+
+    def _on_target(self, message: Any) -> None:
+        values, pixel = self._runner.observation, (message.point.x, message.point.y)
+        values["goals.vision.target"][:] = pixel
+        values["goals.vision_enabled"][...] = np.isfinite(pixel).all()
+
+    def _on_feature(self, message: Any) -> None:
+        self._see(np.array([message.point.x, message.point.y]), stamp_of(message))
+
+    def _on_image(self, message: Any) -> None:
+        if self._detector is not None:
+            found = self._detector.detect(image_of(message))
+            pixel = next(iter(found.values())).mean(0) if found else np.full(2, np.nan)
+            self._see(pixel, stamp_of(message))
+
+    def _see(self, pixel: np.ndarray, stamp: float) -> None:
+        """Pair a feature with the joint positions of its image."""
+        values, visible = self._runner.observation, np.isfinite(pixel).all()
+        values["feature_visible"][...] = values["feature_new"][...] = visible
+        if visible and self._states:
+            newest = self._states[-1][0]
+            at = min(self._states, key=lambda one: abs(one[0] - (stamp or newest)))
+            values["feature"][:], values["image_joint_position"][:] = pixel, at[1]
+            values["feature_age"][...] = newest - at[0]
+
+    def _on_push(self, message: Any) -> None:
+        effort = np.array(message.data)
+        if effort.shape == self._runner.observation["nullspace_input"].shape:
+            self._runner.observation["nullspace_input"][:] = effort
+
+    def _on_heartbeat(self, _message: Any) -> None:
+        self._heard = time.monotonic()
+
+    def _report(self, now: float) -> None:
+        """Publish diagnostics and markers, both at low rates."""
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+        from visualization_msgs.msg import MarkerArray
+
+        stamp = self.node.get_clock().now().to_msg()
+        if self.stopped or now - self._diagnosed > 10 * _REPORTS:
+            self._diagnosed, arm = now, self._arm
+            rows = self._counts()
+            recent = [*self.latencies][-500:] or [0.0]
+            rows["latency_p99_ms"] = 1e3 * float(np.percentile(recent, 99))
+            rows["ignored_states"] = 0 if arm is None else arm.ignored
+            status = DiagnosticStatus(
+                level=DiagnosticStatus.ERROR if self.stopped else DiagnosticStatus.OK,
+                name="hrc_learn: controller",
+                message=self.stopped or "active",
+                values=[KeyValue(key=k, value=f"{v:g}") for k, v in rows.items()],
+            )
+            message = DiagnosticArray(status=[status])
+            message.header.stamp = stamp
+            self._diagnostics.publish(message)
+        if now - self._shown > _REPORTS:
+            self._shown = now
+            q = self._runner.observation["joint_position"]
+            self._path.append(self._chain.forward(q.copy()).position.numpy())
+            self._markers.publish(MarkerArray(markers=self._drawn(stamp)))
+
+    def _drawn(self, stamp: Any) -> list[Any]:
+        """Box of the goal, and path of the tool."""
+        from geometry_msgs.msg import Point
+        from visualization_msgs.msg import Marker
+
+        values = self._runner.observation
+        box, path = Marker(type=Marker.CUBE), Marker(type=Marker.LINE_STRIP, id=1)
+        centre, size = values["goals.position.centre"], 2 * values["goals.position.half_size"]
+        for axis, at, edge in zip("xyz", centre.tolist(), size.tolist(), strict=True):
+            setattr(box.pose.position, axis, at)
+            setattr(box.scale, axis, edge)
+        path.scale.x = 0.004
+        path.points = [Point(x=p[0], y=p[1], z=p[2]) for p in self._path]
+        for marker, colour in ((box, (0.2, 0.6, 1.0, 0.3)), (path, (1.0, 0.6, 0.1, 1.0))):
+            marker.header.frame_id, marker.header.stamp, marker.ns = (
+                self._config.base,
+                stamp,
+                "hrc_learn",
+            )
+            marker.color.r, marker.color.g, marker.color.b, marker.color.a = colour
+        return [box, path]
+
+    def start(self) -> bool:
+        """Configure and activate; False if that failed, which the log explains."""
+        done = self._done.SUCCESS
+        return self.node.trigger_configure() == done and self.node.trigger_activate() == done
+
+    def figures(self) -> dict[str, float]:
+        """Latency from joint state to command [ms], and interventions of the safety filter."""
+        rows = {f"safety_{k}": float(v) for k, v in self._counts().items()}
+        values = 1e3 * np.array([*self.latencies] or [np.nan])
+        for percentile in (50, 99, 100):
+            rows[f"latency_p{percentile}_ms"] = float(np.percentile(values, percentile))
+        return {"commands": float(len(self.latencies)), **rows}
+
+    def _counts(self) -> dict[str, float]:
+        """Steps in which each limit of the safety filter acted."""
+        counts = (
+            self._runner.state("safety.counts").tolist() if hasattr(self, "_runner") else ()
+        )
+        return {str(k): v for k, v in zip(INTERVENTIONS, counts, strict=False)}
+
+    def close(self) -> None:
+        """Bring the arm to rest and leave the graph."""
+        self.cleanup()
+        self.session.close()
