@@ -78,6 +78,7 @@ CASES = {
     "fit image-jacobian marked": Case(
         "--marker 7 --out out --json j.json", copies=("marked",), grows=("marked.features",)
     ),
+    "tokens": Case("fit --dataset {inputs}/placing_demos --out out --json j.json"),
     "evaluate": Case("{inputs}/placing {inputs}/placing_demos --out out --json j.json"),
     "play": Case("{inputs}/placing --goal 0.5 0 0.4 --robot panda --out out --json j.json"),
     "smooth": Case(

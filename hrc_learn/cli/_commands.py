@@ -54,6 +54,7 @@ COMMANDS: dict[str, Command] = {
     "fit image-jacobian": Command(
         "image_jacobian_commands.fit_image_jacobian", arguments.FitImageJacobian, ("dataset",)
     ),
+    "tokens": Command("tokens_command.tokens", arguments.Tokens, ("action",)),
     "evaluate": Command("model_commands.evaluate", arguments.Evaluate, ("model", "dataset")),
     "play": Command("play_command.play", arguments.Play, ("model",)),
     "multiply": Command("multiply_command.multiply", arguments.Multiply, ("dataset",)),

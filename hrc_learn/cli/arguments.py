@@ -374,6 +374,28 @@ class FitImageJacobian(Fit):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Tokens(OnDataset, Written):
+    """Fit tokens of action chunks to a dataset, or report their length and errors.
+
+    Every sequence of tokens decodes to a motion that continues from the arm's state and stays
+    in the demonstrated range. Every fifth episode is left out of the fit, for the figures.
+
+        hrc tokens fit --dataset pouring --config tolerance=0.005 seconds=0.5
+        hrc tokens report --dataset pouring --model pouring_tokens
+    """
+
+    action: Literal["fit", "report"]
+    """Fit a tokenizer, or report the figures of one."""
+    model: Path | None = None
+    """Folder of hrc tokens fit, for the report."""
+    out: Path | None = None
+    """Folder for the tokenizer. Default: DATASET_tokens."""
+    config: tuple[str, ...] = ()
+    """Settings (TokenSettings: feature, seconds, vocabulary_size, tolerance, start_known,
+    held_out), as NAME=VALUE or TOML files."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Evaluate(OnDataset, Written):
     """Evaluate a model of `hrc fit` on demonstrations that it has not seen.
 

@@ -29,6 +29,9 @@ LONGEST = 3.0
 """Bound on the logarithm of a duration relative to the mean: a factor of 20."""
 TINY = 1e-24
 """Smallest variance, of columns that never move."""
+TURN = 3.0
+"""Distance of the third control point from a limit relative to that of the second beyond it:
+motions stay within if the second is no farther beyond than 1.6 times the margin."""
 KNOWN_STATE = 2
 DEGREE = 3
 
@@ -184,6 +187,11 @@ class MotionComponents(nn.Module):
             rate = 0 if velocity is None else velocity * duration[..., None]
             begun.append(begun[0] + rate / (DEGREE * (self.points - DEGREE)))
         points = [*begun, *points[len(begun) - self.known :]]
+        if len(begun) == KNOWN_STATE:
+            # A velocity beyond a limit turns back before the motion is there.
+            over = [(points[1] - high[..., 0, :]).relu(), (low[..., 0, :] - points[1]).relu()]
+            points[2] = torch.minimum(points[2], high[..., 0, :] - TURN * over[0])
+            points[2] = torch.maximum(points[2], low[..., 0, :] + TURN * over[1])
         return torch.stack(torch.broadcast_tensors(*points), -2), duration
 
     def _features(self, first: Tensor, velocity: Tensor | None) -> Float[Tensor, "*batch K"]:

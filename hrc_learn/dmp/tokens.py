@@ -241,9 +241,12 @@ class MotionTokenizer(nn.Module):
             whole[..., self.steps] = stepped
         return whole
 
-    def complete(self, ids: Sequence[int]) -> bool:
-        """True if no token that follows these changes the motion."""
-        return self._code.decode([int(i) for i in ids])[1]
+    def length(self, ids: Sequence[int]) -> int:
+        """Number of tokens that a network has to write: until nothing changes the motion."""
+        for i in range(1, len(ids) + 1):
+            if ids[i - 1] == END or self._code.decode(ids[:i])[1]:
+                return i
+        return len(ids) + 1  # and the end
 
     def save(self, folder: str | Path) -> None:
         """Write or replace a folder with `config.json` and `model.safetensors`."""

@@ -1,0 +1,192 @@
+"""`hrc tokens`: a tokenizer of action chunks fitted to a dataset, and its errors."""
+
+import math
+import shlex
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.cli._run import with_settings, write_values
+from hrc_learn.cli.arguments import Tokens, refuse_given, sibling
+from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
+from hrc_learn.demos.read.frames import read_frames
+from hrc_learn.dmp.motion_components import MARGIN
+from hrc_learn.dmp.tokens import MotionTokenizer
+from hrc_learn.store import new_folder, read_made_by, write_json
+from hrc_learn.viz.report import Measurement, show_measurements
+
+MODEL = "tokens"
+"""Folder of the tokenizer in the results of `hrc tokens fit`."""
+MOST_FITTED, MOST_MEASURED = 20_000, 500
+"""Largest number of chunks that are fitted and measured, evenly spread."""
+RANDOM = 1000
+"""Random sequences that are decoded."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TokenSettings:
+    """Settings of tokenizers."""
+
+    feature: str = "action"
+    """Feature of the dataset to encode."""
+    seconds: float = 1.0
+    """Duration of a chunk [s]."""
+    vocabulary_size: int = 1024
+    """Number of tokens."""
+    tolerance: float = 0.01
+    """Root mean square error of decoded chunks, relative to the range of each column."""
+    start_known: bool = True
+    """False: tokens determine the start of a chunk, too, and encode no velocity."""
+    held_out: int = 5
+    """Every episode of this number is left out of the fit, for the report; 0: none."""
+
+
+class Chunks(NamedTuple):
+    """Chunks of T frames that follow a known frame, (N, T + 1, D)."""
+
+    time: Float[np.ndarray, "T1"]
+    """Time since the known frame [s]."""
+    motions: Float[np.ndarray, "N T1 D"]
+    start_velocity: Float[np.ndarray, "N D"]
+    """Velocity before the known frame, by the difference of the last two frames [1/s]."""
+
+
+def read_chunks(
+    dataset: Path, feature: str, seconds: float, episodes: list[int], most: int
+) -> Chunks:
+    """Chunks from evenly spread frames of episodes.
+
+    Raises:
+        ValueError: The dataset does not have the feature, or no episode is long enough.
+    """
+    folder = open_folder(dataset)
+    if feature not in folder.features:
+        known = ", ".join(folder.features)
+        raise ValueError(f"{dataset} has no feature {feature!r}; it has {known}")
+    T = max(2, round(seconds * folder.fps))
+    entries = select_episodes(folder, episodes)
+    read = read_frames(folder, sorted(entries, key=lambda e: (e.file, e.start)), [feature])
+    values = [frames[feature].astype(float) for _, frames in read]
+    # The known frame, the one before it and T frames to encode.
+    counts = [max(0, len(x) - T - 1) for x in values]
+    if not sum(counts):
+        raise ValueError(f"no episode of {dataset} has {T + 2} frames: shorten seconds")
+    stride = math.ceil(sum(counts) / most)
+    firsts = [(x, t) for x, n in zip(values, counts, strict=True) for t in range(0, n, stride)]
+    return Chunks(
+        np.arange(T + 1) / folder.fps,
+        np.array([x[t + 1 : t + T + 2] for x, t in firsts]),
+        np.array([x[t + 1] - x[t] for x, t in firsts]) * folder.fps,
+    )
+
+
+def tokens(args: Tokens) -> None:
+    """Fit a tokenizer, or report the errors of one.
+
+    Raises:
+        ValueError: Options of the other word, or a dataset without the feature.
+    """
+    every = [entry.index for entry in open_folder(args.dataset).episodes]
+    if args.action == "report":
+        refuse_given(args, ["out", "config", "overwrite"], "belongs to hrc tokens fit")
+        if args.model is None:
+            raise ValueError("hrc tokens report needs --model, a folder of hrc tokens fit")
+        settings = TokenSettings(**read_made_by(args.model)["settings"])
+        tokenizer = MotionTokenizer.load(args.model / MODEL)
+        figures = _measured(tokenizer, args.dataset, settings, every)
+    else:
+        refuse_given(args, ["model"], "belongs to hrc tokens report")
+        settings = with_settings(args.config, TokenSettings())
+        folder = args.out or sibling(args.dataset, "tokens")
+        with new_folder(
+            folder, asdict(args) | {"settings": asdict(settings)}, args.overwrite
+        ) as out:
+            kept = [i for i in every if i not in held_out(every, settings.held_out)]
+            tokenizer = fit(args.dataset, settings, kept)
+            tokenizer.save(out / MODEL)
+            figures = _measured(tokenizer, args.dataset, settings, every)
+            write_json(out / "metrics.json", figures)
+        print(f"Tokenizer in {shlex.quote(str(folder / MODEL))}")
+    rows = [Measurement(name=_ROWS[name], value=value) for name, value in figures.items()]
+    show_measurements(rows, everything=True, title=f"Tokens of {args.dataset}")
+    write_values(args.json, figures)
+
+
+def fit(dataset: Path, settings: TokenSettings, episodes: list[int]) -> MotionTokenizer:
+    """Tokenizer of the chunks of episodes."""
+    chunks = read_chunks(dataset, settings.feature, settings.seconds, episodes, MOST_FITTED)
+    return MotionTokenizer.fit(
+        chunks.time,
+        chunks.motions,
+        settings.vocabulary_size,
+        start_velocity=chunks.start_velocity if settings.start_known else None,
+        start_known=settings.start_known,
+        tolerance=settings.tolerance,
+    )
+
+
+def held_out(episodes: list[int], number: int) -> list[int]:
+    """Episodes that a fit leaves out: every one of that number, or the last of fewer."""
+    return [] if not number else episodes[number - 1 :: number] or episodes[1:][-1:]
+
+
+def _measured(
+    tokenizer: MotionTokenizer, dataset: Path, settings: TokenSettings, every: list[int]
+) -> dict[str, float]:
+    """Length, error and seams of the tokens of unseen chunks; limits of random tokens."""
+    episodes = held_out(every, settings.held_out) or every
+    time, recorded, velocity = read_chunks(
+        dataset, settings.feature, settings.seconds, episodes, MOST_MEASURED
+    )
+    motions = torch.from_numpy(recorded)
+    state = (motions[:, 0], torch.from_numpy(velocity))
+    ids = tokenizer.encode(time, motions, velocity)
+    counts = [tokenizer.length(row) for row in ids.tolist()]
+    known = state if tokenizer.components.known else ()
+    error = (tokenizer.decode(ids, time, *known) - motions)[:, 1:]
+    span = (motions.amax((0, 1)) - motions.amin((0, 1))).clamp(min=1e-12)
+    rng = torch.Generator().manual_seed(0)
+    drawn = torch.randint(0, tokenizer.vocabulary_size, (RANDOM, max(counts)), generator=rng)
+    smooth = [i for i in range(motions.shape[-1]) if i not in tokenizer.steps]
+    low, high = tokenizer.components.low, tokenizer.components.high
+    # Starts beyond the demonstrated range move the limits with them.
+    inner = MARGIN / (1 + 2 * MARGIN) * (high - low) - 1e-9
+    start = state[0][:, smooth]
+    inside = ((start >= low + inner) & (start <= high - inner)).all(1).nonzero()[:, 0]
+    chosen = inside[torch.arange(RANDOM) % max(1, len(inside))]
+    states = [x[chosen] for x in state]
+    made = tokenizer.decode(drawn, time, *states)
+    seams = [tokenizer.decode(drawn, time[:1], *states, order=order)[:, 0] for order in (0, 1)]
+    gaps = [(a - b)[:, smooth].abs().max() for a, b in zip(seams, states, strict=True)]
+    excess = torch.maximum(low - made[..., smooth], made[..., smooth] - high)
+    bits = math.log2(tokenizer.vocabulary_size)
+    return {
+        "chunks": float(len(motions)),
+        "tokens_mean": float(np.mean(counts)),
+        "tokens_p95": float(np.quantile(counts, 0.95)),
+        "bits_per_s": float(np.mean(counts)) * bits / tokenizer.duration,
+        "rmse": float(error.square().mean().sqrt()),
+        "rmse_of_range": float((error / span).square().mean().sqrt()),
+        "undecodable_share": float((~made.isfinite()).flatten(1).any(1).double().mean()),
+        "beyond_limits": float((excess.amax((0, 1)) / span[smooth]).clamp(min=0).amax()),
+        "seam": float(gaps[0]),
+        "seam_velocity": float(gaps[1]),
+    }
+
+
+_ROWS = {
+    "chunks": "chunks of held-out episodes",
+    "tokens_mean": "tokens per chunk",
+    "tokens_p95": "tokens per chunk, 95th percentile",
+    "bits_per_s": "bits per second",
+    "rmse": "RMSE in the dataset's units",
+    "rmse_of_range": "RMSE relative to the range of each column",
+    "undecodable_share": "share of random sequences without a motion",
+    "beyond_limits": "their excess beyond the demonstrated range and a tenth, of the range",
+    "seam": "largest gap where chunks meet",
+    "seam_velocity": "largest gap of velocities there",
+}
