@@ -81,6 +81,10 @@ CASES = {
     "tokens": Case("fit --dataset {inputs}/placing_demos --out out --json j.json"),
     "evaluate": Case("{inputs}/placing {inputs}/placing_demos --out out --json j.json"),
     "play": Case("{inputs}/placing --goal 0.5 0 0.4 --robot panda --out out --json j.json"),
+    "multiply": Case(
+        "{inputs}/placing_demos --episodes 3 --out out --config judge.scene=none --json j.json",
+        datasets=("out",),
+    ),
     "smooth": Case(
         "--checkpoint checkpoint --dataset {inputs}/placing_demos --json j.json",
         copies=("checkpoint",),

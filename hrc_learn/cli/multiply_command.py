@@ -98,7 +98,7 @@ def multiply(args: Multiply) -> int:
     """
     if args.episodes < 0:
         raise ValueError(f"--episodes must not be negative, but is {args.episodes}.")
-    job = _Job(args, with_settings(args.config, Settings()))
+    job = Multiplication(args, with_settings(args.config, Settings()))
     print(*aligned(job.segmentation.rows(job.demos[:3])), sep="\n")
     if not args.episodes:
         if file := job.config.segments:
@@ -120,7 +120,7 @@ def multiply(args: Multiply) -> int:
     return 0
 
 
-class _Job:
+class Multiplication:
     """Everything that is known before the first motion is made."""
 
     def __init__(self, args: Multiply, settings: Settings):
@@ -217,9 +217,9 @@ class _Job:
         self, attempts: range, judges: Judges | None
     ) -> Iterator[tuple[int, tuple[dict, str, dict[str, Any]] | str]]:
         """Columns, task and origin of each episode, or the reason why a motion failed."""
-        draws = self._draw(attempts)
+        draws = self.draw(attempts)
         made = self.motions.motions(draws)
-        trials = [self._trial(draws, motion, k) for k, motion in enumerate(made)]
+        trials = [self.trial(draws, motion, k) for k, motion in enumerate(made)]
         good = [t for t, motion in zip(trials, made, strict=True) if not motion.reason]
         replays = map(self._planned, good) if judges is None else judges.replays(good)
         for k, attempt in enumerate(attempts):
@@ -243,7 +243,7 @@ class _Job:
             )
             yield attempt, (values, demo.task, origin)
 
-    def _draw(self, attempts: range) -> Draws:
+    def draw(self, attempts: range) -> Draws:
         """Random choices; each attempt has a generator of its own."""
         config, n, rows = self.config, len(self.demos), []
         for attempt in attempts:
@@ -272,7 +272,7 @@ class _Job:
             start=torch.from_numpy(np.stack(start)),
         )
 
-    def _trial(self, draws: Draws, made: NewMotion, k: int) -> Trial:
+    def trial(self, draws: Draws, made: NewMotion, k: int) -> Trial:
         return Trial(
             joints=made.joints.numpy(),
             gripper=self.columns.gripper(made.source, made.phase.numpy()),
@@ -311,7 +311,7 @@ def _judge(config: JudgeConfig, task: str) -> JudgeConfig:
     return config
 
 
-def _between_cells(taught: Any, job: _Job) -> Any:
+def _between_cells(taught: Any, job: Multiplication) -> Any:
     """Displacement of a task from the demonstrated work cell to that of another arm [m]."""
     old, new = Workplace.of(taught), Workplace.of(job.robot)
     if job.judge.scene == "placing":

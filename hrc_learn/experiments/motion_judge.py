@@ -70,8 +70,8 @@ class JudgeConfig:
     success: str = ""
     """Function of an MJCF scene as MODULE:FUNCTION, which takes model and data at the end and
     returns True after a success."""
-    gripper: str = ""
-    """Actuator of the gripper in an MJCF scene. Default: the one that moves no arm joint."""
+    gripper: tuple[str, ...] = ()
+    """Actuators of the gripper in an MJCF scene. Default: all that move no arm joint."""
     base: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the arm's base in an MJCF scene [m]."""
     processes: int = 2
@@ -160,20 +160,25 @@ class SceneJudge:
             raise ValueError(f"{config.scene} has no joints {', '.join(missing)}")
         ids = [known[name] for name in names]
         self._q = self.model.jnt_qposadr[ids]
+        joint = mujoco.mjtTrn.mjTRN_JOINT
+        # The force of a position actuator falls with the position.
         drives = {
             int(self.model.actuator_trnid[a, 0]): a
-            for a in range(self.model.nu)
-            if self.model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT
+            for a in np.flatnonzero(self.model.actuator_biasprm[:, 1] < 0).tolist()
+            if self.model.actuator_trntype[a] == joint
         }
         if undriven := [n for n, i in zip(names, ids, strict=True) if i not in drives]:
-            raise ValueError(f"{config.scene}: no actuator moves {', '.join(undriven)}")
+            raise ValueError(
+                f"{config.scene}: no position actuator moves {', '.join(undriven)}"
+            )
         self._arm = [drives[i] for i in ids]
-        if any(
-            self.model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_AFFINE for a in self._arm
-        ):
-            raise ValueError(f"{config.scene}: the arm needs position actuators")
-        rest = [a for a in range(self.model.nu) if a not in self._arm]
-        self._hand = [self.model.actuator(config.gripper).id] if config.gripper else rest[:1]
+        at = [int(self.model.actuator_trnid[a, 0]) for a in range(self.model.nu)]
+        rest = [a for a in range(self.model.nu) if at[a] not in ids]
+        self._hand = [self.model.actuator(n).id for n in config.gripper] or rest
+        self._range = self.model.actuator_ctrlrange[self._hand].copy()
+        for k, a in enumerate(self._hand):
+            if not self.model.actuator_ctrllimited[a]:
+                self._range[k] = self.model.jnt_range[at[a]]
 
     def replay(self, trial: Trial) -> Replay:
         """Carry out a motion; bodies with the objects' names are put in their places."""
@@ -185,7 +190,7 @@ class SceneJudge:
         mujoco.mj_forward(model, data)
         joints, ahead = [], np.concatenate([trial.joints[1:], trial.joints[-1:]])
         places: dict[str, list[np.ndarray]] = {name: [] for name in trial.objects}
-        low, high = model.actuator_ctrlrange[self._hand].T
+        low, high = self._range.T
         for wanted, width in zip(ahead, trial.gripper, strict=True):
             joints.append(data.qpos[self._q].copy())
             for name, found in places.items():

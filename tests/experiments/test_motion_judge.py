@@ -1,0 +1,89 @@
+"""Motions judged in a MuJoCo scene that a user brings."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from multiply_samples import END, block, demonstrations
+
+from hrc_learn.experiments.motion_judge import JudgeConfig, Judges, Trial
+from hrc_learn.kinematics import ArmChoice, panda
+from hrc_learn.sim.arm_model import ArmModelConfig, add_arm
+
+PLACE = block(0.45, 0.10, 0.0)
+
+
+def block_is_lifted(model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+    """Success of the scene below: the block hangs between the fingers."""
+    return data.body("block").xpos[2] > 0.1
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A Panda beside a block, as a file that any program can read."""
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio, spec.option.noslip_iterations = 10, 3
+    add_arm(spec, ArmModelConfig(robot=panda))
+    for actuator in list(spec.actuators):
+        if actuator.name.endswith("_velocity"):
+            spec.delete(actuator)
+        elif actuator.name.endswith("_position"):
+            actuator.set_to_position(kp=3000.0, kv=100.0)
+    size = (0.3, 0.4, 0.01)
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    spec.worldbody.add_geom(type=box, size=size, pos=(0.5, 0.0, -0.01))
+    body = spec.worldbody.add_body(name="block", pos=(0.45, 0.10, 0.025))
+    body.add_freejoint()
+    body.add_geom(type=box, size=(0.03, 0.03, 0.05), mass=0.1, friction=(1.5, 0.02, 0.001))
+    spec.compile()
+    file = tmp_path_factory.mktemp("scene") / "scene.xml"
+    file.write_text(spec.to_xml(), encoding="utf-8")
+    return file
+
+
+def settings(scene, **more):
+    success = "test_motion_judge:block_is_lifted"
+    return JudgeConfig(scene=str(scene), success=success, processes=1, **more)
+
+
+def trial(at):
+    """The demonstrated motion with the block somewhere."""
+    (demo,) = demonstrations([PLACE])
+    pose = torch.cat([at.position, at.orientation]).numpy()
+    return Trial(joints=demo.joint_position, gripper=demo.gripper, objects={"block": pose})
+
+
+@pytest.mark.simulation
+def test_only_what_the_success_function_accepts_succeeds(scene, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    with Judges(settings(scene), ArmChoice(), 20.0, 0.08) as judges:
+        good, bad = judges.replays([trial(PLACE), trial(block(0.45, 0.20, 0.0))])
+    assert good.failure == ""
+    assert good.objects["block"][-1, 2] == pytest.approx(0.13, abs=0.01)
+    assert good.joints.shape == (END, 7)
+    assert "says no" in bad.failure
+    assert np.abs(bad.objects["block"][:, 1] - 0.20).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"success": "nowhere:function"}, "no MODULE:FUNCTION"),
+        ({"success": "math:nothing"}, "no MODULE:FUNCTION"),
+        ({"scene": "lost.xml"}, "no scene 'lost.xml'"),
+    ],
+)
+def test_settings_that_do_not_exist_are_named(scene, change, message):
+    given = {"scene": str(scene), "success": "math:floor", **change}
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        JudgeConfig(**given).open(ArmChoice(), 20.0, 0.08)
+
+
+def test_the_scene_has_to_hold_the_arm(scene):
+    with pytest.raises(ValueError, match="has no joints"):
+        settings(scene).open(ArmChoice("ur5e"), 20.0, 0.08)
