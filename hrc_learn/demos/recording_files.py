@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.naming import without_unit
 
 Kind = Literal["number", "image", "encoded", "text", "depth", "pose", "other"]
 """Content of a field; "pose" is that of another frame than the tool's."""
@@ -35,15 +36,9 @@ _TIME = re.compile(
 )
 _NO_CLOCK = re.compile(r"execut|cycle|delay|latency|comput|process|duration|delta|response")
 _UNITS = {"sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "usec": "us"}
-_UNITS |= {"nsec": "ns", "nanos": "ns", "radian": "rad", "radians": "rad", "degree": "deg"}
-_UNITS |= {"degrees": "deg", "°": "deg", "meter": "m", "meters": "m", "nm": "N m", "n*m": "N m"}
-_UNITS |= {
-    "metre": "m",
-    "metres": "m",
-    "percent": "%",
-    "millimeters": "mm",
-    "millimetres": "mm",
-}
+_UNITS |= {"nsec": "ns", "nanos": "ns", "nm": "N m", "n*m": "N m", "metre": "m", "meter": "m"}
+_UNITS |= {"radian": "rad", "degree": "deg", "percent": "%"}
+"""Units that are spelled in files in another way than in names -> units of `read.units`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +167,9 @@ class Recording:
 
 def unit_in_words(unit: str) -> str:
     """Unit in the words of `read.units`, from one that a file declares."""
-    return _UNITS.get(unit.strip().lower(), unit.strip())
+    plain = unit.strip()
+    spelled = "" if " " in plain else without_unit(f"value [{plain}]")[1]
+    return _UNITS.get(plain.lower()) or spelled or plain
 
 
 def is_time(name: str, one: Field) -> bool:

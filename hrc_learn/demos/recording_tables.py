@@ -170,14 +170,8 @@ def read_parquet_table(path: Path) -> dict[str, np.ndarray | list[bytes]]:
         raise DatasetError(f"cannot be read as Parquet: {error}", file=path) from error
     found = _arrow_columns(path, table)
     numbers = {name: v for name, v in found.items() if isinstance(v, np.ndarray)}
-    return (
-        {**found, **numbers}
-        if not numbers
-        else {
-            **{name: v for name, v in found.items() if isinstance(v, list)},
-            **_without_index(path, numbers),
-        }
-    )
+    kept = _without_index(path, dict(numbers))
+    return {name: v for name, v in found.items() if name not in numbers or name in kept}
 
 
 def _arrow_columns(path: Path, table: pa.Table) -> dict[str, np.ndarray | list[bytes]]:
