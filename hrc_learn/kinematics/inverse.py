@@ -310,6 +310,7 @@ def follow_poses(
     path: Pose,
     start: Float[Tensor, "*rows joints"],
     wish: Float[Tensor, "steps *rows joints"] | None = None,
+    task: TaskSpace = "nearest pose",
 ) -> tuple[Float[Tensor, "steps *rows joints"], Float[Tensor, "steps *rows"]]:
     """Joint positions along a path of the tool, by differential inverse kinematics.
 
@@ -321,6 +322,7 @@ def follow_poses(
         path: Poses of the tool centre point, (steps, *#rows).
         start: Joint positions at the first pose [rad, m].
         wish: Posture that the null space takes at each pose [rad, m]; None: none.
+        task: Constrained part of the poses.
 
     Returns:
         Joint positions, and how far the tool is from each pose: the larger one of distance [m]
@@ -335,7 +337,7 @@ def follow_poses(
         )
         near = None if wish is None else wish[k].reshape(q.shape)
         for _ in range(_CORRECTIONS):
-            q, _ = _step(chain, goal, q, "nearest pose", near)
+            q, _ = _step(chain, goal, q, task, near)
         left, _ = task_error_and_jacobian(chain, q, goal)
         positions.append(q.reshape(start.shape))
         errors.append(left.unflatten(-1, (2, 3)).norm(dim=-1).amax(-1).reshape(rows))

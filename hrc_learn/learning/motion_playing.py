@@ -15,8 +15,9 @@ from torch import Tensor
 
 from hrc_learn.controller.motion_filter import MotionFilter, MotionState
 from hrc_learn.dmp import JointDMP, PoseDMP
-from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import Arm, ArmChoice, UnreachableError, arm_angle
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.kinematics import Arm, ArmChoice, TaskSpace, UnreachableError, arm_angle
+from hrc_learn.kinematics.inverse import TASK_ROWS, follow_poses
 from hrc_learn.learning.model_choice import predicted_primitive
 from hrc_learn.learning.primitive_fitting import Primitive, load_primitive
 from hrc_learn.skills.placing import follow_pose
@@ -32,12 +33,11 @@ _DEVIATION = 2e-3
 _SLOWER, _ATTEMPTS = 1.1, 30
 _SETTLING = 1.0
 """Longest time after the path in which the motion reaches its end [s]."""
-_ITERATIONS, _DAMPING, _MISSED = 8, 1e-8, 1e-3
-"""Steps of Newton's method from one pose to the next, their damping, and the error that counts
-as out of reach [m, rad]."""
-_TURNS, _TURN_DAMPING, _LARGEST_TURN, _ROOM = 30, 1e-2, 0.1, 0.1
-"""Steps towards an orientation that an arm may have no joints for, their largest size, and the
-distance from the ends of the joints at which they stop [rad]."""
+_TURNS, _ROOM = 30, 0.1
+"""Steps towards an orientation that an arm may have no joints for, and the distance from the
+ends of the joints at which they stop [rad]."""
+_MISSED = 1e-3
+"""Error that counts as out of reach [m, rad]."""
 _SAME_TOOL = 0.02
 """Largest distance between the model's poses and those of its joints [m]."""
 
@@ -439,52 +439,40 @@ def _joints_along(
     if has_angle and learned and twist is not None and body is not None:
         path = follow_pose(robot.chain, first, poses, twist, body[:, 0], DT)
         # The law follows with a lag that vanishes in time, and some of it is left at the end.
-        path[-1] = _followed(robot, path[-1], poses[-1:])[-1]
+        path[-1] = _followed(robot, path[-1], poses[-1:], "pose")[-1]
         return path
     turns = model.pose is not None or goal.orientation is not None
     if robot.joints >= 6 and turns:
-        return _followed(robot, first, poses)
+        return _followed(robot, first, poses, "pose")
     end = _nearest_posture(robot, poses[-1], first, turns)
-    progress = [
-        minimum_jerk(k / max(len(poses.position) - 1, 1))[0] for k in range(len(poses.position))
-    ]
-    reference = torch.lerp(first, end, torch.tensor(progress, dtype=first.dtype)[:, None])
-    return _followed(robot, first, poses, reference)
+    steps = torch.linspace(0, 1, len(poses.position), dtype=first.dtype)[:, None]
+    progress = steps**3 * (10 - 15 * steps + 6 * steps**2)
+    return _followed(robot, first, poses, "position", torch.lerp(first, end, progress))
 
 
 @torch.no_grad()
 def _followed(
-    robot: Arm,
-    first: Tensor,
-    poses: Pose,
-    reference: Float[Tensor, "samples joints"] | None = None,
+    robot: Arm, first: Tensor, poses: Pose, task: TaskSpace, wish: Tensor | None = None
 ) -> Float[Tensor, "samples joints"]:
-    """Joint positions along poses, each by Newton's method from the one before.
+    """Joint positions along poses, each from the one before; `first` are those at the start.
 
     Args:
         robot: The arm.
         first: Joint positions at the first pose [rad].
         poses: Poses of the end effector.
-        reference: Joint positions to be near to, where only the positions count [rad].
+        task: Constrained part of the poses.
+        wish: Joint positions to be near to, where the task leaves some free [rad].
     """
-    rows, q, path = 6 if reference is None else 3, first, []
-    for k in range(len(poses.position)):
-        for _ in range(_ITERATIONS):
-            pose, J = robot.chain.forward_and_jacobian(q)
-            back = _damped(J[:rows])
-            q = q + back @ pose.twist_to(poses[k])[:rows]
-            if reference is not None:
-                away = reference[k] - q
-                q = q + away - back @ (J[:rows] @ away)
-        if not bool((robot.forward(q).twist_to(poses[k])[:rows].abs() < _MISSED).all()):
-            where = ", ".join(f"{x:.3f}" for x in poses.position[k].tolist())
-            raise UnreachableError(
-                f"{robot.name} does not reach the path at position ({where}) m"
-                f"{' with this orientation' if rows == 6 else ''}: choose another goal or "
-                "start."
-            )
-        path.append(q)
-    return torch.stack(path)
+    path, _ = follow_poses(robot.chain, poses, first, wish, task)
+    rows = TASK_ROWS[task]
+    missed = robot.forward(path).twist_to(poses)[:, :rows].abs().amax(-1) > _MISSED
+    if bool(missed.any()):
+        where = ", ".join(f"{x:.3f}" for x in poses.position[int(missed.int().argmax())])
+        raise UnreachableError(
+            f"{robot.name} does not reach the path at position ({where}) m"
+            f"{' with this orientation' if rows == 6 else ''}: choose another goal or start."
+        )
+    return path
 
 
 def _nearest_posture(
@@ -492,29 +480,18 @@ def _nearest_posture(
 ) -> Float[Tensor, " joints"]:
     """Joint positions at a position [rad], turned towards an orientation as far as they can."""
     q = robot.inverse(pose, near=near, task="position")
-    lower, upper = robot.limits.lower + _ROOM, robot.limits.upper - _ROOM
-    for _ in range(_TURNS if turns else 0):
-        now, J = robot.chain.forward_and_jacobian(q)
-        error, back = now.twist_to(pose), _damped(J[:3])
-        rest = torch.eye(len(q), dtype=q.dtype) - back @ J[:3]
-        turn = rest @ _damped(J[3:] @ rest, _TURN_DAMPING) @ error[3:]
-        turn = turn * (_LARGEST_TURN / turn.norm().clamp(min=_LARGEST_TURN))
-        moved = q + turn + back @ error[:3]
-        # The joints of the path on the way to it need some room.
-        if bool(((moved < lower) | (moved > upper)).any()):
-            break
-        q = moved
-    for _ in range(_ITERATIONS):
-        now, J = robot.chain.forward_and_jacobian(q)
-        q = q + _damped(J[:3]) @ now.twist_to(pose)[:3]
-    return q
-
-
-def _damped(
-    J: Float[Tensor, "rows joints"], damping: float = _DAMPING
-) -> Float[Tensor, "joints rows"]:
-    """Damped pseudo-inverse of a Jacobian."""
-    return J.mT @ torch.linalg.inv(J @ J.mT + damping * torch.eye(len(J), dtype=J.dtype))
+    if not turns:
+        return q
+    turned = quaternion.slerp(
+        robot.forward(q).orientation, pose.orientation, torch.linspace(0, 1, _TURNS).to(q)
+    )
+    turning = Pose(pose.position.expand(_TURNS, 3), turned)
+    path, _ = follow_poses(robot.chain, turning, q)
+    off = torch.linalg.vector_norm(robot.forward(path).position - pose.position, dim=-1)
+    margin = torch.minimum(path - robot.limits.lower, robot.limits.upper - path).amin(-1)
+    # The joints of the path on the way to it need some room.
+    fine = ((off < _MISSED / 10) & (margin > _ROOM)).int().cumprod(0)
+    return path[int(fine.sum()) - 1] if bool(fine[0]) else q
 
 
 def _first_joints(model: FittedModel, robot: Arm, start: Target | None) -> Tensor:
