@@ -22,15 +22,17 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import to_tensor
 from hrc_learn.dmp.joint_dmp import JointDMP, select_basis_count
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
-from hrc_learn.dmp.orientation_dmp import OrientationDMP
-from hrc_learn.dmp.orientation_error import nearest_turn, to_error
 from hrc_learn.dmp.pose_dmp import PoseDMP
-from hrc_learn.dmp.probabilistic_dmp import mean_primitive, with_common_reference
+from hrc_learn.dmp.probabilistic_dmp import (
+    KINDS,
+    columns_of_ends,
+    mean_primitive,
+    with_common_reference,
+)
 from hrc_learn.dmp.task_dmp import FramedDMP, Frames
 from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel, write_model
 
-KINDS = {kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP)}
 BASIS_COUNTS = (10, 20, 30, 50, 100)
 """Numbers of basis functions compared."""
 APPROACHES = (1.0, 0.6)
@@ -191,7 +193,7 @@ class LearnedMotion:
         reference = None if reference is None else reference.reshape(-1, 4)[0]
         like = self.each.with_motion(mean_primitive(self.each).motion, reference)
         if self.by_ends:
-            asked = _ends(like, like.with_boundary(start, goal)).reshape(1, -1)
+            asked = columns_of_ends(like, like.with_boundary(start, goal)).reshape(1, -1)
         elif context is None and self.chosen.family != "frames":
             raise ValueError(f"give the context of the motion, {self.context.shape[1]} numbers")
         else:
@@ -315,17 +317,6 @@ def _given[T](value: T | None, usual: Sequence[T]) -> Sequence[T]:
 def _coordinates(each: MotionPrimitive) -> Float[Tensor, "n D M"]:
     x = each.motion.coordinates().detach().double()
     return x.reshape(-1, *x.shape[-2:])
-
-
-def _ends(like: Any, moved: Any) -> Float[Tensor, "2 D"]:
-    """Start and goal of a primitive in the columns of another."""
-    ends = torch.stack([moved.motion.start, moved.motion.goal])
-    if (errors := like.error_columns) is not None:
-        turned = [getattr(end, "orientation", end) for end in (moved.start, moved.goal)]
-        usual = torch.stack([like.motion.start, like.motion.goal])[:, errors]
-        error = to_error(torch.stack(turned), like.reference)
-        ends[:, errors] = nearest_turn(error, usual)
-    return ends
 
 
 def _shrunk(x: Float[Tensor, "*batch D M"], factor: float) -> Float[Tensor, "*batch D M"]:

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.distributions import LowRankMultivariateNormal, kl_divergence
 
 from hrc_learn.dmp._arguments import (
     Points,
@@ -476,11 +477,30 @@ class MotionDistribution:
         mean, root = self._moments(time)
         return mean, root.norm(dim=-1)
 
-    def kl(self, other: "MotionDistribution") -> Float[Tensor, "*batch"]:
-        """KL divergence KL(self || other) of motions with equal state and timing.
+    def kl(
+        self, other: "MotionDistribution", time: Times | None = None, noise: float = 1e-3
+    ) -> Float[Tensor, "*batch"]:
+        """KL divergence KL(self || other) of motions.
 
-        Motions are an injective linear map of the linear parameters, so it equals theirs.
+        Args:
+            other: Distribution of the same head, with equal state and timing unless `time` is
+                given: motions are an injective linear map of the linear parameters then, so
+                that it equals theirs.
+            time: [s], (T,). The divergence is that of the positions at these times, observed
+                with noise, which differ with start, velocity, duration and delay too.
+            noise: Standard deviation of each position.
+
+        Raises:
+            ValueError: States or timing differ and no times are given: the divergence is
+                infinite then.
         """
+        if time is not None:
+            return kl_divergence(self._observed(time, noise), other._observed(time, noise))
+        if not _same(self._certain(), other._certain()):
+            raise ValueError(
+                "start, velocity or timing of the motions differ, so their divergence is "
+                "infinite: give times, at which noisy positions are compared"
+            )
         L = self.head.n_linear
         off = (other.parameters - self.parameters)[..., :L, None]
         ratio = torch.linalg.solve_triangular(
@@ -492,6 +512,21 @@ class MotionDistribution:
         size = ratio.square().sum((-2, -1)) + moved.square().sum((-2, -1)) - L
         return size / 2 + _log_diagonal(other.scale_tril) - _log_diagonal(self.scale_tril)
 
+    def _certain(self) -> tuple[Tensor, ...]:
+        """Numbers that do not vary: state, timing, and scales of the head."""
+        head = self.head
+        like, given = self.parameters, self.state
+        empty = [like.new_zeros(()) if x is None else to_tensor(x) for x in given.values()]
+        centre = like.new_zeros(()) if head.goal_centre is None else head.goal_centre
+        timing = head._timing(like)
+        return (*empty, centre, head.amplitude, head.goal_scale, *timing)
+
+    def _observed(self, time: Times, noise: float) -> LowRankMultivariateNormal:
+        mean, root = self._moments(time)
+        mean, root = mean.flatten(-2), root.flatten(-3, -2)
+        variance = positive("noise", noise, mean) ** 2
+        return LowRankMultivariateNormal(mean, root, variance.expand_as(mean))
+
     def _moments(self, time: Times) -> tuple[Tensor, Tensor]:
         """Mean (*batch T D) and square root (*batch T D L) of the covariance of positions."""
         head = self.head
@@ -502,6 +537,16 @@ class MotionDistribution:
         factor = self.scale_tril.unflatten(-2, (head.columns, -1))
         factor = head._scales().to(mean)[..., None] * factor
         return mean, torch.einsum("...tm,...dmr->...tdr", rows, factor)
+
+
+def _same(ones: tuple[Tensor, ...], others: tuple[Tensor, ...]) -> bool:
+    """True if all numbers agree, or must not be read."""
+    if not readable(*ones, *others):
+        return True
+    return all(
+        bool(torch.isclose(a.detach(), b.detach().to(a)).all())
+        for a, b in zip(ones, others, strict=True)
+    )
 
 
 def _log_diagonal(factor: Float[Tensor, "*batch L L"]) -> Float[Tensor, "*batch"]:

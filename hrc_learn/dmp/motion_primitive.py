@@ -20,6 +20,7 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     broadcast_shapes,
+    readable,
     regular_times,
     seconds,
     to_tensor,
@@ -526,6 +527,8 @@ def via_values(
     tensor = to_tensor(value, torch.float64, like.device)
     if tensor.ndim < 2 or tensor.shape[-2:] != shape[-2:]:
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
+    if readable(tensor) and tensor.isinf().any():
+        raise ValueError(f"{name} must be finite, or NaN where it is free")
     return tensor.expand(broadcast_shapes(tensor.shape, shape))
 
 

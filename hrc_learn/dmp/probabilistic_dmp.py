@@ -9,20 +9,39 @@ their `motion`.
 """
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.distributions import LowRankMultivariateNormal, kl_divergence
 
-from hrc_learn.dmp._arguments import Points, Scalars, Times, Vectors, seconds, to_tensor
+from hrc_learn.dmp._arguments import (
+    Points,
+    Scalars,
+    Times,
+    Vectors,
+    positive,
+    seconds,
+    to_tensor,
+)
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import MotionPrimitive, ViaOptions
+from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import intrinsic_mean, nearest_turn, reference_of, to_error
+from hrc_learn.dmp.pose_dmp import PoseDMP
 from hrc_learn.dmp.via_points import ViaPoints
 from hrc_learn.geometry import Pose
+from hrc_learn.model_files import SavedModel, write_model
+
+KINDS: dict[str, type[MotionPrimitive]] = {
+    kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP)
+}
+"""Kinds of primitive by the names in files."""
 
 PATH_TIMES = 30
 """Times at which paths are compared; no two routes separate and join again between them."""
@@ -37,6 +56,12 @@ STRONG_EVIDENCE = 10.0
 1995, "Bayes factors"); with few demonstrations, chance alone makes half of it."""
 MAXIMUM_ITERATIONS, SETTLED = 100, 1e-6
 """Limit of expectation-maximisation, and change of responsibilities at which it ends."""
+FEWEST, SINGULAR = 4, 1e-6
+"""Smallest number of primitives by which the dependence of paths on their ends is judged, and
+relative singular value below which ends do not vary."""
+KNOWN_DURATION = 1e-6
+"""Standard deviation of the logarithm of a known duration."""
+GAUSSIAN = ("mean", "spread", "timing")
 SAME_ORIENTATION = 1e-9
 """Angle [rad] below which orientations count as equal: above rounding, below any sensor."""
 
@@ -45,7 +70,8 @@ def mean_primitive[P: MotionPrimitive](primitives: P) -> P:
     """Mean over all batch dimensions of a primitive.
 
     A rollout is linear in weights, start, goal and start velocity. For one duration, and a
-    scaling that does not depend on start and goal, its mean is the rollout of the means.
+    scaling that does not depend on start and goal, its mean is the rollout of the means. The
+    duration is the geometric mean.
 
     Args:
         primitives: Primitives fitted to several demonstrations of one motion.
@@ -111,7 +137,7 @@ def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
 
     return motions.with_coordinates(
         mean(x),
-        mean(motions.duration),
+        mean(motions.duration.log()).exp(),
         amplitude=mean(motions.amplitude),
         timestamps=torch.linspace(0, 1, count, dtype=torch.float64).to(motions.timestamps),
     )
@@ -132,10 +158,19 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     mean: Float[Tensor, "D M"]
     spread: Float[Tensor, "DM rank"]
     """Square root of the covariance, with the rank of the demonstrations."""
+    timing: Float[Tensor, "rank"] = None  # pyright: ignore[reportAssignmentType]
+    """Deviation of the logarithm of the duration for each column of `spread`; zero by default:
+    the duration is certain."""
+    dependence: float = 1.0
+    """Factor on the dependence of paths on start and goal in `at`."""
+
+    def __post_init__(self):
+        if self.timing is None:
+            object.__setattr__(self, "timing", torch.zeros_like(self.spread[0]))
 
     @classmethod
     def fit(cls, primitives: P, slack: float = 0.0) -> "ProbabilisticDMP[P]":
-        """Compute mean and covariance of a batch of primitives.
+        """Compute mean and covariance of a batch of primitives and of their durations.
 
         Args:
             primitives: Primitives of one motion, fitted with `scaling="none"`.
@@ -158,11 +193,21 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         if reference is not None:
             reference = reference.reshape(-1, 4)[0]
         # n - 1, because the mean is taken from the same primitives.
-        spread = (x - mean).flatten(1).mT / (len(x) - 1) ** 0.5
+        spread = (x - mean) / (len(x) - 1) ** 0.5
+        lasting = motion.duration.detach().double().flatten().log()
+        timing = (lasting - lasting.mean()) / (len(x) - 1) ** 0.5
+        spread = spread.flatten(1).mT
         if slack:
-            spread = torch.cat([spread, _free_forcing(middle, slack)], dim=1)
+            free = _free_forcing(middle, slack)
+            spread = torch.cat([spread, free], dim=1)
+            timing = torch.nn.functional.pad(timing, (0, free.shape[1]))
+        middle = middle.with_coordinates(mean, lasting.mean().exp())
         return cls(
-            primitive=primitives.with_motion(middle, reference), mean=mean, spread=spread
+            primitive=primitives.with_motion(middle, reference),
+            mean=mean,
+            spread=spread,
+            timing=timing,
+            dependence=_dependence_on_ends(motion, x),
         )
 
     @classmethod
@@ -187,12 +232,54 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         return self._with_coordinates(self.mean)
 
     def sample(self, n: int, generator: torch.Generator | None = None) -> P:
-        """Batch of n random primitives."""
+        """Batch of n random primitives, with durations of their own."""
         rank = self.spread.shape[1]
         z = torch.randn(n, rank, generator=generator, dtype=torch.float64).to(self.spread)
-        return self._with_coordinates(
-            self.mean + (z @ self.spread.mT).unflatten(-1, self.mean.shape)
-        )
+        motion = self.primitive.motion
+        x = self.mean + (z @ self.spread.mT).unflatten(-1, self.mean.shape)
+        duration = motion.duration.double() * (z @ self.timing).exp()
+        return self.primitive.with_motion(motion.with_coordinates(x, duration))
+
+    def rollout(self, *arguments: Any, **options: Any) -> Any:
+        """Most likely motion; arguments as for `rollout` of the primitive."""
+        return self.mean_primitive().rollout(*arguments, **options)
+
+    def initial_state(self, *arguments: Any, **options: Any) -> Any:
+        """State at the start of the most likely motion, for `step`."""
+        return self.mean_primitive().initial_state(*arguments, **options)
+
+    def step(self, state: Any, dt: Scalars, **inputs: Any) -> Any:
+        """Advance the most likely motion by `dt` [s]; `inputs` as for the primitive."""
+        return self.mean_primitive().step(state, dt, **inputs)
+
+    def to(self, device: torch.device | str) -> "ProbabilisticDMP[P]":
+        """The same distribution on another device."""
+        parts = {name: getattr(self, name).to(device) for name in GAUSSIAN}
+        return replace(self, primitive=deepcopy(self.primitive).to(device), **parts)
+
+    def save(self, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+        own = {f"gaussian.{name}": getattr(self, name) for name in GAUSSIAN}
+        config = self.primitive.motion.config() | {"dependence": self.dependence}
+        config["primitive"] = type(self.primitive).__name__
+        write_model(folder, type(self).__name__, config, self.primitive.tensors() | own)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "ProbabilisticDMP[Any]":
+        """Read a distribution that `save` wrote.
+
+        Raises:
+            FileNotFoundError: The folder holds no saved distribution.
+            ValueError: A wrong field; the message names the file and the field.
+        """
+        saved = SavedModel(folder, cls.__name__)
+        kind = saved.get("primitive", str)
+        if kind not in KINDS:
+            raise saved.invalid_field("primitive", f"choose from {', '.join(KINDS)}")
+        own = {name: saved.tensor(f"gaussian.{name}") for name in GAUSSIAN}
+        primitive: Any = KINDS[kind].restore(saved)
+        dependence = float(saved.get("dependence", float, int))
+        return cls(primitive=primitive, dependence=dependence, **own)
 
     def position(self, time: Times) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T D"]]:
         """Mean and standard deviation of the columns at times [s].
@@ -216,34 +303,57 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         velocity: Points | None = None,
         *,
         noise: Scalars | Vectors = 1e-6,
+        duration: float | None = None,
         **options: Unpack[ViaOptions],
     ) -> "ProbabilisticDMP[P]":
-        """Gaussian conditioned on values and velocities at some times.
+        """Gaussian conditioned on values and velocities at some times, and on a duration.
 
         Gradients flow to times, values, velocities, mean and spread.
 
         Args:
-            time: Times of the via points [s], (n,).
+            time: Times of the via points [s], (n,), in the most likely motion. Empty: the
+                duration alone is known.
             value: Joints (n, D), unit quaternions (n, 4) or a `Pose` of (n). NaN leaves a
                 coordinate free; in a quaternion, the orientation.
             velocity: Of joints (n, D), angular (n, 3) or a twist (n, 6), per second. An angular
                 one without an orientation is taken at that of the mean motion.
             noise: Standard deviation of each value in the units of its coordinate ([rad] for an
                 orientation), or of each velocity per second; one number, (D,) or (n, D).
+            duration: Known duration [s].
             options: Via points of the kind of primitive.
+
+        Raises:
+            ValueError: Noise that is not positive and finite, or values that do not fit.
         """
+        if duration is not None:
+            motion = self.primitive.motion
+            ratio = positive("duration", duration, self.mean) / motion.duration.double()
+            # The logarithm of the duration, as exactly as numbers allow.
+            known = self._given(
+                self.timing[None] / KNOWN_DURATION, ratio.log()[None] / KNOWN_DURATION
+            )
+            middle = motion.with_coordinates(known.mean, motion.duration.double() * ratio)
+            primitive = self.primitive.with_motion(middle)
+            self = replace(known, primitive=primitive)
+        if not len(seconds(time, self.mean.device)):
+            return self
         via = self._via(time, value, velocity, **options)
         motion = self.primitive.motion
         H, tau = motion.response.evaluate(via.s), motion.duration.double()
         mean, root = self._observe(torch.cat([H[:, 0], H[:, 1] / tau]))
         wanted = torch.cat([via.position, via.rate / tau]).reshape(-1)
         given = ~wanted.isnan()
-        deviation = to_tensor(noise, mean.dtype, mean.device).expand_as(via.position)
+        deviation = positive("noise", noise, mean).expand_as(via.position)
         deviation = deviation.repeat(2, 1).reshape(-1)[given]
         # In units of the noise, and in coordinates z of the spread, whose prior is a unit
         # Gaussian.
         root = root[given] / deviation[:, None]
-        residual = (wanted[given] - mean[given]) / deviation
+        return self._given(root, (wanted[given] - mean[given]) / deviation)
+
+    def _given(
+        self, root: Float[Tensor, "k rank"], residual: Float[Tensor, "k"]
+    ) -> "ProbabilisticDMP[P]":
+        """Gaussian given root z = residual with unit noise, z the coordinates of the spread."""
         # The unit covariance keeps it positive definite for any number of equal via points.
         precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
         factor = torch.linalg.cholesky(precision)
@@ -251,22 +361,97 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         # precision^-1 = L^-T L^-1: L^-T is a square root of the remaining variance.
         remaining = torch.linalg.solve_triangular(factor, self.spread.mT, upper=False).mT
         moved = self.mean + (self.spread @ z).view(self.mean.shape)
-        return replace(self, mean=moved, spread=remaining)
+        timing = torch.linalg.solve_triangular(factor, self.timing[:, None], upper=False)
+        motion = self.primitive.motion
+        primitive = self.primitive
+        if self.timing.any():
+            later = motion.duration.double() * (self.timing @ z).exp()
+            primitive = primitive.with_motion(motion.with_coordinates(moved, later))
+        return replace(
+            self, primitive=primitive, mean=moved, spread=remaining, timing=timing[:, 0]
+        )
+
+    def at(
+        self, start: Any = None, goal: Any = None, duration: float | None = None
+    ) -> "ProbabilisticDMP[P]":
+        """Gaussian with a certain start and goal, by default those of the mean.
+
+        Few demonstrations show no reliable dependence of a path on its ends. The covariance
+        with them is therefore multiplied by the factor, 0 to 1, with which each demonstration
+        is predicted best from the others: in the mean it predicts as well as the mean of all.
+
+        Args:
+            start: Start of one motion, as `rollout` of the primitive takes it.
+            goal: Goal.
+            duration: Known duration [s].
+        """
+        if duration is not None:
+            return self.condition([], duration=duration).at(start, goal)
+        like = self.mean_primitive()
+        ends = columns_of_ends(like, like.with_boundary(start, goal)).mT.to(self.mean)
+        spread = self.spread.view(*self.mean.shape, -1)
+        E, k = spread[:, -2:].flatten(0, 1), self.dependence
+        back = torch.linalg.pinv(E, rtol=SINGULAR)
+        z = k * (back @ (ends - self.mean[:, -2:]).flatten())
+        # A root of I - k^2 P, P the projection on what the ends determine.
+        left = torch.eye(len(z)).to(E) - (1 - (1 - k**2) ** 0.5) * (back @ E)
+        mean = torch.cat([(self.mean + spread @ z)[:, :-2], ends], dim=1)
+        remaining = torch.nn.functional.pad(spread[:, :-2] @ left, (0, 0, 0, 2))
+        later = self.primitive.motion.duration.double() * (self.timing @ z).exp()
+        motion = self.primitive.motion.with_coordinates(mean, later)
+        return replace(
+            self,
+            primitive=self.primitive.with_motion(motion),
+            mean=mean,
+            spread=remaining.flatten(0, 1),
+            timing=self.timing @ left,
+        )
+
+    def observed(self, noise: float) -> LowRankMultivariateNormal:
+        """Gaussian of all columns at `PATH_TIMES` even fractions of the motion, one after
+        another, and of the logarithm of the duration, observed with independent noise.
+
+        Its entropy, log density, samples and divergences are those of the motion with its
+        duration, in float64.
+        """
+        s = torch.linspace(0, 1, PATH_TIMES).to(self.mean)
+        mean, root = self._observe(self.primitive.motion.response.evaluate(s)[:, 0])
+        lasting = self.primitive.motion.duration.double().log().reshape(1)
+        mean, root = torch.cat([mean, lasting]), torch.cat([root, self.timing[None]])
+        variance = positive("noise", noise, mean) ** 2
+        return LowRankMultivariateNormal(mean, root, variance.expand(len(mean)))
+
+    def entropy(self, noise: float) -> Float[Tensor, ""]:
+        """Entropy of motion and duration observed with this noise; see `observed`."""
+        return self.observed(noise).entropy()
+
+    def kl(self, other: "ProbabilisticDMP[P]", noise: float) -> Float[Tensor, ""]:
+        """KL(self || other) of motion and duration observed with this noise."""
+        return kl_divergence(self.observed(noise), other.observed(noise))
 
     def log_prob(
         self, time: Times, value: Points | Pose, *, noise: float, **options: Unpack[ViaOptions]
-    ) -> Float[Tensor, ""]:
-        """Log density of values observed at times (n,) with this sensor noise.
+    ) -> Float[Tensor, "*batch"]:
+        """Log density of values (*batch, n, D) observed at times (n,) with this sensor noise.
 
         For orientations it is the density of the error to the primitive's reference. NaN marks
         values that were not observed.
         """
+        deviation = positive("noise", noise, self.mean)
+        value = value if isinstance(value, Pose) else to_tensor(value)
+        batch = (value.position if isinstance(value, Pose) else value).shape[:-2]
+        if batch:
+            densities = [
+                self.log_prob(time, value[i], noise=noise, **_element(options, i))
+                for i in range(batch[0])
+            ]
+            return torch.stack(densities)
         via = self._via(time, value, None, **options)
         motion = self.primitive.motion
         mean, root = self._observe(motion.response.evaluate(via.s)[:, 0])
         seen = ~via.position.isnan().reshape(-1)
-        z = (via.position.reshape(-1) - mean)[seen] / noise
-        return log_density(z, root[seen] / noise) - len(z) * math.log(noise)
+        z = (via.position.reshape(-1) - mean)[seen] / deviation
+        return log_density(z, root[seen] / deviation) - len(z) * deviation.log()
 
     def _via(
         self,
@@ -302,6 +487,40 @@ def log_density(
     square = z.square().sum(-1) - part.square().sum((-2, -1))
     size = z.shape[-1] * math.log(2 * math.pi)
     return -(square + size) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def _element(options: Any, index: int) -> dict[str, Any]:
+    """Options of one motion of a batch."""
+    return {name: None if x is None else x[index] for name, x in options.items()}
+
+
+def _dependence_on_ends(motion: LinearPrimitive, x: Float[Tensor, "n D M"]) -> float:
+    """Factor on the dependence of paths on start and goal that predicts held-out ones best."""
+    n, s = len(x), torch.linspace(0, 1, PATH_TIMES).to(x)
+    if n < FEWEST:
+        return 1.0
+    rows = motion.response.evaluate(s)[:, 0, :-2]
+    ends, paths = x[..., -2:].flatten(1), (x[..., :-2] @ rows.mT).flatten(1)
+    agree = size = 0.0
+    for i in range(n):
+        rest = torch.arange(n) != i
+        e, p = ends[rest].mean(0), paths[rest].mean(0)
+        predicted = (ends[i] - e) @ torch.linalg.pinv(ends[rest] - e, rtol=SINGULAR)
+        predicted = predicted @ (paths[rest] - p)
+        agree += float(predicted @ (paths[i] - p))
+        size += float(predicted @ predicted)
+    return min(max(agree / size, 0.0), 1.0) if size > 0 else 1.0
+
+
+def columns_of_ends(like: Any, moved: Any) -> Float[Tensor, "2 D"]:
+    """Start and goal of a primitive in the columns of another, of the same kind."""
+    ends = torch.stack([moved.motion.start, moved.motion.goal])
+    if (errors := like.error_columns) is not None:
+        turned = [getattr(end, "orientation", end) for end in (moved.start, moved.goal)]
+        usual = torch.stack([like.motion.start, like.motion.goal])[:, errors]
+        error = to_error(torch.stack(turned), like.reference)
+        ends[:, errors] = nearest_turn(error, usual)
+    return ends
 
 
 def _linear_coordinates(primitives: LinearPrimitive) -> Float[Tensor, "*batch D M"]:
@@ -371,11 +590,16 @@ class MixtureDMP[P: MotionPrimitive]:
         r = _responsibilities(principal_components(_paths(motion)), n_modes)
         fraction = r / r.sum(0)
         means = torch.einsum("nk,ndm->kdm", fraction, x)
-        duration = fraction.mT @ motion.duration.detach().double().flatten()
+        duration = (fraction.mT @ motion.duration.detach().double().flatten().log()).exp()
         # Around the means of its modes, each primitive is weighted by its responsibilities.
         off = ((x[:, None] - means) * r.sqrt()[..., None, None]).flatten(2).flatten(0, 1)
         spread = off.mT / max(n - r.shape[1], 1) ** 0.5
-        spread = torch.cat([spread, whole.spread[:, n:]], dim=1)
+        free = _free_forcing(whole.primitive.motion, slack) if slack else spread[:, :0]
+        spread = torch.cat([spread, free], dim=1)
+        lasting = motion.duration.detach().double().flatten().log()
+        later = (lasting[:, None] - fraction.mT @ lasting) * r.sqrt()
+        timing = later.flatten() / max(n - r.shape[1], 1) ** 0.5
+        timing = torch.nn.functional.pad(timing, (0, free.shape[1]))
         middle = whole.primitive.motion
         modes = [
             replace(
@@ -383,6 +607,7 @@ class MixtureDMP[P: MotionPrimitive]:
                 primitive=whole.primitive.with_motion(middle.with_coordinates(mean, tau)),
                 mean=mean,
                 spread=spread,
+                timing=timing,
             )
             for mean, tau in zip(means, duration, strict=True)
         ]

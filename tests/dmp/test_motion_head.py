@@ -181,9 +181,15 @@ def test_density_of_motions(head, factor, state):
         torch.testing.assert_close(density[i], expected)
 
 
+def linear_zero(head, z):
+    """Parameters with the same timing."""
+    return torch.cat([0 * z[..., : head.n_linear], z[..., head.n_linear :]], -1)
+
+
 def test_divergence_of_motions_is_that_of_parameters(head, factor):
     L, start = head.n_linear, torch.zeros(2).double()
     z, others = random(3, head.n_parameters), random(3, head.n_parameters, seed=9)
+    others[:, L:] = z[:, L:]  # equal timing
     p = head.distribution(z, factor, start)
     q = head.distribution(others, 1.5 * factor[0], start)
     P = MultivariateNormal(z[..., :L], scale_tril=factor)
@@ -235,7 +241,7 @@ def test_maps_like_a_loop(head, factor):
     def density(z, factor, start):
         motions = head.distribution(z, factor, start)
         return motions.log_prob(TIME[::8], torch.ones(6, 2).double(), 0.1), motions.kl(
-            head.distribution(0 * z, 2 * factor, start)
+            head.distribution(linear_zero(head, z), 2 * factor, start)
         )
 
     expected = density(z, factor, start)
@@ -249,7 +255,9 @@ def test_gradients_reach_mean_and_factor(head, factor):
 
     def density(z, factor):
         motions = head.distribution(z, factor.tril(), torch.zeros(2).double())
-        reference = head.distribution(0 * z, torch.eye(L).to(z), torch.zeros(2).double())
+        reference = head.distribution(
+            linear_zero(head, z), torch.eye(L).to(z), torch.zeros(2).double()
+        )
         return motions.log_prob(time, y, 0.3) + motions.kl(reference)
 
     inputs = z.requires_grad_(), factor.requires_grad_()
