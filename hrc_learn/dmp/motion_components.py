@@ -189,9 +189,15 @@ class MotionComponents(nn.Module):
         points = [*begun, *points[len(begun) - self.known :]]
         if len(begun) == KNOWN_STATE:
             # A velocity beyond a limit turns back before the motion is there.
-            over = [(points[1] - high[..., 0, :]).relu(), (low[..., 0, :] - points[1]).relu()]
-            points[2] = torch.minimum(points[2], high[..., 0, :] - TURN * over[0])
-            points[2] = torch.maximum(points[2], low[..., 0, :] + TURN * over[1])
+            low, high = low[..., 0, :], high[..., 0, :]
+            turned = points[1].clamp(low, high) * (1 + TURN) - TURN * points[1]
+            turned = turned.clamp(low, high)
+            points[2] = torch.where(
+                points[1] > high, torch.minimum(points[2], turned), points[2]
+            )
+            points[2] = torch.where(
+                points[1] < low, torch.maximum(points[2], turned), points[2]
+            )
         return torch.stack(torch.broadcast_tensors(*points), -2), duration
 
     def _features(self, first: Tensor, velocity: Tensor | None) -> Float[Tensor, "*batch K"]:

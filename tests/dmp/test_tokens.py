@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 
 from hrc_learn.dmp.motion_components import spline
 from hrc_learn.dmp.token_code import TokenCode
-from hrc_learn.dmp.tokens import MotionTokenizer
+from hrc_learn.dmp.tokens import ActionProcessor, MotionTokenizer
 
 TIME = torch.linspace(0, 1, 21, dtype=torch.float64)
 VOCABULARY = 64
@@ -269,6 +269,36 @@ def test_bad_arguments_of_a_fit_are_named(change, words):
 def test_another_number_of_columns_is_refused(tokenizer):
     with pytest.raises(ValueError, match="motion must have 3 columns, got 2"):
         tokenizer.encode(TIME, motions(2, columns=2)[0])
+
+
+@pytest.fixture(scope="module")
+def processor() -> ActionProcessor:
+    return ActionProcessor.fit(list(motions(300)[0].numpy()), vocab_size=VOCABULARY)
+
+
+def test_processors_keep_fasts_interface(processor, tmp_path):
+    chunks = motions(20, seed=1)[0].numpy()
+    tokens = processor(chunks)
+    assert [type(i) for row in tokens for i in row] == [int] * sum(map(len, tokens))
+    made = processor.decode(tokens, time_horizon=21, action_dim=3)
+    assert made.shape == chunks.shape
+    assert np.sqrt(np.mean((made - chunks) ** 2)) < 0.03
+    assert processor(chunks[0]) == tokens[:1]
+    processor.save_pretrained(tmp_path / "processor")
+    loaded = ActionProcessor.from_pretrained(tmp_path / "processor")
+    assert (loaded.vocab_size, loaded.time_horizon, loaded.action_dim) == (VOCABULARY, 21, 3)
+    assert np.array_equal(loaded.decode(tokens), made)
+
+
+@pytest.mark.slow
+def test_lerobot_measures_a_processor(processor):
+    from lerobot.scripts.lerobot_train_tokenizer import compute_compression_stats
+
+    chunks = motions(50, seed=1)[0].numpy()
+    statistics = compute_compression_stats(processor, chunks)
+    counts = [len(row) for row in processor(chunks)]
+    assert statistics["mean_token_length"] == pytest.approx(np.mean(counts))
+    assert statistics["compression_ratio"] > 3
 
 
 class TestCode:

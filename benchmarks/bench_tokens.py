@@ -1,0 +1,240 @@
+"""Compare tokens of action chunks on LeRobot datasets: ours, FAST's, BEAST's recipe and bins.
+
+Each tokenizer is fitted to four of five episodes and encodes chunks of one second of the
+others. FAST's recipe (Pertsch et al. 2025: DCT, rounding, byte-pair encoding, with the scale of
+10 that LeRobot takes by default) needs `pip install tokenizers`. The others are set to its root
+mean square error: ours by the tolerance, B-spline coefficients in 256 levels (BEAST, Zhou et
+al. 2025) by their number, bins (RT-2) by their width. Errors are relative to half the range
+between the quantiles of 1 and 99 % of each column, as FAST normalises.
+
+    python benchmarks/bench_tokens.py --datasets so101/pick unitree/pour
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from rich.console import Console
+from rich.table import Table
+
+from hrc_learn import cli
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli.tokens_command import Chunks, held_out, read_chunks
+from hrc_learn.demos.read.dataset_folder import open_folder
+from hrc_learn.dmp.motion_components import spline
+from hrc_learn.dmp.tokens import MotionTokenizer
+
+VOCABULARY = 1024
+LEVELS = 256
+"""Levels of a coefficient in BEAST's recipe, and bins of RT-2."""
+WRONG = 0.05
+"""Share of tokens that are replaced to see whether chunks still decode."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    datasets: tuple[Path, ...]
+    """LeRobot datasets."""
+    feature: str = "action"
+    """Feature to encode."""
+    scale: float = 10.0
+    """Scale of FAST's coefficients; errors are compared at that of FAST."""
+    seconds: float = 1.0
+    """Duration of a chunk [s]."""
+    fitted: int = 4000
+    """Largest number of chunks to fit to."""
+    measured: int = 200
+    """Largest number of chunks to encode."""
+    random: int = 0
+    """Random sequences to decode with each of our tokenizers."""
+    json: Path | None = None
+    """Receives all figures as one flat object."""
+
+
+class Fast:
+    """FAST's recipe: rounded coefficients of a cosine transform, byte-pair encoded."""
+
+    def __init__(self, chunks: Float[np.ndarray, "N T D"], scale: float):
+        """Learn the merges."""
+        from tokenizers import ByteLevelBPETokenizer  # pyright: ignore[reportMissingImports]
+        from tokenizers.trainers import BpeTrainer  # pyright: ignore[reportMissingImports]
+
+        self.scale, self.shape = scale, chunks.shape[1:]
+        q = self.rounded(chunks)
+        self.least, most = int(q.min()), int(q.max())
+        if most - self.least >= VOCABULARY:
+            raise ValueError("the coefficients need more symbols than the vocabulary has")
+        self.code: Any = ByteLevelBPETokenizer()
+        trainer = BpeTrainer(
+            vocab_size=VOCABULARY,
+            min_frequency=2,
+            show_progress=False,
+            special_tokens=[],
+            initial_alphabet=[chr(i) for i in range(most - self.least + 1)],
+            max_token_length=10000,
+        )
+        self.code._tokenizer.train_from_iterator(map(self.text, q), trainer=trainer)
+
+    def rounded(self, chunks: Float[np.ndarray, "N T D"]) -> Int[np.ndarray, "N K"]:
+        """Coefficients, low frequencies of all columns first."""
+        from scipy.fft import dct
+
+        q = np.around(dct(chunks, axis=1, norm="ortho") * self.scale).astype(int)
+        return q.reshape(len(q), -1)
+
+    def text(self, q: Int[np.ndarray, "K"]) -> str:
+        """Coefficients as characters."""
+        return "".join(map(chr, np.maximum(q - self.least, 0)))
+
+    def encode(self, chunks: Float[np.ndarray, "N T D"]) -> list[list[int]]:
+        """Tokens of chunks."""
+        return [self.code.encode(self.text(q)).ids for q in self.rounded(chunks)]
+
+    def decode(self, ids: list[int]) -> Float[np.ndarray, "T D"] | None:
+        """Chunk of tokens; None if they do not make as many coefficients as it has."""
+        from scipy.fft import idct
+
+        q = np.array([ord(c) for c in self.code.decode(ids)]) + self.least
+        if len(q) != np.prod(self.shape):
+            return None
+        return idct(q.reshape(self.shape) / self.scale, axis=0, norm="ortho")
+
+
+def main(args: Args) -> None:
+    """Compare the tokenizers on each dataset."""
+    table = Table("dataset", "RMSE", "FAST", "ours", "ratio", "BEAST", "bins", "FAST broken")
+    figures: dict[str, float] = {}
+    console = Console()
+    for dataset in args.datasets:
+        found = compare(dataset, args)
+        figures |= {f"{dataset.name}_{name}": value for name, value in found.items()}
+        table.add_row(dataset.name, *(f"{value:.3g}" for value in list(found.values())[:7]))
+        console.print({name: round(value, 5) for name, value in found.items()})
+    console.print(table)
+    write_values(args.json, figures)
+
+
+def compare(dataset: Path, args: Args) -> dict[str, float]:
+    """Tokens per chunk at FAST's error, and what becomes of broken sequences."""
+    every = [entry.index for entry in open_folder(dataset).episodes]
+    unseen = held_out(every, 5)
+    kept = [i for i in every if i not in unseen]
+    train = read_chunks(dataset, args.feature, args.seconds, kept, args.fitted)
+    test = read_chunks(dataset, args.feature, args.seconds, unseen, args.measured)
+    low, high = np.quantile(train.motions, (0.01, 0.99), axis=(0, 1))
+    moves = high > low
+    half = np.where(moves, (high - low) / 2, 1)
+    train, test = (
+        Chunks(
+            c.time,
+            ((c.motions - (low + high) / 2) / half)[..., moves],
+            (c.start_velocity / half)[:, moves],
+        )
+        for c in (train, test)
+    )
+    fast = Fast(train.motions[:, 1:], args.scale)
+    y = test.motions[:, 1:]
+    ids = fast.encode(y)
+    made = np.stack([fast.decode(row) for row in ids])
+    rmse = float(np.sqrt(np.mean((made - y) ** 2)))
+    counts = float(np.mean([len(row) for row in ids]))
+    tokenizer, ours, error = matched(train, test, rmse)
+    rng = np.random.default_rng(0)
+    broken = [
+        fast.decode([int(rng.integers(VOCABULARY)) if rng.random() < WRONG else i for i in row])
+        for row in ids
+    ]
+    result = {
+        "rmse": rmse,
+        "fast_tokens": counts,
+        "tokens": ours,
+        "ratio": ours / counts,
+        "beast_tokens": beast(train, test, rmse),
+        "bins": float(y[0].size),
+        "fast_undecodable_share": float(np.mean([b is None for b in broken])),
+        "our_rmse": error,
+        "bin_rmse": float(
+            np.sqrt(np.mean(np.ptp(train.motions, (0, 1)) ** 2 / LEVELS**2 / 12))
+        ),
+        "chunks": float(len(y)),
+    }
+    if args.random:
+        result |= at_random(tokenizer, train, args.random)
+    return result
+
+
+def matched(train: Chunks, test: Chunks, rmse: float) -> tuple[MotionTokenizer, float, float]:
+    """Tokenizer of about this error, its tokens per chunk at this error, and its own error.
+
+    The logarithms of two near errors and their tokens are interpolated.
+    """
+    state = torch.from_numpy(test.motions[:, 0]), torch.from_numpy(test.start_velocity)
+    tolerance, points = rmse / 2, []
+    for _ in range(3):
+        tokenizer = MotionTokenizer.fit(
+            train.time,
+            train.motions,
+            VOCABULARY,
+            start_velocity=train.start_velocity,
+            tolerance=tolerance,
+        )
+        ids = tokenizer.encode(test.time, test.motions, test.start_velocity)
+        made = tokenizer.decode(ids, test.time, *state).numpy()
+        error = float(np.sqrt(np.mean((made - test.motions)[:, 1:] ** 2)))
+        points.append((np.log(error), np.mean([tokenizer.length(row) for row in ids.tolist()])))
+        if abs(np.log(rmse / error)) < 0.01:
+            return tokenizer, float(points[-1][1]), error
+        tolerance *= rmse / error
+    (e0, n0), (e1, n1) = sorted(points, key=lambda p: abs(p[0] - np.log(rmse)))[:2]
+    n = n0 + (n1 - n0) * (np.log(rmse) - e0) / (e1 - e0) if abs(e1 - e0) > 1e-3 else n0
+    return tokenizer, float(n), error
+
+
+def beast(train: Chunks, test: Chunks, rmse: float) -> float:
+    """Tokens per chunk of B-spline coefficients in equal levels, at most at this error."""
+    s = torch.linspace(0, 1, test.motions.shape[1] - 1, dtype=torch.float64)
+    for count in range(4, len(s) + 1):
+        B = spline(s, count).numpy()
+        known, c = (np.linalg.pinv(B) @ x.motions[:, 1:] for x in (train, test))
+        low, high = known.min((0, 1)), known.max((0, 1))
+        step = (high - low) / (LEVELS - 1)
+        made = B @ (low + np.around((c.clip(low, high) - low) / step) * step)
+        if np.sqrt(np.mean((made - test.motions[:, 1:]) ** 2)) <= rmse:
+            return float(count * c.shape[-1])
+    return float("nan")
+
+
+def at_random(tokenizer: MotionTokenizer, train: Chunks, count: int) -> dict[str, float]:
+    """Shares of random sequences that do not decode or leave the limits, and largest seams."""
+    rng = torch.Generator().manual_seed(0)
+    low, high = tokenizer.components.low, tokenizer.components.high
+    failed = beyond = 0
+    seam = 0.0
+    for _ in range(0, count, 1000):
+        ids = torch.randint(0, VOCABULARY, (1000, 20), generator=rng)
+        at = torch.randint(0, len(train.motions), (1000,), generator=rng).numpy()
+        start, rate = train.motions[at, 0], train.start_velocity[at]
+        made = tokenizer.decode(ids, train.time, start, rate)
+        failed += int((~made.isfinite()).flatten(1).any(1).sum())
+        beyond += int(((made < low) | (made > high)).flatten(1).any(1).sum())
+        for order, state in ((0, start), (1, rate)):
+            joined = tokenizer.decode(ids, [0.0], start, rate, order=order)[:, 0].numpy()
+            seam = max(seam, float(np.abs(joined - state).max()))
+    return {
+        "random_undecodable_share": failed / count,
+        "random_beyond_share": beyond / count,
+        "seam": seam,
+    }
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
