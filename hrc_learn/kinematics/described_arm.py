@@ -68,6 +68,7 @@ def arm_from_file(
     limits: LimitsGiven = None,
     ready: Sequence[float] | None = None,
     body: FittedBody | None = None,
+    base_turn: float = 0.0,
 ) -> Arm:
     """An arm from a URDF or MJCF file.
 
@@ -87,6 +88,8 @@ def arm_from_file(
         ready: A comfortable posture [rad, m]; None: the file's `home`, or a posture near the
             middle of the joints' ranges and far from singularities.
         body: Capsules and overlapping links; None fits capsules on first use.
+        base_turn: Turn of the base link about its z axis, for a file whose arm does not extend
+            along the x axis [rad].
 
     Raises:
         ValueError: The format is unknown, the links form no serial chain, or `ready` is outside
@@ -97,7 +100,7 @@ def arm_from_file(
     base, tip, joints = description.path_between(base, tip)
     moving = [joint for joint in joints if joint.kind in MOVING]
     kinds: list[JointKind] = [cast(JointKind, joint.kind) for joint in moving]
-    places, mounts = _places(description, base, moving)
+    places, mounts = _places(description, base, moving, base_turn)
     flange = places[tip][1]
     tcp = np.eye(4) if tool is None else tool.double().numpy()
     if limits is None and (sidecar := path.with_suffix(".limits.toml")).is_file():
@@ -170,10 +173,13 @@ def _ready(
 
 
 def _places(
-    description: Description, base: str, moving: Sequence[Joint]
+    description: Description, base: str, moving: Sequence[Joint], base_turn: float
 ) -> tuple[dict[str, tuple[int, Transform]], list[Transform]]:
     """Number of each link's frame and its pose there, and the mounts of the joints."""
-    places = {name: (0, pose) for name, pose in description.rigid_subtree(base).items()}
+    turned, (c, s) = np.eye(4), (np.cos(base_turn), np.sin(base_turn))
+    turned[:2, :2] = [[c, -s], [s, c]]
+    subtree = description.rigid_subtree(base)
+    places = {name: (0, turned @ pose) for name, pose in subtree.items()}
     mounts = []
     for number, joint in enumerate(moving, start=1):
         turn = turn_to(joint.axis)

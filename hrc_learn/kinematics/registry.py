@@ -92,7 +92,7 @@ def arm_of_robot(robot_type: str | None) -> Arm | None:
         return ArmChoice(simulated).work_arm()
     name = _plain(_ROLES.sub("", (robot_type or "").lower().replace("_", "").replace("-", "")))
     known = {_plain(registered): registered for registered in registered_arms()}
-    found = known.get(name) or _OTHER_NAMES.get(name)
+    found = _OTHER_NAMES.get(name) or known.get(name)
     try:
         return _registered(found) if found else None
     except MissingModelError:
@@ -226,7 +226,8 @@ def _described(name: str, choice: Mapping[str, Any]) -> Arm:
         )
     source = _sources()[name]
     path = _locate(name, source["package"], source["file"])
-    settings = {key: source.get(key) for key in ("base", "tip", "limits", "ready")}
+    kept = ("base", "tip", "limits", "ready", "base_turn")
+    settings = {key: source[key] for key in kept if key in source}
     if tool := source.get("tool"):
         settings["tool"] = torch.from_numpy(turn_to(np.array(tool["approach"])))
         settings["tool"][:3, 3] = torch.tensor(tool["origin"])

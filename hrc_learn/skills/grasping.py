@@ -150,7 +150,9 @@ class Grasping:
                 f"the skill has no visual target: its demonstrations lack {OBJECT_FEATURE}."
             )
         self._visual = skill.target
-        self._config = config = config or GraspingConfig()
+        config = config or GraspingConfig()
+        config = replace(config, servo=config.servo.scaled(self._size))
+        self._config = config
         self._check = check
         self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
         controller = AdaptiveController(

@@ -325,6 +325,21 @@ class VisualServoConfig:
     drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
     """Effect of a person's drawing on the goals."""
 
+    def scaled(self, size: float) -> "VisualServoConfig":
+        """The same with the lengths over the table in proportion to a hand.
+
+        Args:
+            size: Size of the hand relative to the Franka hand.
+        """
+        (a, b, c), (d, e, f) = self.half_size, self.acquisition_half_size
+        return replace(
+            self,
+            height_tolerance=size * self.height_tolerance,
+            probe=size * self.probe,
+            half_size=(size * a, size * b, c),
+            acquisition_half_size=(size * d, size * e, f),
+        )
+
     def within(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
         """The nearest pixel that keeps the distance from the border of the image [px]."""
         return np.clip(pixel, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
