@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -447,7 +447,8 @@ class Arm(SerialChain):
         if mount is not None:
             flange, tcp = flange @ mount.to(flange), torch.eye(4, dtype=flange.dtype)
             # A fixed jaw belongs to the gripper that the hand replaces.
-            links = [capsule for capsule in links if not _is_ahead(capsule, n, flange)]
+            last = [_behind(capsule, flange) for capsule in links if capsule.link == n]
+            links = [*(c for c in links if c.link < n), *(c for c in last if c is not None)]
         # Along the arm's own direction of approach, which need not be the flange's z axis.
         tcp[:3, 3] = size * TCP_OFFSET * tcp[:3, 2]
         return Arm(
@@ -469,11 +470,16 @@ class Arm(SerialChain):
         )
 
 
-def _is_ahead(capsule: LinkCapsule, link: int, hand: Float[Tensor, "4 4"]) -> bool:
-    """True if a capsule lies on the last link, ahead of the base of a hand in its frame."""
+def _behind(capsule: LinkCapsule, hand: Float[Tensor, "4 4"]) -> LinkCapsule | None:
+    """Part of a capsule behind the base of a hand in the frame of its link; None: no part."""
     axis, origin = hand[:3, 2], hand[:3, 3]
     ends = torch.tensor([capsule.start, capsule.end], dtype=hand.dtype)
-    return capsule.link == link and bool(((ends - origin) @ axis > 0).all())
+    ahead = (ends - origin) @ axis
+    if bool((ahead > 0).all()):
+        return None
+    back = torch.where(ahead > 0, ahead + capsule.radius, 0.0)
+    start, end = (ends - back[:, None] * axis).tolist()
+    return replace(capsule, start=tuple(start), end=tuple(end))
 
 
 def hand_capsules(link: int, size: float = 1.0) -> tuple[LinkCapsule, ...]:

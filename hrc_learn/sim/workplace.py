@@ -44,12 +44,14 @@ _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 # Distances of table and cabinet from the base, relative to the usual ones, and where the
 # cabinet stands besides: further along the base's x axis, and higher [m].
 _SCALES = (1.0, 0.85, 0.7, 0.55)
-# An arm of fewer than six joints keeps its tool in a plane through the axis of its first joint.
-# So its cabinet stands straight beside that axis, so many times as far away as the table, and
-# home is on the way there, at these fractions of that distance. With its wrist right above the
-# tool it works lower over the table, and its marker is seen from the far side.
-_BESIDE_SCALES, _BESIDE, _ON_THE_WAY = (0.78, 0.7, 0.85), (1.4, 1.6, 1.2), (0.55, 0.65)
+# An arm of fewer than six joints keeps its tool in a plane through the axis of its first joint,
+# and some others have wrists that turn little out of it. Their cabinet stands straight beside
+# that axis, so many times as far away as the table, and home is on the way there, at these
+# fractions of that distance. With its wrist right above the tool such an arm works lower over
+# the table, and its marker is seen from the far side.
+_BESIDE, _ON_THE_WAY = (1.4, 1.6, 1.2), (0.55, 0.65)
 _HOVER_BESIDE, _CAMERA_BESIDE = 0.85, 1.5
+_SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (1.1, True))
 # All lengths below are those of a cell for the Franka hand; a smaller hand makes them smaller.
 # Distance from the middle of the table to reach in view of the camera [m]: with a margin to
 # spare, then no further than objects are put.
@@ -360,10 +362,12 @@ def _candidates(robot: Arm) -> Iterator[tuple[list[Workplace], _Above]]:
     """Workplaces that suit an arm, with postures above their table; the likely ones first."""
     unlikely = []
     for reach in _REACHES:
-        for scale in _SCALES if robot.task == "pose" else _BESIDE_SCALES:
+        for scale, beside in _SCALED:
+            if robot.task != "pose" and not beside:
+                continue
             places = [
                 replace(place, table_reach=(robot.hand_size * reach,) * 2)
-                for place in _workplaces(robot, scale)
+                for place in _workplaces(robot, scale, beside)
             ]
             above = _above_table(places[0])
             # No layout is better than the best posture above its table.
@@ -379,11 +383,17 @@ def _worth(quality: float, seen: float) -> float:
     return min(quality, 1.0 - _UNSEEN * (1.0 - seen))
 
 
-def _workplaces(robot: Arm, scale: float) -> Iterator[Workplace]:
-    """Layouts with the table at one distance and the cabinet in several places."""
+def _workplaces(robot: Arm, scale: float, beside: bool) -> Iterator[Workplace]:
+    """Layouts with the table at one distance and the cabinet in several places.
+
+    Args:
+        robot: The arm.
+        scale: Distance of the table, relative to the usual one.
+        beside: Put the cabinet straight beside the axis of the first joint.
+    """
     usual = SceneConfig()
     usual = replace(usual, arm=replace(usual.arm, robot=robot))
-    if robot.task == "nearest pose":
+    if beside:
         for far, higher, home in product(_BESIDE, _HIGHER, _ON_THE_WAY):
             yield _beside(_placed(usual, scale, 0.0, higher, _DEPTHS[-1], far), home)
         return

@@ -7,6 +7,7 @@ times out, it starts again from home.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -58,6 +59,9 @@ _POSTURES = 9
 _AT_HOME = 0.05
 # Features of a tool without markers are found less exactly than corners of a marker.
 _UNMARKED = CameraConfig(pixel_noise=0.6, bump=6.0)
+# Fractions of the height of a probe that are tried, and distance from joint limits there [rad]:
+# nearer to one the arm is slow.
+_PROBE_FRACTIONS, _PROBE_MARGIN = (1.0, 0.75, 0.5, 0.25), 0.1
 # Uncertainty of the table height before and after the fingers touch it [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 
@@ -151,8 +155,11 @@ class Grasping:
             )
         self._visual = skill.target
         config = config or GraspingConfig()
-        config = replace(config, servo=config.servo.scaled(self._size))
-        self._config = config
+        servo = config.servo.scaled(self._size)
+        probe = servo.probe * _reachable_probe(
+            workplace, servo.probe, cell.config.safety.margin
+        )
+        self._config = config = replace(config, servo=replace(servo, probe=probe))
         self._check = check
         self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
         controller = AdaptiveController(
@@ -385,6 +392,27 @@ class Grasping:
         if self._cell.pose.position[2] < self._workplace.hover_height:
             self.lift()
         self.go_home()
+
+
+def _reachable_probe(workplace: Workplace, probe: float) -> float:
+    """Fraction of the height of a probe at which the arm reaches all over the objects.
+
+    Args:
+        workplace: Workplace with the region of the objects.
+        probe: Height above that of servoing [m].
+    """
+    robot, hover = workplace.robot, workplace.hover()
+    _, half = workplace.object_region()
+    signs = half.new_tensor([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]])
+    for fraction in _PROBE_FRACTIONS:
+        corners = hover.position + signs * half + half.new_tensor([0, 0, fraction * probe])
+        with suppress(UnreachableError):
+            pose = Pose(corners, hover.orientation.expand(4, 4))
+            q = robot.inverse(pose, near=workplace.hover_joints())
+            within = [robot.limits.contain(q + side * _PROBE_MARGIN) for side in (-1, 1)]
+            if bool((within[0] & within[1]).all()):
+                return fraction
+    return _PROBE_FRACTIONS[-1]
 
 
 def joint_plan(

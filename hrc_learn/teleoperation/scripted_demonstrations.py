@@ -200,7 +200,7 @@ def servo_expert(
     return ScriptedExpert(
         workplace.robot.chain,
         path,
-        tremor=Tremor(config.tremor, rng),
+        tremor=Tremor(size * config.tremor, rng),
         orientation=orientation,
     )
 
@@ -390,7 +390,7 @@ def placing_expert(
         workplace.robot.chain,
         GuidedPath(waypoints, config.duration),
         forces=ELBOW_FORCES if pulled else (),
-        tremor=Tremor(config.tremor, rng),
+        tremor=Tremor(size * config.tremor, rng),
         orientation=lambda position, _: coarse_orientation(position, workplace.level_at),
     )
 

@@ -41,7 +41,9 @@ def described(name):
 
 
 # The search takes a few seconds of each arm.
-@pytest.fixture(params=["six", pytest.param("xarm7", marks=pytest.mark.slow)])
+@pytest.fixture(
+    params=["six", *(pytest.param(name, marks=pytest.mark.slow) for name in ("xarm7", "so101"))]
+)
 def robot(request):
     return six_joints() if request.param == "six" else described(request.param)
 
