@@ -18,7 +18,9 @@ Franka's meshes of both arms, equal to 2 mm, protrude from the capsules by at mo
 
 from __future__ import annotations
 
+import tomllib
 from functools import partial
+from importlib.resources import files
 from math import cos, pi, sin
 
 import numpy as np
@@ -188,73 +190,23 @@ LINK_MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
 """Masses of links 1 to 7 [kg], from franka_description."""
 HAND_MASS = 0.73
 """Mass of the gripper without its fingers [kg], from franka_description."""
-# Centre (x, y, z) [m] and inertia (xx, xy, xz, yy, yz, zz) about it [kg m^2] of links 1 to 7,
-# from franka_description (Ledezma and Haddadin 2018); then of the gripper, in the tool's frame.
-_INERTIA = (
-    (0.003875, 0.002081, -0.04762, 0.70337, -0.000139, 0.006772, 0.70661, 0.019169, 0.009117),
-    (-0.003141, -0.02872, 0.003495, 0.007962, -0.003925, 0.010254, 0.02811, 0.000704, 0.025995),
-    (
-        0.027518,
-        0.039252,
-        -0.066502,
-        0.037242,
-        -0.004761,
-        -0.011396,
-        0.036155,
-        -0.012805,
-        0.01083,
-    ),
-    (-0.05317, 0.104419, 0.027454, 0.025853, 0.007796, -0.001332, 0.019552, 0.008641, 0.028323),
-    (
-        -0.011953,
-        0.041065,
-        -0.038437,
-        0.035549,
-        -0.002117,
-        -0.004037,
-        0.029474,
-        0.000229,
-        0.008627,
-    ),
-    (
-        0.060149,
-        -0.014117,
-        -0.010517,
-        0.001964,
-        0.000109,
-        -0.001158,
-        0.004354,
-        0.000341,
-        0.005433,
-    ),
-    (
-        0.010517,
-        -0.004252,
-        0.061597,
-        0.012516,
-        -0.000428,
-        -0.001196,
-        0.010027,
-        -0.000741,
-        0.004815,
-    ),
-    (-0.01, 0.0, 0.03 - TCP_OFFSET, 0.001, 0.0, 0.0, 0.0025, 0.0, 0.0017),
-)
 
 # Links whose capsules overlap by design although they are no neighbours. The flange (8) has
 # none, so the hand follows link 7.
 OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, TOOL_LINK), (7, TOOL_LINK))
 
 
-def _frankas_inertia() -> tuple[Float[np.ndarray, "4 4"] | None, ...]:
+def _inertias() -> tuple[Float[np.ndarray, "4 4"] | None, ...]:
     """Pseudo-inertias of base, links, flange and gripper."""
+    table = files(__package__).joinpath("franka_inertia.toml").read_text(encoding="utf-8")
     found = []
-    for mass, (x, y, z, xx, xy, xz, yy, yz, zz) in zip(
-        (*LINK_MASSES, HAND_MASS), _INERTIA, strict=True
-    ):
+    for mass, row in zip((*LINK_MASSES, HAND_MASS), tomllib.loads(table)["rows"], strict=True):
+        x, y, z, xx, xy, xz, yy, yz, zz = row
         inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         found.append(pseudo_inertia(mass, (x, y, z), inertia))
-    return (None, *found[:-1], np.zeros((4, 4)), found[-1])
+    to_tool = np.eye(4)
+    to_tool[2, 3] = -TCP_OFFSET
+    return (None, *found[:-1], np.zeros((4, 4)), to_tool @ found[-1] @ to_tool.T)
 
 
 def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
@@ -272,7 +224,7 @@ def _franka(name: str, limits: JointLimits, ranges: tuple[bool, ...]) -> Arm:
     return Arm(
         name=name,
         chain=chain,
-        shape=ArmShape(masses=(None, *LINK_MASSES, 0.0, HAND_MASS), inertia=_frankas_inertia()),
+        shape=ArmShape(masses=(None, *LINK_MASSES, 0.0, HAND_MASS), inertia=_inertias()),
         capsules=LINK_CAPSULES + hand_capsules(TOOL_LINK),
         overlapping=OVERLAPPING,
         closed_form=partial(franka_branches, ranges=ranges),
