@@ -126,6 +126,7 @@ def contacts(
     *,
     load: float = 0.0,
     area: float = 1.0,
+    padding: float = np.inf,
     rows: Iterable[int] | None = None,
 ) -> list[Contact]:
     """All contacts of a recorded motion, each with its hardest moment.
@@ -136,20 +137,28 @@ def contacts(
         worker: Size of the worker.
         load: Mass of the carried object [kg].
         area: Contact area [cm^2].
+        padding: Stiffness of a padding of the arm [N/mm]; infinite: none.
         rows: Steps to look at; default: those in which the worker is within the arm's reach.
     """
-    return _Replay(scene, worker, motion, load, area).contacts(rows)
+    return _Replay(scene, worker, motion, load, area, padding).contacts(rows)
 
 
 class _Replay:
     """The recorded motion, step by step in MuJoCo."""
 
     def __init__(
-        self, scene: SceneConfig, worker: WorkerConfig, motion: Motion, load: float, area: float
+        self,
+        scene: SceneConfig,
+        worker: WorkerConfig,
+        motion: Motion,
+        load: float,
+        area: float,
+        padding: float,
     ):
         self._world = World(replace(scene, worker=worker))
         model = self._world.model
         self._motion, self._load, self._area = motion, load, area
+        self._softness = 1 / padding
         self._item = scene.objects[0]
         self._worker = {model.geom(name).id: k for k, name in enumerate(WORKER_BODIES)}
         self._dofs = np.array(
@@ -226,7 +235,7 @@ class _Replay:
         force, pressure, spring, mass = LIMITS[
             pair[1].removesuffix("_left").removesuffix("_right")
         ]
-        stiffness = 1e3 * spring
+        stiffness = 1e3 / (1 / spring + self._softness)
         part = self._world.model.geom(f"worker_{pair[1]}")
         clamped = self._held(point, normal, 2 * float(part.size[0]) + _BEHIND)
         advance[pair] = advance.get(pair, 0.0) + max(v, 0.0) * dt

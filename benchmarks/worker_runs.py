@@ -7,6 +7,7 @@ watch and `ArmLoop`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -89,6 +90,8 @@ class Reaction:
     protective distance, slower or at rest."""
     mode: PersonMode = "ssm"
     """Separation monitoring, or power and force limiting."""
+    padding: float = math.inf
+    """Stiffness of a padding of the arm [N/mm]; infinite: none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -181,13 +184,17 @@ class _Batch:
         self._job, self._reaction = job, reaction
         self._load = job.cycles[0].load
         safety = job.sizes.plant(config.safety)
-        self._separation = replace(safety.separation, mode=reaction.mode)
+        contact = replace(safety.separation.contact, padding=reaction.padding)
+        self._separation = replace(safety.separation, mode=reaction.mode, contact=contact)
         safety = replace(safety, separation=self._separation)
         self._regions = region_numbers(REGIONS)
         self._limits = self._true_limits = None
         if reaction.mode != "ssm":
             boxes, config_used = job.workplace.scene.boxes(), self._separation.contact
             whole = replace(self._separation, contact=replace(config_used, used=1.0))
+            safety = replace(
+                safety, tcp_speed=min(safety.tcp_speed, PersonWatchConfig().fastest)
+            )
             self._limits, self._true_limits = (
                 ContactLimits(job.arm, separation, boxes)
                 for separation in (self._separation, whole)

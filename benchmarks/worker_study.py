@@ -10,6 +10,7 @@ touched a worker with more than the allowed force or pressure.
 
 from __future__ import annotations
 
+import math
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -107,6 +108,8 @@ class Args:
     people: tuple[PersonMode, ...] = ("ssm",)
     """Reactions to people to compare, each with every source of null-space motion: separation
     monitoring, power and force limiting, or both."""
+    padding: float = math.inf
+    """Stiffness of a padding of the arm [N/mm]; infinite: none."""
     stop_distances: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.8)
     """Distances within which arms stop and wait [m]."""
     cycles: int = 24
@@ -148,6 +151,7 @@ def main(args: Args) -> int:
             config,
             modes=args.modes,
             people=args.people,
+            padding=args.padding,
             stop_distances=args.stop_distances,
             report=report,
         )
@@ -333,7 +337,11 @@ class WorkerStudy:
 
 
 def measure_contacts(
-    job: Job, trace: Sequence[tuple[Tensor, Tensor]], runs: WorkerRuns, dt: float
+    job: Job,
+    trace: Sequence[tuple[Tensor, Tensor]],
+    runs: WorkerRuns,
+    dt: float,
+    padding: float = math.inf,
 ) -> None:
     """Force and pressure of the contacts of each run, by an evaluator of its own.
 
@@ -342,6 +350,7 @@ def measure_contacts(
         trace: Positions of the arms, and which of them hold the object, at each step.
         runs: Receives the figures.
         dt: Control step [s].
+        padding: Stiffness of a padding of the arm [N/mm].
     """
     scene = job.workplace.scene
     for run, body in enumerate(job.bodies):
@@ -353,7 +362,7 @@ def measure_contacts(
             holding=np.array([bool(held[run]) for _, held in trace[:steps]]),
             ends=np.stack([job.workers.truth(k, number).ends[0].numpy() for k in range(steps)]),
         )
-        found = contacts(motion, scene, body, load=scene.objects[0].mass)
+        found = contacts(motion, scene, body, load=scene.objects[0].mass, padding=padding)
         moved = [contact for contact in found if contact.by_arm]
         runs.touches[run] = len(moved)
         runs.run_into[run] = len(found) - len(moved)
@@ -413,6 +422,7 @@ def run_study(
     *,
     modes: Sequence[Mode] = MODES,
     people: Sequence[PersonMode] = ("ssm",),
+    padding: float = math.inf,
     stop_distances: Sequence[float] = (),
     report: Callable[[str, float], None] = lambda name, done: None,
 ) -> WorkerStudy:
@@ -424,11 +434,14 @@ def run_study(
         config: Settings of the runs.
         modes: Sources of null-space motion.
         people: Reactions to people.
+        padding: Stiffness of a padding of the arm [N/mm]; infinite: none.
         stop_distances: Distances of stop-and-wait [m].
         report: Called with a reaction and the number of its runs that have ended.
     """
     reactions: dict[str, Reaction] = {
-        key(mode, person): Reaction(way_making=WayMakingConfig(mode=mode), mode=person)
+        key(mode, person): Reaction(
+            way_making=WayMakingConfig(mode=mode), mode=person, padding=padding
+        )
         for person in people
         for mode in modes
     }
@@ -448,7 +461,7 @@ def run_study(
 
             trace: list[tuple[Tensor, Tensor]] = []
             runs = run_near_workers(job, reaction, config.cell, config.limit, ended, trace)
-            measure_contacts(job, trace, runs, config.cell.dt)
+            measure_contacts(job, trace, runs, config.cell.dt, reaction.padding)
             parts[name].append(runs)
     joined = {name: WorkerRuns.joined(part) for name, part in parts.items()}
     return WorkerStudy(

@@ -52,6 +52,8 @@ class FrankaPandaConfig(FrankyConfig, ArmRobotConfig):
             raise ValueError(
                 "person.kind: a script pushes simulated arms only, not a real one."
             )
+        if self.person.worker:
+            raise ValueError("person.worker: workers are simulated beside simulated arms only.")
         if not self.timeout > 1.5 / self.fps:
             raise ValueError(
                 f"timeout must be longer than an action and a half at {self.fps:g} fps, but is "

@@ -199,7 +199,13 @@ class MujocoArmRobot(ArmRobot):
         config, images = self.config, self.config.images
         scenario = make_scenario(config.scenario, config.shelf, self.work_arm)
         sizes = Imperfections.nominal().scaled(config.imperfections)
-        self.run = ScenarioRun(scenario, config.fps, seed=config.seed, imperfections=sizes)
+        self.run = ScenarioRun(
+            scenario,
+            config.fps,
+            seed=config.seed,
+            imperfections=sizes,
+            worker=config.person.mode if config.person.worker else None,
+        )
         moved = config.moved_camera
         if moved.distance or moved.angle:
             change = CameraChange(distance=moved.distance, angle=math.radians(moved.angle))

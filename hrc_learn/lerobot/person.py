@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from hrc_learn.controller.contact_limits import PersonMode
 from hrc_learn.kinematics import Arm, SerialChain
 from hrc_learn.protocols import Arm as Driver
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
@@ -55,6 +56,12 @@ class PersonConfig:
     """Address of the page. Anyone that can reach it can move the arm."""
     port: int | None = None
     """Port to serve it at; the first free one from 8080 on if None."""
+    worker: bool = False
+    """Simulate a worker who comes to the table, before whom the arm slows down and waits."""
+    mode: PersonMode = "ssm"
+    """Reaction to the worker: separation monitoring ("ssm"), force limiting ("pfl"), or both
+    ("ssm+pfl").
+    """
 
     def names(self, chain: SerialChain) -> tuple[str, ...]:
         """Units of the values observed of a person near an arm."""

@@ -13,6 +13,7 @@ from hrc_learn.controller.resolved_rate import task_rate
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState
+from hrc_learn.skills.person_watch import PersonWatch
 
 # Mean angular speed on a straight line, where that takes longer than the translation [rad/s].
 _TURNING_SPEED = 0.6
@@ -118,7 +119,12 @@ class PositionServo:
     """
 
     def __init__(
-        self, chain: SerialChain, arm: Arm, dt: float, config: PositionServoConfig | None = None
+        self,
+        chain: SerialChain,
+        arm: Arm,
+        dt: float,
+        config: PositionServoConfig | None = None,
+        watch: PersonWatch | None = None,
     ):
         """Connect to an arm at rest.
 
@@ -127,13 +133,17 @@ class PositionServo:
             arm: Driver of the arm.
             dt: Time between targets [s].
             config: Settings of the tracking.
+            watch: Tracks people, before whom the arm slows down and waits; None: people are not
+                tracked.
 
         Raises:
             ValueError: dt is longer than the safety filter can guarantee its limits for.
         """
         self._chain, self._arm, self._dt = chain, arm, dt
         self.config = config = config or PositionServoConfig()
-        self._filter = SafetyFilter(chain, config.safety)
+        self._watch = watch
+        safety = config.safety if watch is None else watch.watchful(config.safety)
+        self._filter = SafetyFilter(chain, safety)
         if not 0 < dt <= config.safety.longest_step:
             raise ValueError(
                 f"targets must come within {config.safety.longest_step:g} s of each other, but "
@@ -178,8 +188,17 @@ class PositionServo:
         here, q = state.joint_position, torch.from_numpy(state.joint_position)
         self._motion = self._smoother.step(before, np.asarray(target, dtype=float))
         wanted = self._motion.velocity + self.config.gain * (before.position - here)
+        distances = None
+        if self._watch is not None:
+            watched = self._watch.look(state.time, q)
+            wanted, distances = watched.speed_scale * wanted, watched.distances
         filtered, self.safety, _ = self._filter.step(
-            self.safety, q, torch.from_numpy(wanted), self._dt, jacobian=self._chain.jacobian(q)
+            self.safety,
+            q,
+            torch.from_numpy(wanted),
+            self._dt,
+            jacobian=self._chain.jacobian(q),
+            distances=distances,
         )
         velocity = filtered.numpy()
         self._arm.command(velocity)

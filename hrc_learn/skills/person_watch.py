@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hrc_learn.controller import ConstraintConfig, Distances, SeparationConfig
+from hrc_learn.controller import ConstraintConfig, Distances, SafetyConfig, SeparationConfig
 from hrc_learn.controller.contact_limits import ContactSpeeds, contact_speeds, region_numbers
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import Arm, CapsuleArm, GraspedBox, Separation, separation
@@ -46,9 +46,9 @@ class PersonWatchConfig:
     """Observed distance below which a person may touch the arm [m], three standard deviations
     of a tracker's noise. The arm stops, as the direction away from the person is not known;
     where contact is allowed it only stops to approach the person."""
-    fastest: float = 1.0
-    """Highest speed of a part of the arm [m/s]: the default of `SafetyConfig.tcp_speed`. A
-    person who may be touched slows the arm down to this times the speed scale."""
+    fastest: float = 0.5
+    """Cap on the speed of the arm with power and force limiting [m/s], to which the speed scale
+    near people refers."""
 
     def __post_init__(self) -> None:
         if self.acceleration < 0:
@@ -105,6 +105,18 @@ class PersonWatch:
         self._limits = None
         if self._separation.mode != "ssm":
             self._limits = ContactLimits(arm, self._separation, furniture)
+
+    def watchful(self, safety: SafetyConfig) -> SafetyConfig:
+        """Settings of a safety filter that keeps these distances, and the cap on the speed that
+        the speed scale relies on.
+        """
+        cap = math.inf if self._limits is None else self._config.fastest
+        return replace(
+            safety,
+            constraints=safety.constraints or NEAR_PEOPLE,
+            separation=self._separation,
+            tcp_speed=min(safety.tcp_speed, cap),
+        )
 
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None

@@ -36,7 +36,7 @@ from hrc_learn.skills.marker_sensor import (
     LatencyConfig,
     MarkerObservation,
 )
-from hrc_learn.skills.person_watch import NEAR_PEOPLE, PersonWatch, WatchedPeople
+from hrc_learn.skills.person_watch import PersonWatch, WatchedPeople
 from hrc_learn.skills.step_report import (
     NO_VISION,
     PersonFeedback,
@@ -229,9 +229,8 @@ class WorkCell:
         """Settings of a safety filter that keeps its distance from the people tracked here."""
         if self._watch is None:
             return safety
-        constraints = safety.constraints or NEAR_PEOPLE
         separation = self.config.safety.separation
-        return replace(safety, constraints=constraints, separation=separation)
+        return replace(self._watch.watchful(safety), separation=separation)
 
     # Messages and images.
 

@@ -15,14 +15,28 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.controller import SafetyConfig
+from hrc_learn.controller.contact_limits import PersonMode
 from hrc_learn.kinematics import Arm, gripper_down
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
-from hrc_learn.sim import CameraChange, CameraKind, Imperfections, World, open_camera
+from hrc_learn.sim import (
+    CameraChange,
+    CameraKind,
+    Imperfections,
+    Worker,
+    WorkerConfig,
+    WorkerSensor,
+    WorkerVisit,
+    World,
+    open_camera,
+    random_visit,
+    whole_arm,
+)
 from hrc_learn.sim.cameras import hidden_markers
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.skills.grasping import CLOSED, OPEN
 from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,
     placing_expert,
@@ -155,9 +169,11 @@ class ScenarioRun:
         camera: Fixed camera at its present pose.
         seed: Seed of the present initial configuration.
         commands: Number of commands since then.
+        visit: Motion of the worker; None: no worker.
     """
 
     expert: Human
+    visit: WorkerVisit | None
 
     def __init__(
         self,
@@ -166,6 +182,7 @@ class ScenarioRun:
         *,
         seed: int = 0,
         imperfections: Imperfections | None = None,
+        worker: PersonMode | None = None,
     ):
         """Begin.
 
@@ -175,7 +192,10 @@ class ScenarioRun:
             seed: Seed of the first initial configuration.
             imperfections: Imperfections of arm, calibration and workplace, drawn anew from each
                 seed; None: none.
+            worker: Reaction of the arm to a worker who comes to the table, another one for each
+                seed; None: no worker.
         """
+        self._worker, self.visit = worker, None
         self.scenario, self.dt = scenario, 1.0 / fps
         self._sizes = imperfections or Imperfections.ideal()
         self._build(np.random.default_rng(0))
@@ -186,7 +206,7 @@ class ScenarioRun:
     def begin(self, seed: int) -> None:
         """Put everything in place as a seed has it."""
         self.seed, self.commands = seed, 0
-        if self._sizes != Imperfections.ideal():
+        if self._sizes != Imperfections.ideal() or self._worker is not None:
             self._build(np.random.default_rng([seed, 2]))
         self.expert = self.scenario.begin(self.world, np.random.default_rng(seed))
         self.servo.restart()
@@ -195,14 +215,26 @@ class ScenarioRun:
 
     def _build(self, rng: np.random.Generator) -> None:
         """World with drawn imperfections, and the servo of its arm."""
-        robot = self.scenario.workplace.robot
-        self.world = World(
-            self.scenario.workplace.scene,
-            self._sizes.draw(rng, robot.joints, robot.hand_size),
-        )
-        config = PositionServoConfig(safety=self._sizes.plant(SafetyConfig()))
+        workplace, robot = self.scenario.workplace, self.scenario.workplace.robot
+        drawn = self._sizes.draw(rng, robot.joints, robot.hand_size)
+        scene, safety = workplace.scene, self._sizes.plant(SafetyConfig())
+        if self._worker is not None:
+            body = Worker(WorkerConfig.draw(rng))
+            under = workplace.table_centre
+            self.visit = random_visit(body, rng, bench=scene.table, under=under)
+            scene = replace(scene, worker=body.config)
+        world = self.world = World(scene, drawn)
+        watch = None
+        if self._worker is not None and self.visit is not None:
+            radius, clock = self.visit.worker.radius, lambda: world.time
+            watch = PersonWatch(
+                WorkerSensor(self.visit.ends_at, radius, clock, self._sizes, rng),
+                whole_arm(scene.arm),
+                replace(safety.separation, mode=self._worker),
+                furniture=scene.boxes(),
+            )
         self.servo = PositionServo(
-            self.scenario.workplace.robot.chain, self.world.arm, self.dt, config
+            robot.chain, world.arm, self.dt, PositionServoConfig(safety=safety), watch
         )
 
     def command(self, joints: Float[np.ndarray, " joints"], width: float) -> np.ndarray:
@@ -219,6 +251,9 @@ class ScenarioRun:
             _, sent = self.servo.follow(joints)
         if np.isfinite(width):
             self.world.arm.move(width)
+        if self.visit is not None:
+            ends = self.visit.ends_at(self.world.time)
+            self.world.move_worker(ends, self.visit.item_at(self.world.time, ends))
         self.world.advance(self.dt)
         self.commands += 1
         return sent
