@@ -80,6 +80,12 @@ class MultiplyConfig:
     demonstrations: tuple[int, ...] = ()
     """Episodes to learn from. Default: all."""
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.style <= 1:
+            raise ValueError(f"style must be from 0 to 1, but is {self.style}.")
+        if not 0 < self.speed[0] <= self.speed[1]:
+            raise ValueError(f"speed must be a range above 0, but is {self.speed}.")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
@@ -100,6 +106,8 @@ def multiply(args: Multiply) -> int:
         raise ValueError(f"--episodes must not be negative, but is {args.episodes}.")
     job = Multiplication(args, with_settings(args.config, Settings()))
     print(*aligned(job.segmentation.rows(job.demos[:3])), sep="\n")
+    if not job.objects:
+        print("no object poses: the scene stays as it was; --config objects.NAME.columns=...")
     if not args.episodes:
         if file := job.config.segments:
             write_json(Path(file), job.segmentation)
@@ -142,6 +150,11 @@ class Multiplication:
             for name, o in settings.objects.items()
             if o.pose
         }
+        if unknown := settings.objects.keys() - objects.keys():
+            raise ValueError(
+                f"no pose is known of the object {min(unknown)!r}; there are "
+                f"{', '.join(objects) or 'none'}: give objects.{min(unknown)}.columns or .pose."
+            )
         shown = [d.joint_position for d in self.demos if d.joint_position is not None]
         joints = [torch.from_numpy(taught.positions(q)) for q in shown]
         tool = [taught.arm.forward(q) for q in joints]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -77,7 +78,7 @@ class JudgeConfig:
     processes: int = 2
     """Processes that judge."""
 
-    def open(self, robot: ArmChoice, fps: float, widest: float) -> "CellJudge | SceneJudge":
+    def open(self, robot: ArmChoice, fps: float, widest: float) -> _Judge:
         """The judge for an arm.
 
         Args:
@@ -94,136 +95,160 @@ class JudgeConfig:
         return SceneJudge(self, robot, fps, widest)
 
 
-class CellJudge:
+class _Judge(ABC):
+    """A simulated arm that carries out motions."""
+
+    @abstractmethod
+    def begin(self, trial: Trial) -> None:
+        """Put arm and objects where the motion begins."""
+
+    @abstractmethod
+    def read(self) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
+        """Joint positions, opening of the gripper (NaN: as planned), poses of objects now."""
+
+    @abstractmethod
+    def command(self, joints: np.ndarray, width: float) -> np.ndarray:
+        """Let a frame pass; returns the joint positions that were commanded."""
+
+    @abstractmethod
+    def failure(self) -> str:
+        """Reason for which the task was not done, or empty."""
+
+    def replay(self, trial: Trial) -> Replay:
+        """Carry out a motion."""
+        self.begin(trial)
+        read, sent, failure = [], [], ""
+        ahead = np.concatenate([trial.joints[1:], trial.joints[-1:]])
+        try:
+            for joints, width in zip(ahead, trial.gripper, strict=True):
+                read.append(self.read())
+                sent.append(self.command(joints, float(width)))
+        except PhysicsError as error:
+            failure = f"physics: {error}"
+        gripper = np.array([width for _, width, _ in read])
+        return Replay(
+            joints=np.stack([joints for joints, _, _ in read]),
+            sent=np.stack(sent or [ahead[0]]),
+            gripper=gripper if np.isfinite(gripper).all() else None,
+            objects={n: np.stack([o[n] for _, _, o in read]) for n in trial.objects},
+            failure=failure or self.failure(),
+        )
+
+
+class CellJudge(_Judge):
     """Grasping or placing in our work cell, laid out for the arm."""
 
     def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float):
         """Build the work cell."""
         scenario = make_scenario(config.scene, config.shelf, robot.work_arm())
-        self.run = ScenarioRun(scenario, fps)
-        self._holds = config.scene == "placing"
+        self.run, self._holds = ScenarioRun(scenario, fps), config.scene == "placing"
+        self._item = scenario.workplace.scene.objects[0].name
 
-    def replay(self, trial: Trial) -> Replay:
-        """Carry out a motion with the first object of the scene."""
-        world, item = self.run.world, self.run.scenario.workplace.scene.objects[0].name
-        name = next(iter(trial.objects), "")
-        if self._holds:
-            world.hold(item, trial.joints[0])
+    def begin(self, trial: Trial) -> None:
+        """The first object lies on the table, or in the gripper; others are places."""
+        self._names, self._places = [*trial.objects], dict(trial.objects)
+        if self._holds or not self._names:
+            self.run.world.hold(self._item, trial.joints[0])
         else:
-            at = torch.from_numpy(trial.objects[name])
-            world.reset(trial.joints[0], {item: Pose(at[:3], at[3:]).matrix().numpy()})
+            at = torch.from_numpy(trial.objects[self._names[0]])
+            pose = Pose(at[:3], at[3:]).matrix().numpy()
+            self.run.world.reset(trial.joints[0], {self._item: pose})
         self.run.servo.restart()
-        states, sent, poses, failure = [], [], [], ""
-        ahead = np.concatenate([trial.joints[1:], trial.joints[-1:]])
-        for joints, width in zip(ahead, trial.gripper, strict=True):
-            states.append(world.arm.read())
-            poses.append(world.object_pose(item))
-            try:
-                sent.append(self.run.command(joints, float(width)))
-            except PhysicsError as error:
-                sent.append(joints)
-                failure = f"physics: {error}"
-                break
-        if touched := world.touched_since(0.0):
-            failure = touched[0]
-        elif not failure and not self.run.succeeded():
-            failure = "the task was not done in simulation"
-        pose = Pose.from_matrix(np.stack(poses))
-        moved = torch.cat([pose.position, pose.orientation], -1).numpy()
-        still = {key: np.tile(at, (len(poses), 1)) for key, at in trial.objects.items()}
-        return Replay(
-            joints=np.stack([state.joint_position for state in states]),
-            sent=np.stack(sent),
-            gripper=np.array([state.gripper_width for state in states]),
-            objects=still | ({name: moved} if name else {}),
-            failure=failure,
-        )
+
+    def read(self) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
+        """What the simulated sensors and MuJoCo say."""
+        state = self.run.world.arm.read()
+        pose = Pose.from_matrix(self.run.world.object_pose(self._item))
+        moved = torch.cat([pose.position, pose.orientation]).numpy()
+        here = self._places | dict.fromkeys(self._names[:1], moved)
+        return state.joint_position, state.gripper_width, here
+
+    def command(self, joints: np.ndarray, width: float) -> np.ndarray:
+        """Track the joints within the limits of the arm."""
+        return self.run.command(joints, width)
+
+    def failure(self) -> str:
+        """A contact that was not wanted, or a task that was not done."""
+        touched = self.run.world.touched_since(0.0)
+        done = "" if self.run.succeeded() else "the task was not done in simulation"
+        return touched[0] if touched else done
 
 
-class SceneJudge:
+class SceneJudge(_Judge):
     """An MJCF scene with position actuators, and a success function in Python."""
 
     def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float, widest: float):
         """Read the scene."""
         if not Path(config.scene).is_file():
+            known = ", ".join(SCENARIOS)
             raise FileNotFoundError(
-                f"no scene {config.scene!r}: there are {', '.join(SCENARIOS)}, or an MJCF file"
+                f"no scene {config.scene!r}: there are {known}, or an MJCF file"
             )
-        self.model = mujoco.MjModel.from_xml_path(config.scene)
-        self.data = mujoco.MjData(self.model)
-        self.succeeded = _function(config.success)
-        self._config, self._widest = config, widest or 1.0
-        self._steps = max(1, round(1 / fps / self.model.opt.timestep))
-        names = robot.arm().joint_names
-        known = {self.model.joint(i).name: i for i in range(self.model.njnt)}
-        if missing := [name for name in names if name not in known]:
-            raise ValueError(f"{config.scene} has no joints {', '.join(missing)}")
-        ids = [known[name] for name in names]
-        self._q = self.model.jnt_qposadr[ids]
-        joint = mujoco.mjtTrn.mjTRN_JOINT
+        self.model = model = mujoco.MjModel.from_xml_path(config.scene)
+        self.data, self._config = mujoco.MjData(model), config
+        self.succeeded, self._widest = _function(config.success), widest or 1.0
+        self._steps = max(1, round(1 / fps / model.opt.timestep))
+        known = {model.joint(i).name: i for i in range(model.njnt)}
         # The force of a position actuator falls with the position.
-        drives = {
-            int(self.model.actuator_trnid[a, 0]): a
-            for a in np.flatnonzero(self.model.actuator_biasprm[:, 1] < 0).tolist()
-            if self.model.actuator_trntype[a] == joint
-        }
-        if undriven := [n for n, i in zip(names, ids, strict=True) if i not in drives]:
-            raise ValueError(
-                f"{config.scene}: no position actuator moves {', '.join(undriven)}"
-            )
-        self._arm = [drives[i] for i in ids]
-        at = [int(self.model.actuator_trnid[a, 0]) for a in range(self.model.nu)]
-        rest = [a for a in range(self.model.nu) if at[a] not in ids]
-        self._hand = [self.model.actuator(n).id for n in config.gripper] or rest
-        self._range = self.model.actuator_ctrlrange[self._hand].copy()
-        for k, a in enumerate(self._hand):
-            if not self.model.actuator_ctrllimited[a]:
-                self._range[k] = self.model.jnt_range[at[a]]
-
-    def replay(self, trial: Trial) -> Replay:
-        """Carry out a motion; bodies with the objects' names are put in their places."""
-        model, data = self.model, self.data
-        mujoco.mj_resetData(model, data)
-        data.qpos[self._q] = data.ctrl[self._arm] = trial.joints[0]
-        for name, pose in trial.objects.items():
-            self._put(name, pose)
-        mujoco.mj_forward(model, data)
-        joints, ahead = [], np.concatenate([trial.joints[1:], trial.joints[-1:]])
-        places: dict[str, list[np.ndarray]] = {name: [] for name in trial.objects}
-        low, high = self._range.T
-        for wanted, width in zip(ahead, trial.gripper, strict=True):
-            joints.append(data.qpos[self._q].copy())
-            for name, found in places.items():
-                body = data.body(name)
-                found.append(np.concatenate([body.xpos - self._config.base, body.xquat]))
-            data.ctrl[self._arm] = wanted
-            data.ctrl[self._hand] = low + (high - low) * float(width) / self._widest
-            mujoco.mj_step(model, data, self._steps)
-        done = bool(self.succeeded(model, data))
-        return Replay(
-            joints=np.stack(joints),
-            sent=ahead,
-            gripper=None,
-            objects={name: np.stack(found) for name, found in places.items()},
-            failure="" if done else f"{self._config.success} says no",
+        servo = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+            model.actuator_biasprm[:, 1] < 0
         )
+        drives = {int(model.actuator_trnid[a, 0]): int(a) for a in np.flatnonzero(servo)}
+        names = robot.arm().joint_names
+        if missing := [name for name in names if known.get(name) not in drives]:
+            raise ValueError(f"{config.scene}: no position actuator moves {', '.join(missing)}")
+        ids = [known[name] for name in names]
+        self._q, self._arm = model.jnt_qposadr[ids], [drives[i] for i in ids]
+        at = [int(model.actuator_trnid[a, 0]) for a in range(model.nu)]
+        rest = [a for a in range(model.nu) if at[a] not in ids]
+        self._hand = [model.actuator(name).id for name in config.gripper] or rest
+        self._range = model.actuator_ctrlrange[self._hand].copy()
+        for k, a in enumerate(self._hand):
+            if not model.actuator_ctrllimited[a]:
+                self._range[k] = model.jnt_range[at[a]]
+
+    def begin(self, trial: Trial) -> None:
+        """Put bodies with the objects' names in their places."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[self._q] = self.data.ctrl[self._arm] = trial.joints[0]
+        self._names = [*trial.objects]
+        for name, pose in trial.objects.items():
+            self._put(name, np.concatenate([pose[:3] + self._config.base, pose[3:]]))
+        mujoco.mj_forward(self.model, self.data)
+
+    def read(self) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
+        """Joints and bodies."""
+        bodies = {name: self.data.body(name) for name in self._names}
+        objects = {
+            name: np.concatenate([body.xpos - self._config.base, body.xquat])
+            for name, body in bodies.items()
+        }
+        return self.data.qpos[self._q].copy(), np.nan, objects
+
+    def command(self, joints: np.ndarray, width: float) -> np.ndarray:
+        """Set the actuators."""
+        low, high = self._range.T
+        self.data.ctrl[self._arm] = joints
+        self.data.ctrl[self._hand] = low + (high - low) * width / self._widest
+        mujoco.mj_step(self.model, self.data, self._steps)
+        return joints
+
+    def failure(self) -> str:
+        """What the success function says."""
+        done = bool(self.succeeded(self.model, self.data))
+        return "" if done else f"{self._config.success} says no"
 
     def _put(self, name: str, pose: Float[np.ndarray, "7"]) -> None:
         """Put a body somewhere: its free joint, its mocap pose, or its place in its parent."""
-        try:
-            body = self.model.body(name)
-        except KeyError:
-            raise ValueError(f"{self._config.scene} has no body {name!r}") from None
-        there = np.concatenate([pose[:3] + self._config.base, pose[3:]])
-        first = int(body.jntadr[0])
+        body = self.model.body(name)
+        first, mocap = int(body.jntadr[0]), int(body.mocapid[0])
         if first >= 0 and self.model.jnt_type[first] == mujoco.mjtJoint.mjJNT_FREE:
             at = int(self.model.jnt_qposadr[first])
-            self.data.qpos[at : at + 7] = there
-        elif body.mocapid[0] >= 0:
-            self.data.mocap_pos[body.mocapid[0]] = there[:3]
-            self.data.mocap_quat[body.mocapid[0]] = there[3:]
+            self.data.qpos[at : at + 7] = pose
+        elif mocap >= 0:
+            self.data.mocap_pos[mocap], self.data.mocap_quat[mocap] = pose[:3], pose[3:]
         else:
-            self.model.body_pos[body.id], self.model.body_quat[body.id] = there[:3], there[3:]
+            self.model.body_pos[body.id], self.model.body_quat[body.id] = pose[:3], pose[3:]
 
 
 def _function(text: str) -> Callable[[Any, Any], bool]:
@@ -244,7 +269,7 @@ def _function(text: str) -> Callable[[Any, Any], bool]:
         sys.path.pop(0)
 
 
-_JUDGE: list[CellJudge | SceneJudge] = []
+_JUDGE: list[_Judge] = []
 """Judge of this process."""
 
 

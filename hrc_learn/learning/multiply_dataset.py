@@ -69,30 +69,57 @@ class MultipliedColumns:
         """
         self._source, self._taught, self._robot = source, taught, robot
         self._same = robot.name == taught.arm.name
-        folder, self._selections = source.folder, source.columns.selections
-        lost = {k for r in _LEFT_OUT if r in self._selections for k, _ in self._places(r)}
-        known = {key: f for key, f in folder.features.items() if f.numeric}
-        self._old = {k: f for k, f in known.items() if k not in (*INDEX_KEYS, *lost)}
-        self._frames: list[RawFrames] = [
-            frames for _, frames in read_frames(folder, source.entries, [*self._old])
-        ]
-        self._objects = self._object_columns(objects)
-        self.objects = {name: self._first(places) for name, places in self._objects.items()}
-        self.features = {
-            key: {"dtype": f.dtype, "shape": list(f.shape), "names": f.names}
-            for key, f in self._old.items()
-        }
+        self._made = taught
         if not self._same:
-            self._rename()
-
-    def _places(self, role: str) -> list[Place]:
-        """Components of a quantity, of joints those of the arm in its order."""
-        places = self._selections[role].columns
-        return [places[c] for c in self._taught.columns] if role in _JOINTS else [*places]
+            self._made = DatasetArm(robot, tuple(range(robot.joints)), taught.joints)
+        selections = source.columns.selections
+        self._places = {role: [*selections[role].columns] for role in selections}
+        for role in filter(self._places.__contains__, _JOINTS):
+            self._places[role] = [self._places[role][column] for column in taught.columns]
+        lost = {key for r in _LEFT_OUT if r in self._places for key, _ in self._places[r]}
+        known = {key: f for key, f in source.folder.features.items() if f.numeric}
+        self._old = {key: f for key, f in known.items() if key not in (*INDEX_KEYS, *lost)}
+        read = read_frames(source.folder, source.entries, [*self._old])
+        self._frames: list[RawFrames] = [frames for _, frames in read]
+        found = self._object_columns(objects)
+        self._places |= {f"object {name}": places for name, places in found.items()}
+        self.objects = {
+            name: pose_of(
+                torch.from_numpy(
+                    np.stack([self._first(places, main) for main in range(len(source))])
+                )
+            )
+            for name, places in found.items()
+        }
+        # A command of the tool is its next pose, as LeRobot's robots take it.
+        shown = {
+            self._old[k].component(i): (r, n)
+            for r in _TOOL
+            for n, (k, i) in enumerate(self._places.get(r, ()))
+        }
+        self._next = [
+            (key, i, *shown[name])
+            for key, feature in self._old.items()
+            for i, name in enumerate(feature.names or ())
+            if key.startswith("action") and name in shown
+        ]
+        names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
+        if not self._same:
+            self._rename(names)
+        self.features = {
+            key: {
+                "dtype": feature.dtype,
+                "shape": [names[key].shape[1]]
+                if names[key].shape[1] != feature.width
+                else list(feature.shape),
+                "names": feature.names and names[key][0].tolist(),
+            }
+            for key, feature in self._old.items()
+        }
 
     def _object_columns(self, given: Mapping[str, str]) -> dict[str, list[Place]]:
         """Components of the pose of each object."""
-        taken = {place for role in self._selections for place in self._places(role)}
+        taken = {place for places in self._places.values() for place in places}
         found: dict[str, dict[str, Place]] = {}
         for key, feature in self._old.items():
             for i, name in enumerate(feature.names or ()):
@@ -115,55 +142,46 @@ class MultipliedColumns:
             places[name] = [(match[1], i) for i in numbers]
         return places
 
-    def _first(self, places: Sequence[Place]) -> Pose:
-        rows = [[float(frames[key][0, i]) for key, i in places] for frames in self._frames]
-        return pose_of(torch.tensor(rows, dtype=torch.float64))
+    def _first(self, places: Sequence[Place], main: int) -> Float[np.ndarray, " numbers"]:
+        return np.array([float(self._frames[main][key][0, i]) for key, i in places])
 
-    def _rename(self) -> None:
-        """Name and count the joints of another arm."""
-        names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
+    def _rename(self, names: dict[str, np.ndarray]) -> None:
+        """Name the joints of another arm."""
         old, new = self._taught.arm.joint_names[0], self._robot.joint_names
-        for role in filter(self._selections.__contains__, _JOINTS):
-            key, first = self._places(role)[0]
+        patterns = {}
+        for role in filter(self._places.__contains__, _JOINTS):
+            key, first = self._places[role][0]
             pattern = str(names[key][0, first]).replace(old, "{}")
-            self._replace(
-                names, role, np.array([[pattern.format(name) for name in new]], object)
-            )
-        for key, row in names.items():
-            listed = None if self._old[key].names is None else row[0].tolist()
-            self.features[key] |= {"shape": [row.shape[1]], "names": listed}
+            patterns[role] = np.array([[pattern.format(name) for name in new]], object)
+        self._put_joints(names, patterns)
 
-    def _replace(self, made: dict[str, np.ndarray], role: str, values: np.ndarray) -> None:
-        """Put the joints of this arm in the place of the demonstrated ones."""
-        key = self._places(role)[0][0]
-        columns = [i for _, i in self._places(role)]
-        if self._same:
-            made[key][:, columns] = values
-            return
-        # Joints in front of these have been replaced already, perhaps by fewer or more.
-        more = self._robot.joints - self._taught.arm.joints
-        before = sum(
-            other in self._selections
-            and self._places(other)[0] < (key, min(columns))
-            and self._places(other)[0][0] == key
-            for other in _JOINTS[: _JOINTS.index(role)]
-        )
-        columns = [i + more * before for i in columns]
-        kept = np.delete(made[key], columns, 1)
-        made[key] = np.insert(kept, [min(columns)] * values.shape[1], values, axis=1)
+    def _put_joints(
+        self, made: dict[str, np.ndarray], values: Mapping[str, np.ndarray]
+    ) -> None:
+        """Put the joints of the new motions in the place of the demonstrated ones."""
+        # The last first: there may be more joints, or fewer.
+        for role in sorted(values, key=lambda role: self._places[role][0], reverse=True):
+            key, columns = self._places[role][0][0], [i for _, i in self._places[role]]
+            if self._same:
+                made[key][:, columns] = values[role]
+            else:
+                rest, at = (
+                    np.delete(made[key], columns, 1),
+                    [min(columns)] * values[role].shape[1],
+                )
+                made[key] = np.insert(rest, at, values[role], axis=1)
 
     def gripper(self, main: int, phase: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
         """Commanded opening of the gripper, or the measured one if none was commanded."""
-        places = [
-            (not key.startswith("action"), key, i)
+        commands = [
+            (key, i)
             for key, feature in self._old.items()
             for i, name in enumerate(feature.names or ())
-            if "gripper" in name.lower()
+            if key.startswith("action") and "gripper" in name.lower()
         ]
-        if not places:
-            return np.zeros(len(phase))
-        _, key, i = min(places)
-        return self._along(main, key, phase)[:, i]
+        for key, i in [*commands, *self._places.get("gripper", ())]:
+            return self._along(main, key, phase)[:, i]
+        return np.zeros(len(phase))
 
     def _along(
         self, main: int, key: str, phase: Float[np.ndarray, " T"]
@@ -195,66 +213,59 @@ class MultipliedColumns:
             gripper: Measured opening; None: that of the demonstration.
             objects: Pose of each object.
         """
-        tool, dt = self._robot.forward(torch.from_numpy(joints)), 1 / self._source.fps
+        tool = self._robot.forward(torch.from_numpy(joints))
         made = {key: self._along(main, key, phase) for key in self._old}
-        tools = self._encoded(tool, "rotation_vector", main)
-        new: dict[str, np.ndarray] = dict(zip(_TOOL, tools, strict=True))
+        new = {role: self._pose_columns(role, tool, main) for role in _TOOL}
         if gripper is not None:
             new["gripper"] = gripper[:, None]
-        for role in filter(self._selections.__contains__, new):
-            on_disk = new[role] / self._source.units[role].factor
-            for (key, i), column in zip(self._places(role), on_disk.T, strict=True):
-                made[key][:, i] = column
-                name = self._old[key].component(i)
-                for other, feature in self._old.items():
-                    # A command of the tool is its next pose, as LeRobot's robots take it.
-                    names = [*(feature.names or ())] if other.startswith("action") else []
-                    if role != "gripper" and name in names:
-                        made[other][:, names.index(name)] = np.append(column[1:], column[-1])
+        units = self._source.units
+        new = {r: x / units[r].factor for r, x in new.items() if r in self._places}
         for name, path in objects.items():
-            places = self._objects.get(name, ())
-            pose = pose_of(torch.from_numpy(path))
-            position, vector, turned, _ = self._encoded(pose, name, main)
-            shown = np.concatenate([position, turned if len(places) == 7 else vector], axis=1)
-            for (key, i), column in zip(places, shown.T, strict=False):
+            role, pose = f"object {name}", pose_of(torch.from_numpy(path))
+            width = len(self._places.get(role, ()))
+            turned = "quaternion_wxyz" if width == 7 else "rotation_vector"
+            columns = [self._pose_columns(x, pose, main, role) for x in ("position", turned)]
+            if width:
+                new[role] = np.concatenate(columns, axis=1)[:, :width]
+        for role, columns in new.items():
+            for (key, i), column in zip(self._places[role], columns.T, strict=True):
                 made[key][:, i] = column
-        rates = np.gradient(joints, dt, axis=0), np.gradient(sent, dt, axis=0)
-        for role, values in zip(_JOINTS, (joints, rates[0], sent, rates[1]), strict=True):
-            if role in self._selections:
-                self._replace(made, role, self._on_disk(role, values))
+        for key, i, role, number in self._next:
+            made[key][:, i] = np.append(new[role][1:, number], new[role][-1, number])
+        rates = [np.gradient(q, 1 / self._source.fps, axis=0) for q in (joints, sent)]
+        moved = dict(zip(_JOINTS, (joints, rates[0], sent, rates[1]), strict=True))
+        moved = {
+            role: self._on_disk(role, x) for role, x in moved.items() if role in self._places
+        }
+        self._put_joints(made, moved)
         return made
 
-    def _encoded(self, pose: Pose, of: str, main: int) -> tuple[np.ndarray, ...]:
-        """Position, rotation vector and quaternions of poses.
-
-        Rotation vectors continue that of the demonstration: at half a turn there are two.
-        """
-        places = self._objects.get(of) or []
-        places = places[3:6] if len(places) == 6 else []
-        if of in self._selections:
-            places = self._places(of)
-        near = [float(self._frames[main][key][0, i]) for key, i in places] or [0.0, 0.0, 0.0]
-        vectors = torch.cat([torch.tensor([near]).double(), quaternion.log(pose.orientation)])
-        vectors = quaternion.unwrap_log(vectors)[1:]
+    def _pose_columns(
+        self, role: str, pose: Pose, main: int, of: str = ""
+    ) -> Float[np.ndarray, "T _numbers"]:
+        """Poses as the numbers of a role, of the tool or of an object."""
+        if role == "position":
+            return pose.position.numpy()
         q = quaternion.continuous(pose.orientation)
-        return tuple(x.numpy() for x in (pose.position, vectors, q, q.roll(-1, -1)))
+        if role != "rotation_vector":
+            return q.numpy() if role == "quaternion_wxyz" else q.roll(-1, -1).numpy()
+        # It continues that of the demonstration: at half a turn there are two.
+        places = self._places.get(of, ())[3:6] if of else self._places.get(role, ())
+        near = torch.from_numpy(self._first(places, main) if len(places) == 3 else np.zeros(3))
+        vectors = torch.cat([near[None], quaternion.log(q)])
+        return quaternion.unwrap_log(vectors)[1:].numpy()
 
     def _on_disk(self, role: str, values: np.ndarray) -> np.ndarray:
         """Joint values as the dataset has them; the inverse of `DatasetArm.positions`."""
-        decision, columns = self._source.units[role], list(self._taught.columns)
-        factor = np.broadcast_to(decision.factor, len(self._source.joint_names))[columns]
-        if not self._same:
-            return values / factor[0]
-        zero, one = np.zeros((2, len(self._source.joint_names))), np.ones(len(columns))
-        if role.endswith("position") and {decision.unit_of(c) for c in columns} & {
-            "%",
-            "1",
-            "tick",
-        }:
-            zero = self._taught.positions(zero)
-            one = self._taught.positions(np.ones((1, zero.shape[1])))[0] - zero[0]
-            values = values - zero[0]
-        return values / one / factor
+        count = max(self._made.columns) + 1
+        zero, one = self._made.positions(np.stack([np.zeros(count), np.ones(count)]))
+        if role.endswith("position"):
+            values = values - zero
+        factor = np.ravel(self._source.units[role].factor)
+        chosen = (
+            factor[list(self._made.columns)] if self._same and len(factor) > 1 else factor[0]
+        )
+        return values / (one - zero) / chosen
 
 
 def pose_of(values: Float[torch.Tensor, "*batch numbers"]) -> Pose:
