@@ -224,6 +224,8 @@ def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> Non
 _MODELS = {
     "contextual": "a function of start and goal (or of --context)",
     "nearest": "the demonstration of the nearest start and goal",
+    "kernel": "a mean weighted by nearness of start and goal (or of --context)",
+    "line": "a straight line",
 }
 
 

@@ -189,9 +189,7 @@ class LearnedMotion:
         Raises:
             ValueError: A context or frames are missing, or have another size.
         """
-        reference = getattr(self.each, "reference", None)
-        reference = None if reference is None else reference.reshape(-1, 4)[0]
-        like = self.each.with_motion(mean_primitive(self.each).motion, reference)
+        like = self.each.with_motion(mean_primitive(self.each).motion, self._reference)
         if self.by_ends:
             asked = columns_of_ends(like, like.with_boundary(start, goal)).reshape(1, -1)
         elif context is None and self.chosen.family != "frames":
@@ -203,18 +201,42 @@ class LearnedMotion:
             if frames is None:
                 raise ValueError(f"give the {self.frames.b.shape[-2]} frames of the motion")
             x = FramedDMP.of(cast(JointDMP, self.each), self.frames).at(frames).coordinates()
-            w = x.new_full((1, len(self.context)), 1 / len(self.context))
+            w = torch.full((1, len(self.context)), 1 / len(self.context)).to(x)
+            found = self._primitives(x[None], w)
+        elif asked.shape[-1] != self.context.shape[-1]:
+            raise ValueError(
+                f"context must have {self.context.shape[-1]} numbers, got {asked.shape[-1]}"
+            )
         else:
-            if asked.shape[-1] != self.context.shape[-1]:
-                raise ValueError(
-                    f"context must have {self.context.shape[-1]} numbers, got {asked.shape[-1]}"
-                )
-            w = _weights(self.chosen.family, self.chosen.strength, self.context, asked)
-            x = torch.einsum("n,ndm->dm", w[0], _coordinates(self.each))
-        lasting = (w @ self.each.motion.duration.detach().double().log()).exp()[0]
+            found = self.at_contexts(asked)
+        return found[0].with_boundary(start, goal, duration)
+
+    def at_contexts(self, context: Float[Tensor, "q C"]) -> MotionPrimitive:
+        """Primitives for contexts as learned from, with starts and goals of the model.
+
+        Raises:
+            ValueError: The model is one of frames.
+        """
+        if self.chosen.family == "frames":
+            raise ValueError("a model of frames has no contexts: use `at`")
+        w = _weights(self.chosen.family, self.chosen.strength, self.context, context.double())
+        x = torch.einsum("qn,ndm->qdm", w, _coordinates(self.each))
+        return self._primitives(x, w)
+
+    def _primitives(
+        self, x: Float[Tensor, "q D M"], w: Float[Tensor, "q n"]
+    ) -> MotionPrimitive:
+        """Shrunk primitives with coordinates, and durations of weighted demonstrations."""
+        lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
         x = _shrunk(x.detach(), self.chosen.shrinkage)
-        motion = like.motion.with_coordinates(x, lasting)
-        return like.with_motion(motion, reference).with_boundary(start, goal, duration)
+        middle, reference = mean_primitive(self.each).motion, self._reference
+        return self.each.with_motion(middle.with_coordinates(x, lasting), reference)
+
+    @property
+    def _reference(self) -> Tensor | None:
+        """Common reference of orientations, (4,)."""
+        found = getattr(self.each, "reference", None)
+        return None if found is None else found.reshape(-1, 4)[0]
 
     def rollout(self, time: Any = None, *arguments: Any, **options: Any) -> Any:
         """Motion at times [s]; other arguments as for `at`."""

@@ -1,10 +1,7 @@
-"""Choice of the model that predicts held-out demonstrations best.
+"""Choice of the model that predicts held-out demonstrations best; see `dmp.learned_motion`."""
 
-Candidates are the mean, a function of start and goal, and the nearest demonstration.
-"""
-
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
@@ -14,13 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.demos import DemonstrationSet
-from hrc_learn.dmp import ContextualDMP, JointDMP, fit_ridge
-from hrc_learn.learning.primitive_fitting import (
-    EACH,
-    FittedPrimitives,
-    Motions,
-    load_primitive,
-)
+from hrc_learn.dmp import ContextualDMP, JointDMP, LearnedMotion
+from hrc_learn.dmp.learned_motion import Candidate, choose
+from hrc_learn.learning.primitive_fitting import FittedPrimitives, Motions, load_primitive
 from hrc_learn.learning.reproduction_error import Reproduction
 from hrc_learn.store import read_json, write_json
 
@@ -28,23 +21,23 @@ CONTEXTUAL = "contextual"
 """Folder of contextual primitives."""
 CHOICE = "prediction.json"
 """File in a model's folder that names the model of each channel."""
-MODELS = ("mean", "contextual", "nearest")
-"""Candidates, the simplest first."""
+LEARNED = "learned"
+"""Folder of the best models."""
+MODELS = ("mean", "kernel", "nearest", "contextual", "line")
+"""Kinds of model: the mean, a mean weighted by nearness, the nearest demonstration, a
+regression, and a straight line; all but the line may be shrunk towards it."""
+type Model = Literal["mean", "kernel", "nearest", "contextual", "line"]
 FEWEST = 4
 """Smallest number of demonstrations whose held-out errors distinguish models."""
 LINEAR = ("joint", "position")
 """Channels whose models are compared."""
-_WORTH = 0.9
-"""Largest error, relative to a simpler model, that justifies a less simple one."""
-_REGULARIZATIONS = (1e-6, 1e-3, 1e-1, 1.0)
-"""Candidates for the regularisation of the contextual model; the largest is nearly the mean."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Choice:
     """Content of the file `CHOICE`."""
 
-    models: dict[str, Literal["mean", "contextual", "nearest"]]
+    models: dict[str, Model]
     """Best model by channel."""
     context: tuple[str, ...]
     """Columns whose first row is the context."""
@@ -128,86 +121,20 @@ def fit_contextual(
     return metrics
 
 
-@dataclass(frozen=True, kw_only=True)
-class HeldOutErrors:
-    """Errors of each demonstration when it is predicted from all others."""
-
-    nrmse: Mapping[str, Float[Tensor, " demos"]]
-    """Root mean square error divided by the range of motion, by model."""
-    regularization: float
-    """Regularisation of the contextual model. It is chosen by these errors among so few
-    candidates that their bias is negligible."""
-
-    @property
-    def median(self) -> dict[str, float]:
-        """Median error by model."""
-        return {model: float(error.median()) for model, error in self.nrmse.items()}
-
-    @property
-    def best(self) -> str:
-        """Simplest model that no other improves on clearly."""
-        best, *others = (model for model in MODELS if model in self.nrmse)
-        for model in others:
-            if self.median[model] < _WORTH * self.median[best]:
-                best = model
-        return best
-
-
-def held_out_errors(
-    fitted: FittedPrimitives, channel: str, context: Float[Tensor, "demos C"]
-) -> HeldOutErrors:
-    """Predict each demonstration from all others with every model.
-
-    Mean and ridge regression of the others (PRESS) follow from the primitives of all in closed
-    form, without further fits.
-
-    Args:
-        fitted: Primitives of every demonstration.
-        channel: One of `LINEAR`.
-        context: Context of each demonstration.
-    """
-    each = cast(JointDMP, fitted.each[channel])
-    x, n = each.coordinates().detach().double(), len(context)
-
-    def error(coordinates: Tensor) -> Tensor:
-        made = fitted.motions.adapted(channel, each.with_coordinates(coordinates))
-        return fitted.motions.error(channel, made).columns()["nrmse"].double()
-
-    others = (x.sum(0) - x) / (n - 1)
-    found = {"mean": error(others), "nearest": error(x[_nearest(context, context, True)])}
-    regressed = {}
-    for strength in _REGULARIZATIONS:
-        left = fit_ridge(context.double(), x.flatten(1), strength).held_out
-        regressed[strength] = error(x - left.view_as(x))
-    strength = min(regressed, key=lambda s: float(regressed[s].median()))
-    return HeldOutErrors(
-        nrmse=found | {"contextual": regressed[strength]}, regularization=strength
-    )
-
-
-def _nearest(
-    asked: Float[Tensor, "asked C"], known: Float[Tensor, "known C"], others: bool = False
-) -> Tensor:
-    """Index of the nearest known context, each component scaled by its standard deviation.
-
-    Args:
-        asked: Contexts.
-        known: Contexts of demonstrations.
-        others: Both are the same, and no context is its own neighbour.
-    """
-    spread = known.std(0)
-    varies = spread > 1e-9 * (1 + known.abs().amax(0))
-    scale = torch.where(varies, spread, torch.inf)
-    distance = torch.cdist((asked / scale).double(), (known / scale).double())
-    if others:
-        distance.fill_diagonal_(torch.inf)
-    return distance.argmin(1)
+def kind_of(candidate: Candidate) -> Model:
+    """Kind of a model, one of `MODELS`."""
+    if candidate.shrinkage == 0:
+        return "line"
+    if candidate.family == "ridge":
+        return "contextual"
+    named: dict[float, Model] = {0.0: "nearest", float("inf"): "mean"}
+    return named.get(candidate.strength, "kernel")
 
 
 def keep_best(
     fitted: FittedPrimitives, demos: DemonstrationSet, columns: tuple[str, ...], folder: Path
 ) -> dict[str, float]:
-    """Compare models, and save the best one if it is not the mean.
+    """Compare models, and save the best one of each channel.
 
     Args:
         fitted: Primitives of the demonstrations.
@@ -216,28 +143,23 @@ def keep_best(
         folder: Folder of the model.
 
     Returns:
-        Median held-out errors, `held_out_CHANNEL_MODEL_nrmse_median`.
+        Median held-out errors, `held_out_CHANNEL_MODEL_nrmse_median`, of the best model of each
+        kind.
     """
     metrics: dict[str, float] = {}
     chosen: dict[str, str] = {}
     for channel in LINEAR:
         if channel not in fitted.each or len(demos) < FEWEST:
             continue
-        context = contexts(demos, columns, fitted.motions, channel)
-        errors = held_out_errors(fitted, channel, context)
-        if columns:
-            # Saved primitives hold start and goal, but not these columns.
-            kept = {k: v for k, v in errors.nrmse.items() if k != "nearest"}
-            errors = replace(errors, nrmse=kept)
-        chosen[channel] = errors.best
-        metrics |= {
-            f"held_out_{channel}_{model}_nrmse_median": value
-            for model, value in errors.median.items()
-        }
-        if errors.best == "contextual":
-            fit_contextual(fitted, demos, columns, folder, [channel], errors.regularization)
-        elif errors.best == "nearest":
-            fitted.each[channel].save(folder / EACH / channel)
+        context = contexts(demos, columns, fitted.motions, channel) if columns else None
+        best = choose([fitted.each[channel]], context)
+        best.save(folder / LEARNED / channel)
+        chosen[channel] = kind_of(best.chosen)
+        for candidate in (*best.candidates, best.chosen):
+            name = f"held_out_{channel}_{kind_of(candidate)}_nrmse_median"
+            error = float(candidate.error.median())
+            known = metrics.get(name, error)
+            metrics[name] = error if candidate is best.chosen else min(known, error)
     if chosen:
         write_json(folder / CHOICE, {"models": chosen, "context": columns})
     return metrics
@@ -277,37 +199,24 @@ def predict(
         ValueError: The model is damaged, or a demonstration lacks a column of the context.
     """
     choice = _choice(folder)
-    if choice.models.get(channel, "mean") == "mean":
+    if channel not in choice.models:
         return motions.adapted(channel, load_primitive(folder / channel, channel))
     context = contexts(demos, choice.context, motions, channel)
-    return motions.adapted(channel, _at_context(folder, channel, choice, context))
+    model = LearnedMotion.load(folder / LEARNED / channel)
+    return motions.adapted(channel, cast(JointDMP, model.at_contexts(context)))
 
 
 def predicted_primitive(
     folder: Path, channel: str, start: Float[Tensor, " D"], goal: Float[Tensor, " D"]
 ) -> JointDMP:
-    """Primitive of the best model for one start and goal; the mean where it is best, and where
-    the best one needs other columns than start and goal.
+    """Primitive of the best model for one start and goal; the mean where there is none, and
+    where it needs other columns than start and goal.
 
     Raises:
         FileNotFoundError: The folder holds no model.
         ValueError: The model is damaged.
     """
     choice = _choice(folder)
-    if choice.models.get(channel, "mean") == "mean" or choice.context:
+    if channel not in choice.models or choice.context:
         return cast(JointDMP, load_primitive(folder / channel, channel))
-    return _at_context(folder, channel, choice, torch.cat([start, goal])[None])[0]
-
-
-def _at_context(
-    folder: Path, channel: str, choice: _Choice, context: Float[Tensor, "motions C"]
-) -> JointDMP:
-    """Primitives of a model that is not the mean."""
-    if choice.models[channel] == "contextual":
-        return ContextualDMP.load(folder / CONTEXTUAL / channel).at(context)
-    each = cast(JointDMP, load_primitive(folder / EACH / channel, channel))
-    x = each.coordinates().detach()
-    known = torch.cat([x[..., -2], x[..., -1]], dim=-1)  # start and goal
-    chosen = _nearest(context.to(known), known)
-    like = cast(JointDMP, load_primitive(folder / channel, channel))
-    return like.with_coordinates(x[chosen], each.duration[chosen])
+    return LearnedMotion.load(folder / LEARNED / channel).at(start, goal)
