@@ -156,9 +156,7 @@ class Grasping:
         self._visual = skill.target
         config = config or GraspingConfig()
         servo = config.servo.scaled(self._size)
-        probe = servo.probe * _reachable_probe(
-            workplace, servo.probe, cell.config.safety.margin
-        )
+        probe = servo.probe * _reachable_probe(workplace, servo.probe)
         self._config = config = replace(config, servo=replace(servo, probe=probe))
         self._check = check
         self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
