@@ -152,10 +152,7 @@ def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:
             f"episodes of a single frame are left out: {', '.join(map(str, left_out))}"
         )
     if "gripper" in source.units:
-        text = (
-            "no primitive is fitted to the gripper; the policy of --as-lerobot-policy moves it"
-        )
-        notes.append(text)
+        notes.append("no primitive is fitted to the gripper (--as-lerobot-policy moves it)")
     return source, notes
 
 

@@ -1,0 +1,9 @@
+"""Fit motion tokens to a dataset, and report them.
+
+The same as `hrc tokens`.
+"""
+
+from hrc_learn import cli
+
+if __name__ == "__main__":
+    cli.main("tokens")
