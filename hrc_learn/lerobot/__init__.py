@@ -16,3 +16,5 @@ from hrc_learn.lerobot.franka_panda import FrankaPanda as FrankaPanda
 from hrc_learn.lerobot.mujoco_arm import MujocoArmRobot as MujocoArmRobot
 from hrc_learn.lerobot.policy.dmp_policy import DMPConfig as DMPConfig
 from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkConfig as MotionChunkConfig
+from hrc_learn.lerobot.ros2_arm_robot import Ros2ArmRobot as Ros2ArmRobot
+from hrc_learn.lerobot.ros2_arm_robot import Ros2Camera as Ros2Camera

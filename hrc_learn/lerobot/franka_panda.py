@@ -5,6 +5,8 @@ Run with its driver against simulators of the arm's network protocol; NOT RUN ON
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -18,6 +20,8 @@ from lerobot.robots import RobotConfig
 
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.hardware import ArmProcess, FrankyArm, FrankyConfig
+from hrc_learn.hardware.driver_process import StoppableArm
+from hrc_learn.kinematics import Arm as ArmModel
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
 
@@ -31,21 +35,21 @@ if TYPE_CHECKING:
 _DELAY = 0.030
 
 
-@RobotConfig.register_subclass("franka_panda")
 @dataclass(kw_only=True)
-class FrankaPandaConfig(FrankyConfig, ArmRobotConfig):
-    """A Franka Panda at its control box; `--robot.type=franka_panda`."""
+class DrivenArmConfig(ArmRobotConfig):
+    """Settings common to real arms."""
 
-    ip: str
-    """Address of the control box."""
     tcp_speed: float = 0.25
-    """Cap on the speed of the tool centre point [m/s] (ISO 10218-1:2025: reduced speed)."""
+    """Cap on the speed of the tool centre point [m/s] (ISO 10218: reduced speed)."""
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     """Cameras of LeRobot, by name."""
+    dynamics: float = 0.3
+    """Fraction of the acceleration of the arm that is used."""
+    timeout: float = 0.15
+    """Longest time without an action, after which the arm is stopped [s]."""
 
     def __post_init__(self) -> None:
-        ArmRobotConfig.__post_init__(self)
-        FrankyConfig.__post_init__(self)
+        super().__post_init__()
         if not 5 <= self.fps <= 1000:
             raise ValueError(f"fps must be from 5 to 1000, but is {self.fps}.")
         if self.person.kind == "scripted":
@@ -60,28 +64,23 @@ class FrankaPandaConfig(FrankyConfig, ArmRobotConfig):
                 f"{self.timeout} s."
             )
 
-    def driver(self) -> FrankyConfig:
-        """Settings of the driver, which its process reads without LeRobot."""
-        return FrankyConfig(**{f.name: getattr(self, f.name) for f in fields(FrankyConfig)})
 
+class DrivenArm(ArmRobot):
+    """An arm commanded by positions, through a driver that takes velocities.
 
-class FrankaPanda(ArmRobot):
-    """A Franka Panda commanded by positions, through its velocity interface.
-
-    NOT RUN ON HARDWARE. Between an action and the arm stand, in this order: the limits of the
-    joints' motion (`MotionFilter`), the safety filter with a cap on the speed of the tool,
-    a watchdog that stops the arm when the loop falls silent, in a process of its own with the
-    driver, and the driver, which ends every velocity by itself. Keep the stop button in hand.
+    Between an action and the arm stand, in this order: the limits of the joints' motion
+    (`MotionFilter`), the safety filter with a cap on the speed of the tool, a watchdog that
+    stops the arm when the loop falls silent, in a process of its own with the driver, and the
+    driver, which ends every velocity by itself. Keep the stop button in hand.
 
     Attributes:
         arm: The driver's process, while connected.
     """
 
-    config_class = FrankaPandaConfig
-    name = "franka_panda"
+    config: DrivenArmConfig
 
-    def __init__(self, config: FrankaPandaConfig):
-        super().__init__(config, panda)
+    def __init__(self, config: DrivenArmConfig, work_arm: ArmModel):
+        super().__init__(config, work_arm)
         self.config = config
         self.cameras = make_cameras_from_configs(config.cameras)
         self._arm: ArmProcess
@@ -104,20 +103,25 @@ class FrankaPanda(ArmRobot):
     def servo(self) -> PositionServo:
         return self._servo
 
+    @abstractmethod
+    def _driver(self) -> Callable[[], StoppableArm]:
+        """Function that connects to the arm, which its process calls."""
+
     def _open(self) -> None:
         from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 
         config = self.config
-        open_arm = partial(FrankyArm, config.ip, config.driver())
         safety = SafetyConfig(tcp_speed=config.tcp_speed, braking=config.dynamics, delay=_DELAY)
         with ExitStack() as devices:
             for camera in self.cameras.values():
                 camera.connect()
                 devices.callback(camera.disconnect)
-            self._arm = devices.enter_context(ArmProcess(open_arm, timeout=config.timeout))
+            self._arm = devices.enter_context(
+                ArmProcess(self._driver(), timeout=config.timeout)
+            )
             self._trips = self._arm.trips
             self._servo = PositionServo(
-                panda.chain, self._arm, self.dt, PositionServoConfig(safety=safety)
+                self.work_arm.chain, self._arm, self.dt, PositionServoConfig(safety=safety)
             )
             self._devices = devices.pop_all()
 
@@ -142,3 +146,34 @@ class FrankaPanda(ArmRobot):
             self._arm.move(width)
         self._arm.feed()
         return sent
+
+
+@RobotConfig.register_subclass("franka_panda")
+@dataclass(kw_only=True)
+class FrankaPandaConfig(FrankyConfig, DrivenArmConfig):
+    """A Franka Panda at its control box; `--robot.type=franka_panda`."""
+
+    ip: str
+    """Address of the control box."""
+
+    def __post_init__(self) -> None:
+        DrivenArmConfig.__post_init__(self)
+        FrankyConfig.__post_init__(self)
+
+    def driver(self) -> FrankyConfig:
+        """Settings of the driver, which its process reads without LeRobot."""
+        return FrankyConfig(**{f.name: getattr(self, f.name) for f in fields(FrankyConfig)})
+
+
+class FrankaPanda(DrivenArm):
+    """A Franka Panda through its velocity interface; NOT RUN ON HARDWARE."""
+
+    config_class = FrankaPandaConfig
+    name = "franka_panda"
+    config: FrankaPandaConfig
+
+    def __init__(self, config: FrankaPandaConfig):
+        super().__init__(config, panda)
+
+    def _driver(self) -> Callable[[], StoppableArm]:
+        return partial(FrankyArm, self.config.ip, self.config.driver())
