@@ -1,16 +1,27 @@
-"""The simulated workplace as a robot of ROS 2 with the topics of stock controllers."""
+"""The simulated workplace as a robot of ROS 2 with the topics of stock controllers.
+
+python benchmarks/ros2_robot.py --interface trajectory
+"""
 
 from __future__ import annotations
 
+import random
 import threading
 import time
-from typing import Any
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
+from hrc_learn import cli
+from hrc_learn.cli import write_values
 from hrc_learn.hardware.ros2_arm import Ros2Config
-from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of
+from hrc_learn.hardware.ros2_topics import Ros2Session, quality, ros2_origin, stamp_of
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.protocols import ArmState
+from hrc_learn.sim import SceneConfig
 from hrc_learn.sim.world import World
 
 _BEHIND = 0.5
@@ -33,13 +44,21 @@ class Ros2Robot:
         late: Delay of the last step behind real time [s].
     """
 
-    def __init__(self, world: World, config: Ros2Config | None = None, rate: float = 500.0):
+    def __init__(
+        self,
+        world: World,
+        config: Ros2Config | None = None,
+        rate: float = 500.0,
+        hostile: float = 0.0,
+    ):
         """Publish joint states.
 
         Args:
             world: The world.
             config: Topics.
             rate: Joint states a second.
+            hostile: Fraction of states and of commands that are lost, and as many that come
+                50 ms late, after newer ones.
         """
         from sensor_msgs.msg import JointState
         from std_msgs.msg import Float64MultiArray
@@ -47,7 +66,8 @@ class Ros2Robot:
 
         self.world, self._config = world, config or Ros2Config()
         self._rate, self.violations, self.commands = rate, 0, 0
-        self._silent = False
+        self._silent, self._hostile, self._chance = False, hostile, random.Random(0)
+        self._late: list[tuple[float, Any]] = []
         self.late, self.state = 0.0, world.arm.read()
         self._chain = world.arm.robot.chain
         self._velocity = np.zeros(len(self._chain.joint_names))
@@ -67,7 +87,16 @@ class Ros2Robot:
         self._thread = threading.Thread(target=self._run, name="ros2 robot", daemon=True)
         self._thread.start()
 
-    def _on_values(self, message: Any) -> None:
+    def _meets_trouble(self, act: Any) -> bool:
+        """True if a message is lost, or kept for 50 ms."""
+        chance = self._chance.random()
+        if chance < self._hostile:
+            self._late.append((time.monotonic() + 0.05, act))
+        return chance < 2 * self._hostile
+
+    def _on_values(self, message: Any, late: bool = False) -> None:
+        if not late and self._meets_trouble(lambda: self._on_values(message, True)):
+            return
         self.commands += 1
         values = np.array(message.data)
         if self._config.interface == "velocity":
@@ -123,6 +152,10 @@ class Ros2Robot:
         low = state.joint_position < limits.lower.numpy() - 1e-3
         high = state.joint_position > limits.upper.numpy() + 1e-3
         self.violations += bool((fast | low | high).any())
+        due = [one for one in self._late if one[0] <= time.monotonic()]
+        for one in due:
+            self._late.remove(one)
+            one[1]()
         if not self._silent:
             self._publish(state)
 
@@ -139,7 +172,8 @@ class Ros2Robot:
             velocity=[*state.joint_velocity.tolist(), *(0.0 for _ in hand)],
         )
         message.header.stamp = self.session.node.get_clock().now().to_msg()
-        self._states.publish(message)
+        if not self._meets_trouble(lambda: self._states.publish(message)):
+            self._states.publish(message)
 
     def close(self) -> None:
         """Stop publishing."""
@@ -152,3 +186,41 @@ class Ros2Robot:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Publish a simulated arm until Ctrl-C."""
+
+    robot: str = "panda"
+    """Arm by name, or its description."""
+    interface: Literal["velocity", "position", "trajectory"] = "velocity"
+    """Controller that listens on /forward_velocity_controller/commands or `command`."""
+    command: str = Ros2Config.command
+    """Topic of the controller."""
+    hostile: float = 0.0
+    """Fraction of states and commands that are lost, and as many that come 50 ms late."""
+    duration: float = float("inf")
+    """Duration [s]."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+def main(args: Args) -> None:
+    """Run until the end."""
+    config = Ros2Config(interface=args.interface, command=args.command)
+    scene = replace(SceneConfig(), timestep=0.002)
+    arm = ArmChoice(args.robot).work_arm()
+    world = World(replace(scene, arm=replace(scene.arm, robot=arm)))
+    world.reset(arm.chain.ready.numpy())
+    end = time.monotonic() + args.duration
+    with Ros2Robot(world, config, hostile=args.hostile) as robot, suppress(KeyboardInterrupt):
+        print(ros2_origin(), flush=True)
+        while time.monotonic() < end:
+            time.sleep(0.1)
+    figures = {"commands": robot.commands, "violations": robot.violations}
+    write_values(args.json, figures)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

@@ -4,9 +4,11 @@ import json
 import os
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -135,3 +137,24 @@ def test_the_command_serves_the_node(robot, tmp_path):
     figures = json.loads((tmp_path / "j").read_text())
     assert figures["commands"] > 10
     assert figures["safety_invalid"] == 0
+
+
+def test_the_launch_file_starts_a_command_that_exists():
+    """Launch files in XML need no ROS to be read; the command line parses what they start."""
+    from xml.etree import ElementTree
+
+    from hrc_learn.cli.arguments import Serve
+
+    file = Path(__file__).parents[2] / "docs/howto/ros2_launch.xml"
+    launch = ElementTree.parse(file).getroot()
+    (started,) = launch.findall("executable")
+    defaults = {one.get("name"): one.get("default", "") for one in launch.findall("arg")}
+    words = started.attrib["cmd"]
+    for name, value in defaults.items():
+        words = words.replace(f"$(var {name})", value)
+    program, command, *options = words.split()
+    assert (program, command) == ("hrc", "serve")
+    parsed = tyro.cli(Serve, args=options)
+    assert parsed.ros2
+    assert parsed.robot == "/robot_description:tool0"
+    assert parsed.config == ("autostart=false",)
