@@ -150,7 +150,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
         "rerun",
     },
     "experiments": {"rich"},
-    "lerobot": {"torchvision", "pyarrow"},
+    "lerobot": {"torchvision", "pyarrow", *ROS2},
 }
 """Libraries that they may import in the functions that need them, and nowhere else."""
 
