@@ -29,6 +29,7 @@ from hrc_learn.jacobian.perspective import FOCAL, ROTATION, SHIFT, marker_pixels
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.store import new_file
 from hrc_learn.vision.landmarks import (
+    ASIDE,
     FEWEST_POINTS,
     RATIO,
     Features,
@@ -37,9 +38,9 @@ from hrc_learn.vision.landmarks import (
     Landmarks,
     Object,
     Tool,
-    blob_features,
     changed_features,
     draw_finding,
+    features_near,
     match_view,
     nearest,
 )
@@ -166,8 +167,8 @@ def find_landmarks(source: DemonstrationSource, camera: str = "") -> MarkerlessF
     )
     tool = _tool(tracks, link, fit.camera, width)
     landmarks = Landmarks(tool=tool, image_size=(width, height))
-    found = search.follow(landmarks)
-    item = search.object(found, fit.camera)
+    found = search.follow(landmarks, fit)
+    item = search.object(fit.camera)
     landmarks = replace(landmarks, objects={} if item is None else {"object": item[0]})
     sure = [f.deviation for row in found for f in row if f is not None]
     objects = [None] * len(demos) if item is None else item[1]
@@ -213,7 +214,7 @@ class _Search:
             shown = self._reader.stream(demo.episode, self._key, frames)
             yield [as_grey(image) for _, image in shown]
 
-    def follow(self, landmarks: Landmarks) -> list[list[Finding | None]]:
+    def follow(self, landmarks: Landmarks, fit: CameraFit) -> list[list[Finding | None]]:
         """The tool in frames of every demonstration; None where it was not looked for, too."""
         found: list[list[Finding | None]] = []
         stride = max(1, sum(map(len, self._demos)) // _FOLLOWED)
@@ -222,8 +223,13 @@ class _Search:
             row: list[Finding | None] = [None] * len(demo)
             # From the last frame back, at which the target is learned.
             wanted = list(range(len(demo) - 1, -1, -stride))[::-1]
+            expected = marker_pixels(fit.camera, _pose_of(demo))[0].numpy()
+            most = max(4 * _AGREES * self._size[0] / 1440, 6 * fit.noise)
             for k, image in self._reader.stream(demo.episode, self._key, wanted):
-                row[k] = detector.find(image, ["tool"]).get("tool")
+                seen = detector.find(image, ["tool"]).get("tool")
+                # A few points may agree by chance, but not with the motion of the arm.
+                if seen is not None and np.linalg.norm(seen.pixel - expected[k]) < most:
+                    row[k] = seen
             found.append(row)
             self.followed += len(wanted)
         return found
@@ -246,21 +252,19 @@ class _Search:
                 tiles.append(image[::smaller, ::smaller])
         return np.vstack([np.hstack(tiles[k : k + 3]) for k in range(0, len(tiles), 3)])
 
-    def object(
-        self, found: Sequence[Sequence[Finding | None]], camera: Float[Tensor, "13"]
-    ) -> tuple[Object, list[Finding | None]] | None:
+    def object(self, camera: Float[Tensor, "13"]) -> tuple[Object, list[Finding | None]] | None:
         """Views of the object, and its place in each demonstration; None: there is none."""
         below = [_below(demo, camera) for demo in self._demos]
         rows = []
-        for seen, line in zip(found, below, strict=True):
-            away = [
-                0.0 if f is None else np.linalg.norm(f.pixel - line, axis=1).min() for f in seen
-            ]
+        for demo, line in zip(self._demos, below, strict=True):
+            # While the tool is far from it, or not in the image yet, nothing hides the object.
+            tool = marker_pixels(camera, _pose_of(demo))[0].numpy()
+            away = np.linalg.norm(tool[:, None] - line, axis=-1).min(axis=1)
             rows.append(sorted(np.argsort(away)[-_CLEAR:].tolist()))
         views = [np.median(np.stack(p), axis=0).astype(np.uint8) for p in self._pictures(rows)]
         usual = np.median(np.stack(views), axis=0).astype(np.uint8)
-        seen = [blob_features(v, usual, line) for v, line in zip(views, below, strict=True)]
-        return _common_object(seen, self._size[0])
+        seen = [features_near(v, usual, line) for v, line in zip(views, below, strict=True)]
+        return _common_object(seen, below, self._size[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -395,10 +399,11 @@ def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> Demonst
 
 def _poses(demos: DemonstrationSet, picked: Sequence[Sequence[int]]) -> Pose:
     """Poses of the tool in picked frames of all demonstrations."""
-    rows = list(zip(demos, picked, strict=True))
-    position = np.concatenate([d.position[k] for d, k in rows if d.position is not None])
-    turn = np.concatenate([d.orientation[k] for d, k in rows if d.orientation is not None])
-    return Pose(torch.from_numpy(position), torch.from_numpy(turn))
+    parts = [_pose_of(d)[torch.tensor(k)] for d, k in zip(demos, picked, strict=True)]
+    return Pose(
+        torch.cat([part.position for part in parts]),
+        torch.cat([part.orientation for part in parts]),
+    )
 
 
 def _links(
@@ -435,11 +440,16 @@ def _seen_place(
     return _as_demonstration(pixels, pose)
 
 
-def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray, "points 2"]:
-    """Pixels of the line along which the tool points at the end of a demonstration."""
+def _pose_of(demo: Demonstration) -> Pose:
     assert demo.position is not None
     assert demo.orientation is not None
-    position, orientation = map(torch.from_numpy, (demo.position[-1], demo.orientation[-1]))
+    return Pose(torch.from_numpy(demo.position), torch.from_numpy(demo.orientation))
+
+
+def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray, "points 2"]:
+    """Pixels of the line along which the tool points at the end of a demonstration."""
+    end = _pose_of(demo)[-1]
+    position, orientation = end.position, end.orientation
     depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)
     along = torch.zeros(len(depth), 3, dtype=torch.float64)
     along[:, 2] = depth
@@ -451,21 +461,37 @@ def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray
 
 
 def _common_object(
-    seen: Sequence[tuple[Features, Float[np.ndarray, "2"]]], width: int
+    seen: Sequence[Features], lines: Sequence[Float[np.ndarray, "points 2"]], width: int
 ) -> tuple[Object, list[Finding | None]] | None:
-    """The object in the view with most features, matched in all others."""
-    features, middle = max(seen, key=lambda one: len(one[0].pixels))
-    if len(features.pixels) < FEWEST_POINTS:
+    """The object in the view that most others match where their motion ends."""
+    best: list[Finding | None] = []
+    for features, line in zip(seen, lines, strict=True):
+        first = replace(features, pixels=features.pixels - line[len(line) // 2])
+        found = [
+            _at_end(first, other, end, width) for other, end in zip(seen, lines, strict=True)
+        ]
+        if sum(f is not None for f in found) > sum(f is not None for f in best):
+            best = found
+    if sum(f is not None for f in best) < 2:
         return None
-    first = replace(features, pixels=features.pixels - middle)
-    found = [match_view(first, other, width) for other, _ in seen]
     views = []
-    for (other, _), finding in zip(seen, found, strict=True):
+    for other, finding in zip(seen, best, strict=True):
         if finding is not None:
             c, s = finding.scale * np.cos(finding.angle), finding.scale * np.sin(finding.angle)
             back = np.linalg.inv([[c, -s], [s, c]])
             views.append(replace(other, pixels=(other.pixels - finding.pixel) @ back.T))
-    return Object(views=tuple(views)), found
+    return Object(views=tuple(views)), best
+
+
+def _at_end(
+    first: Features, other: Features, line: Float[np.ndarray, "points 2"], width: int
+) -> Finding | None:
+    """The object of a view in another image, near the line below the tool."""
+    found = match_view(first, other, width)
+    if found is None:
+        return None
+    apart = np.linalg.norm(line - found.pixel, axis=1).min()
+    return found if apart < ASIDE * width else None
 
 
 def _described(

@@ -16,6 +16,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from hrc_learn.vision.markers import as_grey
 
+ASIDE = 0.06
+"""Reach of an object about where it is expected, as a fraction of the image's width."""
 RATIO = 0.8
 """Largest ratio of the distances to the best and to the second best descriptor."""
 # Points of a tool closer than this are views of one point [m].
@@ -33,9 +35,6 @@ _MARGIN = 70
 
 # Grey levels by which a pixel differs from the usual one, and reach about such pixels [px].
 _CHANGED, _GROWN = 14, 9
-# Least area of an object, as a fraction of the image; and its largest distance from where it is
-# expected, as a fraction of the image's width.
-_SMALLEST, _ASIDE = 3e-4, 0.06
 
 Grey = UInt8[np.ndarray, "height width"]
 
@@ -157,7 +156,7 @@ class Tool:
 
     def _matches(self, seen: Features) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
         """Indices of features, and of the points that they match better than any other."""
-        if len(seen.pixels) < FEWEST_POINTS:
+        if min(len(seen.pixels), len(self.points)) < FEWEST_POINTS:
             return np.zeros(0, int), np.zeros(0, int)
         # Other views of the same point are no rivals of the best.
         index, distance = nearest(seen.descriptors, self.descriptors, 6)
@@ -380,32 +379,20 @@ def changed_features(image: np.ndarray, usual: np.ndarray) -> Features:
     return seen.chosen(mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)])
 
 
-def blob_features(
-    view: np.ndarray, usual: np.ndarray, line: Float[np.ndarray, "points 2"]
-) -> tuple[Features, Float[np.ndarray, "2"]]:
-    """Features and middle of what lies at the end of a demonstration and not in others.
+def features_near(image: Grey, usual: Grey, line: Float[np.ndarray, "points 2"]) -> Features:
+    """Features that differ from the usual image, near a line.
 
     Args:
-        view: Grey image without the arm before the object.
-        usual: The same without the object.
-        line: Pixels at which it may lie.
+        image: Grey image.
+        usual: What is usually seen there.
+        line: Points of the line [px].
     """
-    import cv2
-
-    count, labels, stats, middles = cv2.connectedComponentsWithStats(
-        changed(view, usual).astype(np.uint8)
-    )
-    least = _SMALLEST * view.size
-    best, nearest_to = 0, np.inf
-    for k in range(1, count):
-        if stats[k, cv2.CC_STAT_AREA] >= least:
-            v, u = np.nonzero(labels == k)
-            apart = np.linalg.norm(np.column_stack([u, v])[:, None] - line, axis=-1).min()
-            if apart < nearest_to:
-                best, nearest_to = k, apart
-    if not best or nearest_to > _ASIDE * view.shape[1]:
-        return Features.of(view[:0]), np.full(2, np.nan)
-    x, y, w, h = stats[best, :4].tolist()
-    seen = Features.of(view, (x, y, x + w, y + h))
+    reach, size = ASIDE * image.shape[1], image.shape[::-1]
+    left, top = np.maximum(line.min(axis=0) - reach, 0).astype(int).tolist()
+    right, bottom = np.minimum(line.max(axis=0) + reach, size).astype(int).tolist()
+    if right - left < 2 or bottom - top < 2:
+        return Features.of(image[:0])
+    seen = Features.of(image, (left, top, right, bottom))
     u, v = seen.pixels.astype(int).T
-    return seen.chosen(labels[v, u] == best), middles[best]
+    near = np.linalg.norm(seen.pixels[:, None] - line, axis=-1).min(axis=1) < reach
+    return seen.chosen(near & changed(image, usual)[v, u])

@@ -1,3 +1,6 @@
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,8 +13,11 @@ from hrc_learn.skills.marker_sensor import (
     DelayedDetection,
     LatencyConfig,
     MarkerConsistency,
+    feature_sensor,
     longest_occlusion,
 )
+from hrc_learn.vision.imaging import carton
+from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 PERIOD = 0.04
 WORKPLACE = Workplace()
@@ -117,3 +123,40 @@ def test_an_image_is_judged_once():
     held = held.updated(0.0, np.array([50.0, 50.0]), pose, jacobian)
     assert held.consistent
     assert not held.updated(0.1, np.array([50.0, 50.0]), pose, jacobian).consistent
+
+
+class Photo:
+    """A camera that always shows the same image."""
+
+    def __init__(self, image):
+        self.image = image
+
+    def read(self):
+        return self.image
+
+
+def test_landmarks_give_pixel_angle_and_covariance_or_nothing(tmp_path):
+    print_ = carton("thing", (0.3, 0.5, 0.6, 1.0))
+    view = Features.of(print_)
+    middle = np.array([print_.shape[1], print_.shape[0]]) / 2
+    item = Object(views=(replace(view, pixels=view.pixels - middle),))
+    none = np.zeros((0, 3))
+    tool = Tool(
+        points=none,
+        descriptors=np.zeros((0, 128), np.uint8),
+        place=np.zeros(3),
+        optics=(500.0, 320.0, 240.0, 0.0),
+    )
+    landmarks = Landmarks(tool=tool, objects={"object": item}, image_size=(640, 480))
+    turned = cv2.getRotationMatrix2D((0, 0), -40, 0.6)
+    turned[:, 2] += (300, 250) - turned[:, :2] @ middle
+    image = cv2.warpAffine(print_, turned, (640, 480), borderValue=(90, 90, 90))
+    # A board hides a third of it.
+    image[:215] = 120
+    sensor = feature_sensor(Photo(image), landmarks, tool=7, objects=[11])
+    found = sensor.features()
+    assert set(found) == {11}  # a tool without points is not found
+    np.testing.assert_allclose(found[11].pixel, (300, 250), atol=1.0)
+    assert found[11].angle == pytest.approx(np.deg2rad(40), abs=0.02)
+    assert np.linalg.eigvalsh(found[11].covariance)[1] < 1.0
+    assert sensor.features([7]) == {}
