@@ -34,6 +34,8 @@ _SCALES = (0.5, 2.0)
 _MARGIN = 70
 # Images from one search at full resolution for what stays unseen to the next.
 _CLOSE_LOOK_EVERY = 5
+# Width of images beyond which half the resolution shows enough [px].
+_LARGE = 960
 
 # Grey levels by which a pixel differs from the usual one, and reach about such pixels [px].
 _CHANGED, _GROWN = 14, 9
@@ -318,7 +320,7 @@ class LandmarkDetector:
         for name in names:
             item, vain = self._item(name), self._in_vain.get(name, 0)
             near, finding = self._last.pop(name, None), None
-            if near is None and vain % _CLOSE_LOOK_EVERY:
+            if near is None and vain % _CLOSE_LOOK_EVERY and size[0] > _LARGE:
                 half = half or Features.coarse(image)
                 near = item.find(half, size[0])
             elif near is None:
