@@ -224,7 +224,7 @@ class _Search:
             # From the last frame back, at which the target is learned.
             wanted = list(range(len(demo) - 1, -1, -stride))[::-1]
             expected = marker_pixels(fit.camera, _pose_of(demo))[0].numpy()
-            most = max(_AGREES * self._size[0] / 1440, 6 * fit.noise)
+            most = max(2 * _AGREES * self._size[0] / 1440, 6 * fit.noise)
             for k, image in self._reader.stream(demo.episode, self._key, wanted):
                 seen = detector.find(image, ["tool"]).get("tool")
                 # A few points may agree by chance, but not with the motion of the arm.

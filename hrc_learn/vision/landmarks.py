@@ -320,13 +320,15 @@ class LandmarkDetector:
         for name in names:
             item, vain = self._item(name), self._in_vain.get(name, 0)
             near, finding = self._last.pop(name, None), None
-            if near is None and vain % _CLOSE_LOOK_EVERY and size[0] > _LARGE:
-                half = half or Features.coarse(image)
-                near = item.find(half, size[0])
-            elif near is None:
-                finding = item.find(Features.of(image), size[0])
             if near is not None:
                 finding = item.find(Features.of(image, _about(near.points, size)), size[0])
+            if finding is None and vain % _CLOSE_LOOK_EVERY and size[0] > _LARGE:
+                half = half or Features.coarse(image)
+                near = item.find(half, size[0])
+                if near is not None:
+                    finding = item.find(Features.of(image, _about(near.points, size)), size[0])
+            elif finding is None:
+                finding = item.find(Features.of(image), size[0])
             self._in_vain[name] = 0 if finding is not None else vain + 1
             if finding is not None:
                 found[name] = self._last[name] = finding
