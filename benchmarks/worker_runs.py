@@ -34,6 +34,7 @@ from hrc_learn.skills.person_watch import (
     NEAR_PEOPLE,
     ContactLimits,
     PersonWatchConfig,
+    person_speed_cap,
     person_speed_scale,
     urgent_distances,
 )
@@ -192,9 +193,6 @@ class _Batch:
         if reaction.mode != "ssm":
             boxes, config_used = job.workplace.scene.boxes(), self._separation.contact
             whole = replace(self._separation, contact=replace(config_used, used=1.0))
-            safety = replace(
-                safety, tcp_speed=min(safety.tcp_speed, PersonWatchConfig().fastest)
-            )
             self._limits, self._true_limits = (
                 ContactLimits(job.arm, separation, boxes)
                 for separation in (self._separation, whole)
@@ -296,7 +294,7 @@ class _Batch:
         q = self._q[live] + job.encoder_offset[live] + noise[live, step % noise.shape[1]]
         cycle, progress = self._progress()
         holding = self._holding[cycle, progress.long()]
-        distances, scale, stop = self._look(step, q, holding)
+        distances, scale, cap, stop = self._look(step, q, holding)
         pose, jacobian = panda.forward_and_jacobian(q)
         pulls = self._reaction.way_making.expert
         return ArmReading(
@@ -307,13 +305,14 @@ class _Batch:
             pause=torch.zeros_like(stop),
             distances=distances,
             person_speed_scale=scale,
+            person_speed_cap=cap,
             stop=stop,
         )
 
     def _look(
         self, step: int, measured: Tensor, holding: Tensor
-    ) -> tuple[Distances | None, Float[Tensor, " live"], Bool[Tensor, " live"]]:
-        """Distances to keep, the speed scale, and True where the arm must rest."""
+    ) -> tuple[Distances | None, Tensor, Tensor | None, Bool[Tensor, " live"]]:
+        """Distances to keep, speed scale and cap, and True where the arm must rest."""
         seen, age = self._job.workers.seen(step, self.live)
         # Arms rest as long as nothing was seen.
         stop, age = age.isnan(), age.nan_to_num()
@@ -323,7 +322,7 @@ class _Batch:
             limit = self._reaction.stop_distance
             for rows, found, _ in self._near(measured, holding, seen, bound, bound < limit):
                 stop[rows] |= found.distance.amin((-2, -1)) < limit
-            return None, scale, stop
+            return None, scale, None, stop
         gain = self._watch.acceleration * (age + self._separation.reaction_time)
         towards = gain.unsqueeze(-1) + seen.velocity.norm(dim=-1).amax(-1)
         allowed = self._separation.highest_speed(bound - age.unsqueeze(-1) * towards, towards)
@@ -335,7 +334,7 @@ class _Batch:
         shape = (len(age), self._watch.pairs)
         distance = measured.new_full(shape, _FAR)
         gradient, approach = measured.new_zeros(*shape, 7), measured.new_zeros(shape)
-        touch = measured.new_zeros(shape)
+        touch, cap = measured.new_zeros(shape), torch.full_like(scale, math.inf)
         for rows, found, columns in self._near(measured, holding, seen, bound, relevant):
             contact, load = None, bool(holding[rows[0]])
             if self._limits is not None:
@@ -351,6 +350,7 @@ class _Batch:
             )
             part = urgent_distances(*observed)
             scale[rows] = person_speed_scale(*observed)
+            cap[rows] = person_speed_cap(*observed)
             distance[rows] = part.distance
             gradient[rows], approach[rows] = part.gradient, part.approach_speed
             if part.contact_speed is not None:
@@ -362,7 +362,7 @@ class _Batch:
             person=torch.ones(shape, dtype=torch.bool),
             contact_speed=touch,
         )
-        return distances, scale, stop
+        return distances, scale, cap, stop
 
     def _bound(self, q: Tensor, holding: Tensor, workers: Workers) -> Float[Tensor, "live H"]:
         """Lower bounds of the distances between the workers' capsules and the arms [m]."""

@@ -48,6 +48,7 @@ from hrc_learn.controller.path_law import PathLaw
 from hrc_learn.controller.pose_tracking import PoseTracking, twist_of
 from hrc_learn.controller.task_pace import (
     TaskPace,
+    capped_scale,
     closes_in,
     fraction_of_motion,
     people_bind,
@@ -258,6 +259,17 @@ class ArmLoop:
     ) -> tuple[Tensor, ArmLoopState, ArmReport]:
         """Send a joint velocity through the safety filter."""
         velocity = wanted.joint_velocity
+        if reading.person_speed_cap is not None:
+            scale = capped_scale(
+                self.chain,
+                reading.joint_position,
+                reading.jacobian,
+                velocity,
+                reading.person_speed_cap,
+            )
+            if reading.person_speed_scale is not None:
+                scale = torch.minimum(scale, reading.person_speed_scale)
+            reading = replace(reading, person_speed_scale=scale)
         J, load = reading.jacobian, reading.load
         sent, safety, filtered = self.safety.step(
             state.safety,

@@ -76,6 +76,8 @@ class ArmReading:
     """Distances from people, which the safety filter keeps; None: people are not tracked."""
     person_speed_scale: Float[Tensor, "*batch"] | None = None
     """Speed scale imposed by approaching people, 0 to 1; None: 1."""
+    person_speed_cap: Float[Tensor, "*batch"] | None = None
+    """Cap on the speed of all parts of the arm near people [m/s]; None: none."""
     stop: Bool[Tensor, "*batch"] | None = None
     """True where the arm must come to rest for the sake of people; None: nowhere."""
     explain: bool = static(False)

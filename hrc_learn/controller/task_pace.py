@@ -13,10 +13,13 @@ from hrc_learn.controller.constraint_layer import Distances
 from hrc_learn.controller.interface import ConstraintReport, SafetyConfig
 from hrc_learn.controller.joint_path import CHANGE_OF_RATE, changed_rate
 from hrc_learn.geometry.numerics import safe_norm
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree, static
 
 # Twist below which a fraction of it is not computed (metres and radians mixed) [1/s].
 _AT_REST = 1e-3
+# Step of a difference quotient along a motion [s].
+_STEP = 1e-4
 # Fraction of the task given up by the constraint layer that exceeds rounding.
 _SLOWED = 1e-3
 # Margin of the closing speed below which a distance counts as binding [m/s]: what the solver
@@ -102,6 +105,31 @@ def fraction_of_motion(
     square, along = (requested * requested).sum(-1), (requested * done).sum(-1)
     moves = square > _AT_REST**2
     return torch.where(moves, along / torch.where(moves, square, 1.0), 1.0).clamp(0, 1)
+
+
+def capped_scale(
+    chain: SerialChain,
+    q: Float[Tensor, "*batch n"],
+    jacobian: Float[Tensor, "*batch 6 n"],
+    velocity: Float[Tensor, "*batch n"],
+    cap: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch"]:
+    """Scale with which the tool and all joints keep a cap on their speed, 0 to 1.
+
+    Args:
+        chain: Kinematics of the arm.
+        q: Joint positions [rad].
+        jacobian: Jacobian of the tool.
+        velocity: Joint velocity to scale [rad/s].
+        cap: Cap on the speed [m/s]; infinite: none.
+    """
+    moved = chain.joint_origins(q + _STEP * velocity) - chain.joint_origins(q)
+    joints = torch.linalg.vector_norm(moved, dim=-1).amax(-1) / _STEP
+    tool = torch.linalg.vector_norm(
+        torch.linalg.vecdot(jacobian[..., :3, :], velocity.unsqueeze(-2)), dim=-1
+    )
+    speed = torch.maximum(joints, tool)
+    return (cap / speed.clamp(min=torch.finfo(q.dtype).tiny)).clamp(0, 1)
 
 
 def people_bind(

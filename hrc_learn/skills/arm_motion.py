@@ -10,6 +10,7 @@ from torch import Tensor
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.controller.motion_filter import MotionFilter, MotionState
 from hrc_learn.controller.resolved_rate import task_rate
+from hrc_learn.controller.task_pace import capped_scale
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState
@@ -191,7 +192,10 @@ class PositionServo:
         distances = None
         if self._watch is not None:
             watched = self._watch.look(state.time, q)
-            wanted, distances = watched.speed_scale * wanted, watched.distances
+            distances, u = watched.distances, torch.from_numpy(wanted)
+            cap = q.new_tensor(watched.speed_cap)
+            scale = capped_scale(self._chain, q, self._chain.jacobian(q), u, cap)
+            wanted = min(watched.speed_scale, float(scale)) * wanted
         filtered, self.safety, _ = self._filter.step(
             self.safety,
             q,

@@ -47,8 +47,8 @@ class PersonWatchConfig:
     of a tracker's noise. The arm stops, as the direction away from the person is not known;
     where contact is allowed it only stops to approach the person."""
     fastest: float = 0.5
-    """Cap on the speed of the arm with power and force limiting [m/s], to which the speed scale
-    near people refers."""
+    """Speed from which the arm is taken to need its full time to come to rest [m/s], for
+    `person_speed_cap`."""
 
     def __post_init__(self) -> None:
         if self.acceleration < 0:
@@ -73,6 +73,8 @@ class WatchedPeople:
     """Age of the observation [s]."""
     speed_scale: float = 1.0
     """Speed scale of the arm in every direction, 0 to 1: see `person_speed_scale`."""
+    speed_cap: float = math.inf
+    """Cap on the speed of all parts of the arm [m/s]: see `person_speed_cap`."""
 
 
 class PersonWatch:
@@ -107,16 +109,9 @@ class PersonWatch:
             self._limits = ContactLimits(arm, self._separation, furniture)
 
     def watchful(self, safety: SafetyConfig) -> SafetyConfig:
-        """Settings of a safety filter that keeps these distances, and the cap on the speed that
-        the speed scale relies on.
-        """
-        cap = math.inf if self._limits is None else self._config.fastest
-        return replace(
-            safety,
-            constraints=safety.constraints or NEAR_PEOPLE,
-            separation=self._separation,
-            tcp_speed=min(safety.tcp_speed, cap),
-        )
+        """Settings of a safety filter that keeps these distances."""
+        constraints = safety.constraints or NEAR_PEOPLE
+        return replace(safety, constraints=constraints, separation=self._separation)
 
     def look(
         self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
@@ -160,6 +155,7 @@ class PersonWatch:
             nearest=float(found.distance.min()),
             age=age,
             speed_scale=float(person_speed_scale(*observed)),
+            speed_cap=float(person_speed_cap(*observed)),
         )
 
 
@@ -271,8 +267,7 @@ def person_speed_scale(
     or makes way, approaches them as soon as they have come near; so it comes to rest by the
     time at which they may touch any part of it, if they accelerate all the while. People who
     recede count as at rest: a hand turns round faster than a tracker, which averages over some
-    images, can show. Where contact is allowed, the arm slows down to a speed that is allowed in
-    every direction instead.
+    images, can show. Where contact is allowed, `person_speed_cap` takes its place.
 
     Args:
         found: Distances of the arm as it is now from people as they were observed.
@@ -282,16 +277,45 @@ def person_speed_scale(
         config: Assumptions about people.
         contact: Highest relative speeds of contacts; None: no contact is allowed.
     """
+    scale, _ = _scale_and_speed(found, velocity, age, separation, config)
+    if contact is not None:
+        scale = scale.masked_fill(contact.first > 0, 1.0)
+    return scale.amin((-2, -1))
+
+
+def person_speed_cap(
+    found: Separation,
+    velocity: Float[Tensor, "*batch H 2 3"],
+    age: Float[Tensor, "*batch"],
+    separation: SeparationConfig,
+    config: PersonWatchConfig,
+    contact: ContactSpeeds | None = None,
+) -> Float[Tensor, "*batch"]:
+    """Cap on the speed of all parts of the arm near people whom it may touch [m/s].
+
+    People may step into the way of an arm that moves past them. By the time at which they may
+    touch it, the arm is at rest, or no faster than a contact in any direction allows. Infinite
+    where no such contact may come about. Arguments are those of `person_speed_scale`.
+    """
+    if contact is None:
+        return torch.full_like(age, math.inf)
+    scale, coming = _scale_and_speed(found, velocity, age, separation, config)
+    cap = torch.maximum(contact.first - coming, config.fastest * scale)
+    applies = (contact.first > 0) & (scale < 1)
+    return torch.where(applies, cap, math.inf).amin((-2, -1))
+
+
+def _scale_and_speed(
+    found: Separation,
+    velocity: Tensor,
+    age: Tensor,
+    separation: SeparationConfig,
+    config: PersonWatchConfig,
+) -> tuple[Tensor, Tensor]:
+    """Speed scale due to each pair, and speed of the person once the arm reacts [m/s]."""
     coming = (-found.person_rate(velocity)).clamp(min=0)
     # The root t of  coming t + a t^2/2 = distance.
     a, distance = config.acceleration, (found.distance - config.contact).clamp(min=0)
     arrival = 2 * distance / (coming + (coming**2 + 2 * a * distance).sqrt()).clamp(min=1e-9)
-    if contact is None:
-        arrival = arrival.amin((-2, -1), keepdim=True)
     late = (age + separation.reaction_time)[..., None, None]
-    scale = ((arrival - late) / _COMING_TO_REST).clamp(0, 1)
-    if contact is not None:
-        scale = scale.maximum(
-            ((contact.first - coming - a * late) / config.fastest).clamp(0, 1)
-        )
-    return scale.amin((-2, -1))
+    return ((arrival - late) / _COMING_TO_REST).clamp(0, 1), coming + a * late

@@ -512,6 +512,7 @@ class WorkCell:
             load=None if self.load is None else joints.new_tensor(self.load.end),
             distances=None if watched is None else watched.distances,
             person_speed_scale=scale,
+            person_speed_cap=None if watched is None else joints.new_tensor(watched.speed_cap),
             explain=bool(push.any()) and (way is None or way.expert),
         )
 

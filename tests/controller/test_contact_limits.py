@@ -12,6 +12,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.controller import BODY_REGIONS, ContactConfig, SeparationConfig, contact_speed
 from hrc_learn.controller.contact_limits import clamped, contact_speeds, region_numbers
+from hrc_learn.controller.task_pace import capped_scale
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda, separation
 from hrc_learn.kinematics.inertia import MassMatrix
@@ -230,3 +231,23 @@ def test_unknown_names_list_the_known_ones():
     modes = r"mode must be ssm or pfl or ssm\+pfl, but is 'fast'"
     with pytest.raises(ValueError, match=modes), shapes_unchecked():
         SeparationConfig(mode="fast")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("cap", [0.0, 0.1, 0.7, math.inf])
+def test_the_cap_near_people_holds_for_tool_and_joints(cap):
+    rng = torch.Generator().manual_seed(1)
+    q = panda.ready + 0.3 * torch.randn(20, 7, generator=rng, dtype=DOUBLE)
+    u = 0.4 * torch.randn(20, 7, generator=rng, dtype=DOUBLE)
+    u[0] = 0.0
+    limit = torch.full((20,), cap, dtype=DOUBLE)
+    scale = capped_scale(panda, q, panda.jacobian(q), u, limit)
+    speeds = torch.stack(
+        [
+            (panda.joint_jacobian(q, joint)[:, :3] @ u.unsqueeze(-1)).squeeze(-1).norm(dim=-1)
+            for joint in range(1, 8)
+        ]
+        + [(panda.jacobian(q)[:, :3] @ u.unsqueeze(-1)).squeeze(-1).norm(dim=-1)]
+    ).amax(0)
+    expected = (limit / speeds.clamp(min=1e-12)).clamp(max=1.0)
+    torch.testing.assert_close(scale[1:], expected[1:], rtol=0, atol=1e-3)
+    assert scale[0] == (1.0 if cap else 0.0)

@@ -306,6 +306,8 @@ def test_the_arm_goes_on_before_a_hand_but_not_before_a_face():
     unknown, near_unknown = ball(0.052, ())
     apart, near_apart = ball(0.052, ("hand",), mode="ssm")
     assert hand.speed_scale == 1.0
+    assert 0.5 < hand.speed_cap < math.inf
+    assert face.speed_cap == apart.speed_cap == math.inf
     assert face.speed_scale == unknown.speed_scale == apart.speed_scale < 0.7
     assert near_hand.min() > 0.5
     assert near_apart.min() < 0.2
@@ -314,7 +316,8 @@ def test_the_arm_goes_on_before_a_hand_but_not_before_a_face():
     assert unknown.distances.contact_speed is None
     # Towards a hand that comes too fast for any contact the arm is at rest.
     fast, near_fast = ball(0.1, ("hand",), speed=2.0)
-    assert near_fast.min() == fast.speed_scale == 0.0
+    assert near_fast.min() == 0.0
+    assert fast.speed_cap == 0.0
 
 
 def test_an_arm_that_touches_a_hand_goes_on_but_not_towards_it():
@@ -322,7 +325,8 @@ def test_an_arm_that_touches_a_hand_goes_on_but_not_towards_it():
     assert hand.nearest < PersonWatchConfig().contact
     assert hand.distances.known()
     assert near_hand.min() < 0.01
-    assert hand.speed_scale > 0.5
+    assert hand.speed_scale == 1.0
+    assert hand.speed_cap > 0.5
     assert 0 < hand.distances.contact_speed.min() < 0.1
     assert not ball(0.02, ("head",))[0].distances.known()
     assert not ball(0.02, ("hand",), mode="ssm")[0].distances.known()
