@@ -1,6 +1,6 @@
-"""Run an exported control step without the library that made it.
+"""Run a control step of `export_torch_package` without the library that made it.
 
-    python docs/run_exported_step.py step-.../step.pt2
+    python docs/run_exported_step.py step.pt2
 
 The arm moves as it is told; a real loop would read its joints and write to its driver.
 """
@@ -11,12 +11,12 @@ import sys
 import time
 
 import torch
+import torch._inductor
 
 DT = 0.002  # the step the package was exported with [s]
 
-# The public `torch._inductor.aoti_load_package` takes the same file, but seconds.
-loader = torch._C._aoti.AOTIModelPackageLoader(sys.argv[1], "model", False, 1, -1)
-says = loader.get_metadata()
+step = torch._inductor.aoti_load_package(sys.argv[1])
+says = step.get_metadata()
 
 # Where each field stands in the three vectors of numbers.
 rows, sizes = {}, {"state": 0, "observation": 0, "command": 0}
@@ -38,7 +38,7 @@ velocity = command[rows["command", "joint_velocity"]].numpy()
 seconds = []
 for _ in range(1000):
     began = time.perf_counter()
-    loader.run([state, observation, command])  # writes the command and the next state
+    step(state, observation, command)  # writes the command and the next state
     seconds.append(time.perf_counter() - began)
     q += DT * velocity
 

@@ -1,9 +1,10 @@
 """The control step for real-time loops: compiled ahead of time, NumPy in and out."""
 
-from hrc_learn.deploy.export import NoCompilerError as NoCompilerError
 from hrc_learn.deploy.export import export_step as export_step
+from hrc_learn.deploy.export import export_torch_package as export_torch_package
 from hrc_learn.deploy.runner import EagerRunner as EagerRunner
 from hrc_learn.deploy.runner import PackageRunner as PackageRunner
 from hrc_learn.deploy.runner import Rate as Rate
 from hrc_learn.deploy.runner import StepRunner as StepRunner
 from hrc_learn.deploy.runner import open_step as open_step
+from hrc_learn.deploy.scalar_program import UnknownOperationError as UnknownOperationError

@@ -4,24 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, final
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.fx import Graph, Node
 from torch.utils import _pytree
 
-from hrc_learn.deploy.package import PackedStep, StepObservation, Steppable, describe, machine
+from hrc_learn.deploy.native_code import NativeCode, assemble, lanes_of
+from hrc_learn.deploy.package import (
+    CODE,
+    DESCRIPTION,
+    LANES,
+    WORKSPACE,
+    PackedStep,
+    StepLayouts,
+    StepObservation,
+    Steppable,
+    c_header,
+    describe,
+    machine,
+)
+from hrc_learn.deploy.scalar_program import UnknownOperationError, scalar_program
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.store import EXPORT, Claim, replacing
-
-
-class NoCompilerError(RuntimeError):
-    """No C++ compiler was found."""
+from hrc_learn.store import EXPORT, Claim, new_file, replacing, write_json, write_text
 
 
 def export_step(
@@ -29,24 +38,26 @@ def export_step(
 ) -> Path:
     """Compile the step of a controller, unless an equal one has been compiled before.
 
-    A package runs on the machine that built it. The name of its folder is a hash of torch's
-    version, of the processor, of the source of this library, and of all settings and weights of
-    the controller. With classes from outside this library, whose source is unknown, the hash is
+    The machine code comes from LLVM, so no compiler needs to be installed. It runs on the
+    processor that built it. Next to it are `step.h`, a header for C and C++, and `step.json`, a
+    description for other languages. The name of their folder is a hash of torch's version, of
+    the processor, of the source of this library, and of all settings and weights of the
+    controller. With classes from outside this library, whose source is unknown, the hash is
     that of the traced step, which takes seconds longer.
 
     Args:
         controller: Controller with the step.
         observation: An example with exactly the fields of later observations. Missing fields,
             and a `dt` that is a number, become constants; so do the controller's own goals if
-            it has none. It sets batch dimensions and dtype of the package; float32 counts
+            it has none. It sets batch dimensions and dtype of the step; float32 counts
             interventions to 16 million only.
-        folder: Folder of the packages; default: the user's cache.
+        folder: Folder of the compiled steps; default: the user's cache.
 
     Returns:
-        Path of the package, `step.pt2` in its folder.
+        Path of the machine code, `step.o` in its folder.
 
     Raises:
-        NoCompilerError: There is neither a package nor a C++ compiler.
+        UnknownOperationError: The step uses an operation of PyTorch for which there is no code.
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
     if folder is None:
@@ -59,38 +70,93 @@ def export_step(
         program = trace(step, observation)
         key = _digest(step, program)
     target = folder / f"step-{key[:24]}"
-    package = target / "step.pt2"
-    if package.is_file():
-        return package
-    _require_compiler()
+    code = target / CODE
+    if code.is_file():
+        return code
     folder.mkdir(parents=True, exist_ok=True)
     # Waiting for another process that compiles the same step is faster than compiling it again.
     with Claim(target, wait=True) as claim:
-        if package.is_file():
-            return package
+        if code.is_file():
+            return code
         with replacing(claim, EXPORT, overwrite=True) as new:
             new.mkdir()
-            program = program or trace(step, observation)
-            metadata = {"aot_inductor.metadata": describe(step, observation)}
-            with torch.no_grad(), tuned_for(step.layouts.state.batch) as options:
-                torch._inductor.aoti_compile_and_package(
-                    program,
-                    package_path=str(new / package.name),
-                    inductor_configs=options | metadata,
-                )
+            _compile(step, observation, new)
+    return code
+
+
+def _compile(step: PackedStep, observation: StepObservation, folder: Path) -> None:
+    """Write machine code, header and description of a step."""
+    few, fewer = _few_arms(step, observation)
+    dtype = step.layouts.state.dtype
+    program = scalar_program(trace(few, fewer), dtype)
+    lanes = lanes_of(np.dtype(program.number)) if step.layouts.state.batch else 1
+    native = NativeCode(program, StepLayouts._fields, lanes)
+    (folder / CODE).write_bytes(assemble(native.text))
+    sizes = {LANES: str(native.lanes), WORKSPACE: str(native.workspace)}
+    about = describe(step, observation) | sizes
+    write_text(folder / "step.h", c_header(about))
+    write_json(folder / DESCRIPTION, about)
+
+
+def _few_arms(
+    step: PackedStep, observation: StepObservation
+) -> tuple[PackedStep, StepObservation]:
+    """The same step for a few arms of a batch, enough to see that they do not mix."""
+    batch = step.layouts.state.batch
+    if not batch:
+        return step, observation
+    # A size that no unbatched field has by chance: then the layouts are equal.
+    for size in (2, 3, 5, 11):
+        part = (slice(size), *(slice(1) for _ in batch[1:]))
+        few = _pytree.tree_map_only(
+            Tensor,
+            lambda x, part=part: x[part] if tuple(x.shape[: len(batch)]) == batch else x,
+            observation,
+        )
+        smaller = PackedStep(step.controller, few)
+        if all(
+            ours.fields == theirs.fields
+            for ours, theirs in zip(smaller.layouts, step.layouts, strict=True)
+        ):
+            return smaller, few
+    raise UnknownOperationError("the fields of a batch cannot be told from those of one arm")
+
+
+def export_torch_package(
+    controller: Steppable, observation: StepObservation, package: Path
+) -> Path:
+    """Compile the step of a controller with PyTorch's AOTInductor, for programs with libtorch.
+
+    It takes a C++ compiler and a minute or two, and is slower than `export_step`.
+
+    Args:
+        controller: Controller with the step.
+        observation: An example, as for `export_step`.
+        package: File to write; its name ends with `.pt2`.
+
+    Returns:
+        `package`.
+    """
+    step = PackedStep(controller, observation)
+    program = trace(step, observation)
+    for node in program.graph.nodes:
+        # The inductor of torch 2.11 cannot raise a constant to a power.
+        if node.target is torch.ops.aten.square.default:
+            node.target, node.args = torch.ops.aten.mul.Tensor, (node.args[0], node.args[0])
+    with torch.no_grad(), new_file(package) as part:
+        built = torch._inductor.aoti_compile_and_package(
+            program,
+            package_path=str(part.with_suffix(".pt2")),
+            inductor_configs={"aot_inductor.metadata": describe(step, observation)},
+        )
+        Path(built).rename(part)
     return package
 
 
 def trace(step: PackedStep, observation: StepObservation) -> torch.export.ExportedProgram:
-    """Graph of a step in the form that AOTInductor needs."""
+    """Graph of a step."""
     with torch.no_grad():
-        program = torch.export.export(step, tuple(step.example(observation)), strict=False)
-    aten = torch.ops.aten
-    for node in program.graph.nodes:
-        # The inductor of torch 2.11 cannot raise a constant to a power.
-        if node.target is aten.square.default:
-            node.target, node.args = aten.mul.Tensor, (node.args[0], node.args[0])
-    return program
+        return torch.export.export(step, tuple(step.example(observation)), strict=False)
 
 
 def _structure(observation: StepObservation) -> list[tuple[str, str]]:
@@ -116,15 +182,6 @@ def _digest(step: PackedStep, program: torch.export.ExportedProgram) -> str:
         assert isinstance(value, Tensor)
         digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
-
-
-def _require_compiler() -> None:
-    from torch._inductor import cpp_builder, exc
-
-    try:
-        cpp_builder.get_cpp_compiler()
-    except exc.InvalidCxxCompiler as error:
-        raise NoCompilerError("no C++ compiler found: install g++, or set CXX") from error
 
 
 # Sources of a compiled step, all hashed: equal hashes mean equal compiled code.
@@ -217,144 +274,3 @@ def _source_hash() -> bytes:
             if path.is_file():
                 digest.update(str(path.relative_to(_ROOT)).encode() + path.read_bytes())
     return digest.digest()
-
-
-# Memory layout of compiled steps. Inductor has no public option for the layout of results, nor
-# for the level of optimization, so four of its private functions, and a limit, are replaced
-# during a compilation. They exist in
-# all versions of torch that pyproject.toml allows; tests/deploy/test_inductor.py watches them.
-
-# Stack memory that a step may use [bytes]: allocations there are free, while those of torch
-# cost more than the arithmetic. Threads commonly have 8 MB.
-_STACK = 2**20
-_CAT, _PERMUTE = torch.ops.aten.cat.default, torch.ops.aten.permute.default
-
-
-@contextmanager
-def tuned_for(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
-    """Context in which inductor compiles fast code for a step of a batch.
-
-    Args:
-        batch: Sizes of the batch, the leading axes of tensors; empty for one arm.
-
-    Yields:
-        Options to compile with.
-    """
-    from torch._inductor import cpp_builder
-    from torch._inductor.codegen import cpp_wrapper_cpu_array_ref as wrapper
-
-    plain = cpp_builder._get_optimization_cflags
-
-    def flags_of_batches(*args: Any, **more: Any) -> tuple[list[str], list[str]]:
-        # One kernel of 26,000 lines: GCC 12.2 ends with an internal error at -O3. The loops
-        # over the batch are vectorized by inductor, at any level.
-        compiling, linking = plain(*args, **more)
-        return ["O2" if flag == "O3" else flag for flag in compiling], linking
-
-    options: dict[str, Any] = {"aot_inductor.allow_stack_allocation": True}
-    with ExitStack() as stack:
-        stack.enter_context(_replaced(wrapper, "MAX_STACK_ALLOCATION_SIZE", _STACK))
-        if batch:
-            stack.enter_context(_batch_last(list(batch)))
-            stack.enter_context(
-                _replaced(cpp_builder, "_get_optimization_cflags", flags_of_batches)
-            )
-            options["post_grad_custom_post_pass"] = cat_batch_last(list(batch))
-        yield options
-
-
-@contextmanager
-def _replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
-    """Context in which one attribute of a class or module is replaced."""
-    # Not getattr, which would bind a classmethod: the original object has to be restored.
-    before = vars(owner)[name]
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)
-
-
-@contextmanager
-def _batch_last(batch: list[int]) -> Iterator[None]:
-    """Context in which tensors with leading batch axes have the batch last in memory.
-
-    Then the innermost loops run over the batch, a vector register of elements at a time. By
-    default inductor keeps the batch first in memory, and transposes again and again.
-    """
-    from torch._inductor import ir
-
-    view = ir.View.create
-    plain, preferred = ir.FlexibleLayout.__init__, ir.ComputedBuffer.get_fill_order
-
-    def lay_out(
-        self: Any, device: Any, dtype: Any, size: Any, stride_order: Any = None, **more: Any
-    ) -> None:
-        if not stride_order and _leads(batch, size):
-            stride_order = _fill_order(len(batch), len(size))
-        plain(self, device, dtype, size, stride_order, **more)
-
-    def fill_order(self: Any) -> Any:
-        # Inductor would take the order of the buffer's inputs, and transpose.
-        size = self.get_size()
-        if isinstance(self.layout, ir.FlexibleLayout) and _leads(batch, size):
-            return _fill_order(len(batch), len(size))
-        return preferred(self)
-
-    def decided_view(x: Any, new_size: Sequence[Any]) -> Any:
-        # Inductor copies the strides of the viewed buffer, and may change those later: it
-        # treats every layout as undecided that does not have the last axis last.
-        if ir.is_storage_and_layout(x):
-            x.freeze_layout()
-        return view(x, new_size)
-
-    with (
-        _replaced(ir.FlexibleLayout, "__init__", lay_out),
-        _replaced(ir.ComputedBuffer, "get_fill_order", fill_order),
-        _replaced(ir.View, "create", staticmethod(decided_view)),
-    ):
-        yield
-
-
-def _leads(batch: Sequence[int], size: Sequence[Any]) -> bool:
-    """True if a size begins with the batch and does not end with it already."""
-    n = len(batch)
-    return list(size[:n]) == batch and list(size[-n:]) != batch
-
-
-def _fill_order(first: int, axes: int) -> list[int]:
-    """Axes from the fastest one: the first ones, then the others."""
-    return [*reversed(range(first)), *reversed(range(first, axes))]
-
-
-def cat_batch_last(batch: list[int]) -> Callable[[Graph], None]:
-    """Graph pass that permutes tensors before a concatenation, and its result back.
-
-    Inductor writes the parts directly into the result, whose layout cannot be set otherwise.
-    """
-
-    def permute(graph: Graph) -> None:
-        for node in graph.find_nodes(op="call_function", target=_CAT):
-            args: Any = node.args
-            parts, dim, *_ = *args, 0  # aten.cat leaves out a dim of zero
-            axes = range(node.meta["val"].ndim)
-            dim = axes[dim]
-            # Concatenation along the batch, or with the batch last already: nothing to gain.
-            if dim < len(batch) or not _leads(batch, node.meta["val"].shape):
-                continue
-            first, last = axes[: len(batch)], axes[len(batch) :]
-            with graph.inserting_before(node):
-                permuted = [_call(graph, _PERMUTE, x, [*last, *first]) for x in parts]
-                whole = _call(graph, _CAT, permuted, dim - len(batch))
-                back = _call(graph, _PERMUTE, whole, [*axes[len(last) :], *axes[: len(last)]])
-            node.replace_all_uses_with(back)
-            graph.erase_node(node)
-
-    return permute
-
-
-def _call(graph: Graph, function: Any, *args: Any) -> Node:
-    """New node, with the metadata of its result that inductor needs."""
-    node = graph.call_function(function, args)
-    node.meta["val"] = function(*_pytree.tree_map_only(Node, lambda x: x.meta["val"], args))
-    return node

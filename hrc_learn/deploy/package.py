@@ -10,7 +10,8 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -19,13 +20,14 @@ from typing import Any, NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.utils import _pytree
 
 from hrc_learn.controller import Observation, WantedVelocity
+from hrc_learn.deploy.native_code import NativeStep
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.store import require_unchanged
+from hrc_learn.store import read_json, require_unchanged
 
 type StepObservation = Observation | WantedVelocity
 """Observation of a controller's step."""
@@ -127,6 +129,13 @@ class IOLayout:
     def views(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
         """Views of a vector in the shapes of the fields."""
         return [self._part(field, vector) for field in self.fields]
+
+    def shared_rows(self) -> Int[Tensor, " rows"]:
+        """Rows of the fields that have one value for the whole batch."""
+        rows = [self.rows[field.name] for field in self.fields if not field.batched]
+        return torch.tensor(
+            [row for part in rows for row in range(part.start, part.stop)]
+        ).long()
 
     def arrays(self, vector: Float[Tensor, "rows *batch"]) -> dict[str, np.ndarray]:
         """Views of a vector by field name, for reading and writing."""
@@ -230,6 +239,11 @@ def tensors_of(tree: object) -> list[Tensor]:
 _LAYOUT, _BATCH, _DTYPE = "hrc_learn.layout", "hrc_learn.batch", "hrc_learn.dtype"
 _STATE, _OBSERVATION = "hrc_learn.state", "hrc_learn.observation"
 _BUILT_FOR = "hrc_learn.built_for"
+LANES, WORKSPACE = "hrc_learn.lanes", "hrc_learn.workspace"
+"""Keys of machine code alone: arms at once, and numbers in its workspace."""
+
+CODE, DESCRIPTION = "step.o", "step.json"
+"""Files of a compiled step: machine code, and the metadata as one JSON object."""
 
 
 @dataclass(frozen=True)
@@ -270,20 +284,17 @@ def describe(step: PackedStep, observation: StepObservation) -> dict[str, str]:
 
 
 def load(path: Path) -> Package:
-    """Load a package in milliseconds.
+    """Load a compiled step: the machine code of `export_step`, or PyTorch's package.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: `export_step` did not write the file, it has changed since, or it was
+        ValueError: It was not written by this library, it has changed since, or it was
             written for another machine.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"no package {path}")
+        raise FileNotFoundError(f"no compiled step {path}")
     require_unchanged(path.parent)
-    try:
-        run, metadata = _open(path)
-    except RuntimeError as error:
-        raise ValueError(f"{path} was not written by export_step: {error}") from error
+    metadata, run = _metadata(path)
     if _LAYOUT not in metadata:
         raise ValueError(f"{path} was not written by export_step: it has no layout")
     if metadata[_BUILT_FOR] != machine():
@@ -298,9 +309,14 @@ def load(path: Path) -> Package:
         vector, name, kind, batched, *shape = line.split()
         field = Field(name, getattr(torch, kind), batched == "1", tuple(map(int, shape)))
         fields[vector].append(field)
+    layouts = StepLayouts(*(IOLayout(part, batch, dtype) for part in fields.values()))
+    if run is None:
+        sizes = int(metadata[LANES]), int(metadata[WORKSPACE])
+        shared = [layout.shared_rows() for layout in layouts[:2]] if batch else []
+        run = NativeStep(path.read_bytes(), *sizes, shared)
     return Package(
         run=run,
-        layouts=StepLayouts(*(IOLayout(part, batch, dtype) for part in fields.values())),
+        layouts=layouts,
         first_state=_vector(metadata[_STATE], batch, dtype),
         example=_vector(metadata[_OBSERVATION], batch, dtype),
     )
@@ -339,8 +355,52 @@ def _vector(text: str, batch: list[int], dtype: torch.dtype) -> Tensor:
     return numbers.reshape((-1, *batch))
 
 
-def _open(path: Path) -> tuple[Callable[[list[Tensor]], object], dict[str, str]]:
-    # Private, ready in milliseconds; torch's public loader probes compilers for half a minute.
-    loader = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore
-    package = loader(str(path), "model", False, 1, -1)
-    return package.run, package.get_metadata()
+def _metadata(path: Path) -> tuple[dict[str, str], Callable[[list[Tensor]], object] | None]:
+    """Metadata of a compiled step, and the function of PyTorch's package."""
+    if path.suffix != ".pt2":
+        return read_json(path.with_name(DESCRIPTION), dict[str, str], "export it again"), None
+    try:
+        package = torch._inductor.aoti_load_package(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path} is no package of export_torch_package: {error}") from error
+    return package.get_metadata(), lambda vectors: package(*vectors)
+
+
+def c_header(metadata: Mapping[str, str]) -> str:
+    """Header of the machine code for C and C++: its function, and where each field is."""
+    dtype = {"float64": "double", "float32": "float"}[metadata[_DTYPE]]
+    batch = [int(n) for n in metadata[_BATCH].split()]
+    sizes = dict.fromkeys(StepLayouts._fields, 0)
+    places = []
+    for line in metadata[_LAYOUT].splitlines():
+        vector, name, _, _, *shape = line.split()
+        rows = math.prod(map(int, shape))
+        word = re.sub(r"\W+", "_", f"{vector}_{name}").upper()
+        places.append(f"#define {word} {sizes[vector]} /* {rows} rows */")
+        sizes[vector] += rows
+    arms = math.prod(batch)
+    return "\n".join([
+        "/* One control step. Vectors are arrays of rows; a row has a number for each arm. */",
+        f"#define STEP_ARMS {arms}",
+        f"#define STEP_ARMS_AT_ONCE {metadata[LANES]}",
+        *(f"#define {name.upper()}_ROWS {size}" for name, size in sizes.items()),
+        f"#define WORKSPACE_SIZE {metadata[WORKSPACE]} /* numbers, of any value */",
+        *places,
+        "/* At rest in the ready posture, and the observation of the export. */",
+        *(
+            f"static const {dtype} first_{name}[] = {{{_c_numbers(metadata[key])}}};"
+            for name, key in (("state", _STATE), ("observation", _OBSERVATION))
+        ),
+        "#ifdef __cplusplus",
+        'extern "C"',
+        "#endif",
+        "/* Takes a step: reads the observation, writes the command and the next state. Rows",
+        "   are `stride` numbers apart; `count` arms, a multiple of STEP_ARMS_AT_ONCE. */",
+        f"void control_step({dtype} *state, const {dtype} *observation, {dtype} *command,",
+        f"                  {dtype} *workspace, long long stride, long long count);",
+        "",
+    ])  # fmt: skip
+
+
+def _c_numbers(text: str) -> str:
+    return text.replace("nan", "(0.0 / 0.0)").replace("inf", "(1.0 / 0.0)").replace(" ", ", ")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.deploy.export import NoCompilerError, export_step
+from hrc_learn.deploy.export import export_step
 from hrc_learn.deploy.package import (
     PackedStep,
     StepLayouts,
@@ -22,6 +22,7 @@ from hrc_learn.deploy.package import (
     load,
     tensors_of,
 )
+from hrc_learn.deploy.scalar_program import UnknownOperationError
 
 type _Joints = Float[np.ndarray, "*batch n"]
 
@@ -131,11 +132,11 @@ class PackageRunner(StepRunner):
     """A step compiled ahead of time; a step allocates nothing."""
 
     def __init__(self, package: Path):
-        """Load a package written by `export_step`, in milliseconds.
+        """Load machine code written by `export_step`, in milliseconds, or PyTorch's package.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: `export_step` did not write the file, it has changed since, or it was
+            ValueError: This library did not write the file, it has changed since, or it was
                 written for another machine.
         """
         loaded = load(package)
@@ -167,16 +168,16 @@ def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
 def open_step(
     controller: Steppable, observation: StepObservation, folder: Path | None = None
 ) -> StepRunner:
-    """The fastest available runner: compiled, or eager with a warning without a C++ compiler.
+    """The fastest available runner: compiled, or eager with a warning if that is not possible.
 
     Args:
         controller: Controller with the step.
         observation: First observation, with exactly the fields of later ones.
-        folder: Folder of the packages; default: the user's cache.
+        folder: Folder of the compiled steps; default: the user's cache.
     """
     try:
         runner = PackageRunner(export_step(controller, observation, folder))
-    except NoCompilerError as error:
+    except UnknownOperationError as error:
         warnings.warn(f"control steps run uncompiled and slower: {error}", stacklevel=2)
         return EagerRunner(controller, observation)
     runner.observe(observation)

@@ -29,7 +29,6 @@ from jaxtyping import Float
 from hrc_learn.controller import VelocityStep, WantedVelocity
 from hrc_learn.deploy import (
     EagerRunner,
-    NoCompilerError,
     PackageRunner,
     StepRunner,
     export_step,
@@ -371,13 +370,7 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
         dt=CYCLE,
     )
     if config.compiled:
-        try:
-            return partial(PackageRunner, export_step(step, example))
-        except NoCompilerError as error:
-            raise DriverError(
-                f"the step of the loop cannot be compiled: {error} Uncompiled (compiled=False) "
-                "it takes about a cycle, which serves for simulators only."
-            ) from error
+        return partial(PackageRunner, export_step(step, example))
     # Copies: on its way to another process the memory of a tensor is replaced by shared memory,
     # and NumPy's views of it would be left behind.
     return partial(EagerRunner, *copy.deepcopy((step, example)))

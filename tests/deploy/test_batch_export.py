@@ -1,6 +1,7 @@
 """The step of many arms, compiled as one loop over them."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +9,21 @@ import pytest
 import sampling
 import torch
 from step_equality import assert_equal_steps, controller_and_observation
-from torch.fx.experimental.proxy_tensor import make_fx
+from torch import nn
 from unchecked import shapes_unchecked
 
-from hrc_learn.deploy import EagerRunner, PackageRunner, export_step
-from hrc_learn.deploy.export import cat_batch_last
+from hrc_learn.controller import VelocityStep, WantedVelocity
+from hrc_learn.deploy import (
+    EagerRunner,
+    PackageRunner,
+    UnknownOperationError,
+    export_step,
+)
 from hrc_learn.deploy.package import load
 from hrc_learn.kinematics import panda
 
-ARMS = 40
+ARMS = 43
+"""No multiple of the numbers in a vector register."""
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -32,25 +39,86 @@ def package(tmp_path_factory, _no_shape_checks) -> Path:
     return export_step(controller, observation, tmp_path_factory.mktemp("packages"))
 
 
-def test_what_is_joined_has_the_batch_last():
-    def join(a, b):
-        return torch.cat([torch.cat([a, b], 1), torch.cat([b, a], -2)], -1), torch.cat([a, a])
+def told(*batch: int, dtype: torch.dtype) -> WantedVelocity:
+    q = panda.ready + 0.3 * torch.randn(
+        *batch, 7, generator=sampling.generator(), dtype=torch.float64
+    )
+    return WantedVelocity(
+        joint_position=q.to(dtype),
+        joint_velocity=torch.zeros(*batch, 7, dtype=dtype),
+        stop=torch.zeros(batch, dtype=torch.bool),
+        dt=torch.tensor(0.004, dtype=dtype),
+    )
 
-    rng = sampling.generator()
-    a, b = torch.randn(5, 4, 3, generator=rng), torch.randn(5, 2, 3, generator=rng)
-    module = make_fx(join, tracing_mode="fake")(a, b)
-    cat_batch_last([5])(module.graph)
-    module.recompile()
-    for ours, theirs in zip(module(a, b), join(a, b), strict=True):
-        assert torch.equal(ours, theirs)
-    joins = module.graph.find_nodes(op="call_function", target=torch.ops.aten.cat.default)
-    shapes = [tuple(node.meta["val"].shape) for node in joins]
-    assert sorted(shapes) == [(6, 3, 5), (6, 3, 5), (6, 6, 5), (10, 4, 3)]
+
+@pytest.mark.parametrize(
+    ("batch", "dtype", "tolerance"),
+    [
+        ((ARMS,), torch.float32, 2e-5),
+        ((3, 2), torch.float64, 1e-12),
+        ((1,), torch.float64, 1e-12),
+    ],
+)
+def test_commanded_velocities_equal_the_eager_ones(tmp_path, batch, dtype, tolerance):
+    step, example = VelocityStep(panda).to(dtype), told(*batch, dtype=dtype)
+    runners = [EagerRunner(step, example), PackageRunner(export_step(step, example, tmp_path))]
+    rng, q = np.random.default_rng(0), example.joint_position.numpy().copy()
+    for runner in runners:
+        runner.observe(example)
+        runner.start(q)
+    for k in range(60):
+        if k % 20 == 0:
+            wanted, stop = 3 * rng.normal(size=(*batch, 7)), rng.random(batch) < 0.2
+        sent = []
+        for runner in runners:
+            runner.observation["joint_position"][:] = q
+            runner.observation["joint_velocity"][:] = wanted
+            runner.observation["stop"][...] = stop
+            sent.append(runner.step().copy())
+        np.testing.assert_allclose(sent[1], sent[0], rtol=0, atol=tolerance * (k + 1))
+        q += 0.004 * sent[0]
+    assert np.abs(sent[0]).max() > 0.5
+
+
+def test_threads_share_a_large_batch(tmp_path):
+    arms = 1040
+    step, example = VelocityStep(panda), told(arms, dtype=torch.float64)
+    example = replace(example, joint_velocity=torch.ones(arms, 7, dtype=torch.float64))
+    runner = PackageRunner(export_step(step, example, tmp_path))
+    velocities = []
+    for threads in (1, 3):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            runner.observe(example)
+            runner.start(example.joint_position.numpy())
+            velocities.append(runner.step().copy())
+        finally:
+            torch.set_num_threads(before)
+    np.testing.assert_array_equal(velocities[1], velocities[0])
+    eager, _ = step.step(step.initial_state(example.joint_position), example)
+    np.testing.assert_allclose(velocities[0], eager.joint_velocity, rtol=0, atol=1e-12)
+
+
+class Mixed(VelocityStep):
+    """The arms of a batch all move as the fastest of them."""
+
+    def step(self, state, observation):
+        wanted = observation.joint_velocity.amax(0, keepdim=True)
+        wanted = wanted.expand_as(observation.joint_velocity)
+        return super().step(state, replace(observation, joint_velocity=wanted))
+
+
+def test_arms_that_depend_on_each_other_are_refused(tmp_path):
+    with pytest.raises(UnknownOperationError, match="an arm of the batch reads observation"):
+        export_step(Mixed(panda), told(4, dtype=torch.float64), tmp_path)
+    assert not list(tmp_path.glob("step-*"))
+    assert isinstance(Mixed(panda), nn.Module)
 
 
 @pytest.mark.slow
 class TestBatch:
-    """Built once, in a minute or two."""
+    """Everything that a controller does."""
 
     def test_it_equals_the_eager_step(self, package):
         controller, observation = controller_and_observation(panda.ready.expand(ARMS, 7))

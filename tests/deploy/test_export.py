@@ -13,16 +13,20 @@ import numpy as np
 import pytest
 import sampling
 import torch
-from graphs import library_calls
 from step_equality import assert_equal_steps, controller_and_observation
 from torch import Tensor
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import AdaptiveController, Observation
-from hrc_learn.deploy import EagerRunner, NoCompilerError, PackageRunner, export_step, open_step
-from hrc_learn.deploy import export as export_module
+from hrc_learn.deploy import (
+    EagerRunner,
+    PackageRunner,
+    UnknownOperationError,
+    export_step,
+    export_torch_package,
+    open_step,
+)
 from hrc_learn.deploy import package as package_module
-from hrc_learn.deploy.export import trace
 from hrc_learn.deploy.package import PackedStep, Vectors, load
 from hrc_learn.kinematics import panda
 from hrc_learn.store import EXPORT, replacing
@@ -45,26 +49,24 @@ def observed() -> tuple[AdaptiveController, Observation]:
 
 
 @pytest.fixture(scope="module")
-def traced(observed) -> torch.export.ExportedProgram:
+def compiled(observed, tmp_path_factory) -> Path:
     with shapes_unchecked():
-        return trace(PackedStep(*observed), observed[1])
+        return export_step(*observed, tmp_path_factory.mktemp("compiled"))
 
 
-class TestTraced:
-    """The graph that is exported."""
+class TestCompiled:
+    """Machine code of everything a controller does."""
 
-    def test_it_equals_the_eager_step_and_is_written_out(self, observed, traced):
-        assert not library_calls(traced)
-        program = traced.module()
-        assert_equal_steps(*observed, lambda vectors: program(*vectors), 40)
+    def test_it_equals_the_eager_step(self, observed, compiled):
+        assert_equal_steps(*observed, load(compiled).run, 40)
 
-    def test_it_takes_poison_as_the_eager_one_does(self, observed, traced):
+    def test_it_takes_poison_as_the_eager_one_does(self, observed, compiled):
         """In any number of the observation, the step among them."""
-        program, step = traced.module(), PackedStep(*observed)
+        program, step = load(compiled).run, PackedStep(*observed)
         vectors = step.example(observed[1])
         velocity = step.layouts.command.rows["joint_velocity"]
         for _ in range(20):
-            program(*vectors)
+            program(list(vectors))
         usual = vectors.command[velocity].norm()
         assert usual > 0.05
         healthy = vectors.observation.clone()
@@ -74,7 +76,7 @@ class TestTraced:
             for value in (torch.nan, torch.inf, -torch.inf):
                 vectors.observation[step.layouts.observation.rows[field.name]] = value
                 expected = Vectors(*(x.clone() for x in vectors))
-                program(*vectors)
+                program(list(vectors))
                 step(*expected)
                 for got, wanted in zip(vectors, expected, strict=True):
                     torch.testing.assert_close(
@@ -84,8 +86,67 @@ class TestTraced:
                 assert vectors.state.isfinite().all(), field.name
                 vectors.observation.copy_(healthy)
         for _ in range(20):
-            program(*vectors)
+            program(list(vectors))
         assert 0.5 * usual < vectors.command[velocity].norm() < 2 * usual
+
+    def test_it_is_built_once(self, observed, compiled):
+        built = compiled.stat().st_mtime_ns
+        controller, observation = observed
+        elsewhere = replace(observation, joint_position=panda.ready + 0.1)
+        assert export_step(controller, elsewhere, compiled.parents[1]) == compiled
+        assert compiled.stat().st_mtime_ns == built
+        assert list(compiled.parents[1].iterdir()) == [compiled.parent]
+
+    def test_it_opens_within_a_tenth_of_a_second(self, observed, compiled):
+        seconds = []
+        for _ in range(5):
+            began = time.process_time()
+            open_step(*observed, compiled.parents[1]).step()
+            seconds.append(time.process_time() - began)
+        assert min(seconds) < 0.1
+
+    def test_it_allocates_nothing(self, observed, compiled):
+        runner = open_step(*observed, compiled.parents[1])
+        velocity = runner.step()
+        address = velocity.ctypes.data
+        with torch.profiler.profile(profile_memory=True) as profile:
+            assert runner.step() is velocity
+        assert velocity.ctypes.data == address
+        assert not [event for event in profile.events() or () if event.cpu_memory_usage > 0]
+
+    def test_it_starts_again_anywhere(self, observed, compiled):
+        runners = [EagerRunner(*observed), open_step(*observed, compiled.parents[1])]
+        q = panda.ready.numpy() + 0.2
+        for runner in runners:
+            runner.step()
+            runner.start(q)
+            runner.observation["joint_position"][:] = np.nan  # so it needs what it remembers
+            for _ in range(3):
+                runner.step()
+        np.testing.assert_allclose(
+            runners[0].command("twist"), runners[1].command("twist"), rtol=0, atol=1e-12
+        )
+
+    def test_it_remembers_its_layout_and_first_state(self, observed, compiled):
+        step, kept = PackedStep(*observed), load(compiled)
+        for ours, theirs in zip(step.layouts, kept.layouts, strict=True):
+            assert (theirs.fields, theirs.batch) == (ours.fields, ours.batch)
+        assert torch.equal(kept.first_state, step.first_state)
+
+    def test_one_of_another_machine_is_refused(self, compiled, monkeypatch):
+        monkeypatch.setattr(torch, "__version__", "1.0")
+        with pytest.raises(ValueError, match=r"built for torch 2.*, but this is torch 1\.0"):
+            load(compiled)
+
+    def test_a_program_in_c_runs_it(self, observed, compiled, tmp_path):
+        if shutil.which("cc") is None:
+            pytest.skip("needs a C compiler")
+        program = tmp_path / "run_exported_step"
+        source = ROOT / "docs" / "run_exported_step.c"
+        command = ["cc", "-Wall", "-Werror", "-O1", source, compiled, f"-I{compiled.parent}"]
+        subprocess.run([*command, "-lm", "-o", program], check=True)
+        done = subprocess.run([program], capture_output=True, text=True, check=True)
+        assert_same_run(done.stdout, compiled, observed[1])
 
 
 class TestArrays:
@@ -168,37 +229,32 @@ def test_batches_have_their_own_arrays():
     np.testing.assert_array_equal(runner.step(), expected.joint_velocity.numpy())
 
 
-def test_without_a_compiler_the_step_runs_eagerly_and_says_so(monkeypatch, tmp_path):
-    def missing():
-        raise NoCompilerError("no C++ compiler found")
+class Sorted(AdaptiveController):
+    """A law with an operation that cannot be compiled."""
 
-    monkeypatch.setattr(export_module, "_require_compiler", missing)
-    controller, observation = controller_and_observation()
-    with pytest.warns(UserWarning, match="run uncompiled and slower: no C\\+\\+ compiler"):
+    def step(self, state, observation):
+        q = observation.joint_position
+        return super().step(state, replace(observation, joint_position=q + 0 * q.sort()[0]))
+
+
+def test_a_step_that_cannot_be_compiled_runs_eagerly_and_says_so(tmp_path):
+    plain, observation = controller_and_observation()
+    controller = Sorted(panda, plain.estimator, plain.goals)
+    with pytest.raises(UnknownOperationError, match=r"operation aten.sort.default of the step"):
+        export_step(controller, observation, tmp_path)
+    with pytest.warns(UserWarning, match="run uncompiled and slower: operation aten.sort"):
         runner = open_step(controller, observation, tmp_path)
     state = controller.initial_state(observation.joint_position)
     expected, _ = controller.step(state, observation)
     np.testing.assert_array_equal(runner.step(), expected.joint_velocity.numpy())
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_missing_compiler_is_noticed():
-    from torch._inductor import config, cpp_builder
-
-    cpp_builder.cpp_compiler_search.cache_clear()
-    with (
-        config.patch({"cpp.cxx": ("no-such-compiler",)}),
-        pytest.raises(NoCompilerError, match=r"no C\+\+ compiler found: install g\+\+"),
-    ):
-        export_module._require_compiler()
-    cpp_builder.cpp_compiler_search.cache_clear()
+    assert not list(tmp_path.glob("step-*"))
 
 
 @pytest.mark.parametrize("content", [b"", b"no archive"])
 def test_a_foreign_file_is_refused(tmp_path, content):
     path = tmp_path / "step.pt2"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"step.pt2 was not written by export_step"):
+    with pytest.raises(ValueError, match=r"step.pt2 is no package of export_torch_package"):
         PackageRunner(path)
 
 
@@ -212,7 +268,7 @@ def test_a_damaged_package_is_refused(tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no package .*step.pt2"):
+    with pytest.raises(FileNotFoundError, match=r"no compiled step .*step.pt2"):
         PackageRunner(tmp_path / "step.pt2")
 
 
@@ -229,7 +285,7 @@ def test_a_package_tells_all_it_takes_to_call_it(monkeypatch, tmp_path, dtype, b
     step = PackedStep(controller.to(dtype), observation)
     (path := tmp_path / "step.pt2").touch()
     says = package_module.describe(step, observation)
-    monkeypatch.setattr(package_module, "_open", lambda path: (step, says))
+    monkeypatch.setattr(package_module, "_metadata", lambda path: (says, step))
     kept, example = load(path), step.example(observation)
     for ours, theirs in zip(step.layouts, kept.layouts, strict=True):
         assert (theirs.fields, theirs.batch) == (ours.fields, batch)
@@ -238,120 +294,37 @@ def test_a_package_tells_all_it_takes_to_call_it(monkeypatch, tmp_path, dtype, b
     torch.testing.assert_close(kept.example, example.observation, rtol=0, atol=0)
 
 
-@pytest.fixture(scope="module")
-def package(tmp_path_factory) -> Path:
-    with shapes_unchecked():
-        controller, observation = controller_and_observation()
-        return export_step(controller, observation, tmp_path_factory.mktemp("packages"))
+@pytest.mark.slow
+def test_ten_thousand_steps_equal_the_eager_ones(observed, compiled):
+    assert_equal_steps(*observed, load(compiled).run, 10_000)
 
 
 @pytest.mark.slow
-class TestPackage:
-    """Built once, in a minute or two."""
-
-    def test_it_equals_the_eager_step(self, package):
-        assert_equal_steps(*controller_and_observation(), load(package).run, 10_000)
-
-    def test_it_is_built_once(self, package):
-        built = package.stat().st_mtime_ns
-        controller, observation = controller_and_observation(panda.ready + 0.1)
-        assert export_step(controller, observation, package.parents[1]) == package
-        assert package.stat().st_mtime_ns == built
-        assert list(package.parents[1].iterdir()) == [package.parent]
-
-    def test_it_needs_no_compiler_once_it_is_there(self, package, monkeypatch):
-        def missing():
-            raise NoCompilerError("no C++ compiler found")
-
-        monkeypatch.setattr(export_module, "_require_compiler", missing)
-        runner = open_step(*controller_and_observation(), package.parents[1])
-        assert isinstance(runner, PackageRunner)
-        eager = EagerRunner(*controller_and_observation())
-        for _ in range(20):
-            np.testing.assert_allclose(runner.step(), eager.step(), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(runner.command("s"), eager.command("s"), atol=1e-12)
-
-    def test_it_opens_within_a_tenth_of_a_second(self, package):
-        controller, observation = controller_and_observation()
-        seconds = []
-        for _ in range(5):
-            began = time.process_time()
-            open_step(controller, observation, package.parents[1]).step()
-            seconds.append(time.process_time() - began)
-        assert min(seconds) < 0.1
-
-    def test_it_allocates_nothing(self, package):
-        runner = open_step(*controller_and_observation(), package.parents[1])
-        velocity = runner.step()
-        address = velocity.ctypes.data
-        with torch.profiler.profile(profile_memory=True) as profile:
-            assert runner.step() is velocity
-        assert velocity.ctypes.data == address
-        assert not [event for event in profile.events() or () if event.cpu_memory_usage > 0]
-
-    def test_it_starts_again_anywhere(self, package):
-        runners = [
-            EagerRunner(*controller_and_observation()),
-            open_step(*controller_and_observation(), package.parents[1]),
-        ]
-        q = panda.ready.numpy() + 0.2
-        for runner in runners:
-            runner.step()
-            runner.start(q)
-            runner.observation["joint_position"][:] = np.nan  # so it needs what it remembers
-            for _ in range(3):
-                runner.step()
-        np.testing.assert_allclose(
-            runners[0].command("twist"), runners[1].command("twist"), rtol=0, atol=1e-12
-        )
-
-    def test_it_remembers_its_layout_and_first_state(self, package):
-        step = PackedStep(*controller_and_observation())
-        kept = load(package)
-        for ours, theirs in zip(step.layouts, kept.layouts, strict=True):
-            assert (theirs.fields, theirs.batch) == (ours.fields, ours.batch)
-        assert torch.equal(kept.first_state, step.first_state)
-
-    def test_one_of_another_machine_is_refused(self, package, monkeypatch):
-        monkeypatch.setattr(torch, "__version__", "1.0")
-        with pytest.raises(ValueError, match=r"built for torch 2.*, but this is torch 1\.0"):
-            load(package)
-
-    def test_a_program_without_this_library_runs_it(self, package, tmp_path):
-        blocked = (
-            "import sys, runpy; sys.modules['hrc_learn'] = None; "
-            "del sys.argv[0]; "
-            "runpy.run_path(sys.argv[0], run_name='__main__')"
-        )
-        program = ROOT / "docs" / "run_exported_step.py"
-        done = subprocess.run(
-            [sys.executable, "-c", blocked, program, package],
-            capture_output=True,
-            text=True,
-            cwd=tmp_path,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
-        assert done.returncode == 0, done.stderr
-        assert_same_run(done.stdout, package)
-
-    def test_a_program_in_cpp_runs_it(self, package, tmp_path):
-        if shutil.which("cmake") is None:
-            pytest.skip("needs cmake")
-        source = ROOT / "docs" / "run_exported_step"
-        prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
-        subprocess.run(["cmake", "-S", source, "-B", tmp_path, prefix], check=True)
-        subprocess.run(["cmake", "--build", tmp_path], check=True)
-        done = subprocess.run(
-            [tmp_path / "run_exported_step", package], capture_output=True, text=True
-        )
-        assert done.returncode == 0, done.stderr
-        assert_same_run(done.stdout, package)
+def test_a_torch_package_runs_without_this_library(observed, compiled, tmp_path):
+    """Built in a minute or two."""
+    package = export_torch_package(*observed, tmp_path / "step.pt2")
+    assert_equal_steps(*observed, load(package).run, 100)
+    blocked = (
+        "import sys, runpy; sys.modules['hrc_learn'] = None; "
+        "del sys.argv[0]; "
+        "runpy.run_path(sys.argv[0], run_name='__main__')"
+    )
+    program = ROOT / "docs" / "run_exported_step.py"
+    done = subprocess.run(
+        [sys.executable, "-c", blocked, program, package],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert_same_run(done.stdout, compiled, observed[1])
 
 
-def assert_same_run(printed: str, package: Path) -> None:
+def assert_same_run(printed: str, package: Path, observation: Observation) -> None:
     """An example of the documentation printed where our runner moves the joints to."""
     runner = PackageRunner(package)
-    runner.observe(controller_and_observation()[1])
+    runner.observe(observation)
     q = runner.observation["joint_position"]
     start = q.copy()
     for _ in range(1000):

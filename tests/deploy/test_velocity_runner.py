@@ -48,7 +48,6 @@ def test_a_field_that_there_is_not_is_named():
         EagerRunner(STEP, EXAMPLE).set_state("velocity", np.zeros(7))
 
 
-@pytest.mark.slow
 def test_the_exported_step_equals_the_eager_one(tmp_path):
     runners = [EagerRunner(STEP, EXAMPLE), PackageRunner(export_step(STEP, EXAMPLE, tmp_path))]
     rng, q = np.random.default_rng(0), READY.copy()

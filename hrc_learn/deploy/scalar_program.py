@@ -1,0 +1,463 @@
+"""A traced step as straight-line arithmetic on single numbers.
+
+A tensor of the trace is replaced by a tensor of value numbers, one for each of its elements.
+PyTorch itself then does all that only moves elements (views, slices, concatenations), and the
+arithmetic that is left is one instruction an element. Equal instructions are kept once, and
+those of constants are carried out here.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, final
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.export import ExportedProgram
+from torch.utils import _pytree
+
+aten = torch.ops.aten
+
+
+class UnknownOperationError(NotImplementedError):
+    """A step uses an operation of PyTorch that has no machine code here."""
+
+
+type Instruction = tuple[Any, ...]
+"""Name of an operation, then the numbers of its operands.
+
+`("input", vector, row, element)` and `("constant", value)` have no operands.
+"""
+
+BOOLEAN = frozenset({"gt", "lt", "ge", "le", "eq", "ne", "and", "or", "not"})
+"""Operations with a truth value as their result, besides selections of truth values."""
+
+
+# Complements of comparisons, true as well if a number is NaN.
+_COMPLEMENTS = {"gt": "not gt", "lt": "not lt", "ge": "not ge", "le": "not le", "eq": "ne"}
+
+
+@final
+class ScalarProgram:
+    """Straight-line program of one step.
+
+    Attributes:
+        instructions: Each has operands before itself.
+        boolean: For each instruction, whether its result is a truth value.
+        results: For each mutated vector, the value number of each row.
+    """
+
+    def __init__(self, dtype: torch.dtype):
+        """Begin an empty program whose numbers are of one floating-point type."""
+        self.instructions: list[Instruction] = []
+        self.boolean: list[bool] = []
+        self.results: dict[str, list[int]] = {}
+        self.number = np.dtype(str(dtype).removeprefix("torch.")).type
+        self._known: dict[Instruction, int] = {}
+
+    def constant(self, value: float | bool) -> int:
+        """Value number of a constant."""
+        if isinstance(value, bool):
+            return self._add(("constant", value), boolean=True)
+        # `repr` keeps the sign of zero apart, and NaN equal to itself.
+        return self._add(("constant", repr(float(self.number(value)))), boolean=False)
+
+    def input(self, vector: str, row: int, element: int) -> int:
+        """Value number of an input."""
+        return self._add(("input", vector, row, element), boolean=False)
+
+    def emit(self, name: str, *operands: int) -> int:
+        """Value number of an operation on values."""
+        if name == "select":
+            condition, yes, no = operands
+            condition = self.as_truth(condition)
+            if yes == no:
+                return yes
+            boolean = self.boolean[yes] and self.boolean[no]
+            if not boolean:
+                yes, no = self.as_number(yes), self.as_number(no)
+            if self.instructions[condition][0] == "constant":
+                return yes if self.instructions[condition][1] else no
+            return self._add((name, condition, yes, no), boolean)
+        if name in ("and", "or", "not"):
+            operands = tuple(map(self.as_truth, operands))
+        else:
+            operands = tuple(map(self.as_number, operands))
+        if all(self.instructions[x][0] == "constant" for x in operands):
+            return self._folded(name, operands)
+        if name == "not" and (
+            complement := _COMPLEMENTS.get(self.instructions[operands[0]][0])
+        ):
+            return self._add((complement, *self.instructions[operands[0]][1:]), boolean=True)
+        for one in operands if name == "mul" else operands[1:] if name == "div" else ():
+            if self.instructions[one] == ("constant", "1.0"):
+                return operands[1] if one == operands[0] else operands[0]
+        return self._add((name, *operands), name in BOOLEAN)
+
+    def as_number(self, x: int) -> int:
+        """A truth value as 1 or 0; numbers are returned unchanged."""
+        if not self.boolean[x]:
+            return x
+        return self.emit("select", x, self.constant(1.0), self.constant(0.0))
+
+    def as_truth(self, x: int) -> int:
+        """Truth value of a number."""
+        return x if self.boolean[x] else self.emit("ne", x, self.constant(0.0))
+
+    def value(self, x: int) -> float | bool:
+        """Value of a constant.
+
+        Raises:
+            UnknownOperationError: The value is not a constant.
+        """
+        name, value, *_ = self.instructions[x]
+        if name != "constant":
+            raise UnknownOperationError(f"a constant is needed in place of {name}")
+        return value if isinstance(value, bool) else float(value)
+
+    def needed(self) -> list[int]:
+        """Value numbers that the results depend on, in order."""
+        used = {x for rows in self.results.values() for x in rows}
+        for x in range(len(self.instructions) - 1, -1, -1):
+            if x in used:
+                used.update(operands(self.instructions[x]))
+        return sorted(used)
+
+    def _add(self, instruction: Instruction, boolean: bool) -> int:
+        known = self._known.get(instruction)
+        if known is None:
+            known = self._known[instruction] = len(self.instructions)
+            self.instructions.append(instruction)
+            self.boolean.append(boolean)
+        return known
+
+    def _folded(self, name: str, operands: Sequence[int]) -> int:
+        values = [self.value(x) for x in operands]
+        dtype = torch.float64 if self.number is np.float64 else torch.float32
+        tensors = [
+            torch.tensor(x, dtype=torch.bool if isinstance(x, bool) else dtype) for x in values
+        ]
+        return self.constant(_CALCULATION[name](*tensors).item())
+
+
+def operands(instruction: Instruction) -> tuple[int, ...]:
+    """Value numbers that an instruction reads."""
+    return () if instruction[0] in ("input", "constant") else instruction[1:]
+
+
+_CALCULATION: dict[str, Callable[..., Tensor]] = {
+    "add": torch.add, "sub": torch.sub, "mul": torch.mul, "div": torch.div,
+    "neg": torch.neg, "abs": torch.abs, "sqrt": torch.sqrt, "trunc": torch.trunc,
+    "floor": torch.floor, "ceil": torch.ceil, "round": torch.round,
+    "sin": torch.sin, "cos": torch.cos, "exp": torch.exp, "log": torch.log,
+    "tanh": torch.tanh, "asin": torch.asin, "acos": torch.acos, "atan": torch.atan,
+    "atan2": torch.atan2, "pow": torch.pow, "copysign": torch.copysign,
+    "max": torch.maximum, "min": torch.minimum,
+    "gt": torch.gt, "lt": torch.lt, "ge": torch.ge, "le": torch.le, "eq": torch.eq,
+    "ne": torch.ne, "and": torch.logical_and, "or": torch.logical_or,
+    "not": torch.logical_not,
+}  # fmt: skip
+"""Operations of instructions; both operands of each are of one type."""
+
+
+def _operations(names: str) -> dict[Any, str]:
+    return {getattr(aten, name): name for name in names.split()}
+
+
+# PyTorch's names of operations on each element, where they differ from ours.
+_SYNONYMS = {
+    "maximum": "max", "clamp_min": "max", "minimum": "min", "clamp_max": "min",
+    "bitwise_and": "and", "logical_and": "and", "__and__": "and",
+    "bitwise_or": "or", "logical_or": "or", "__or__": "or",
+    "bitwise_not": "not", "logical_not": "not", "where": "select",
+}  # fmt: skip
+_ELEMENTWISE = {
+    operation: _SYNONYMS.get(name, name)
+    for operation, name in _operations(
+        "add sub mul div neg abs sqrt trunc floor ceil round sin cos exp log tanh asin acos "
+        "atan atan2 copysign maximum clamp_min minimum clamp_max gt lt ge le eq ne bitwise_and "
+        "logical_and __and__ bitwise_or logical_or __or__ bitwise_not logical_not where"
+    ).items()
+}
+# Operations that move elements and calculate nothing: PyTorch does them on value numbers.
+_MOVES = {operator.getitem} | set(
+    _operations(
+        "alias broadcast_tensors cat clone copy detach detach_ diagonal expand expand_as fill_ "
+        "flatten flip index index_select lift_fresh_copy mT movedim permute repeat reshape "
+        "roll select select_scatter slice slice_scatter split split_with_sizes squeeze stack t "
+        "transpose unbind unflatten unsqueeze view"
+    )
+)
+# Operations of shapes and constants alone.
+_FILLS = set(_operations("arange eye full ones scalar_tensor zeros"))
+
+
+def scalar_program(program: ExportedProgram, dtype: torch.dtype) -> ScalarProgram:
+    """Unroll a traced step into instructions of its first batch element.
+
+    Args:
+        program: Trace of a step on vectors of shape (rows, *batch), without a batch or with a
+            small one.
+        dtype: Type of its numbers.
+
+    Raises:
+        UnknownOperationError: An operation is not known here, or an arm of the batch depends
+            on another.
+    """
+    result = ScalarProgram(dtype)
+    with torch.no_grad():
+        written = _Unroller(result, program).run()
+    for name, values in written.items():
+        result.results[name] = values.reshape(len(values), -1)[:, 0].tolist()
+    for x in result.needed():
+        name, *where = result.instructions[x]
+        if name == "input" and where[2] != 0:
+            raise UnknownOperationError(f"an arm of the batch reads {where[0]} of another")
+    return result
+
+
+@final
+class _Unroller:
+    """Walk over the nodes of a trace."""
+
+    def __init__(self, result: ScalarProgram, program: ExportedProgram):
+        self.result, self.program = result, program
+        self.values: dict[Any, Any] = {}
+
+    def run(self) -> dict[str, Tensor]:
+        """Value numbers that the step writes into its inputs."""
+        signature = self.program.graph_signature
+        stored: dict[str, Any] = self.program.state_dict | self.program.constants
+        names = dict(signature.inputs_to_parameters) | dict(signature.inputs_to_buffers)
+        names |= dict(signature.inputs_to_lifted_tensor_constants)
+        written: dict[str, Tensor] = {}
+        nodes: Any = self.program.graph.nodes
+        for node in nodes:
+            if node.op == "placeholder" and node.name in names:
+                self.values[node] = self._constants(stored[names[node.name]])
+            elif node.op == "placeholder":
+                self.values[node] = self._inputs(node.name, node.meta["val"].shape)
+            elif node.target is aten.copy_.default:
+                target, source = node.args
+                written[target.name] = self.values[source]
+            elif node.op == "call_function":
+                self.values[node] = self._called(node)
+        return written
+
+    def _constants(self, x: Tensor) -> Tensor:
+        values = x.detach().flatten().tolist()
+        kept = [self.result.constant(v if x.dtype == torch.bool else float(v)) for v in values]
+        return torch.tensor(kept, dtype=torch.int64).reshape(x.shape)
+
+    def _inputs(self, name: str, shape: Sequence[int]) -> Tensor:
+        rows, elements = shape[0], math.prod(shape[1:])
+        kept = [self.result.input(name, row, k) for row in range(rows) for k in range(elements)]
+        return torch.tensor(kept, dtype=torch.int64).reshape(tuple(shape))
+
+    def _called(self, node: Any) -> Any:
+        args, keywords = _pytree.tree_map_only(
+            torch.fx.Node, lambda x: self.values[x], (list(node.args), dict(node.kwargs))
+        )
+        operation: Any = getattr(node.target, "overloadpacket", node.target)
+        if operation in _ELEMENTWISE:
+            if "alpha" in keywords:
+                args[1] = self._each("mul", args[1], keywords.pop("alpha"))
+            if keywords:
+                raise UnknownOperationError(f"{node.target} with {', '.join(keywords)}")
+            return self._each(_ELEMENTWISE[operation], *args)
+        if operation in _MOVES:
+            return node.target(*args, **keywords)
+        if operation in _FILLS:
+            return self._constants(node.target(*args, **keywords))
+        method = getattr(self, f"aten_{operation.__name__.lstrip('_')}", None)
+        if method is None:
+            raise UnknownOperationError(f"operation {node.target} of the step is not known")
+        return method(*args, **keywords)
+
+    def _each(self, name: str, *args: Any) -> Tensor:
+        """An operation on each element, with broadcasting."""
+        tensors = torch.broadcast_tensors(*map(self._tensor, args))
+        rows = zip(*(x.flatten().tolist() for x in tensors), strict=True)
+        kept = [self.result.emit(name, *row) for row in rows]
+        return torch.tensor(kept, dtype=torch.int64).reshape(tensors[0].shape)
+
+    def _tensor(self, x: Any) -> Tensor:
+        return x if isinstance(x, Tensor) else torch.tensor(self.result.constant(x))
+
+    def _reduced(self, name: str, x: Tensor, dims: Any, keep: bool, first: Any) -> Tensor:
+        """A reduction of elements; `first` is the result of none."""
+        axes = list(range(x.ndim)) if dims in (None, []) else dims
+        axes = [axis % x.ndim for axis in ([axes] if isinstance(axes, int) else axes)]
+        others = [axis for axis in range(x.ndim) if axis not in axes]
+        shape = [x.shape[axis] for axis in others]
+        rows = x.permute(*others, *axes).reshape(math.prod(shape), -1).tolist()
+        kept = [self._joined(name, row or [self.result.constant(first)]) for row in rows]
+        if keep:
+            shape = [1 if axis in axes else x.shape[axis] for axis in range(x.ndim)]
+        return torch.tensor(kept, dtype=torch.int64).reshape(shape)
+
+    def _joined(self, name: str, row: list[int]) -> int:
+        """Reduction by halves: processors do independent operations at the same time."""
+        while len(row) > 1:
+            pairs = zip(row[::2], row[1::2], strict=False)
+            row = [self.result.emit(name, a, b) for a, b in pairs] + row[len(row) & ~1 :]
+        return row[0]
+
+    # Operations of PyTorch, by name; arguments as there.
+
+    def aten_sum(self, x: Tensor, dim: Any = None, keepdim: bool = False, **_: Any) -> Tensor:
+        return self._reduced("add", x, dim, keepdim, 0.0)
+
+    def aten_mean(self, x: Tensor, dim: Any = None, keepdim: bool = False, **_: Any) -> Tensor:
+        total = self.aten_sum(x, dim, keepdim)
+        return self._each("div", total, float(x.numel() // total.numel()))
+
+    def aten_amax(self, x: Tensor, dim: Any = (), keepdim: bool = False) -> Tensor:
+        return self._reduced("max", x, list(dim), keepdim, -math.inf)
+
+    def aten_amin(self, x: Tensor, dim: Any = (), keepdim: bool = False) -> Tensor:
+        return self._reduced("min", x, list(dim), keepdim, math.inf)
+
+    def aten_any(self, x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
+        return self._reduced("or", x, dim, keepdim, False)
+
+    def aten_all(self, x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
+        return self._reduced("and", x, dim, keepdim, True)
+
+    def aten_linalg_vector_norm(
+        self, x: Tensor, ord: float = 2, dim: Any = None, keepdim: bool = False, **_: Any
+    ) -> Tensor:
+        if ord == math.inf:
+            return self._reduced("max", self._each("abs", x), dim, keepdim, 0.0)
+        if ord != 2:
+            raise UnknownOperationError(f"norm of order {ord}")
+        return self._each("sqrt", self.aten_sum(self._each("mul", x, x), dim, keepdim))
+
+    def aten_softmax(self, x: Tensor, dim: int, *_: Any) -> Tensor:
+        weights = self._each("exp", self._each("sub", x, self.aten_amax(x, [dim], True)))
+        return self._each("div", weights, self.aten_sum(weights, dim, True))
+
+    def aten_argmax(self, x: Tensor, dim: int, keepdim: bool = False) -> Tensor:
+        return self._best("gt", x, dim, keepdim)
+
+    def aten_argmin(self, x: Tensor, dim: int, keepdim: bool = False) -> Tensor:
+        return self._best("lt", x, dim, keepdim)
+
+    def _best(self, better: str, x: Tensor, dim: int, keepdim: bool) -> Tensor:
+        """Position of the first best element along an axis; NaN is better than any number."""
+        first, *others = x.unbind(dim)
+        best, position = first, self._tensor(0.0).expand(first.shape)
+        for k, element in enumerate(others, start=1):
+            is_nan = self._each("ne", element, element)
+            replaces = self._each("or", self._each(better, element, best), is_nan)
+            replaces = self._each("and", replaces, self._each("eq", best, best))
+            best = self._each("select", replaces, element, best)
+            position = self._each("select", replaces, float(k), position)
+        return position.unsqueeze(dim) if keepdim else position
+
+    def aten_gather(self, x: Tensor, dim: int, index: Tensor) -> Tensor:
+        part = x[tuple(slice(None) if k == dim % x.ndim else slice(size)
+                       for k, size in enumerate(index.shape))]  # fmt: skip
+        result, *others = (element.unsqueeze(dim) for element in part.unbind(dim))
+        for k, element in enumerate(others, start=1):
+            result = self._each("select", self._each("eq", index, float(k)), element, result)
+        return result.expand(index.shape)
+
+    def aten_logsumexp(self, x: Tensor, dim: Any, keepdim: bool = False) -> Tensor:
+        most = self.aten_amax(x, dim, True)
+        infinite = self._each("eq", self._each("abs", most), math.inf)
+        shift = self._each("select", infinite, 0.0, most)
+        total = self.aten_sum(self._each("exp", self._each("sub", x, shift)), dim, True)
+        result = self._each("add", self._each("log", total), shift)
+        return result if keepdim else result.squeeze(dim)
+
+    def aten_clamp(self, x: Tensor, low: Any = None, high: Any = None) -> Tensor:
+        if low is not None:
+            x = self._each("max", x, low)
+        return x if high is None else self._each("min", x, high)
+
+    def aten_rsub(self, x: Tensor, other: Any) -> Tensor:
+        return self._each("sub", other, x)
+
+    def aten_addcmul(self, x: Tensor, a: Tensor, b: Tensor, *, value: float = 1) -> Tensor:
+        return self._each("add", x, self._each("mul", self._each("mul", a, value), b))
+
+    def aten_addcdiv(self, x: Tensor, a: Tensor, b: Tensor, *, value: float = 1) -> Tensor:
+        return self._each("add", x, self._each("div", self._each("mul", a, value), b))
+
+    def aten_lerp(self, start: Tensor, end: Tensor, weight: Any) -> Tensor:
+        step = self._each("mul", weight, self._each("sub", end, start))
+        return self._each("add", start, step)
+
+    def aten_linalg_vecdot(self, a: Tensor, b: Tensor, *, dim: int = -1) -> Tensor:
+        return self.aten_sum(self._each("mul", a, b), dim)
+
+    def aten_masked_fill(self, x: Tensor, mask: Tensor, value: Any) -> Tensor:
+        return self._each("select", mask, value, x)
+
+    def aten_reciprocal(self, x: Tensor) -> Tensor:
+        return self._each("div", 1.0, x)
+
+    def aten_rsqrt(self, x: Tensor) -> Tensor:
+        return self._each("div", 1.0, self._each("sqrt", x))
+
+    def aten_sign(self, x: Tensor) -> Tensor:
+        below = self._each("select", self._each("lt", x, 0.0), -1.0, x)  # zero and NaN stay
+        return self._each("select", self._each("gt", x, 0.0), 1.0, below)
+
+    def aten_sigmoid(self, x: Tensor) -> Tensor:
+        exponential = self._each("exp", self._each("neg", x))
+        return self._each("div", 1.0, self._each("add", exponential, 1.0))
+
+    def aten_pow(self, x: Tensor, exponent: Any) -> Tensor:
+        if exponent == 0.5:
+            return self._each("sqrt", x)
+        if isinstance(exponent, int | float) and exponent in (2, 3, 4):
+            square = self._each("mul", x, x)
+            rest = {2: None, 3: x, 4: square}[exponent]
+            return square if rest is None else self._each("mul", square, rest)
+        return self._each("pow", x, exponent)
+
+    def aten_square(self, x: Tensor) -> Tensor:
+        return self._each("mul", x, x)
+
+    def aten_isnan(self, x: Tensor) -> Tensor:
+        return self._each("ne", x, x)
+
+    def aten_isfinite(self, x: Tensor) -> Tensor:
+        return self._each("lt", self._each("abs", x), math.inf)
+
+    def aten_to(self, x: Tensor, dtype: Any = None, *_: Any, **__: Any) -> Tensor:
+        if not isinstance(dtype, torch.dtype) or not x.numel():
+            return x
+        convert = self.result.as_truth if dtype == torch.bool else self.result.as_number
+        kept = [convert(v) for v in x.flatten().tolist()]
+        values = torch.tensor(kept, dtype=torch.int64).reshape(x.shape)
+        if dtype == torch.bool or dtype.is_floating_point:
+            return values
+        # Whole numbers are kept as floating-point ones, exact to 2^53.
+        return self._each("trunc", values)
+
+    def aten_full_like(self, x: Tensor, value: Any, **_: Any) -> Tensor:
+        return self._tensor(value).expand(x.shape).clone()
+
+    def aten_zeros_like(self, x: Tensor, **_: Any) -> Tensor:
+        return self.aten_full_like(x, 0.0)
+
+    def aten_ones_like(self, x: Tensor, **_: Any) -> Tensor:
+        return self.aten_full_like(x, 1.0)
+
+    def aten_new_zeros(self, _: Tensor, size: Sequence[int], **__: Any) -> Tensor:
+        return self._tensor(0.0).expand(tuple(size)).clone()
+
+    def aten_pad(
+        self, x: Tensor, pad: Iterable[int], mode: str = "constant", value: Any = None
+    ) -> Tensor:
+        filled = self.result.constant(float(value or 0.0))
+        return torch.nn.functional.pad(x, list(pad), mode, value=filled)
+
+    def aten_assert_tensor_metadata(self, *_: Any, **__: Any) -> None:
+        """A check of the trace, which was passed."""
