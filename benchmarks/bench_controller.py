@@ -73,7 +73,7 @@ class Args:
     repeats: int = 500
     """Repeats of each call."""
     compile: bool = True
-    """Measure compiled code as well, where there is a C++ compiler."""
+    """Measure compiled code as well."""
     packages: Path | None = None
     """Folder in which compiled steps are kept; default: the user's cache."""
     json: Path | None = None

@@ -711,8 +711,8 @@ class Serve(WithDriver):
 
     The arm servoes to a marker that a simulated camera sees at 31 Hz; a real arm does move.
     Reported are the time from reading the joints to the command, the delay of each tick, and
-    the ticks that were missed. The first start compiles the step, in a minute or two, if there
-    is a C++ compiler (`--config step=eager`: not). With --ros2 it is a lifecycle node instead:
+    the ticks that were missed. The first start compiles the step, in about 10 s
+    (`--config step=eager`: not). With --ros2 it is a lifecycle node instead:
     goals, images and pushes come over topics, commands go to a stock controller.
 
         hrc serve --ros2 --robot /robot_description:tool0

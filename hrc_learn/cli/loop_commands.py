@@ -210,7 +210,7 @@ class _ServeSettings:
 
     site: ArmSite = field(default_factory=ArmSite)
     step: Literal["fastest", "eager"] = "fastest"
-    """Compile the step ahead of time if there is a C++ compiler, or do not."""
+    """Compile the step to machine code, or do not."""
     autostart: bool = True
     """Configure and activate the node at once; False: a launch file does."""
 

@@ -204,7 +204,7 @@ class NativeCode:
         if name == "neg":
             return [f"  %v{v} = fneg {kind} {a}"]
         if name == "not":
-            return [f"  %v{v} = xor {kind} {a}, {self._literal(1, kind)}"]
+            return [f"  %v{v} = xor {kind} {a}, {self._literal(True, kind)}"]
         if name == "select":
             return [f"  %v{v} = select {self._truth} {a}, {kind} {more[0]}, {kind} {more[1]}"]
         if name in ("max", "min"):
@@ -238,7 +238,7 @@ class NativeCode:
         kind = self._truth if self._program.boolean[x] else self._number
         return self._literal(self._program.value(x), kind)
 
-    def _literal(self, value: float, kind: str) -> str:
+    def _literal(self, value: float | bool, kind: str) -> str:
         if "i1" in kind:
             text, scalar = str(int(value)), "i1"
         else:

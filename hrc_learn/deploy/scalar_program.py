@@ -185,10 +185,10 @@ _ELEMENTWISE = {
 # Operations that move elements and calculate nothing: PyTorch does them on value numbers.
 _MOVES = {operator.getitem} | set(
     _operations(
-        "alias broadcast_tensors cat clone copy detach detach_ diagonal expand expand_as fill_ "
-        "flatten flip index index_select lift_fresh_copy mT movedim permute repeat reshape "
-        "roll select select_scatter slice slice_scatter split split_with_sizes squeeze stack t "
-        "transpose unbind unflatten unsqueeze view"
+        "alias broadcast_tensors cat clone copy copy_ detach detach_ diagonal expand expand_as "
+        "fill_ flatten flip index index_select lift_fresh_copy mT movedim permute repeat "
+        "reshape roll select select_scatter slice slice_scatter split split_with_sizes squeeze "
+        "stack t transpose unbind unflatten unsqueeze view"
     )
 )
 # Operations of shapes and constants alone.
@@ -240,7 +240,7 @@ class _Unroller:
                 self.values[node] = self._constants(stored[names[node.name]])
             elif node.op == "placeholder":
                 self.values[node] = self._inputs(node.name, node.meta["val"].shape)
-            elif node.target is aten.copy_.default:
+            elif node.target is aten.copy_.default and node.args[0].op == "placeholder":
                 target, source = node.args
                 written[target.name] = self.values[source]
             elif node.op == "call_function":
@@ -285,7 +285,9 @@ class _Unroller:
         return torch.tensor(kept, dtype=torch.int64).reshape(tensors[0].shape)
 
     def _tensor(self, x: Any) -> Tensor:
-        return x if isinstance(x, Tensor) else torch.tensor(self.result.constant(x))
+        if isinstance(x, Tensor):
+            return x
+        return torch.tensor(self.result.constant(x if isinstance(x, bool) else float(x)))
 
     def _reduced(self, name: str, x: Tensor, dims: Any, keep: bool, first: Any) -> Tensor:
         """A reduction of elements; `first` is the result of none."""
@@ -328,7 +330,7 @@ class _Unroller:
         return self._reduced("and", x, dim, keepdim, True)
 
     def aten_linalg_vector_norm(
-        self, x: Tensor, ord: float = 2, dim: Any = None, keepdim: bool = False, **_: Any
+        self, x: Tensor, ord: float | int = 2, dim: Any = None, keepdim: bool = False, **_: Any
     ) -> Tensor:
         if ord == math.inf:
             return self._reduced("max", self._each("abs", x), dim, keepdim, 0.0)
@@ -382,10 +384,14 @@ class _Unroller:
     def aten_rsub(self, x: Tensor, other: Any) -> Tensor:
         return self._each("sub", other, x)
 
-    def aten_addcmul(self, x: Tensor, a: Tensor, b: Tensor, *, value: float = 1) -> Tensor:
+    def aten_addcmul(
+        self, x: Tensor, a: Tensor, b: Tensor, *, value: float | int = 1
+    ) -> Tensor:
         return self._each("add", x, self._each("mul", self._each("mul", a, value), b))
 
-    def aten_addcdiv(self, x: Tensor, a: Tensor, b: Tensor, *, value: float = 1) -> Tensor:
+    def aten_addcdiv(
+        self, x: Tensor, a: Tensor, b: Tensor, *, value: float | int = 1
+    ) -> Tensor:
         return self._each("add", x, self._each("div", self._each("mul", a, value), b))
 
     def aten_lerp(self, start: Tensor, end: Tensor, weight: Any) -> Tensor:
@@ -405,8 +411,7 @@ class _Unroller:
         return self._each("div", 1.0, self._each("sqrt", x))
 
     def aten_sign(self, x: Tensor) -> Tensor:
-        below = self._each("select", self._each("lt", x, 0.0), -1.0, x)  # zero and NaN stay
-        return self._each("select", self._each("gt", x, 0.0), 1.0, below)
+        return self._each("sub", self._each("gt", x, 0.0), self._each("lt", x, 0.0))
 
     def aten_sigmoid(self, x: Tensor) -> Tensor:
         exponential = self._each("exp", self._each("neg", x))

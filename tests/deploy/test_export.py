@@ -17,11 +17,15 @@ from step_equality import assert_equal_steps, controller_and_observation
 from torch import Tensor
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import AdaptiveController, Observation
+from hrc_learn.controller import (
+    AdaptiveController,
+    Observation,
+    VelocityStep,
+    WantedVelocity,
+)
 from hrc_learn.deploy import (
     EagerRunner,
     PackageRunner,
-    UnknownOperationError,
     export_step,
     export_torch_package,
     open_step,
@@ -229,23 +233,25 @@ def test_batches_have_their_own_arrays():
     np.testing.assert_array_equal(runner.step(), expected.joint_velocity.numpy())
 
 
-class Sorted(AdaptiveController):
+class Sorted(VelocityStep):
     """A law with an operation that cannot be compiled."""
 
     def step(self, state, observation):
-        q = observation.joint_position
-        return super().step(state, replace(observation, joint_position=q + 0 * q.sort()[0]))
+        wanted = observation.joint_velocity.sort()[0]
+        return super().step(state, replace(observation, joint_velocity=wanted))
 
 
 def test_a_step_that_cannot_be_compiled_runs_eagerly_and_says_so(tmp_path):
-    plain, observation = controller_and_observation()
-    controller = Sorted(panda, plain.estimator, plain.goals)
-    with pytest.raises(UnknownOperationError, match=r"operation aten.sort.default of the step"):
-        export_step(controller, observation, tmp_path)
-    with pytest.warns(UserWarning, match="run uncompiled and slower: operation aten.sort"):
-        runner = open_step(controller, observation, tmp_path)
-    state = controller.initial_state(observation.joint_position)
-    expected, _ = controller.step(state, observation)
+    law = Sorted(panda)
+    example = WantedVelocity(
+        joint_position=panda.ready,
+        joint_velocity=torch.linspace(0.3, -0.3, 7, dtype=DOUBLE),
+        stop=torch.tensor(False),
+        dt=0.002,
+    )
+    with pytest.warns(UserWarning, match=r"uncompiled and slower: operation aten.sort.default"):
+        runner = open_step(law, example, tmp_path)
+    expected, _ = law.step(law.initial_state(panda.ready), example)
     np.testing.assert_array_equal(runner.step(), expected.joint_velocity.numpy())
     assert not list(tmp_path.glob("step-*"))
 
