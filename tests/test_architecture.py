@@ -121,6 +121,7 @@ ROS2 = {
 """Packages of ROS 2, from the registry or the system."""
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
+    "deploy": {"llvmlite"},
     "geometry": {"trimesh", "collada"},
     "kinematics": {"frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
