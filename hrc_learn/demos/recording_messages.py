@@ -18,10 +18,6 @@ from hrc_learn.demos.videos import Image, decode_image
 
 _JOINTS = {"position": "joint_positions", "velocity": "joint_velocities"}
 _JOINTS |= {"effort": "joint_efforts"}
-_VECTORS = {
-    ("force", "torque"): ("fx", "fy", "fz", "tx", "ty", "tz"),
-    ("linear", "angular"): ("vx", "vy", "vz", "wx", "wy", "wz"),
-}
 # Encodings of raw images: channels, and PyAV's name of the format.
 _PIXELS = {"rgb8": (3, "rgb24"), "bgr8": (3, "bgr24"), "8uc3": (3, "bgr24")}
 _PIXELS |= {"mono8": (1, "gray8"), "8uc1": (1, "gray8"), "yuv422_yuy2": (2, "yuyv422")}
@@ -89,13 +85,10 @@ def parts_of(name: str, message: Any) -> Iterator[Part]:
             yield f"{name}/command/joint_positions", tuple(message.joint_names), values
     elif has("data") and (has("encoding", "width") or has("format") or has("pts")):
         yield name, None, np.zeros(0)
-    elif inner := [part for part in ("pose", "wrench", "twist") if has(part)]:
-        yield from parts_of(name, getattr(message, inner[0]))
+    elif has("pose"):
+        yield from parts_of(name, message.pose)
     elif has("position", "orientation"):
         yield name, None, matrix_of(message.position, message.orientation)
-    elif vectors := [pair for pair in _VECTORS if has(*pair)]:
-        both = [getattr(message, part) for part in vectors[0]]
-        yield name, _VECTORS[vectors[0]], np.array([v for b in both for v in (b.x, b.y, b.z)])
     elif has("data") and not isinstance(message.data, (str, bytes)):
         values = np.atleast_1d(np.array(message.data))
         if values.dtype.kind in "fiub" and values.size and values.ndim == 1:

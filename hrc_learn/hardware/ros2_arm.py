@@ -49,8 +49,6 @@ class Ros2Config:
     """Longest wait for the first one [s]."""
     lag: float = 0.35
     """Largest distance of commanded positions from the measured ones [rad]."""
-    wrench: str = ""
-    """Topic of the force and torque at the tool, in its frame; empty: none."""
     gripper: str = ""
     """Topic of a gripper's position controller (Float64MultiArray); empty: no gripper."""
     gripper_joint: str = ""
@@ -101,7 +99,6 @@ class Ros2Arm:
         self.config = config = config or Ros2Config()
         self._chain, self._names, self.ignored = chain, chain.joint_names, 0
         self.session = Ros2Session("hrc_arm")
-        from geometry_msgs.msg import WrenchStamped
         from sensor_msgs.msg import JointState
         from std_msgs.msg import Float64MultiArray
         from trajectory_msgs.msg import JointTrajectory
@@ -109,7 +106,6 @@ class Ros2Arm:
         self._lock, self._changed = threading.Lock(), threading.Condition()
         self._state: ArmState | None = None
         self._offset, self.received, self._seen = math.inf, -math.inf, ()
-        self._wrench: np.ndarray | None = None
         self._velocity = np.zeros(len(self._names))
         self._goal: np.ndarray | None = None
         self._commanded_at = -math.inf
@@ -121,8 +117,6 @@ class Ros2Arm:
             if config.gripper
             else None
         )
-        if config.wrench:
-            node.create_subscription(WrenchStamped, config.wrench, self._on_wrench, quality())
         node.create_subscription(JointState, config.joint_states, self._on_state, quality())
         self._guard: subprocess.Popen | None = None
         self._dog = Watchdog(config.timeout, self.stop)
@@ -131,7 +125,7 @@ class Ros2Arm:
             self._await_controllers()
             if kind == "velocity":
                 longest = 1.5 * config.timeout
-                self._guard = start_guard(node, config.command, len(self._names), longest)
+                self._guard = start_guard(config.command, len(self._names), longest)
         except BaseException:
             self.session.close()
             raise
@@ -161,11 +155,6 @@ class Ros2Arm:
                     text = f"no controller listens on {publisher.topic_name}: is it active"
                     raise ConnectionError(f"{text} (ros2 control list_controllers)?")
                 time.sleep(0.02)
-
-    def _on_wrench(self, message: Any) -> None:
-        force, torque = message.wrench.force, message.wrench.torque
-        both = (force.x, force.y, force.z, torque.x, torque.y, torque.z)
-        self._wrench = np.array(both)
 
     def _on_state(self, message: Any) -> None:
         names, now = message.name, time.monotonic()
@@ -200,21 +189,12 @@ class Ros2Arm:
             joint_position=position,
             joint_velocity=velocity,
             gripper_width=float(width),
-            external_torque=self._torque(position),
         )
         with self._changed:
             # The quickest message so far tells how the robot's clock differs from ours.
             self._offset = min(self._offset, now - stamp)
             self._state, self.received = state, now
             self._changed.notify_all()
-
-    def _torque(self, position: np.ndarray) -> np.ndarray | None:
-        """External torques that the wrench at the tool stands for [N m]."""
-        if self._wrench is None:
-            return None
-        J = self._chain.jacobian(position).numpy()
-        R = self._chain.forward(position).matrix()[:3, :3].numpy()
-        return J.T @ np.concatenate([R @ self._wrench[:3], R @ self._wrench[3:]])
 
     def read(self) -> ArmState:
         """Return the newest state; `time` is that of its message [s].

@@ -134,11 +134,10 @@ def stamp_of(message: Any) -> float:
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
-def start_guard(node: Any, topic: str, joints: int, timeout: float) -> subprocess.Popen:
-    """The process of `guard_velocities`, once it watches.
+def start_guard(topic: str, joints: int, timeout: float) -> subprocess.Popen:
+    """The process of `guard_velocities`, once it hears the commands and is heard.
 
     Args:
-        node: Node of this process.
         topic: Topic of the velocity controller.
         joints: Number of its joints.
         timeout: Longest silence after a velocity [s].
@@ -147,15 +146,10 @@ def start_guard(node: Any, topic: str, joints: int, timeout: float) -> subproces
         ConnectionError: It does not start.
     """
     words = [sys.executable, str(Path(__file__)), topic, str(joints), str(timeout)]
-    process = subprocess.Popen(words)
-    name, end = f"hrc_guard_{process.pid}", time.monotonic() + _STARTUP
-    while name not in node.get_node_names():
-        if process.poll() is not None or time.monotonic() > end:
-            process.kill()
-            raise ConnectionError(
-                f"the guard of {topic} does not start: velocities are not safe"
-            )
-        time.sleep(0.02)
+    process = subprocess.Popen(words, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    if not process.stdout.readline():
+        raise ConnectionError(f"the guard of {topic} does not start: see its error above")
     return process
 
 
@@ -174,6 +168,13 @@ def guard_velocities(topic: str, joints: int, timeout: float) -> None:
 
     session.node.create_subscription(Float64MultiArray, topic, take, quality(reliable=True))
     zeros = session.node.create_publisher(Float64MultiArray, topic, quality(reliable=True))
+    end = time.monotonic() + _STARTUP
+    # Each time itself and another: the controller, and the process that commands it.
+    while zeros.get_subscription_count() < 2 or session.node.count_publishers(topic) < 2:
+        if time.monotonic() > end or os.getppid() != parent:
+            sys.exit(f"neither controller nor commands on {topic} for {_STARTUP:g} s")
+        time.sleep(0.02)
+    print("ready", flush=True)
     while os.getppid() == parent or newest["moving"]:
         time.sleep(timeout / 5)
         if newest["moving"] and time.monotonic() - newest["time"] > timeout:

@@ -92,10 +92,13 @@ class Publisher:
 
     def __init__(self, topic="/joint_states"):
         from sensor_msgs.msg import JointState
+        from std_msgs.msg import Float64MultiArray
 
         self.session, self._kind = Ros2Session("joints"), JointState
         node = self.session.node
         self._states = node.create_publisher(JointState, topic, quality(reliable=True))
+        command = Ros2Config().command
+        node.create_subscription(Float64MultiArray, command, lambda _: None, quality())
 
     def send(self, stamp, position, names=NAMES):
         message = self._kind(name=list(names), position=[float(x) for x in position])

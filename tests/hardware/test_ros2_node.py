@@ -116,6 +116,31 @@ def test_it_goes_to_a_goal_and_stops_when_the_robot_falls_silent(robot, node):
     assert np.isfinite(node.figures()["latency_p99_ms"])
 
 
+def test_images_with_a_marker_move_the_arm_towards_the_target(robot, node):
+    import cv2
+    from geometry_msgs.msg import Point, PointStamped
+    from rclpy.parameter import Parameter
+    from sensor_msgs.msg import CompressedImage
+
+    assert node.node.set_parameters([Parameter("marker", value=7.0)])[0].successful
+    assert node.start()
+    drawn = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image = np.full((480, 640), 255, np.uint8)
+    image[200:280, 300:380] = cv2.aruco.generateImageMarker(drawn, 7, 80)
+    data = cv2.imencode(".png", image)[1].tobytes()
+    peer, start = Peer(robot), robot.state.joint_position
+    target = Point(x=320.0, y=240.0, z=0.0)
+    peer.send(PointStamped, "/hrc_learn/target", point=target)
+
+    def moves():
+        peer.send(CompressedImage, "/hrc_learn/image/compressed", format="png", data=data)
+        return np.abs(robot.state.joint_position - start).max() > 0.01
+
+    until(moves)
+    assert node.stopped == ""
+    assert robot.violations == 0
+
+
 def test_a_missing_heartbeat_stops_it(robot, node):
     from rclpy.parameter import Parameter
 
