@@ -391,8 +391,6 @@ def _demo(name: str, args: Args) -> str:
 def _refusal(name: str) -> str:
     """Why the demo does not begin with an arm; empty where it does."""
     choice = ArmChoice(name)
-    if len(arm(name).joint_names) < 6:
-        return "five joints"
     try:
         Workplace.of(choice.work_arm())
     except UnreachableError:

@@ -226,13 +226,13 @@ def _described(name: str, choice: Mapping[str, Any]) -> Arm:
         )
     source = _sources()[name]
     path = _locate(name, source["package"], source["file"])
-    kept = ("base", "tip", "limits", "ready", "base_turn")
+    kept = ("base", "tip", "limits", "ready")
     settings = {key: source[key] for key in kept if key in source}
     if tool := source.get("tool"):
         settings["tool"] = torch.from_numpy(turn_to(np.array(tool["approach"])))
         settings["tool"][:3, 3] = torch.tensor(tool["origin"])
     settings |= choice
-    if not choice.keys() & {"base", "tip", "tool"}:
+    if not choice.keys() & {"base", "tip", "tool", "base_turn"}:
         settings["body"] = _fitted_body(name, path)
     return arm_from_file(path, name=name, **settings)
 
@@ -299,6 +299,8 @@ def _equipped(choice: ArmChoice) -> Arm:
     if found.is_franka:
         return found
     hand, mount = _sources().get(choice.name, {}).get("hand", {}), None
+    if "base" in hand:
+        found = _described(choice.name, {"base_turn": hand["base"]})
     if "origin" in hand:
         c, s = math.cos(hand["turn"]), math.sin(hand["turn"])
         mount = found.tcp.clone()

@@ -51,7 +51,7 @@ _SCALES = (1.0, 0.85, 0.7, 0.55)
 # the table, and its marker is seen from the far side.
 _BESIDE, _ON_THE_WAY = (1.4, 1.6, 1.2), (0.55, 0.65)
 _HOVER_BESIDE, _CAMERA_BESIDE = 0.85, 1.5
-_SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (1.1, True))
+_SCALED = (*((scale, False) for scale in _SCALES), (0.78, True), (0.7, True), (0.95, True))
 # All lengths below are those of a cell for the Franka hand; a smaller hand makes them smaller.
 # Distance from the middle of the table to reach in view of the camera [m]: with a margin to
 # spare, then no further than objects are put.
@@ -521,11 +521,14 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
         at_home = robot.postures(workplace.home())[:_POSTURES]
     except UnreachableError:
         return None
-    paths = [_path_to_shelf(workplace, name) for name in workplace.shelf_names()]
     clearances, level_at = workplace.arm_clearances, workplace.level_at
-    to_shelves = torch.stack(
-        [path_quality(robot, clearances, path, level_at, at_home) for path in paths]
-    ).amin(0)
+    to_shelves = torch.ones(len(at_home), dtype=torch.float64)
+    for name in workplace.shelf_names():
+        path = _path_to_shelf(workplace, name)
+        quality = path_quality(robot, clearances, path, level_at, at_home)
+        to_shelves = torch.minimum(to_shelves, quality)
+        if not bool((to_shelves > 0).any()):
+            return None
     best: CellLayout | None = None
     for k in to_shelves.argsort(descending=True).tolist()[:_TRIED]:
         home, quality = at_home[k], float(to_shelves[k])
