@@ -172,7 +172,7 @@ def _measured(
         "rmse": float(error.square().mean().sqrt()),
         "rmse_of_range": float((error / span).square().mean().sqrt()),
         "undecodable_share": float((~made.isfinite()).flatten(1).any(1).double().mean()),
-        "beyond_limits": float((excess.amax((0, 1)) / span[smooth]).clamp(min=0).amax()),
+        "beyond_limits": float((excess.amax((0, 1)) / span[smooth] - 1e-9).clamp(min=0).amax()),
         "seam": float(gaps[0]),
         "seam_velocity": float(gaps[1]),
     }

@@ -29,9 +29,9 @@ LONGEST = 3.0
 """Bound on the logarithm of a duration relative to the mean: a factor of 20."""
 TINY = 1e-24
 """Smallest variance, of columns that never move."""
-TURN = 3.0
+TURN = 6.0
 """Distance of the third control point from a limit relative to that of the second beyond it:
-motions stay within if the second is no farther beyond than 1.6 times the margin."""
+motions stay within if the second is no farther beyond than four times the margin."""
 KNOWN_STATE = 2
 DEGREE = 3
 

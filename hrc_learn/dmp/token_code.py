@@ -29,7 +29,7 @@ PRIOR = 20.0
 """Weight of a Laplace distribution against the counts of an integer, in vectors."""
 LEAST = 0.02
 """Mean magnitude of an integer that was always zero."""
-HEADROOM = 1.5
+HEADROOM = 2.0
 """Largest magnitude of an integer relative to those seen."""
 
 

@@ -323,10 +323,11 @@ class MotionTokenizer(nn.Module):
         wrong = {i for row in rows for i in row if not 0 <= i < self.vocabulary_size}
         if wrong:
             raise ValueError(f"token {min(wrong)} is not in 0 to {self.vocabulary_size - 1}")
-        integers = torch.zeros(len(rows), self._code.size, dtype=torch.float64)
-        for i, row in enumerate(rows):
+        integers = np.zeros((len(rows), self._code.size))
+        for row, found in zip(rows, integers, strict=True):
             for k, sign, low, _ in self._code.decode(row)[0]:
-                integers[i, k] = sign * low
+                found[k] = sign * low
+        integers = torch.from_numpy(integers).to(self.levels)
         return integers.reshape(*batch, -1)
 
     def _stepped(self, jumps: Tensor, s: Tensor, start: Tensor) -> Float[Tensor, "*batch T S"]:
