@@ -83,16 +83,11 @@ class Segmentation:
                 known = ", ".join([BASE, *objects])
                 raise ValueError(f"segments: no frame {frame!r}; there are {known}")
         for demo in demos:
-            cuts = self.cuts.get(demo.episode, ())
-            if len(cuts) != len(self.frames) + 1 or cuts[-1] >= len(demo):
+            cuts, n = self.cuts.get(demo.episode, ()), len(self.frames) + 1
+            if len(cuts) != n or cuts[-1] >= len(demo) or min(np.diff(cuts)) < _SHORTEST:
                 raise ValueError(
-                    f"segments: episode {demo.episode} needs {len(self.frames) + 1} cuts below "
-                    f"{len(demo)}, has {list(cuts)}"
-                )
-            if min(np.diff(cuts)) < _SHORTEST:
-                raise ValueError(
-                    f"segments: those of episode {demo.episode} need {_SHORTEST} frames or "
-                    f"more each, but are cut at {list(cuts)}"
+                    f"segments: episode {demo.episode} needs {n} cuts below {len(demo)}, "
+                    f"{_SHORTEST} frames or more apart, but has {list(cuts)}"
                 )
 
 
@@ -171,15 +166,12 @@ def _best_frame(ends: Pose, objects: Mapping[str, Pose]) -> str:
 
 def frame_of(objects: Mapping[str, Pose], name: str, like: Pose) -> Pose:
     """Pose of a frame in the base frame, for each element of a batch of poses."""
+    still = torch.zeros_like(like.orientation)
+    still[..., 0] = 1.0
     if name == BASE:
-        place, turned = torch.zeros_like(like.position), None
-    else:
-        pose = objects[name.removesuffix(POSITION_ONLY)]
-        place, turned = pose.position, pose.orientation
-    if turned is None or name.endswith(POSITION_ONLY):
-        turned = torch.zeros_like(like.orientation)
-        turned[..., 0] = 1.0
-    return Pose(place, turned)
+        return Pose(torch.zeros_like(like.position), still)
+    pose = objects[name.removesuffix(POSITION_ONLY)]
+    return Pose(pose.position, still) if name.endswith(POSITION_ONLY) else pose
 
 
 def stacked(poses: Sequence[Pose]) -> Pose:
@@ -244,6 +236,10 @@ class _Segment:
     first: Float[Tensor, "n"]
     last: Float[Tensor, "n"]
 
+    def span(self, main: Int[Tensor, "B"]) -> Float[Tensor, "2 B 1"]:
+        """First frame and number of further frames in the main demonstrations."""
+        return torch.stack([self.first, self.last - self.first])[:, main, None]
+
     def mixed(self, weights: Float[Tensor, "B n"], speed: Float[Tensor, "B"]) -> PoseDMP:
         """Primitives with mixed coordinates and durations."""
         motion = self.dmp.motion
@@ -255,6 +251,12 @@ class _Segment:
             timestamps=torch.linspace(0, 1, 2).to(motion.timestamps),
         )
         return self.dmp.with_motion(mixed, self.dmp.reference[:1].expand(len(x), 4))
+
+
+def _turned(frame: Pose, twist: Float[Tensor, "B 6"]) -> Float[Tensor, "B 6"]:
+    """A twist in the axes of the parent of a frame."""
+    parts = twist.unflatten(-1, (2, 3))
+    return quaternion.rotate(frame.orientation[:, None], parts).flatten(-2)
 
 
 @torch.no_grad()
@@ -399,35 +401,28 @@ class MotionSource:
         total = torch.stack([dmp.duration for dmp in mixed]).sum(0)
         length = (total * self.fps - 1e-9).ceil().long() + 1
         ticks = torch.arange(int(length.max()), dtype=torch.float64) / self.fps
-        begin = torch.zeros_like(total)
-        twist, posture, made = torch.zeros(len(total), 6).double(), None, []
+        begin, twist = torch.zeros_like(total), torch.zeros(len(total), 6).double()
+        ends: dict[str, Any] = {}
+        columns: list[Tensor] = []
         for segment, dmp in zip(self.segments, mixed, strict=True):
-            frame = frame_of(draws.scene, segment.frame, start)
-            back = frame.inverse()
-            turned = quaternion.rotate(back.orientation[:, None], twist.unflatten(-1, (2, 3)))
-            ends = {} if posture is None else {"start_body": posture}
-            options = {"start": back @ start, "start_velocity": turned.flatten(-2), **ends}
-            clock = torch.minimum((ticks - begin[:, None]).clamp(min=0), dmp.duration[:, None])
-            path = dmp.rollout(clock, **options)
-            last = dmp.rollout(dmp.duration[:, None], **options)
-            poses, body = frame[:, None] @ path.pose, path.body
-            span = (segment.last - segment.first)[main, None]
-            phase = segment.first[main, None] + span * clock / dmp.duration[:, None]
-            made.append((ticks >= begin[:, None], poses, body, phase))
-            start, posture = frame @ last.pose[:, 0], last.body[:, 0]
-            turned = quaternion.rotate(
-                frame.orientation[:, None], last.twist[:, 0].unflatten(-1, (2, 3))
-            )
-            twist, begin = turned.flatten(-2), begin + dmp.duration
-        _, poses, body, phase = made[0]
-        for begun, later, later_body, later_phase in made[1:]:
-            wide = begun[..., None]
-            poses = Pose(
-                torch.where(wide, later.position, poses.position),
-                torch.where(wide, later.orientation, poses.orientation),
-            )
-            body = torch.where(wide, later_body, body)
-            phase = torch.where(begun, later_phase, phase)
+            frame, tau = frame_of(draws.scene, segment.frame, start), dmp.duration[:, None]
+            velocity = _turned(frame.inverse(), twist)
+            ends |= {"start": frame.inverse() @ start, "start_velocity": velocity}
+            clock = torch.minimum((ticks - begin[:, None]).clamp(min=0), tau)
+            path, last = dmp.rollout(clock, **ends), dmp.rollout(tau, **ends)
+            poses, (first, span) = frame[:, None] @ path.pose, segment.span(main)
+            new = [poses.position, poses.orientation, path.body, first + span * clock / tau]
+            begun = ticks >= begin[:, None]
+            if columns:
+                new = [
+                    torch.where(begun if x.ndim == 2 else begun[..., None], x, old)
+                    for x, old in zip(new, columns, strict=True)
+                ]
+            columns, begin = new, begin + dmp.duration
+            start, twist = frame @ last.pose[:, 0], _turned(frame, last.twist[:, 0])
+            ends = {"start_body": last.body[:, 0]}
+        position, orientation, body, phase = columns
+        poses = Pose(position, orientation)
         carried = body if body.shape[-1] else None
         return _Poses(pose=poses, body=carried, phase=phase, length=length)
 

@@ -170,7 +170,7 @@ def test_gradients_flow_to_the_scene(source):
     [
         (("lid", "block"), (0, 40, 63), "no frame 'lid'"),
         (("block", "block"), (0, 63), "needs 3 cuts"),
-        (("block", "block"), (0, 61, 63), "6 frames or more"),
+        (("block", "block"), (0, 61, 63), "6 frames or more apart"),
     ],
 )
 def test_wrong_segments_are_refused(demos, objects, frames, cuts, message):
