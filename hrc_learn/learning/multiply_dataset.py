@@ -17,7 +17,7 @@ from jaxtyping import Float
 from hrc_learn.demos import DemonstrationSource
 from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.dataset_arm import DatasetArm
-from hrc_learn.demos.dataset_assembly import begin, finish
+from hrc_learn.demos.dataset_assembly import begin, discard, finish
 from hrc_learn.demos.read.dataset_folder import staging_folder
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.metadata import INDEX_FEATURES, Sidecar, read_sidecar
@@ -377,3 +377,5 @@ class MultipliedWriter:
         with self._claim:
             if kind is None:
                 finish(self.root, self._claim)
+            elif not self.provenance:
+                discard(self._staging)
