@@ -7,7 +7,8 @@ differ in length. Sizes that have to agree are compared where the values are use
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.autograd.forward_ad import unpack_dual
 
+FLOATING = (torch.float32, torch.float64)
 type Nested = Sequence
 """Lists or tuples of numbers, nested to any depth."""
 type Number = float | int | np.number
@@ -41,12 +43,37 @@ def to_tensor(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> Tensor:
-    """Convert like `torch.as_tensor`; arrays may be read-only or have negative strides."""
+    """Convert like `torch.as_tensor`; arrays may be read-only or have negative strides.
+
+    Raises:
+        ValueError: Values that are no real numbers, or truth values where numbers are due.
+    """
     if isinstance(values, Tensor) and values.dtype == dtype and values.device == device:
         return values  # the common case: `as_tensor` takes longer to find out
     if isinstance(values, np.ndarray):
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"expected real numbers, got an array of {values.dtype}")
         values = np.require(values, requirements=["C", "W"])
+    tensor = torch.as_tensor(values)
+    if tensor.is_complex() or (tensor.dtype == torch.bool and dtype in FLOATING):
+        raise ValueError(f"expected real numbers, got {tensor.dtype}")
+    if isinstance(values, Tensor):
+        return tensor.to(device, dtype)
+    # From Python's numbers again, because their float64 values would be rounded to float32.
     return torch.as_tensor(values, dtype=dtype, device=device)
+
+
+def full_precision[**P, R](function: Callable[P, R]) -> Callable[P, R]:
+    """Function that `torch.autocast` leaves alone: in half precision paths are off visibly."""
+
+    @wraps(function)
+    def exact(*arguments: P.args, **options: P.kwargs) -> R:
+        if not any(map(torch.is_autocast_enabled, ("cpu", "cuda"))):
+            return function(*arguments, **options)
+        with torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False):
+            return function(*arguments, **options)
+
+    return exact
 
 
 def readable(*tensors: Tensor) -> bool:
@@ -166,7 +193,7 @@ def check_not_negative(name: str, value: Tensor | float | int) -> None:
             return
         good = bool(((value >= 0) & (value < math.inf)).all())
     else:
-        good = 0 <= value < math.inf
+        good = not isinstance(value, bool) and 0 <= value < math.inf
     if not good:
         raise ValueError(f"{name} must be finite and not negative, got {value}")
 

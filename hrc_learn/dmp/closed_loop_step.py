@@ -235,7 +235,7 @@ def _filtered(
     the equation for a goal that decays to its target.
     """
     denominator = rate**2 - spring.alpha * rate + spring.stiffness
-    if not rate > 0 or abs(denominator) < RESONANCE * spring.stiffness:
+    if not 0 < rate < math.inf or abs(denominator) < RESONANCE * spring.stiffness:
         raise ValueError(
             f"a goal filter needs a positive rate off the modes of the spring, got {rate}"
         )

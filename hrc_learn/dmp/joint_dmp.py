@@ -9,7 +9,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn import distributed
-from hrc_learn.dmp._arguments import Mask, Points, Scalars, Times, Vectors, positive
+from hrc_learn.dmp._arguments import (
+    Mask,
+    Points,
+    Scalars,
+    Times,
+    Vectors,
+    full_precision,
+    positive,
+)
 from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.dynamics import Basis, GaussianBasis, SpringDamper
 from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling, find_scaling
@@ -129,6 +137,7 @@ class JointDMP(LinearPrimitive, MotionPrimitive[Vectors, Trajectory, DMPState]):
         return self
 
     @classmethod
+    @full_precision
     def fit(
         cls,
         time: Times,

@@ -25,6 +25,7 @@ from hrc_learn.dmp._arguments import (
     checked_vector,
     finite,
     fits_numpy,
+    full_precision,
     normalised_time,
     positive,
     to_tensor,
@@ -296,7 +297,8 @@ class LinearPrimitive(nn.Module):
         start, goal, rate = self.resolve_boundary(boundary, duration)
         weights = self._scaled_weights(start, goal)
         if forcing_gain is not None:
-            weights = weights * self._as_tensor(forcing_gain)[..., None, None]
+            gain = finite("forcing_gain", self._as_tensor(forcing_gain))
+            weights = weights * gain[..., None, None]
         shape = weights.shape[:-1]
         if not rate.shape == start.shape == goal.shape == shape or duration.shape != shape[:-1]:
             self._check_batches(rate=rate, start=start, goal=goal, duration=duration)
@@ -343,6 +345,7 @@ class LinearPrimitive(nn.Module):
                 return None
         return x
 
+    @full_precision
     def initial_columns(
         self, boundary: Boundary, duration: Float[Tensor, "*#batch"]
     ) -> DMPState:
@@ -369,6 +372,7 @@ class LinearPrimitive(nn.Module):
             forced=forced @ self.weights.mT,
         )
 
+    @full_precision
     def step_columns(
         self,
         state: DMPState,
@@ -413,6 +417,11 @@ class LinearPrimitive(nn.Module):
         if external_acceleration is not None:
             # Second derivatives by s are tau^2 times those by t.
             push = finite("coupling", self._as_tensor(external_acceleration))
+            if push.ndim and push.shape[-1] not in (1, self.weights.shape[-2]):
+                raise ValueError(
+                    f"coupling must have shape (..., {self.weights.shape[-2]}), got "
+                    f"{tuple(push.shape)}"
+                )
             push = push * state.duration[..., None] ** 2
         attractor = target if goal_filter is None else state.goal
         return closed_loop_step.step(
@@ -454,6 +463,7 @@ class LinearPrimitive(nn.Module):
                 f"{batches}"
             ) from None
 
+    @full_precision
     def second_derivative(self, state: DMPState) -> Float[Tensor, "*batch D"]:
         """Second derivative d^2 y / ds^2 at a state without coupling."""
         response = self.response
@@ -546,12 +556,13 @@ class LinearPrimitive(nn.Module):
         self, start: Tensor, goal: Tensor, forcing_gain: Scalars | None
     ) -> Callable[[Tensor], Tensor]:
         """Scaling, for this start and goal, of states (*batch, K, D) caused by the forcing."""
+        gain = None
+        if forcing_gain is not None:
+            gain = finite("forcing_gain", self._as_tensor(forcing_gain))[..., None, None]
 
         def scale(values: Tensor) -> Tensor:
             values = self._scaled(values, start, goal)
-            if forcing_gain is None:
-                return values
-            return values * self._as_tensor(forcing_gain)[..., None, None]
+            return values if gain is None else values * gain
 
         return scale
 

@@ -18,12 +18,14 @@ from torch import Tensor, nn
 from torch.distributions import LowRankMultivariateNormal, kl_divergence
 
 from hrc_learn.dmp._arguments import (
+    FLOATING,
     Points,
     Scalars,
     Times,
     Vectors,
     checked_vector,
     finite,
+    full_precision,
     positive,
     readable,
     seconds,
@@ -248,6 +250,7 @@ class MotionHead(nn.Module):
             return self.amplitude.new_empty(0)
         return torch.stack(torch.broadcast_tensors(*found), -1)
 
+    @full_precision
     def encode(
         self,
         time: Times,
@@ -285,6 +288,7 @@ class MotionHead(nn.Module):
         z = torch.linalg.solve(normal, rows.mT @ missing[..., None])[..., 0]
         return torch.cat([z.flatten(-2).to(y), zeros[..., self.n_linear :]], -1)
 
+    @full_precision
     def _plan(
         self,
         parameters: Tensor,
@@ -298,6 +302,9 @@ class MotionHead(nn.Module):
                 f"parameters must have shape (..., {self.n_parameters}), got "
                 f"{tuple(parameters.shape)}"
             )
+        # Networks under autocast give half precision, in which paths are off visibly.
+        if parameters.dtype not in FLOATING:
+            parameters = to_tensor(parameters, self.amplitude.dtype, parameters.device)
         finite("parameters", parameters)
         linear = parameters[..., : self.n_linear].unflatten(-1, (self.columns, -1))
         like = linear[..., 0]
@@ -414,6 +421,7 @@ class PlannedTrajectory(Trajectory):
         time = self.s * self.duration[..., None] + self.delay[..., None]
         return time.to(self._coordinates.dtype).expand(*self._batch, -1)
 
+    @full_precision
     def _derivative(self, order: int) -> Float[Tensor, "*batch T D"]:
         y = super()._derivative(order)
         plan = self._plan
@@ -527,6 +535,7 @@ class MotionDistribution:
         variance = positive("noise", noise, mean) ** 2
         return LowRankMultivariateNormal(mean, root, variance.expand_as(mean))
 
+    @full_precision
     def _moments(self, time: Times) -> tuple[Tensor, Tensor]:
         """Mean (*batch T D) and square root (*batch T D L) of the covariance of positions."""
         head = self.head

@@ -20,6 +20,7 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     broadcast_shapes,
+    checked_vector,
     readable,
     regular_times,
     seconds,
@@ -320,7 +321,7 @@ class MotionPrimitive[Value, Path, State](nn.Module):
         """
         columns, frame, target = self._retargeted(state, goal, goal_body)
         if target is not None:
-            target = to_tensor(target, columns.target.dtype, columns.target.device)
+            target = checked_vector("goal", target, columns.target)
             columns = replace(columns, target=target.expand_as(columns.target))
         return self.state_of(columns, frame)
 

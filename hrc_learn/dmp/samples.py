@@ -283,7 +283,10 @@ def _floating(values: Points) -> Tensor:
     tensor = to_tensor(values)
     if tensor.is_floating_point():
         check_precision(tensor.dtype)
-    return tensor if tensor.is_floating_point() else tensor.to(torch.get_default_dtype())
+    # Truth values are no positions.
+    return to_tensor(
+        tensor, tensor.dtype if tensor.is_floating_point() else torch.get_default_dtype()
+    )
 
 
 def _expand(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:

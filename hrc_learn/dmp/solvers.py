@@ -4,6 +4,7 @@ Demonstrations with the same normalised times are fitted by one matrix product, 
 times of their own by batched normal equations.
 """
 
+import math
 from functools import lru_cache
 
 import torch
@@ -42,6 +43,8 @@ def fit_samples(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; choose from {', '.join(METHODS)}")
+    if not 0 <= regularization < math.inf:
+        raise ValueError(f"regularization must be finite, not negative: {regularization}")
     position = samples.position.double()
     rate = None
     if samples.velocity is not None:

@@ -286,6 +286,8 @@ def _array(x: Tensor) -> Float64[np.ndarray, "..."]:
 
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{name} must hold real numbers, got {values.dtype}")
     # For so few numbers Python's sum takes a third of the time.
     if not math.isfinite(sum(values.tolist())):
         raise ValueError(f"{name} must be finite, got {values}")

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import broadcast_shapes, readable
+from hrc_learn.dmp._arguments import broadcast_shapes, full_precision, readable
 from hrc_learn.dmp.ragged_times import motion
 from hrc_learn.dmp.response import Response, numpy_limit, product
 
@@ -118,6 +118,7 @@ class Trajectory(ArrayOutputs):
         """Jerk, position units per second cubed."""
         return self._derivative(3)
 
+    @full_precision
     def _derivative(self, order: int) -> Float[Tensor, "*batch T D"]:
         """Derivative of the motion by time."""
         s = self.s

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import readable
+from hrc_learn.dmp._arguments import full_precision, readable
 from hrc_learn.dmp.linear_primitive import Boundary, LinearPrimitive
 from hrc_learn.dmp.response import Response
 
@@ -52,6 +52,7 @@ class ViaPoints:
     """Derivative by s."""
 
 
+@full_precision
 def through_via_points(
     motion: LinearPrimitive,
     via: ViaPoints,

@@ -246,3 +246,25 @@ def test_samples_that_do_not_count_change_no_fit():
         alone = JointDMP.fit(time[i, kept], position[i, kept], 12, velocity[i, kept])
         torch.testing.assert_close(together[i].weights, alone.weights, rtol=1e-6, atol=1e-5)
         torch.testing.assert_close(together[i].start_velocity, alone.start_velocity)
+
+
+GRADIENT = """
+import sys
+import torch
+from hrc_learn.dmp import JointDMP
+
+t = torch.linspace(0, 2, 40, dtype=torch.float64)
+dmp = JointDMP.fit(t, torch.stack([torch.sin(t), t**2], -1), 6)
+path = lambda tau: dmp.rollout(t[::8], duration=tau).position.square().sum()
+tau = torch.tensor([1.7, 2.1], dtype=torch.float64, requires_grad=True)
+compiled = torch.compile(path, fullgraph=True, backend=sys.argv[1])
+found, expected = (torch.autograd.grad(f(tau), tau)[0] for f in (compiled, path))
+torch.testing.assert_close(found, expected)
+"""
+
+
+@pytest.mark.parametrize(
+    "backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)]
+)
+def test_a_compiled_rollout_has_the_gradient_by_its_duration(backend):
+    subprocess.run([sys.executable, "-c", GRADIENT, backend], check=True)

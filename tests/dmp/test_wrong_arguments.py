@@ -1,0 +1,118 @@
+"""Numbers that are none, and precisions that are not enough: refused, or right."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from demo_motions import arm_motion, turning_motion
+from unchecked import shapes_unchecked
+
+from hrc_learn.dmp import JointDMP, MotionHead, OrientationDMP, Stepper
+
+TIME, POSITION = arm_motion(n_joints=3)
+BAD = [math.nan, math.inf, -math.inf]
+NOT_REAL = [
+    torch.zeros(3, dtype=torch.complex64),
+    torch.zeros(3, dtype=torch.bool),
+    np.zeros(3, complex),
+    np.array(["a", "b", "c"]),
+    np.zeros(3, object),
+]
+
+
+@pytest.fixture(scope="module", params=["single", "batch", "orientation"])
+def dmp(request):
+    if request.param == "orientation":
+        return OrientationDMP.fit(*turning_motion(), 8)
+    position = POSITION if request.param == "single" else torch.stack([POSITION] * 2)
+    return JointDMP.fit(TIME, position, 8)
+
+
+@shapes_unchecked()
+@pytest.mark.parametrize("bad", BAD)
+def test_numbers_that_are_not_finite_are_refused_by_steps_and_rollouts(dmp, bad):
+    state = dmp.initial_state()
+    goal = torch.full_like(dmp.goal, bad)
+    push = torch.full((3,), bad, dtype=torch.float64)
+    for use in (
+        lambda: dmp.step(state, 0.01, goal=goal),
+        lambda: dmp.step(state, 0.01, coupling=push),
+        lambda: dmp.step(state, bad),
+        lambda: dmp.step(state, torch.tensor(bad)),
+        lambda: dmp.step(state, 0.01, phase_stopping=bad),
+        lambda: dmp.step(state, 0.01, forcing_gain=bad),
+        lambda: dmp.step(state, 0.01, goal=dmp.goal, goal_filter=bad),
+        lambda: dmp.retarget(state, goal),
+        lambda: dmp.rollout(start=goal),
+        lambda: dmp.rollout(goal=goal),
+        lambda: dmp.rollout(start_velocity=push),
+        lambda: dmp.rollout(forcing_gain=bad),
+        lambda: dmp.rollout(duration=bad),
+        lambda: dmp.rollout(time=[0.0, bad]),
+    ):
+        with pytest.raises(ValueError, match=r"finite|positive|unit"):
+            use()
+
+
+@shapes_unchecked()
+@pytest.mark.parametrize("back", [-0.5, torch.tensor(-0.5)])
+def test_time_never_runs_backwards(dmp, back):
+    state = dmp.initial_state()
+    with pytest.raises(ValueError, match="dt must be finite and not negative"):
+        dmp.step(state, back)
+    with pytest.raises(ValueError, match="phase_stopping must be finite and not negative"):
+        dmp.step(state, 0.1, phase_stopping=back)
+
+
+@shapes_unchecked()
+@pytest.mark.parametrize("values", NOT_REAL, ids=lambda x: str(x.dtype))
+def test_only_real_numbers_are_numbers(values):
+    dmp = JointDMP.fit(TIME, POSITION, 8)
+    state, head = dmp.initial_state(), MotionHead(3, 4)
+    series = np.resize(np.asarray(values), (len(TIME), 3))
+    if isinstance(values, torch.Tensor):
+        series = torch.as_tensor(series)
+    for use in (
+        lambda: JointDMP.fit(TIME, series, 8),
+        lambda: dmp.step(state, 0.01, goal=values),
+        lambda: dmp.step(state, 0.01, coupling=values),
+        lambda: dmp.rollout(start=values),
+        lambda: dmp.condition([1.0], values[None]),
+        lambda: head(torch.zeros(head.n_parameters), [0.0, 0.5], values),
+        lambda: Stepper(dmp).step(Stepper(dmp).initial_state(), 0.01, goal=np.asarray(values)),
+    ):
+        with pytest.raises(ValueError, match="real numbers"):
+            use()
+    with pytest.raises(ValueError, match="real numbers"):
+        dmp.step(state, True)
+
+
+def test_a_coupling_of_another_size_and_a_bad_ridge_are_named():
+    dmp = JointDMP.fit(TIME, POSITION, 8)
+    with pytest.raises(ValueError, match=r"coupling must have shape \(..., 3\), got \(0,\)"):
+        dmp.step(dmp.initial_state(), 0.01, coupling=torch.zeros(0))
+    for ridge in (math.nan, -1.0):
+        with pytest.raises(ValueError, match="regularization must be finite, not negative"):
+            JointDMP.fit(TIME, POSITION, 8, regularization=ridge)
+
+
+def test_autocast_changes_nothing():
+    time, position = TIME.float(), POSITION.float()
+    head, z = MotionHead(3, 4), torch.ones(15)
+
+    def motions():
+        dmp = JointDMP.fit(time, position, 8)
+        state = dmp.step(dmp.initial_state(), 0.3, goal=dmp.goal + 0.1)
+        bent = dmp.condition([1.0], [[0.1, 0.2, 0.3]])
+        shown = dmp.rollout(), dmp.rollout(duration=[1.0, 2.0]), bent.rollout()
+        planned = head(z, [0.1, 0.5], torch.zeros(3)).position
+        return [x.position for x in shown] + [state.position, planned]
+
+    expected = motions()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = motions()
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    half = head(z.bfloat16(), [0.1, 0.5], torch.zeros(3)).position
+    torch.testing.assert_close(half, expected[-1])
