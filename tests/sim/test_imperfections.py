@@ -286,3 +286,12 @@ def test_estimated_torques_come_through_a_filter_of_the_first_order():
     whole = made.arm.read().external_torque[0]
     made.advance(0.05)
     assert made.arm.read().external_torque[0] == pytest.approx(whole / np.e, rel=0.05)
+
+
+def test_heights_and_loads_are_in_proportion_to_the_hand():
+    sizes = Imperfections.nominal()
+    whole, half = (sizes.draw(np.random.default_rng(3), 5, size) for size in (1.0, 0.5))
+    assert half.table_height == pytest.approx(whole.table_height / 2)
+    np.testing.assert_allclose(half.object_heights, whole.object_heights / 2)
+    assert half.payload == pytest.approx(whole.payload / 8)
+    np.testing.assert_array_equal(half.encoder_offset, whole.encoder_offset)
