@@ -26,6 +26,8 @@ _SAME_POINT = 0.006
 _REACH, _WIDTH = 5.0, 1440
 # Fewest points that agree on a tool, and on an object.
 FEWEST_POINTS, _FEWEST_MATCHES = 8, 6
+# Samples of matches: among clutter one in ten may be right, and a sample has four.
+_TRIALS = 5000
 # Least standard deviation of a feature's place [px].
 _LEAST_NOISE = 0.15
 # Range of an object's size relative to its view.
@@ -145,7 +147,7 @@ class Tool:
             pixels,
             matrix,
             lens,
-            iterationsCount=300,
+            iterationsCount=_TRIALS,
             reprojectionError=reach,
             flags=cv2.SOLVEPNP_AP3P,
         )
@@ -176,7 +178,9 @@ class Tool:
         index, distance = nearest(seen.descriptors, self.descriptors, 6)
         apart = np.linalg.norm(self.points[index] - self.points[index[:, :1]], axis=-1)
         rival = np.where(apart > _SAME_POINT, distance, distance[:, -1:]).min(axis=1)
-        clear = distance[:, 0] < RATIO * rival
+        back, _ = nearest(self.descriptors, seen.descriptors, 1)
+        mutual = back[index[:, 0], 0] == np.arange(len(index))
+        clear = mutual & (distance[:, 0] < RATIO * rival)
         return np.flatnonzero(clear), index[clear, 0]
 
 
