@@ -9,9 +9,10 @@ force v sqrt(mu k), with 1/mu = 1/m_H + 1/m_R and the effective mass of the arm 
 along the direction n of approach. A part of the body between the arm and furniture cannot
 yield: there the arm is also taken to push on until it has stopped.
 
-The values are those of ISO/TS 15066:2016, tables A.2 and A.3, taken from secondary sources
-that agree with each other; that the edition of 2025 kept them is from such sources, too. None
-of this is a certified safety function.
+The values are those of ISO/TS 15066:2016, tables A.2 and A.3, as commonly quoted; secondary
+sources confirm the spring constants and masses, and that the edition of 2025 kept the tables.
+Compare forces and pressures with the standard before you rely on them. None of this is a
+certified safety function.
 """
 
 from __future__ import annotations
