@@ -15,7 +15,13 @@ from jaxtyping import Float
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import Arm, SerialChain, coarse_orientation, gripper_down
+from hrc_learn.kinematics import (
+    Arm,
+    SerialChain,
+    UnreachableError,
+    coarse_orientation,
+    gripper_down,
+)
 from hrc_learn.protocols import Camera, Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
@@ -314,12 +320,20 @@ def _arranged(
             "move the camera, or choose a smaller reach of the demonstrations."
         )
     above = np.append(pose[:2, 3], workplace.hover_height)
-    expert = servo_expert(workplace, above, config, rng, _turn_for(pose, workplace))
-    start = torch.from_numpy(expert.path.position(0.0))
-    goal = Pose(start, expert.orientation(start, 0.0))
-    q = workplace.robot.inverse(goal, near=workplace.hover_joints())
-    world.reset(q.numpy(), {item.name: pose})
-    return expert, target
+    refused: UnreachableError | None = None
+    for _ in range(_DRAWS):
+        expert = servo_expert(workplace, above, config, rng, _turn_for(pose, workplace))
+        start = torch.from_numpy(expert.path.position(0.0))
+        goal = Pose(start, expert.orientation(start, 0.0))
+        try:
+            q = workplace.robot.inverse(goal, near=workplace.hover_joints())
+        except UnreachableError as error:
+            refused = error  # small arms tilt little at the highest of the points
+        else:
+            world.reset(q.numpy(), {item.name: pose})
+            return expert, target
+    assert refused is not None
+    raise refused
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
