@@ -157,7 +157,7 @@ def parse[Args](
         with redirect_stderr(said):
             return tyro.cli(
                 arguments,
-                args=words,
+                args=_joined(words),
                 prog=program,
                 description=description or inspect.getdoc(arguments),
             )
@@ -165,6 +165,20 @@ def parse[Args](
         if text := said.getvalue():
             print(f"error: {_complaint(text)} (see {program} --help)", file=sys.stderr)
         raise
+
+
+def _joined(words: Sequence[str]) -> list[str]:
+    """Command line with the values of all `--config` at the first one: the parser would keep
+    those of the last alone.
+    """
+    parts: list[list[str]] = [[]]
+    for word in words:
+        if word.startswith("--"):
+            parts.append([])
+        parts[-1].append(word)
+    first, *later = [part for part in parts if part[:1] == ["--config"]] or [[]]
+    first += [value for part in later for value in part[1:]]
+    return [word for part in parts if not any(part is x for x in later) for word in part]
 
 
 def _complaint(box: str) -> str:

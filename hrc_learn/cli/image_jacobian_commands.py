@@ -1,6 +1,7 @@
 """`hrc fit image-jacobian`, and `hrc evaluate` of its models."""
 
 import shlex
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -102,7 +103,7 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
 
 
 type _Searched = tuple[
-    DemonstrationSource | DemonstrationSet, dict[str, float], MarkerlessFit | None
+    DemonstrationSource | DemonstrationSet, Mapping[str, float | int], MarkerlessFit | None
 ]
 """Demonstrations, figures of the search in their video, and what was found without markers."""
 
@@ -173,7 +174,7 @@ def _write(
     args: FitImageJacobian,
     skill: VisualServoSkill,
     demos: DemonstrationSource | DemonstrationSet,
-    searched: dict[str, float],
+    searched: Mapping[str, float | int],
     unmarked: MarkerlessFit | None,
 ) -> None:
     metrics = skill.metrics()
@@ -202,7 +203,7 @@ def _write(
         print(f"Found in the video: {shlex.quote(str(args.folder / FOUND))}")
     print(f"Model in {shlex.quote(str(args.folder))}")
     print(f"Dashboard: {show_command(args.folder)}")
-    write_values(args.json, metrics | searched)
+    write_values(args.json, metrics | dict(searched))
 
 
 FOUND = "found.png"

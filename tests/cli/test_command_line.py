@@ -20,7 +20,8 @@ from commands import done, hrc
 from hrc_learn import cli
 from hrc_learn.cli import arguments
 from hrc_learn.cli._commands import COMMANDS, device_settings
-from hrc_learn.cli._run import with_settings
+from hrc_learn.cli._run import parse, with_settings
+from hrc_learn.cli.arguments import Serve
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.kinematics import MissingModelError
 from hrc_learn.learning.primitive_fitting import CHANNELS
@@ -359,3 +360,19 @@ def test_a_lerobot_arm_needs_its_type_and_no_address(tmp_path):
     assert "--ip is for Franka arms: LeRobot's have --robot.port" in asked.error
     asked = done("run", "placing", "--arm", "lerobot", "--out", out, status=2)
     assert "hrc run leads Franka arms only" in asked.error
+
+
+def test_settings_of_several_config_options_count_together():
+    words = [
+        "--config",
+        "site.speed=0.1",
+        "--rate",
+        "100",
+        "--config",
+        "step=eager",
+        "film=false",
+    ]
+    args = parse(Serve, words, "hrc serve")
+    assert list(args.config) == ["site.speed=0.1", "step=eager", "film=false"]
+    assert args.rate == 100
+    assert list(parse(Serve, ["--rate", "50"], "hrc serve").config) == []

@@ -133,10 +133,10 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
         *("run", "collaboration", "--placing", models / "placing"),
         *("--aiming", models / "aiming", "--out", out, "--shelf", "upper"),
         *("--camera", "synthetic", "--seed", 3, "--json", figures),
-        *("--config", "experiment.config.interaction=2.5"),
+        *("--config", "film=false", "experiment.config.interaction=2.5"),
         "experiment.disturbances.occlusions=[{start=0, duration=1.5}]",
         "experiment.cell.latency={delay=0.04, frame_loss=0.1}",
-        *("--imperfections", 0.5, "--worker", "--config", "film=false"),
+        *("--imperfections", 0.5, "--worker"),
     )
     ((shelves, scenario, options),) = asked
     assert (shelves, scenario.camera, options["seed"]) == (("upper",), "synthetic", 3)
