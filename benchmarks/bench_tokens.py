@@ -89,7 +89,7 @@ class Fast:
         """Coefficients, low frequencies of all columns first."""
         from scipy.fft import dct
 
-        q = np.around(dct(chunks, axis=1, norm="ortho") * self.scale).astype(int)
+        q = np.around(np.asarray(dct(chunks, axis=1, norm="ortho")) * self.scale).astype(int)
         return q.reshape(len(q), -1)
 
     def text(self, q: Int[np.ndarray, "K"]) -> str:
@@ -110,7 +110,7 @@ class Fast:
         from scipy.fft import idct
 
         q = q.reshape(-1, *self.shape).clip(self.least, self.most)
-        return idct(q / self.scale, axis=1, norm="ortho")
+        return np.asarray(idct(q / self.scale, axis=1, norm="ortho"))
 
 
 def main(args: Args) -> None:

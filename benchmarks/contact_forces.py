@@ -21,6 +21,9 @@ from hrc_learn.sim import World
 from hrc_learn.sim.scene import WORKER_BODIES, SceneConfig
 from hrc_learn.sim.worker import WorkerConfig
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 # Force [N], pressure [N/cm^2], both quasi-static, spring [N/mm] and mass [kg]: ISO/TS
 # 15066:2016, tables A.2 and A.3, the strictest place of each region; zero: no contact is
 # allowed.
