@@ -105,16 +105,6 @@ class SavedModel:
             raise ValueError(f"{path}: not a safetensors file ({error})") from None
 
 
-def saved_kind(folder: str | Path) -> str:
-    """Class of the model in a folder.
-
-    Raises:
-        FileNotFoundError: The folder holds no saved model.
-        ValueError: The config is not valid.
-    """
-    return str(_read_config(Path(folder)).get("kind"))
-
-
 def _read_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
     store.settle(folder)

@@ -21,13 +21,13 @@ from torch.utils._pytree import tree_map
 
 from hrc_learn import store
 from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.orientation_dmp import OrientationState
 from hrc_learn.dmp.orientation_error import to_orientation
 from hrc_learn.dmp.pose_dmp import BODY, POSITION, PoseDMP, PoseState
-from hrc_learn.dmp.stepper import STATES, Stepper, can_step
+from hrc_learn.dmp.stepper import Stepper
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.model_files import saved_kind
 
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
@@ -49,8 +49,7 @@ class ExportedDMP:
 
     dmp: MotionPrimitive
     stepper: Stepper | None
-    """One motion in NumPy, float64; None for kinds that only the program steps: moving goals
-    and `formulation="ude"`."""
+    """One motion of joints in NumPy, float64; None for other kinds, which the program steps."""
     program: ExportedProgram
     """Maps (state, dt, inputs) to a state: dictionaries of tensors (B, ...), dt (B,) [s].
 
@@ -84,28 +83,21 @@ def export_dmp(dmp: MotionPrimitive, *, goal_filter: float | None = None) -> Exp
     """
     if dmp.duration.ndim:
         raise ValueError(f"export takes one primitive, got a batch {tuple(dmp.duration.shape)}")
-    stepper = Stepper(dmp) if can_step(dmp) else None  # pyright: ignore[reportArgumentType]
+    stepper = Stepper(dmp) if isinstance(dmp, JointDMP) else None
     return ExportedDMP(dmp=dmp, stepper=stepper, program=_program(dmp, goal_filter))
 
 
 def load_stepper(folder: str | Path) -> Stepper:
-    """NumPy stepper of an export, or of a saved primitive.
+    """NumPy stepper of an export, or of a saved joint primitive.
 
     Raises:
         FileNotFoundError: The folder holds no export.
-        ValueError: A wrong field; the message names the file and the field.
+        ValueError: Another kind, or a wrong field; the message names the file and the field.
     """
     folder = Path(folder)
     store.settle(folder)
     folder = folder / PRIMITIVE if (folder / PRIMITIVE).is_dir() else folder
-    kinds = {kind.__name__: kind for kind in STATES}
-    kind = saved_kind(folder)
-    if kind not in kinds:
-        raise ValueError(f"{folder}: a stepper takes {', '.join(kinds)}, got {kind!r}")
-    dmp: Any = kinds[kind].load(folder)  # pyright: ignore[reportAttributeAccessIssue]
-    if not can_step(dmp):
-        raise ValueError(f"{folder}: its formulation has no stepper, run the program instead")
-    return Stepper(dmp)
+    return Stepper(JointDMP.load(folder))
 
 
 class StepModule(nn.Module):

@@ -423,7 +423,7 @@ def test_steps_refuse_what_no_loop_means(kind):
         "pose": lambda: PoseDMP.fit(time, position[:, :3], turning, 12),
         "moving goal": lambda: MovingGoalDMP(JointDMP.fit(time, position, 12)),
     }[kind]()
-    loops = [dmp] if kind == "moving goal" else [dmp, Stepper(dmp)]
+    loops = [dmp, Stepper(dmp)] if kind == "joint" else [dmp]
     nan = float("nan")
     bad_goal = {
         "orientation": np.full(4, nan),
@@ -440,7 +440,5 @@ def test_steps_refuse_what_no_loop_means(kind):
             {"dt": 0.01, "coupling": np.full(push, nan)},
             {"dt": 0.01, "goal": bad_goal},
         ):
-            if loop is not dmp and "coupling" in wrong and kind == "orientation":
-                continue  # a stepper pushes joints and positions only
             with pytest.raises(ValueError, match=r"finite|unit quaternions"):
                 loop.step(state, **wrong)
