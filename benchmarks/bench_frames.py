@@ -20,7 +20,7 @@ from rich.table import Table
 from torch import Tensor
 
 from hrc_learn import cli
-from hrc_learn.dmp import ContextualDMP, FramedDMP, Frames, JointDMP, mean_primitive
+from hrc_learn.dmp import FramedDMP, Frames, JointDMP, fit_ridge, mean_primitive
 
 SAMPLES, PLACES = 100, 50
 
@@ -61,12 +61,12 @@ def predict(count: int, n_basis: int, rng: torch.Generator) -> dict[str, float]:
     time, position = made_up_motions(shown, 0.1, rng)
     _, wanted = made_up_motions(others, 0.0, rng)
     start, goal = others.b.unbind(1)
-    mean = mean_primitive(JointDMP.fit(time, position, n_basis, approach=1.0))
-    function = ContextualDMP.fit(time, position, context(shown), n_basis=n_basis)
+    each = JointDMP.fit(time, position, n_basis, approach=1.0)
+    mean, function = mean_primitive(each), regression(each, context(shown), context(others))
     framed = FramedDMP.fit(time, position, shown, n_basis)
     made = {
         "mean": mean.rollout(time, start, goal).position,
-        "function": function.at(context(others)).rollout(time, start, goal).position,
+        "function": function.rollout(time, start, goal).position,
         "moments": product_of_moments(position, shown, others),
         "framed": framed.at(others).rollout(time).position,
     }
@@ -105,6 +105,15 @@ def context(frames: Frames) -> Tensor:
     return torch.cat([frames.b, frames.A[..., 0]], dim=-1).flatten(1)
 
 
+def regression(each: JointDMP, shown: Tensor, asked: Tensor) -> JointDMP:
+    """Primitives for contexts, linear in those of the demonstrations."""
+    x = each.coordinates().detach()
+    fit = fit_ridge(shown, x.flatten(1), 1e-6)
+    features = torch.nn.functional.pad((asked - fit.mean) / fit.scale, (1, 0), value=1.0)
+    made = (features @ fit.coefficients).unflatten(-1, x.shape[1:])
+    return mean_primitive(each).with_coordinates(made)
+
+
 def product_of_moments(position: Tensor, shown: Frames, others: Frames) -> Tensor:
     """Gaussians of each moment by itself, seen from the frames and multiplied elsewhere."""
     seen = torch.linalg.solve(shown.A, (position[:, None] - shown.b[:, :, None]).mT).mT
@@ -121,7 +130,7 @@ def product_of_moments(position: Tensor, shown: Frames, others: Frames) -> Tenso
 
 LABELS = {
     "mean": "mean, adapted (approach=1)",
-    "function": "ContextualDMP of the places",
+    "function": "ridge regression on the places",
     "moments": "product at each moment",
     "framed": "FramedDMP",
 }

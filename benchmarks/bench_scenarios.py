@@ -24,7 +24,6 @@ from torch import Tensor
 
 from hrc_learn import cli
 from hrc_learn.dmp import (
-    ContextualDMP,
     JointDMP,
     MotionHead,
     MovingGoalDMP,
@@ -32,6 +31,7 @@ from hrc_learn.dmp import (
     ProbabilisticDMP,
 )
 from hrc_learn.dmp.coupling import offset_error, steering, velocity_coupling
+from hrc_learn.dmp.learned_motion import choose
 from hrc_learn.geometry import quaternion
 
 F64 = torch.float64
@@ -335,7 +335,8 @@ def their_context() -> float:
 
 def our_context() -> float:
     t, y, c = contexts()
-    path = ContextualDMP.fit(t, y, c, 10).at([0.35]).rollout(t).position[:, 0]
+    model = choose([JointDMP.fit(t, y, 10)], c, regression_only=True)
+    path = model.at(context=[0.35]).rollout(t).position[:, 0]
     return np.abs(path.detach().numpy() - wanted_at(t.numpy(), 0.35)).max()
 
 

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import constrained_velocity
-from hrc_learn.dmp import ContextualDMP, JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
+from hrc_learn.dmp import JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
+from hrc_learn.dmp.learned_motion import choose
 from hrc_learn.jacobian import RBFCenters, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import ArmChoice, panda, separation, solve_inverse
 
@@ -115,16 +116,15 @@ def mixture(device: str):
     time, position = demonstrations(device)
     dmps = JointDMP.fit(time, position, 8, scaling="none")
     modes = MixtureDMP.fit(dmps, n_modes=2, slack=0.1)
-    drawn = modes.sample(3, sampling.generator(0)).rollout().position
-    log_prob = modes.log_prob([1.0], position[:1, 50], noise=0.1)
-    return modes.probability.sort().values, drawn.shape, log_prob
+    seen = modes.condition([1.0], position[:1, 50], noise=0.1)
+    return modes.probability.sort().values, seen.probability.sort().values
 
 
 def contexts(device: str):
     time, position = demonstrations(device)
     context = position[:, -1]
-    dmp = ContextualDMP.fit(time, position, context, 8)
-    return dmp.at(context[:3] + 0.01).rollout().position
+    model = choose([JointDMP.fit(time, position, 8)], context, regression_only=True)
+    return model.at_contexts(context[:3] + 0.01).rollout().position
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.learning.fit_dashboards import fit_report, record_fit, shown_fit
 from hrc_learn.learning.large_datasets import fit_all, fit_streamed, sampled
-from hrc_learn.learning.model_choice import best_models, fit_contextual, keep_best
+from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import CHANNELS, FittedPrimitives
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit
 from hrc_learn.store import new_folder, write_json
@@ -86,11 +86,10 @@ def _learn(
     if _is_sample(demos, source):
         fitted = fit_all(fitted, source)
     metrics = fitted.metrics()
-    if args.several == "contextual":
-        metrics |= fit_contextual(fitted, demos, args.context, folder)
     # Scaled motions are linear neither in the mean nor in a context.
-    if args.several == "best" and args.scaling == "none":
-        metrics |= keep_best(fitted, demos, args.context, folder)
+    if args.several in ("best", "contextual") and args.scaling == "none":
+        only = args.several == "contextual"
+        metrics |= keep_best(fitted, demos, args.context, folder, regression_only=only)
     fitted.save(folder, each=args.several == "distribution")
     return fitted, metrics
 
@@ -108,8 +107,9 @@ def _refuse_contradictions(args: FitPrimitives) -> None:
         model, others = "--several streamed", ["context", "method", "scaling"]
     elif args.several not in ("best", "contextual"):
         model, others = f"--several {args.several}", ["context"]
-    elif args.several == "best" and args.scaling != "none":
+    elif args.scaling != "none":
         model, others = f"--scaling {args.scaling}", ["context"]
+        others += ["several"] * (args.several == "contextual")
     else:
         return
     refuse_given(args, others, f"is not used by {model}: leave one of them out")
@@ -211,8 +211,8 @@ def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> Non
         error = 100 * metrics[f"held_out_{channel}_{better}_nrmse_median"]
         mean = 100 * metrics[f"held_out_{channel}_mean_nrmse_median"]
         print(
-            f"{channel}: {_MODELS[better]} predicts held-out demonstrations best, NRMSE "
-            f"{error:.1f} %, mean {mean:.1f} %; hrc evaluate uses it"
+            f"{channel}: {_MODELS[better]} predicts held-out demonstrations with an NRMSE of "
+            f"{error:.1f} %, the mean with {mean:.1f} %; hrc evaluate uses it"
         )
     print(f"Model in {shlex.quote(str(args.folder))}")
     write_values(args.json, metrics)

@@ -12,6 +12,8 @@ from hrc_learn.dmp.dynamics import SpringDamper as SpringDamper
 from hrc_learn.dmp.exported_dmp import ExportedDMP as ExportedDMP
 from hrc_learn.dmp.exported_dmp import export_dmp as export_dmp
 from hrc_learn.dmp.exported_dmp import load_stepper as load_stepper
+from hrc_learn.dmp.framed_dmp import FramedDMP as FramedDMP
+from hrc_learn.dmp.framed_dmp import Frames as Frames
 from hrc_learn.dmp.interaction_primitive import InteractionEstimate as InteractionEstimate
 from hrc_learn.dmp.interaction_primitive import InteractionPrimitive as InteractionPrimitive
 from hrc_learn.dmp.joint_dmp import BasisSelection as BasisSelection
@@ -39,11 +41,7 @@ from hrc_learn.dmp.response import response_of as response_of
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_orientation as fit_rhythmic_orientation
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_pose as fit_rhythmic_pose
+from hrc_learn.dmp.ridge import fit_ridge as fit_ridge
 from hrc_learn.dmp.samples import FitReport as FitReport
 from hrc_learn.dmp.stepper import Stepper as Stepper
-from hrc_learn.dmp.task_dmp import ContextualDMP as ContextualDMP
-from hrc_learn.dmp.task_dmp import FramedDMP as FramedDMP
-from hrc_learn.dmp.task_dmp import Frames as Frames
-from hrc_learn.dmp.task_dmp import RidgeFit as RidgeFit
-from hrc_learn.dmp.task_dmp import fit_ridge as fit_ridge
 from hrc_learn.dmp.trajectory import Trajectory as Trajectory

@@ -3,7 +3,8 @@
 A motion is linear in the coordinates x_j of the primitives of n demonstrations, and each model
 is a sum x(c) = sum_j w_j(c) x_j with sum_j w_j = 1: the mean, the nearest demonstration, means
 weighted by a kernel of the distance of contexts (Nadaraya 1964), and ridge regression on
-contexts. Without demonstration i the weights are closed form, for the regression by its hat
+contexts (Forte et al. 2012, "On-line motion synthesis and adaptation using a trajectory
+database"). Without demonstration i the weights are closed form, for the regression by its hat
 matrix (PRESS; Allen 1974), so no model is fitted again. All are shrunk towards the straight
 minimum-jerk motion by the factor that predicts best, from 1 to 0.
 """
@@ -13,13 +14,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import to_tensor
+from hrc_learn.dmp.framed_dmp import FramedDMP, Frames
 from hrc_learn.dmp.joint_dmp import JointDMP, select_basis_count
 from hrc_learn.dmp.motion_primitive import MotionPrimitive
 from hrc_learn.dmp.pose_dmp import PoseDMP
@@ -29,7 +31,7 @@ from hrc_learn.dmp.probabilistic_dmp import (
     mean_primitive,
     with_common_reference,
 )
-from hrc_learn.dmp.task_dmp import FramedDMP, Frames
+from hrc_learn.dmp.ridge import fit_ridge
 from hrc_learn.geometry import Pose
 from hrc_learn.model_files import SavedModel, write_model
 
@@ -53,6 +55,11 @@ CONSTANT = 1e-9
 """Spread, relative to the size, below which a context counts as constant."""
 
 
+Kind = Literal["mean", "kernel", "nearest", "contextual", "frames", "line"]
+"""Kinds of model: the mean, a mean weighted by nearness, the nearest demonstration, a
+regression, frames, and a straight line."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
     """A model and its errors."""
@@ -69,14 +76,28 @@ class Candidate:
     largest range."""
 
     @property
+    def kind(self) -> Kind:
+        """Kind of the model; all but the line may be shrunk towards it."""
+        if self.shrinkage == 0:
+            return "line"
+        if self.family != "kernel":
+            return "contextual" if self.family == "ridge" else "frames"
+        named: dict[float, Kind] = {0.0: "nearest", math.inf: "mean"}
+        return named.get(self.strength, "kernel")
+
+    @property
     def name(self) -> str:
         """Model in words."""
+        name = {
+            "line": "straight line",
+            "mean": "mean",
+            "nearest": "nearest demonstration",
+            "kernel": f"kernel of width {self.strength:g}",
+            "contextual": f"regression with ridge {self.strength:g}",
+            "frames": "frames",
+        }[self.kind]
         if self.shrinkage == 0:
-            return "straight line"
-        names = {("kernel", math.inf): "mean", ("kernel", 0.0): "nearest demonstration"}
-        plain = {"kernel": f"kernel of width {self.strength:g}", "frames": "frames"}
-        plain["ridge"] = f"regression with ridge {self.strength:g}"
-        name = names.get((self.family, self.strength), plain[self.family])
+            return name
         shrunk = "" if self.shrinkage == 1 else f", shrunk to {self.shrinkage:.2f}"
         return f"{name}{shrunk}, approach {self.approach:g}"
 
@@ -118,7 +139,11 @@ def learn(
 
 
 def choose(
-    fits: Sequence[MotionPrimitive], context: Any = None, frames: Frames | None = None
+    fits: Sequence[MotionPrimitive],
+    context: Any = None,
+    frames: Frames | None = None,
+    *,
+    regression_only: bool = False,
 ) -> "LearnedMotion":
     """Model of least held-out error, among primitives fitted with different options.
 
@@ -126,18 +151,33 @@ def choose(
         fits: Primitives (n) of the same demonstrations, fitted with `scaling="none"`.
         context: (n, C) known before the motion. None: start and goal, in columns.
         frames: (n, F) frames of each demonstration; joint primitives only.
+        regression_only: True to choose among the regressions on contexts only.
+
+    Raises:
+        ValueError: A context that is not finite, or too few demonstrations for a regression.
     """
     fits = [with_common_reference(each) for each in fits]
     x = _coordinates(fits[0])
     n = len(x)
     given = torch.cat([x[..., -2], x[..., -1]], dim=-1)
     if context is not None:
-        given = to_tensor(context, torch.float64).reshape(n, -1)
+        given = to_tensor(context, torch.float64, x.device)
+        if not given.ndim or len(given) != n:
+            raise ValueError(
+                f"context must have one row for each of {n} demonstrations, got "
+                f"{tuple(given.shape)}"
+            )
+        given = given.reshape(n, -1)
         if not given.isfinite().all():
             raise ValueError("context must be finite")
     found = [c for each in fits for c in _candidates(each, given, frames)]
-    best = found[0]
-    for candidate in found[1:] if n > 1 else ():
+    eligible = found
+    if regression_only:
+        eligible = [c for c in found if c.family == "ridge" and c.shrinkage == 1]
+    if not eligible:
+        raise ValueError(f"a regression needs {FEWEST} demonstrations or more, got {n}")
+    best = eligible[0]
+    for candidate in eligible[1:] if n > 1 else ():
         better = best.error - candidate.error
         chance = DEVIATIONS * better.std() / n**0.5
         if better.mean() > max(CLEARLY * best.error.mean(), chance):
@@ -189,13 +229,6 @@ class LearnedMotion:
         Raises:
             ValueError: A context or frames are missing, or have another size.
         """
-        like = self.each.with_motion(mean_primitive(self.each).motion, self._reference)
-        if self.by_ends:
-            asked = columns_of_ends(like, like.with_boundary(start, goal)).reshape(1, -1)
-        elif context is None and self.chosen.family != "frames":
-            raise ValueError(f"give the context of the motion, {self.context.shape[1]} numbers")
-        else:
-            asked = to_tensor(0.0 if context is None else context, torch.float64).reshape(1, -1)
         if self.chosen.family == "frames":
             assert self.frames is not None
             if frames is None:
@@ -203,23 +236,32 @@ class LearnedMotion:
             x = FramedDMP.of(cast(JointDMP, self.each), self.frames).at(frames).coordinates()
             w = torch.full((1, len(self.context)), 1 / len(self.context)).to(x)
             found = self._primitives(x[None], w)
-        elif asked.shape[-1] != self.context.shape[-1]:
-            raise ValueError(
-                f"context must have {self.context.shape[-1]} numbers, got {asked.shape[-1]}"
-            )
         else:
-            found = self.at_contexts(asked)
+            if self.by_ends:
+                like = mean_primitive(self.each)
+                like = self.each.with_motion(like.motion, self._reference)
+                context = columns_of_ends(like, like.with_boundary(start, goal))
+            elif context is None:
+                size = self.context.shape[1]
+                raise ValueError(f"give the context of the motion, {size} numbers")
+            found = self.at_contexts(to_tensor(context, torch.float64).reshape(1, -1))
         return found[0].with_boundary(start, goal, duration)
 
     def at_contexts(self, context: Float[Tensor, "q C"]) -> MotionPrimitive:
         """Primitives for contexts as learned from, with starts and goals of the model.
 
+        Gradients flow to the contexts.
+
         Raises:
-            ValueError: The model is one of frames.
+            ValueError: The model is one of frames, or contexts have another size.
         """
         if self.chosen.family == "frames":
             raise ValueError("a model of frames has no contexts: use `at`")
-        w = _weights(self.chosen.family, self.chosen.strength, self.context, context.double())
+        if context.shape[-1] != self.context.shape[-1]:
+            raise ValueError(
+                f"context must have {self.context.shape[-1]} numbers, got {context.shape[-1]}"
+            )
+        w = _weights(self.chosen.family, self.chosen.strength, self.context, context)
         x = torch.einsum("qn,ndm->qdm", w, _coordinates(self.each))
         return self._primitives(x, w)
 
@@ -228,7 +270,7 @@ class LearnedMotion:
     ) -> MotionPrimitive:
         """Shrunk primitives with coordinates, and durations of weighted demonstrations."""
         lasting = (w @ self.each.motion.duration.detach().double().log()).exp()
-        x = _shrunk(x.detach(), self.chosen.shrinkage)
+        x = _shrunk(x, self.chosen.shrinkage)
         middle, reference = mean_primitive(self.each).motion, self._reference
         return self.each.with_motion(middle.with_coordinates(x, lasting), reference)
 
@@ -247,9 +289,8 @@ class LearnedMotion:
         """The chosen model, its held-out error, and those of the usual ones, in a few lines."""
         each, known = self.each.motion, {"chosen": self.chosen}
         for candidate in self.candidates:
-            name = candidate.name.split(",")[0]
-            if name in ("mean", "nearest demonstration", "straight line"):
-                known.setdefault(name, candidate)
+            if candidate.kind in ("mean", "nearest", "line"):
+                known.setdefault(candidate.name.split(",")[0], candidate)
         lines = [
             f"{name}: {100 * c.error.median():.2f} % median, "
             f"{100 * c.error.quantile(0.9):.2f} % at the 90th percentile"
@@ -430,11 +471,9 @@ def _weights(
         if strength == 0:
             return torch.nn.functional.one_hot(distance.argmin(1), n).to(known)
         return torch.softmax(-((distance / strength) ** 2) / 2, dim=1)
-    A, Q = (torch.nn.functional.pad(z, (1, 0), value=1.0) for z in (b, a))
-    penalty = n * strength * torch.eye(A.shape[1]).to(A)
-    penalty[0, 0] = 0  # the constant is not penalised
-    hat = Q @ torch.linalg.solve(A.mT @ A + penalty, A.mT)
-    if not held_out:
-        return hat
-    own = hat.diagonal().clone()
-    return (hat - torch.diag(own)) / (1 - own)[:, None].clamp(min=1e-12)
+    # A prediction of unit vectors, one for each demonstration, consists of its weights.
+    unit = torch.eye(n).to(b)
+    fit = fit_ridge(b, unit, strength, standardize=False)
+    if held_out:
+        return unit - fit.held_out
+    return torch.nn.functional.pad(a - fit.mean, (1, 0), value=1.0) @ fit.coefficients

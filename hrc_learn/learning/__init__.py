@@ -1,7 +1,6 @@
 """Models of datasets: movement primitives and image Jacobians, with their errors."""
 
 from hrc_learn.learning.large_datasets import fit_streamed as fit_streamed
-from hrc_learn.learning.model_choice import fit_contextual as fit_contextual
 from hrc_learn.learning.model_choice import predict as predict
 from hrc_learn.learning.primitive_fitting import CHANNELS as CHANNELS
 from hrc_learn.learning.primitive_fitting import FittedPrimitives as FittedPrimitives

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -11,24 +11,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.demos import DemonstrationSet
-from hrc_learn.dmp import ContextualDMP, JointDMP, LearnedMotion
-from hrc_learn.dmp.learned_motion import Candidate, choose
+from hrc_learn.dmp import JointDMP, LearnedMotion
+from hrc_learn.dmp.learned_motion import FEWEST, Kind, choose
 from hrc_learn.learning.primitive_fitting import FittedPrimitives, Motions, load_primitive
 from hrc_learn.learning.reproduction_error import Reproduction
 from hrc_learn.store import read_json, write_json
 
-CONTEXTUAL = "contextual"
-"""Folder of contextual primitives."""
 CHOICE = "prediction.json"
 """File in a model's folder that names the model of each channel."""
 LEARNED = "learned"
 """Folder of the best models."""
-MODELS = ("mean", "kernel", "nearest", "contextual", "line")
-"""Kinds of model: the mean, a mean weighted by nearness, the nearest demonstration, a
-regression, and a straight line; all but the line may be shrunk towards it."""
-type Model = Literal["mean", "kernel", "nearest", "contextual", "line"]
-FEWEST = 4
-"""Smallest number of demonstrations whose held-out errors distinguish models."""
 LINEAR = ("joint", "position")
 """Channels whose models are compared."""
 
@@ -37,7 +29,7 @@ LINEAR = ("joint", "position")
 class _Choice:
     """Content of the file `CHOICE`."""
 
-    models: dict[str, Model]
+    models: dict[str, Kind]
     """Best model by channel."""
     context: tuple[str, ...]
     """Columns whose first row is the context."""
@@ -74,65 +66,13 @@ def contexts(
     return torch.from_numpy(np.stack(rows)).double()
 
 
-def fit_contextual(
+def keep_best(
     fitted: FittedPrimitives,
     demos: DemonstrationSet,
-    columns: Sequence[str],
+    columns: tuple[str, ...],
     folder: Path,
-    channels: Sequence[str] = ("joint", "position"),
-    regularization: float = 1e-6,
-) -> dict[str, float]:
-    """Fit joints and positions as functions of a context, and save them.
-
-    Args:
-        fitted: Primitives of the demonstrations.
-        demos: Demonstrations.
-        columns: Columns whose first row is the context. Default: start and goal.
-        folder: Folder of the model.
-        channels: Channels to fit, if they were learned.
-        regularization: See `ContextualDMP.fit`.
-
-    Returns:
-        Median and largest error of demonstrations predicted from all others.
-
-    Raises:
-        ValueError: There are fewer than two demonstrations, no such channel, or no context.
-    """
-    linear = [channel for channel in channels if channel in fitted.each]
-    if not linear:
-        raise ValueError("a function of a context needs the channel joint or position.")
-    metrics = {}
-    for channel in linear:
-        motions = fitted.motions
-        model = ContextualDMP.fit(
-            motions.demos.time,
-            motions.position(channel),
-            contexts(demos, columns, motions, channel),
-            fitted.n_basis,
-            regularization=regularization,
-            mask=motions.demos.mask,
-            **motions.naming(channel),
-            **fitted.options,
-        )
-        model.save(folder / CONTEXTUAL / channel)
-        error = model.held_out.nrmse
-        metrics[f"contextual_{channel}_held_out_nrmse_median"] = float(error.median())
-        metrics[f"contextual_{channel}_held_out_nrmse_max"] = float(error.max())
-    return metrics
-
-
-def kind_of(candidate: Candidate) -> Model:
-    """Kind of a model, one of `MODELS`."""
-    if candidate.shrinkage == 0:
-        return "line"
-    if candidate.family == "ridge":
-        return "contextual"
-    named: dict[float, Model] = {0.0: "nearest", float("inf"): "mean"}
-    return named.get(candidate.strength, "kernel")
-
-
-def keep_best(
-    fitted: FittedPrimitives, demos: DemonstrationSet, columns: tuple[str, ...], folder: Path
+    *,
+    regression_only: bool = False,
 ) -> dict[str, float]:
     """Compare models, and save the best one of each channel.
 
@@ -141,25 +81,32 @@ def keep_best(
         demos: Demonstrations.
         columns: Columns whose first row is the context. Default: start and goal.
         folder: Folder of the model.
+        regression_only: True to save a function of the context, whatever predicts best.
 
     Returns:
         Median held-out errors, `held_out_CHANNEL_MODEL_nrmse_median`, of the best model of each
         kind.
+
+    Raises:
+        ValueError: A function of the context has no channel or too few demonstrations, or a
+            demonstration lacks a column.
     """
     metrics: dict[str, float] = {}
     chosen: dict[str, str] = {}
     for channel in LINEAR:
-        if channel not in fitted.each or len(demos) < FEWEST:
+        if channel not in fitted.each or (len(demos) < FEWEST and not regression_only):
             continue
         context = contexts(demos, columns, fitted.motions, channel) if columns else None
-        best = choose([fitted.each[channel]], context)
+        best = choose([fitted.each[channel]], context, regression_only=regression_only)
         best.save(folder / LEARNED / channel)
-        chosen[channel] = kind_of(best.chosen)
+        chosen[channel] = best.chosen.kind
         for candidate in (*best.candidates, best.chosen):
-            name = f"held_out_{channel}_{kind_of(candidate)}_nrmse_median"
+            name = f"held_out_{channel}_{candidate.kind}_nrmse_median"
             error = float(candidate.error.median())
             known = metrics.get(name, error)
             metrics[name] = error if candidate is best.chosen else min(known, error)
+    if regression_only and not chosen:
+        raise ValueError("a function of a context needs the channel joint or position.")
     if chosen:
         write_json(folder / CHOICE, {"models": chosen, "context": columns})
     return metrics

@@ -10,13 +10,13 @@ from torch.autograd import gradcheck
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import (
-    ContextualDMP,
     FramedDMP,
     Frames,
     JointDMP,
     PeriodicBasis,
     mean_primitive,
 )
+from hrc_learn.dmp.learned_motion import choose
 from hrc_learn.geometry import Pose
 
 
@@ -77,14 +77,12 @@ def test_the_product_is_generalised_least_squares(model):
         Q, R = np.linalg.qr(whole / scale)
         expected = np.linalg.solve(R, Q.T @ np.concatenate(values)) / scale
         spread = np.linalg.inv(R) / scale[:, None]
-        made = model.distribution(Frames(frames.A[i], frames.b[i]))
+        made = model.at(Frames(frames.A[i], frames.b[i])).coordinates()
         unit = np.sqrt(np.diag(spread @ spread.T))
         # Covariances with eigenvalues 1e-6 apart and more, inverted on either side.
-        assert np.abs((made.mean.numpy().ravel() - expected) / unit).max() < 1e-3
-        off = made.spread.numpy() @ made.spread.numpy().T - spread @ spread.T
-        assert np.abs(off / unit / unit[:, None]).max() < 1e-3
+        assert np.abs((made.detach().numpy().ravel() - expected) / unit).max() < 1e-3
         batch = model.at(frames)[i]
-        torch.testing.assert_close(batch.coordinates(), made.mean, rtol=1e-6, atol=1e-8)
+        torch.testing.assert_close(batch.coordinates(), made, rtol=1e-6, atol=1e-8)
 
 
 def test_a_frame_knows_what_was_shown_in_it():
@@ -122,13 +120,12 @@ def test_few_demonstrations_lead_elsewhere():
     place = torch.cat([frames.b, frames.A[..., 0]], -1).flatten(1)
     there = torch.cat([others.b, others.A[..., 0]], -1).flatten(1)
     start, goal = others.b.unbind(1)
-    mean = mean_primitive(JointDMP.fit(time, position, 30, approach=1.0))
+    each = JointDMP.fit(time, position, 30, approach=1.0)
+    mean, function = mean_primitive(each), choose([each], place, regression_only=True)
     made = {
         "frames": FramedDMP.fit(time, position, frames, 30).at(others).rollout(time),
         "mean": mean.rollout(time, start, goal),
-        "function": ContextualDMP.fit(time, position, place, n_basis=30)
-        .at(there)
-        .rollout(time, start, goal),
+        "function": function.at_contexts(there).rollout(time, start, goal),
     }
     error = {
         name: (m.position.detach() - wanted).square().sum(-1).mean(-1).sqrt().median()
@@ -178,14 +175,6 @@ def test_poses_in_space_and_a_column_of_no_place():
     torch.testing.assert_close(position[..., :3], way[:2], rtol=0, atol=0.06)
 
 
-def test_what_is_known_can_be_conditioned(model):
-    here = situations(1, seed=4)
-    known = model.distribution(Frames(here.A[0], here.b[0]))
-    via = torch.tensor([[0.5, 0.2]], dtype=torch.float64)
-    passed = known.condition([1.0], via, noise=1e-4).mean_primitive()
-    torch.testing.assert_close(passed.rollout([1.0]).position, via, rtol=0, atol=1e-2)
-
-
 def test_gradients_reach_frames(model):
     frames = situations(1, seed=4)
     with shapes_unchecked():
@@ -208,7 +197,5 @@ def test_what_cannot_be_is_refused(model):
         FramedDMP.fit(time, position, frames, basis=PeriodicBasis(count=9))
     with pytest.raises(ValueError, match="has 2 frames of 2 coordinates, got 1 of 2"):
         model.at(Frames(frames.A[:, :1], frames.b[:, :1]))
-    with pytest.raises(ValueError, match="without a batch"):
-        model.distribution(frames)
     with shapes_unchecked(), pytest.raises(ValueError, match="must have A"):
         replace(frames, A=frames.A[..., :1])

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from hrc_learn.demos import DatasetWriter, Demonstration, DemonstrationSet, open_demos
-from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.dmp import JointDMP, LearnedMotion, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
 from hrc_learn.learning import large_datasets
 from hrc_learn.learning.large_datasets import fit_all, sampled
-from hrc_learn.learning.model_choice import contexts, fit_contextual
+from hrc_learn.learning.model_choice import contexts, keep_best
 from hrc_learn.learning.primitive_fitting import (
     EACH,
     Motions,
@@ -93,18 +93,25 @@ def test_the_number_of_basis_functions_is_chosen_by_samples_held_out(demos):
 
 
 def test_contexts_are_ends_or_columns(demos, tmp_path):
+    column = ("observation.size",)
     fitted = fit_primitives(demos, 15, channels=("position",))
     ends = contexts(demos, (), fitted.motions, "position")
     assert ends.shape == (3, 6)
     np.testing.assert_allclose(ends[1, 3:], demos[1].position[-1])
-    size = contexts(demos, ("observation.size",), fitted.motions, "position")
+    size = contexts(demos, column, fitted.motions, "position")
     assert size[:, 0].tolist() == [1.5, 2.5, 3.5]
-    metrics = fit_contextual(fitted, demos, ("observation.size",), tmp_path)
-    # The reach is a linear function of the size, so two demonstrations tell of the third.
-    assert metrics["contextual_position_held_out_nrmse_max"] < 1e-2
-    model = ContextualDMP.load(tmp_path / "contextual" / "position")
-    middle = model.at([2.0])
+    with pytest.raises(ValueError, match="needs 4 demonstrations or more, got 3"):
+        keep_best(fitted, demos, column, tmp_path, regression_only=True)
+    more = DemonstrationSet([*demos, demonstration(3), demonstration(4)])
+    fitted = fit_primitives(more, 15, channels=("position",))
+    metrics = keep_best(fitted, more, column, tmp_path, regression_only=True)
+    # The reach is a linear function of the size, so the others tell of each.
+    assert metrics["held_out_position_contextual_nrmse_median"] < 1e-2
+    middle = LearnedMotion.load(tmp_path / "learned" / "position").at(context=[2.0])
     assert middle.goal[0].item() == pytest.approx(0.3 + 0.25, abs=1e-4)
+    fitted = fit_primitives(more, 15, channels=("orientation",))
+    with pytest.raises(ValueError, match="needs the channel joint or position"):
+        keep_best(fitted, more, column, tmp_path, regression_only=True)
     with pytest.raises(ValueError, match=r"episode 0: no column 'observation.mass'"):
         contexts(demos, ("observation.mass",), fitted.motions, "position")
 

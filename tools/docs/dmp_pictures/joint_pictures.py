@@ -5,13 +5,13 @@ import torch
 from matplotlib.figure import Figure
 
 from hrc_learn.dmp import (
-    ContextualDMP,
     GaussianBasis,
     JointDMP,
     MovingGoalDMP,
     ProbabilisticDMP,
     SplineBasis,
     fit_rhythmic,
+    learn,
 )
 from hrc_learn.viz import palette
 
@@ -173,14 +173,14 @@ def context(figure: Figure) -> None:
         lift = h * demonstrations.rise(1.4 * s) + 0.08 * torch.sin(torch.pi * s) ** 2
         return torch.stack([(0.4 * demonstrations.rise(s)).expand_as(lift), lift], -1)
 
-    dmp = ContextualDMP.fit(time.expand(5, -1), reach(heights), heights)
+    model = learn([(time, path) for path in reach(heights)], context=heights)
     where, when = panels(figure, 2)
     when.plot([], [], label="demonstrated", **DEMO)
     for path in reach(heights):
         where.plot(*path.T, **DEMO)
         when.plot(time, path[:, 1], **DEMO)
     for k, h in enumerate((0.15, 0.25, 0.35, 0.45)):
-        motion = dmp.at(torch.tensor([h], dtype=torch.float64)).rollout()
+        motion = model.at(context=[h]).rollout()
         path = motion.position.detach()
         where.plot(*path.T, color=palette.RUN)
         where.plot(0.4, path[-1, 1], "s", color=palette.RUN, ms=4.5)
