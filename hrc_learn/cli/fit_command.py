@@ -16,7 +16,7 @@ from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.learning.fit_dashboards import fit_report, record_fit, shown_fit
-from hrc_learn.learning.large_datasets import fit_all, fit_streamed, sampled
+from hrc_learn.learning.large_datasets import fit_streamed, sampled
 from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import CHANNELS, FittedPrimitives
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit
@@ -48,11 +48,10 @@ def fit_primitives(args: FitPrimitives) -> None:
         return
     source, left_out = _open(args)
     demos = sampled(source)
-    notes = [*left_out, *demos.notes, *[_SAMPLE_NOTE] * _is_sample(demos, source)]
-    print(*(f"note: {note}\n" for note in notes), sep="", end="")
+    print(*(f"note: {note}\n" for note in (*left_out, *demos.notes)), sep="", end="")
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
-        with console.status(f"Fitting {len(source)} demonstrations"):
-            fitted, metrics = _learn(args, source, demos, folder)
+        with console.status(f"Fitting {len(demos)} demonstrations"):
+            fitted, metrics = _learn(args, demos, folder)
         _draw(fitted, args, metrics, folder)
         _finish(args, metrics, folder)
     if (args.folder / PAGE).is_file():
@@ -69,11 +68,11 @@ def fit_silently(args: FitPrimitives) -> None:
     torch.manual_seed(0)
     source, _ = _open(args)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
-        _learn(args, source, sampled(source), folder)
+        _learn(args, sampled(source), folder)
 
 
 def _learn(
-    args: FitPrimitives, source: DemonstrationSource, demos: DemonstrationSet, folder: Path
+    args: FitPrimitives, demos: DemonstrationSet, folder: Path
 ) -> tuple[FittedPrimitives, dict[str, float]]:
     """Fit and save the models.
 
@@ -83,8 +82,6 @@ def _learn(
     # Only some channels take a scaling.
     scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
     fitted = fit(demos, args.n_basis, args.method, channels=args.channels, **scaled)
-    if _is_sample(demos, source):
-        fitted = fit_all(fitted, source)
     metrics = fitted.metrics()
     # Scaled motions are linear neither in the mean nor in a context.
     if args.several in ("best", "contextual") and args.scaling == "none":
@@ -92,10 +89,6 @@ def _learn(
         metrics |= keep_best(fitted, demos, args.context, folder, regression_only=only)
     fitted.save(folder, each=args.several == "distribution")
     return fitted, metrics
-
-
-def _is_sample(demos: DemonstrationSet, source: DemonstrationSource) -> bool:
-    return len(demos) < len(source) or demos.frames < source.frames
 
 
 def _refuse_contradictions(args: FitPrimitives) -> None:
@@ -115,12 +108,6 @@ def _refuse_contradictions(args: FitPrimitives) -> None:
     refuse_given(args, others, f"is not used by {model}: leave one of them out")
     if args.n_basis is None and (args.as_lerobot_policy or args.several == "streamed"):
         raise ValueError(f"{model} needs a number of basis functions: --n-basis 60")
-
-
-_SAMPLE_NOTE = (
-    "the mean is fitted to all demonstrations; its error, the comparison of models and all "
-    "other models use a sample of them"
-)
 
 
 def _open(args: FitPrimitives) -> tuple[DemonstrationSource, list[str]]:

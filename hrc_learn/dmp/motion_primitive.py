@@ -5,7 +5,7 @@ joints are columns themselves, an orientation becomes its error to a reference, 
 position, orientation error and body, and a moving goal is the frame in which joints are seen.
 """
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any, ClassVar, NamedTuple, TypedDict, Unpack
@@ -544,9 +544,18 @@ def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
     """
     if not primitives:
         raise ValueError("there are no primitives to stack")
-    for i, primitive in enumerate(primitives):
-        _check_alike(primitives[0], primitive, f"primitive {i}")
-    columns = _columns([primitive.tensors() for primitive in primitives])
+    first, *others = map(_described, primitives)
+    for i, other in enumerate(others, start=1):
+        if different := [name for name in first if other[name] != first[name]]:
+            name = different[0]
+            raise ValueError(
+                f"primitives of one batch must be alike, but {name} of primitive {i} is "
+                f"{other[name]}, of the first {first[name]}"
+            )
+    tensors = [primitive.tensors() for primitive in primitives]
+    # Parts of the fit report may be missing in some.
+    names = set.intersection(*map(set, tensors))
+    columns = {name: [each[name] for each in tensors] for name in names}
     return primitives[0].with_tensors(
         {
             name: _padded(rows) if name == "timestamps" else torch.stack(rows)
@@ -555,60 +564,11 @@ def stack[P: MotionPrimitive](primitives: Sequence[P]) -> P:
     )
 
 
-def concatenate[P: MotionPrimitive](batches: Iterable[P], samples: int) -> P:
-    """Batches of primitives of one kind, joined along their first axis.
-
-    They are read one by one and released after copying. Because demonstrations may have
-    different timestamps, those of the result, for its default rollout, are evenly spaced.
-
-    Args:
-        batches: Batches that agree in the axes after the first.
-        samples: Number of timestamps of the result.
-
-    Raises:
-        ValueError: There is no batch, or they differ; the message says in what.
-    """
-    first = None
-    parts: list[dict[str, Tensor]] = []
-    for batch in batches:
-        if first is None:
-            # A copy, so that the memory behind the batch is released.
-            first = batch[:1]
-        _check_alike(first, batch, f"batch {len(parts)}", axis=1)
-        parts.append({name: x.detach().clone() for name, x in batch.tensors().items()})
-    if first is None:
-        raise ValueError("there are no primitives to concatenate")
-    joined = {name: torch.cat(rows) for name, rows in _columns(parts, {"timestamps"}).items()}
-    joined["timestamps"] = torch.linspace(0, 1, samples).to(first.motion.timestamps)
-    return first.with_tensors(joined)
-
-
-def _check_alike(
-    first: MotionPrimitive, other: MotionPrimitive, label: str, axis: int = 0
-) -> None:
-    """Raise ValueError unless two primitives agree in kind, parts and, from an axis, shape."""
-    described, found = (
-        {
-            "kind": type(each).__name__,
-            **each.motion.config(),
-            "shape of the weights": tuple(each.motion.weights.shape[axis:]),
-        }
-        for each in (first, other)
-    )
-    for name, value in described.items():
-        if found[name] != value:
-            raise ValueError(
-                f"primitives of one batch must be alike, but {name} of {label} is "
-                f"{found[name]}, of the first {value}"
-            )
-
-
-def _columns(
-    tensors: list[dict[str, Tensor]], without: Set[str] = frozenset()
-) -> dict[str, list[Tensor]]:
-    """Tensors that all primitives have, by name."""
-    common = set.intersection(*(set(each) for each in tensors)) - without
-    return {name: [each[name] for each in tensors] for name in tensors[0] if name in common}
+def _described(primitive: MotionPrimitive) -> dict[str, Any]:
+    """Properties in which the primitives of a batch have to agree."""
+    shape = tuple(primitive.motion.weights.shape)
+    kind = {"kind": type(primitive).__name__}
+    return kind | primitive.motion.config() | {"shape of the weights": shape}
 
 
 def _padded(rows: list[Tensor]) -> Tensor:

@@ -1,36 +1,22 @@
-"""Fits of datasets larger than memory: from a sample, in batches, or streamed."""
+"""Fits of datasets larger than memory: from a sample, or streamed."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
-from hrc_learn.dmp import SharedFit, fit_shared, mean_primitive
-from hrc_learn.dmp.motion_primitive import concatenate
-from hrc_learn.learning.primitive_fitting import (
-    CHANNELS,
-    FittedPrimitives,
-    Motions,
-    Primitive,
-    require_motion,
-)
-from hrc_learn.learning.reproduction_error import ReproductionError
+from hrc_learn.dmp import SharedFit, fit_shared
+from hrc_learn.learning.primitive_fitting import CHANNELS, require_motion
 
 HELD_AT_ONCE = 700_000
 """Values of a channel (padded frames times joints, or 7 of a pose) that are held at once. Their
 fit and the comparison of models take up to 300 MB."""
-FITTED_AT_ONCE = 140_000
-"""Values per batch in `fit_all`, large enough for fast matrix products."""
 LONGEST = 5_000
 """Largest number of frames of one demonstration, up to 100 basis functions."""
-_SAMPLES = 50
-"""Frames for each basis function of more than 100: more add nothing that they can follow."""
 
 
 class LazyMap[S, T](Sequence[T]):
@@ -65,69 +51,12 @@ def sampled(source: DemonstrationSource) -> DemonstrationSet:
     longest = min(LONGEST, 2 * int(np.median(lengths)), max(lengths))
     count = min(len(lengths), max(1, HELD_AT_ONCE // (longest * _width(source))))
     demos = [_thinned(demo, longest) for demo in source.spread(count)]
-    note = "the demonstrations are too long for memory"
-    if count < len(lengths):
-        note = f"{count} of {len(lengths)} demonstrations, evenly spread, are a sample"
+    note = f"{count} of {len(lengths)} demonstrations, evenly spread, stand for all of them"
     if max(lengths) > longest:
-        note += f"; of longer ones {longest} frames are used"
+        note += f"; {longest} frames of longer ones are used"
+    note += "; --several streamed uses everything"
     notes, unit = (*source.notes, note), source.joint_unit
     return DemonstrationSet(demos, notes=notes, source=source.source, joint_unit=unit)
-
-
-def fit_all(fitted: FittedPrimitives, source: DemonstrationSource) -> FittedPrimitives:
-    """Fit every demonstration with the options of a sample's fit, batch by batch.
-
-    The mean, `every` and `every_error` of the result cover all demonstrations; `motions` and
-    `each` stay those of the sample.
-
-    Args:
-        fitted: Fit of the sample that `sampled` returns.
-        source: All demonstrations on disk.
-
-    Raises:
-        ValueError: A demonstration cannot be read or holds no motion; the message names it.
-    """
-    found = {channel: _fit_channel(fitted, source, channel) for channel in fitted.each}
-    every = {channel: primitives for channel, (primitives, _) in found.items()}
-    return replace(
-        fitted,
-        every=every,
-        every_error={channel: error for channel, (_, error) in found.items()},
-        common={k: mean_primitive(cast(Any, primitives)) for k, primitives in every.items()},
-    )
-
-
-def _fit_channel(
-    fitted: FittedPrimitives, source: DemonstrationSource, channel: str
-) -> tuple[Primitive, ReproductionError]:
-    """Primitives of all demonstrations with their errors."""
-    errors: list[dict[str, Tensor]] = []
-
-    def batches() -> Iterator[Primitive]:
-        for demos in _batches(source, max(LONGEST, _SAMPLES * fitted.n_basis)):
-            motions = Motions.of(demos)
-            primitives = motions.fit(channel, fitted.n_basis, **fitted.options)
-            errors.append(motions.error(channel, motions.own(primitives)).columns())
-            yield primitives
-
-    primitives = concatenate(batches(), fitted.motions.demos.mask.shape[1])
-    columns = {name: torch.cat([e[name] for e in errors]) for name in errors[0]}
-    return primitives, ReproductionError(**columns)
-
-
-def _batches(source: DemonstrationSource, longest: int) -> Iterator[DemonstrationSet]:
-    """Batches of demonstrations within `FITTED_AT_ONCE`."""
-    batch: list[Demonstration] = []
-    made = partial(DemonstrationSet, source=source.source, joint_unit=source.joint_unit)
-    for demo in source:
-        demo = _thinned(demo, longest)
-        padded = max(len(one) for one in (*batch, demo)) * (len(batch) + 1)
-        if batch and padded * _width(source) > FITTED_AT_ONCE:
-            yield made(batch)
-            batch = []
-        batch.append(demo)
-    if batch:
-        yield made(batch)
 
 
 def _width(source: DemonstrationSource) -> int:

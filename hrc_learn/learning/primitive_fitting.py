@@ -237,11 +237,6 @@ class FittedPrimitives:
     """Selection of the number of basis functions; None if it was given."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the fit."""
-    every: Mapping[str, Primitive] = field(default_factory=dict)
-    """Primitives of a dataset that `motions` and `each` are a sample of, by channel (see
-    `fit_all`). Empty without a sample."""
-    every_error: Mapping[str, ReproductionError] = field(default_factory=dict)
-    """Errors of the primitives in `every`, by channel."""
 
     @property
     def demonstrations(self) -> PaddedDemonstrations:
@@ -258,31 +253,21 @@ class FittedPrimitives:
         """
         for channel, primitive in self.common.items():
             primitive.save(folder / channel)
-        for channel, primitives in {**self.each, **self.every}.items() if each else ():
+        for channel, primitives in self.each.items() if each else ():
             primitives.save(folder / EACH / channel)
 
     def metrics(self) -> dict[str, float]:
         """Errors of the primitives, by name.
 
-        `mean_` marks the mean primitive, given start, goal and duration of each demonstration
-        (of the sample, if there is one).
+        `mean_` marks the mean primitive, given start, goal and duration of each demonstration.
         """
         count = float(len(self.demonstrations.length))
         values = {"demonstrations": count, "basis_functions": float(self.n_basis)}
-        if self.every:
-            values["demonstrations_sampled"] = count
         for channel, primitives in self.each.items():
-            own, mean = (
-                self.motions.error(channel, made)
-                for made in (
-                    self.motions.own(primitives),
-                    self.motions.adapted(channel, self.common[channel]),
-                )
-            )
-            if self.every:
-                own = self.every_error[channel]
-                values["demonstrations"] = float(len(next(iter(own.columns().values()))))
-            values |= own.summary(channel) | mean.summary(f"mean_{channel}")
+            own = self.motions.own(primitives)
+            mean = self.motions.adapted(channel, self.common[channel])
+            for name, made in ((channel, own), (f"mean_{channel}", mean)):
+                values |= self.motions.error(channel, made).summary(name)
         return values
 
 
@@ -305,8 +290,7 @@ def fit_primitives(
         channels: Channels to learn. Default: joints and pose, as far as they were recorded. A
             Panda's pose is computed from its joints, and its arm angle is learned too.
         candidates: Numbers of basis functions to choose from.
-        options: Further fields of `FitOptions`, such as `robust` or `scaling`. `smooth` is True
-            by default.
+        options: Further fields of `FitOptions`, and `scaling`. `smooth` is True by default.
 
     Raises:
         ValueError: The demonstrations hold no motion, or lack a column of a channel.
