@@ -1,6 +1,5 @@
 """`hrc play`: a fitted model carried out to a goal."""
 
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -32,6 +31,11 @@ from hrc_learn.store import new_folder, write_json, write_text
 from hrc_learn.viz.report import show_command
 from hrc_learn.viz.run_dashboard import record_run
 
+_ERRORS = {
+    "goal_position_error_mm": "{:.1f} mm from the goal",
+    "goal_turn_error_deg": "{:.1f} deg from it",
+    "goal_joint_error": "joints {:.2g} from the goal",
+}
 _POSE = ("x [m]", "y [m]", "z [m]", "qw", "qx", "qy", "qz")
 
 
@@ -99,21 +103,14 @@ def _target(model: FittedModel, words: Sequence[str], option: str) -> Target:
 
 
 def _figures(motion: PlayedMotion) -> dict[str, float]:
-    figures = {
+    return {
         "duration_s": float(motion.time[-1]),
         "planned_duration_s": motion.planned_duration,
         "samples": float(len(motion.time)),
         "beyond_limits": 0.0,
         "path_deviation_rad": motion.deviation,
+        **motion.goal_errors,
     }
-    for name, value, factor in (
-        ("goal_position_error_mm", motion.goal_position_error, 1e3),
-        ("goal_turn_error_deg", motion.goal_turn_error, 180 / math.pi),
-        ("goal_joint_error", motion.goal_joint_error, 1.0),
-    ):
-        if value is not None:
-            figures[name] = factor * value
-    return figures
 
 
 def _table(model: FittedModel, robot: Arm | None, motion: PlayedMotion) -> str:
@@ -182,13 +179,7 @@ def _recording(args: Play, robot: Arm, motion: PlayedMotion) -> RunRecording:
 
 def _report(args: Play, robot: Arm | None, motion: PlayedMotion) -> None:
     lasts = float(motion.time[-1])
-    said = []
-    if motion.goal_position_error is not None:
-        said.append(f"{1e3 * motion.goal_position_error:.1f} mm from the goal")
-    if motion.goal_turn_error is not None:
-        said.append(f"{180 / math.pi * motion.goal_turn_error:.1f} deg from it")
-    if motion.goal_joint_error is not None:
-        said.append(f"joints {motion.goal_joint_error:.2g} from the goal")
+    said = [_ERRORS[name].format(error) for name, error in motion.goal_errors.items()]
     print(f"{lasts:.2f} s, {', '.join(said)}")
     if robot is None:
         print("note: no --robot, so no limits were checked: motion.csv has the model's path")

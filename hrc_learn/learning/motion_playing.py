@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -15,12 +16,12 @@ from torch import Tensor
 
 from hrc_learn.controller.motion_filter import MotionFilter, MotionState
 from hrc_learn.dmp import JointDMP, PoseDMP
-from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import Arm, ArmChoice, TaskSpace, UnreachableError, arm_angle
+from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.kinematics import Arm, ArmChoice, UnreachableError
 from hrc_learn.kinematics.inverse import TASK_ROWS, follow_poses
+from hrc_learn.learning.arm_speed import speed_excess
 from hrc_learn.learning.model_choice import predicted_primitive
 from hrc_learn.learning.primitive_fitting import Primitive, load_primitive
-from hrc_learn.skills.placing import follow_pose
 
 DT = 0.02
 """Time between samples [s]."""
@@ -33,15 +34,15 @@ _DEVIATION = 2e-3
 _SLOWER, _ATTEMPTS = 1.1, 30
 _SETTLING = 1.0
 """Longest time after the path in which the motion reaches its end [s]."""
-_TURNS, _ROOM = 30, 0.1
-"""Steps towards an orientation that an arm may have no joints for, and the distance from the
-ends of the joints at which they stop [rad]."""
+_TURNS = 30
+"""Steps towards an orientation that an arm may have no joints for."""
 _MISSED = 1e-3
 """Error that counts as out of reach [m, rad]."""
 _SAME_TOOL = 0.02
 """Largest distance between the model's poses and those of its joints [m]."""
 
-Kind = Literal["joints", "position", "pose"]
+KINDS = "joints", "position", "pose"
+"""Kinds of goals."""
 
 
 class BeyondLimitsError(RuntimeError):
@@ -113,26 +114,20 @@ class FittedModel:
         Raises:
             ValueError: The words name no target of this model.
         """
-        counts: dict[Kind, int] = {"position": 3, "pose": 7}
+        counts = {"position": 3, "pose": 7}
         if self.joint is not None:
             counts = {"joints": len(self.joint_names), **counts}
-        given, numbers = "", list(words)
-        if numbers and numbers[0] in (*counts, "joints"):
-            given, numbers = numbers[0], numbers[1:]
+        given, numbers = ("", words) if words[0] not in KINDS else (words[0], words[1:])
         forms = ", ".join(f"{n} numbers ({kind})" for kind, n in counts.items())
-        if given and given not in counts:
-            raise ValueError(f"{option} joints: {self.folder} moves no joints; give {forms}.")
         try:
             values = torch.tensor([float(word) for word in numbers], dtype=torch.float64)
         except ValueError:
-            raise ValueError(
-                f"{option} {' '.join(words)}: give {forms}, or episode and its number."
-            ) from None
+            values = torch.empty(0)
         fits = [kind for kind, n in counts.items() if n == len(values) and given in ("", kind)]
         if not fits or not bool(values.isfinite().all()):
             raise ValueError(
-                f"{option} has {len(values)} numbers{f' for {given}' if given else ''}, but "
-                f"{self.folder} takes {forms}; all finite."
+                f"{option} {' '.join(words)}: {self.folder} takes {forms}, all finite, or "
+                "episode and its number."
             )
         if len(fits) > 1:
             raise ValueError(
@@ -143,14 +138,12 @@ class FittedModel:
             return Target(joints=values)
         if fits[0] == "position":
             return Target(position=values)
-        if abs(float(values[3:].norm()) - 1) > 0.02:
+        norm = float(values[3:].norm())
+        if abs(norm - 1) > 0.02:
             raise ValueError(
-                f"{option} pose: w x y z have the norm {float(values[3:].norm()):.3f}, but a "
-                "quaternion has 1."
+                f"{option} pose: w x y z have the norm {norm:.3f}, but a quaternion has 1."
             )
-        return Target(
-            position=values[:3], orientation=values[3:] / torch.linalg.vector_norm(values[3:])
-        )
+        return Target(position=values[:3], orientation=values[3:] / norm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,12 +162,9 @@ class PlayedMotion:
     """Duration that was asked for [s]; the motion is longer where the limits demand it."""
     slowed_by: str = ""
     """Limit that made the motion slower."""
-    goal_position_error: float | None = None
-    """Distance of the end from the goal [m]."""
-    goal_turn_error: float | None = None
-    """Angle between the end and the goal [rad]."""
-    goal_joint_error: float | None = None
-    """Largest distance of a joint from its goal, in the unit of `joints`."""
+    goal_errors: Mapping[str, float]
+    """Errors of the end: `goal_position_error_mm`, `goal_turn_error_deg`, and the largest one
+    of a joint in the unit of `joints`, `goal_joint_error`."""
     deviation: float = 0.0
     """Largest distance of a joint from the planned path [rad]."""
 
@@ -205,24 +195,21 @@ def play_path(
     if start is not None and (start.joints is None) != (goal.joints is None):
         raise ValueError("--start and --goal must be of one kind, or give --robot.")
     lasting = _duration(model, kind, duration)
-    if kind == "joint":
-        assert goal.joints is not None
-        joints = _joint_path(
-            model, None if start is None else start.joints, goal.joints, lasting
-        )
-        error = float((joints[-1] - goal.joints).abs().max())
+    time = _times(lasting).numpy()
+    if goal.joints is not None:
+        first = None if start is None else start.joints
+        joints = _joint_path(model, first, goal.joints, lasting)
+        error = {"goal_joint_error": float((joints[-1] - goal.joints).abs().max())}
         return PlayedMotion(
-            time=_times(lasting).numpy(),
-            joints=joints.numpy(),
-            planned_duration=lasting,
-            goal_joint_error=error,
+            time=time, joints=joints.numpy(), planned_duration=lasting, goal_errors=error
         )
-    pose, _, _ = _pose_path(model, start, goal, lasting)
-    return replace(
-        PlayedMotion(time=_times(lasting).numpy(), planned_duration=lasting),
+    pose = _pose_path(model, start, goal, lasting)
+    return PlayedMotion(
+        time=time,
         position=pose.position.numpy(),
         orientation=None if kind == "position" else pose.orientation.numpy(),
-        **_pose_errors(pose, goal),
+        planned_duration=lasting,
+        goal_errors=_pose_errors(pose, goal),
     )
 
 
@@ -250,35 +237,39 @@ def play_on_arm(
         UnreachableError: The arm does not reach the path or the goal.
         BeyondLimitsError: The path leaves the range of a joint.
     """
-    plan = _Plan.of(model, robot, start, goal, duration)
-    path, note, stretch = plan.path(plan.duration), "", 1.0
+    channel, path_in = _planner(model, robot, start, goal)
+    lasting = _duration(model, channel, duration)
+    path, note, stretch = path_in(lasting), "", 1.0
     for _ in range(_ATTEMPTS):
         _require_range(robot, path)
-        factor, limit = _too_fast(robot, path)
-        note = note or limit
-        if factor <= 1.0:
+        excess, limits = speed_excess(robot, path[None], DT, ("velocity", "acceleration"))
+        factor = float(excess)
+        if factor > 1.0:
+            note = note or limits[0]
+        else:
             joints = _within_limits(robot, path)
             off = _distance(joints, path)
             if off <= _DEVIATION:
                 break
             factor, note = _SLOWER, note or "jerk"
         stretch *= max(factor, 1 + 1e-3) * (1 + 1e-6)
-        path = plan.path(plan.duration * stretch)
+        path = path_in(lasting * stretch)
     else:
         raise BeyondLimitsError(f"no duration keeps the limits of {robot.name} on this path.")
     reached = robot.forward(torch.from_numpy(joints))
-    errors = _pose_errors(reached, plan.goal_pose)
+    errors = _pose_errors(reached, goal)
     if goal.joints is not None:
-        errors = {"goal_joint_error": float(np.abs(joints[-1] - plan.goal_joints).max())}
+        wanted = _in_rad(model, robot, goal.joints).numpy()
+        errors = {"goal_joint_error": float(np.abs(joints[-1] - wanted).max())}
     return PlayedMotion(
         time=DT * np.arange(len(joints)),
         joints=joints,
         position=reached.position.numpy(),
         orientation=reached.orientation.numpy(),
-        planned_duration=plan.duration,
+        planned_duration=lasting,
         slowed_by=note if stretch > 1 else "",
         deviation=off,
-        **errors,
+        goal_errors=errors,
     )
 
 
@@ -318,53 +309,33 @@ def arm_for(model: FittedModel, name: str) -> Arm:
     return arms[best]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Plan:
-    """Path of an arm as a function of the duration."""
+def _planner(
+    model: FittedModel, robot: Arm, start: Target | None, goal: Target
+) -> tuple[str, Callable[[float], Float[Tensor, "samples joints"]]]:
+    """Channel that plans the motion, and the joint path [rad] for a duration [s].
 
-    duration: float
-    path: Callable[[float], Float[Tensor, "samples joints"]]
-    """Joint positions [rad] for a duration [s]."""
-    goal_pose: Target
-    goal_joints: np.ndarray | None = None
+    Joints move by their primitive, or by inverse kinematics of the primitive of the tool.
+    """
+    tool = "pose" if model.pose is not None else "position"
+    if goal.joints is None and tool in model.primitives:
+        first = _first_joints(model, robot, start)
+        return tool, partial(_joints_along, model, robot, first, goal)
+    if model.joint is None:
+        raise ValueError(
+            f"{model.folder} holds no primitive of joints: give --goal position or pose."
+        )
+    usual = _in_rad(model, robot, model.joint.goal)  # refuses shares before any search
+    if goal.joints is None:
+        end = _joints_at(model, robot, goal, usual, robot.forward(usual))
+    else:
+        end = _in_rad(model, robot, goal.joints)
+    first = _first_joints(model, robot, start)
 
-    @classmethod
-    def of(
-        cls,
-        model: FittedModel,
-        robot: Arm,
-        start: Target | None,
-        goal: Target,
-        duration: float | None,
-    ) -> _Plan:
-        """Path by the primitive of joints, or by inverse kinematics of that of poses."""
-        has_path = model.pose is not None or "position" in model.primitives
-        if goal.joints is None and has_path:
-            channel = "pose" if model.pose is not None else "position"
-            lasting = _duration(model, channel, duration)
-            first = _first_joints(model, robot, start)
+    def path(duration: float) -> Tensor:
+        asked, wanted = (_in_model(model, robot, q) for q in (first, end))
+        return _in_rad(model, robot, _joint_path(model, asked, wanted, duration))
 
-            def along(time: float) -> Tensor:
-                return _joints_along(model, robot, first, goal, time)
-
-            return cls(duration=lasting, path=along, goal_pose=goal)
-        if model.joint is None:
-            raise ValueError(
-                f"{model.folder} holds no primitive of joints: give --goal position or pose."
-            )
-        lasting = _duration(model, "joint", duration)
-        _in_rad(model, robot, model.joint.start)  # refuses shares before any search
-        if goal.joints is None:
-            ending = _reached(model, robot, goal)
-        else:
-            ending = _in_rad(model, robot, goal.joints)
-        first = _in_model(model, robot, _first_joints(model, robot, start))
-        asked = _in_model(model, robot, ending)
-
-        def path(time: float) -> Tensor:
-            return _in_rad(model, robot, _joint_path(model, first, asked, time))
-
-        return cls(duration=lasting, path=path, goal_pose=goal, goal_joints=ending.numpy())
+    return "joint", path
 
 
 def _duration(model: FittedModel, channel: str, given: float | None) -> float:
@@ -391,17 +362,8 @@ def _joint_path(
 
 
 @torch.no_grad()
-def _pose_path(
-    model: FittedModel,
-    start: Target | None,
-    goal: Target,
-    duration: float,
-    body: Tensor | None = None,
-) -> tuple[Pose, Tensor | None, Tensor | None]:
-    """Poses of the end effector, their twists and the learned body.
-
-    Positions alone keep the orientation of the goal.
-    """
+def _pose_path(model: FittedModel, start: Target | None, goal: Target, duration: float) -> Pose:
+    """Poses of the end effector; positions alone keep the orientation of the goal."""
     time, pose = _times(duration), model.pose
     assert goal.position is not None
     if pose is None:
@@ -411,12 +373,10 @@ def _pose_path(
         moved = best.rollout(time, first, goal.position, duration, torch.zeros_like(first))
         still = torch.tensor((1.0, 0.0, 0.0, 0.0), dtype=time.dtype)
         turned = still if goal.orientation is None else goal.orientation
-        return Pose(moved.position, turned.expand(len(time), 4)), None, None
-    begin = _completed(start, pose.start)
-    end = _completed(goal, pose.goal)
+        return Pose(moved.position, turned.expand(len(time), 4))
+    begin, end = _completed(start, pose.start), _completed(goal, pose.goal)
     rest = torch.zeros(6, dtype=time.dtype)
-    motion = pose.rollout(time, begin, end, duration, rest, start_body=body)
-    return motion.pose, motion.twist, motion.body
+    return pose.rollout(time, begin, end, duration, rest).pose
 
 
 def _completed(target: Target | None, usual: Pose) -> Pose:
@@ -426,43 +386,28 @@ def _completed(target: Target | None, usual: Pose) -> Pose:
     return Pose(target.position, turned)
 
 
+@torch.no_grad()
 def _joints_along(
     model: FittedModel, robot: Arm, first: Tensor, goal: Target, duration: float
 ) -> Float[Tensor, "samples joints"]:
-    """Joint positions [rad] along the model's poses, from the joints at the start."""
+    """Joint positions [rad] along the model's poses, from the joints at the start.
+
+    The null space moves to the joints that the model has at its goal, that of fewer than six
+    joints to joints that turn the tool towards the goal.
+    """
     begin = robot.forward(first)
     start = Target(position=begin.position, orientation=begin.orientation)
-    has_angle = robot.null_space == "arm angle"
-    angle = arm_angle(robot.chain, first)[None] if has_angle else None
-    learned = model.pose is not None and model.pose.motion.start.shape[-1] > 6
-    poses, twist, body = _pose_path(model, start, goal, duration, angle if learned else None)
-    if has_angle and learned and twist is not None and body is not None:
-        path = follow_pose(robot.chain, first, poses, twist, body[:, 0], DT)
-        # The law follows with a lag that vanishes in time, and some of it is left at the end.
-        path[-1] = _followed(robot, path[-1], poses[-1:], "pose")[-1]
-        return path
-    turns = model.pose is not None or goal.orientation is not None
-    if robot.joints >= 6 and turns:
-        return _followed(robot, first, poses, "pose")
-    end = _nearest_posture(robot, poses[-1], first, turns)
-    steps = torch.linspace(0, 1, len(poses.position), dtype=first.dtype)[:, None]
-    progress = steps**3 * (10 - 15 * steps + 6 * steps**2)
-    return _followed(robot, first, poses, "position", torch.lerp(first, end, progress))
-
-
-@torch.no_grad()
-def _followed(
-    robot: Arm, first: Tensor, poses: Pose, task: TaskSpace, wish: Tensor | None = None
-) -> Float[Tensor, "samples joints"]:
-    """Joint positions along poses, each from the one before; `first` are those at the start.
-
-    Args:
-        robot: The arm.
-        first: Joint positions at the first pose [rad].
-        poses: Poses of the end effector.
-        task: Constrained part of the poses.
-        wish: Joint positions to be near to, where the task leaves some free [rad].
-    """
+    poses, end = _pose_path(model, start, goal, duration), None
+    whole = robot.joints >= 6 and (model.pose is not None or goal.orientation is not None)
+    if robot.joints < 6:
+        end = _joints_at(model, robot, None, first, poses[-1])
+    elif model.joint is not None:
+        end = _in_rad(model, robot, model.joint.goal)
+    wish = None
+    if end is not None:
+        progress, _ = minimum_jerk(torch.linspace(0, 1, len(poses.position)).to(first))
+        wish = torch.lerp(first, end, progress[:, None])
+    task = "pose" if whole else "position"
     path, _ = follow_poses(robot.chain, poses, first, wish, task)
     rows = TASK_ROWS[task]
     missed = robot.forward(path).twist_to(poses)[:, :rows].abs().amax(-1) > _MISSED
@@ -475,50 +420,41 @@ def _followed(
     return path
 
 
-def _nearest_posture(
-    robot: Arm, pose: Pose, near: Tensor, turns: bool
-) -> Float[Tensor, " joints"]:
-    """Joint positions at a position [rad], turned towards an orientation as far as they can."""
-    q = robot.inverse(pose, near=near, task="position")
-    if not turns:
-        return q
-    turned = quaternion.slerp(
-        robot.forward(q).orientation, pose.orientation, torch.linspace(0, 1, _TURNS).to(q)
-    )
-    turning = Pose(pose.position.expand(_TURNS, 3), turned)
-    path, _ = follow_poses(robot.chain, turning, q)
-    off = torch.linalg.vector_norm(robot.forward(path).position - pose.position, dim=-1)
-    margin = torch.minimum(path - robot.limits.lower, robot.limits.upper - path).amin(-1)
-    # The joints of the path on the way to it need some room.
-    fine = ((off < _MISSED / 10) & (margin > _ROOM)).int().cumprod(0)
-    return path[int(fine.sum()) - 1] if bool(fine[0]) else q
-
-
 def _first_joints(model: FittedModel, robot: Arm, start: Target | None) -> Tensor:
     """Joint positions at the start [rad]."""
+    near = robot.ready if model.joint is None else _in_rad(model, robot, model.joint.start)
+    if start is None and model.joint is not None:
+        return near
     if start is not None and start.joints is not None:
         return _in_rad(model, robot, start.joints)
-    if start is None and model.joint is not None:
-        return _in_rad(model, robot, model.joint.start)
-    return _reached(model, robot, start)
-
-
-def _reached(model: FittedModel, robot: Arm, target: Target | None) -> Tensor:
-    """Joint positions [rad] of a pose, near those that the model has there."""
-    near, usual = robot.ready, None
-    if model.joint is not None:
-        near = _in_rad(model, robot, model.joint.start if target is None else model.joint.goal)
-        usual = robot.forward(near)
+    usual = robot.forward(near)
     if model.pose is not None:
-        usual = model.pose.start if target is None else model.pose.goal
-    if usual is None:
+        usual = model.pose.start
+    elif "position" in model.primitives:
         linear = cast("JointDMP", model.primitives["position"])
-        usual = Pose(linear.start, robot.forward(near).orientation)
+        usual = Pose(linear.start, usual.orientation)
+    return _joints_at(model, robot, start, near, usual)
+
+
+@torch.no_grad()
+def _joints_at(
+    model: FittedModel, robot: Arm, target: Target | None, near: Tensor, usual: Pose
+) -> Float[Tensor, " joints"]:
+    """Joint positions [rad] at a pose, near others.
+
+    Fewer than six joints keep the position, and the orientation as far as they can.
+    """
     pose = _completed(target, usual)
     free = target is not None and target.orientation is None and model.pose is None
     if robot.joints >= 6 and not free:
         return robot.inverse(pose, near=near)
-    return _nearest_posture(robot, pose, near, not free)
+    q = robot.inverse(pose, near=near, task="position")
+    if free:
+        return q
+    still = Pose(pose.position.expand(_TURNS, 3), pose.orientation.expand(_TURNS, 4))
+    turned, _ = follow_poses(robot.chain, still, q)
+    missed = torch.linalg.vector_norm(robot.forward(turned[-1]).position - pose.position)
+    return turned[-1] if float(missed) < _MISSED / 10 else q
 
 
 def _columns(model: FittedModel, robot: Arm) -> tuple[float, list[int]]:
@@ -560,20 +496,6 @@ def _require_range(robot: Arm, path: Float[Tensor, "samples joints"]) -> None:
         )
 
 
-def _too_fast(robot: Arm, path: Float[Tensor, "samples joints"]) -> tuple[float, str]:
-    """Factor by which the path is too fast, and the limit that it breaks most."""
-    worst, said = 1.0, ""
-    for order, kind in enumerate(("velocity", "acceleration"), 1):
-        rate = torch.diff(path, n=order, dim=0) / DT**order
-        # The path begins and ends at rest: its first step is a change of velocity, too.
-        ratio = (rate.abs() / getattr(robot.limits, kind)).amax(0)
-        factor = float(ratio.max()) ** (1 / order)
-        if factor > worst:
-            name = robot.chain.joint_names[int(ratio.argmax())]
-            worst, said = factor, f"{kind} of {name}"
-    return worst, said
-
-
 def _within_limits(
     robot: Arm, path: Float[Tensor, "samples joints"]
 ) -> Float[np.ndarray, "moments joints"]:
@@ -606,9 +528,9 @@ def _pose_errors(pose: Pose, goal: Target) -> dict[str, float]:
     """Distance and angle of the last pose from the goal."""
     errors = {}
     if goal.position is not None:
-        apart = pose.position[-1] - goal.position
-        errors["goal_position_error"] = float(torch.linalg.vector_norm(apart))
+        apart = (pose.position[-1] - goal.position).norm()
+        errors["goal_position_error_mm"] = 1e3 * float(apart)
     if goal.orientation is not None:
-        turn = quaternion.multiply(quaternion.conjugate(goal.orientation), pose.orientation[-1])
-        errors["goal_turn_error"] = float(torch.linalg.vector_norm(quaternion.log(turn)))
+        turn = quaternion.angle(goal.orientation, pose.orientation[-1])
+        errors["goal_turn_error_deg"] = float(turn.rad2deg())
     return errors

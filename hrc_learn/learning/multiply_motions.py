@@ -25,6 +25,7 @@ from hrc_learn.dmp.probabilistic_dmp import with_common_reference
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm
 from hrc_learn.kinematics.inverse import follow_poses
+from hrc_learn.learning.arm_speed import speed_excess
 
 BASE, POSITION_ONLY = "base", " position"
 """Frame of the base, and end of the name of an object's frame that does not turn."""
@@ -367,7 +368,9 @@ class MotionSource:
             part = draws[left]
             poses = self.poses(part)
             q, missed = self._joint_paths(part, poses)
-            factor, limit = self._too_fast(q)
+            factor, limit = speed_excess(self.robot, q, 1 / self.fps, usable=_USABLE)
+            # Joints of a motion that does not reach its poses may jump, at any speed.
+            factor = factor.clamp(max=_JUMP)
             # What cannot be reached is tried once at a lower speed, at which joints jump less.
             again = (factor > 1) & (turn < _SLOWER) & ((missed == 0) | (turn == 0))
             where = self._collisions(q[~again])
@@ -443,18 +446,6 @@ class MotionSource:
         worst = torch.where(inside, error, 0.0).amax(-1)
         q = torch.where(inside[..., None], q, last[:, None])
         return q, torch.where(worst > _REACHED, worst, 0.0)
-
-    def _too_fast(self, q: Float[Tensor, "B T joints"]) -> tuple[Float[Tensor, "B"], list[str]]:
-        """Factor by which each motion is too fast, and the limit that it breaks most."""
-        factors, names = [], []
-        for order, kind in enumerate(("velocity", "acceleration", "jerk"), 1):
-            rate = torch.diff(q, n=order, dim=1).abs() * self.fps**order
-            ratio = (rate / (_USABLE * getattr(self.robot.limits, kind))).amax(1)
-            factors.append(ratio ** (1 / order))
-            names += [f"{kind} of {joint}" for joint in self.robot.joint_names]
-        worst, at = torch.cat(factors, -1).max(-1)
-        # Of one that does not reach its poses the joints may jump, at any speed.
-        return worst.clamp(max=_JUMP), [names[k] for k in at.tolist()]
 
     def _collisions(self, q: Float[Tensor, "B T joints"]) -> list[str]:
         """Collision of each motion with the arm itself or a box, in words; empty if clear."""
