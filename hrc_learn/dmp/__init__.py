@@ -24,6 +24,7 @@ from hrc_learn.dmp.joint_dmp import fit_shared as fit_shared
 from hrc_learn.dmp.joint_dmp import select_basis_count as select_basis_count
 from hrc_learn.dmp.learned_motion import LearnedMotion as LearnedMotion
 from hrc_learn.dmp.learned_motion import learn as learn
+from hrc_learn.dmp.mixture_dmp import MixtureDMP as MixtureDMP
 from hrc_learn.dmp.motion_head import MotionDistribution as MotionDistribution
 from hrc_learn.dmp.motion_head import MotionHead as MotionHead
 from hrc_learn.dmp.motion_primitive import MotionPrimitive as MotionPrimitive
@@ -33,7 +34,6 @@ from hrc_learn.dmp.orientation_dmp import OrientationDMP as OrientationDMP
 from hrc_learn.dmp.orientation_dmp import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.pose_dmp import PoseDMP as PoseDMP
 from hrc_learn.dmp.pose_dmp import PoseTrajectory as PoseTrajectory
-from hrc_learn.dmp.probabilistic_dmp import MixtureDMP as MixtureDMP
 from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP as ProbabilisticDMP
 from hrc_learn.dmp.probabilistic_dmp import mean_primitive as mean_primitive
 from hrc_learn.dmp.response import Response as Response

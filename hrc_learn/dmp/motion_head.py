@@ -40,6 +40,8 @@ from hrc_learn.dmp.trajectory import Trajectory, output
 
 SAMPLES_PER_FUNCTION = 20
 """Samples per basis function at which the modes of a motion are computed."""
+COMPARED = 30
+"""Times at which motions are compared by their divergence."""
 ENCODING_NOISE = 1e-4
 """Noise of encoded samples relative to the amplitude: far below the differences of motions."""
 
@@ -488,52 +490,27 @@ class MotionDistribution:
     def kl(
         self, other: "MotionDistribution", time: Times | None = None, noise: float = 1e-3
     ) -> Float[Tensor, "*batch"]:
-        """KL divergence KL(self || other) of motions.
+        """KL divergence KL(self || other) of positions observed with noise.
+
+        It is finite also if start, velocity or timing differ, which are certain.
 
         Args:
-            other: Distribution of the same head, with equal state and timing unless `time` is
-                given: motions are an injective linear map of the linear parameters then, so
-                that it equals theirs.
-            time: [s], (T,). The divergence is that of the positions at these times, observed
-                with noise, which differ with start, velocity, duration and delay too.
+            other: Distribution of motions with as many columns.
+            time: [s], (T,); by default `COMPARED` times of the longest motion.
             noise: Standard deviation of each position.
-
-        Raises:
-            ValueError: States or timing differ and no times are given: the divergence is
-                infinite then.
         """
-        if time is not None:
-            return kl_divergence(self._observed(time, noise), other._observed(time, noise))
-        if not _same(self._certain(), other._certain()):
-            raise ValueError(
-                "start, velocity or timing of the motions differ, so their divergence is "
-                "infinite: give times, at which noisy positions are compared"
-            )
-        L = self.head.n_linear
-        off = (other.parameters - self.parameters)[..., :L, None]
-        ratio = torch.linalg.solve_triangular(
-            *torch.broadcast_tensors(other.scale_tril, self.scale_tril), upper=False
-        )
-        batch = torch.broadcast_shapes(off.shape[:-2], other.scale_tril.shape[:-2])
-        factor = other.scale_tril.expand(*batch, L, L)
-        moved = torch.linalg.solve_triangular(factor, off.expand(*batch, L, 1), upper=False)
-        size = ratio.square().sum((-2, -1)) + moved.square().sum((-2, -1)) - L
-        return size / 2 + _log_diagonal(other.scale_tril) - _log_diagonal(self.scale_tril)
-
-    def _certain(self) -> tuple[Tensor, ...]:
-        """Numbers that do not vary: state, timing, and scales of the head."""
-        head = self.head
-        like, given = self.parameters, self.state
-        empty = [like.new_zeros(()) if x is None else to_tensor(x) for x in given.values()]
-        centre = like.new_zeros(()) if head.goal_centre is None else head.goal_centre
-        timing = head._timing(like)
-        return (*empty, centre, head.amplitude, head.goal_scale, *timing)
+        if time is None:
+            head = self.head
+            last = head.longest + head.latest
+            first = 0.0 if self.state["since"] is None else to_tensor(self.state["since"]).max()
+            time = torch.linspace(float(first), last, COMPARED, dtype=torch.float64)
+        return kl_divergence(self._observed(time, noise), other._observed(time, noise))
 
     def _observed(self, time: Times, noise: float) -> LowRankMultivariateNormal:
         mean, root = self._moments(time)
         mean, root = mean.flatten(-2), root.flatten(-3, -2)
-        variance = positive("noise", noise, mean) ** 2
-        return LowRankMultivariateNormal(mean, root, variance.expand_as(mean))
+        variance = (positive("noise", noise, mean) ** 2).expand_as(mean)
+        return LowRankMultivariateNormal(mean, root, variance, validate_args=False)
 
     @full_precision
     def _moments(self, time: Times) -> tuple[Tensor, Tensor]:
@@ -546,20 +523,6 @@ class MotionDistribution:
         factor = self.scale_tril.unflatten(-2, (head.columns, -1))
         factor = head._scales().to(mean)[..., None] * factor
         return mean, torch.einsum("...tm,...dmr->...tdr", rows, factor)
-
-
-def _same(ones: tuple[Tensor, ...], others: tuple[Tensor, ...]) -> bool:
-    """True if all numbers agree, or must not be read."""
-    if not readable(*ones, *others):
-        return True
-    return all(
-        bool(torch.isclose(a.detach(), b.detach().to(a)).all())
-        for a, b in zip(ones, others, strict=True)
-    )
-
-
-def _log_diagonal(factor: Float[Tensor, "*batch L L"]) -> Float[Tensor, "*batch"]:
-    return factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 def _each_column(name: str, value: Any, columns: int) -> Float[Tensor, "D"]:

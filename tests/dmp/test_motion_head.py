@@ -186,17 +186,21 @@ def linear_zero(head, z):
     return torch.cat([0 * z[..., : head.n_linear], z[..., head.n_linear :]], -1)
 
 
-def test_divergence_of_motions_is_that_of_parameters(head, factor):
-    L, start = head.n_linear, torch.zeros(2).double()
+@pytest.mark.parametrize("state", [{}, {"since": 0.6}], ids=["whole", "from a state"])
+def test_divergence_of_motions_is_that_of_noisy_positions(head, factor, state):
+    start, time = torch.zeros(3, 2).double(), 0.6 + TIME[::8]
     z, others = random(3, head.n_parameters), random(3, head.n_parameters, seed=9)
-    others[:, L:] = z[:, L:]  # equal timing
-    p = head.distribution(z, factor, start)
-    q = head.distribution(others, 1.5 * factor[0], start)
-    P = MultivariateNormal(z[..., :L], scale_tril=factor)
-    Q = MultivariateNormal(others[..., :L], scale_tril=1.5 * factor[0])
-    torch.testing.assert_close(p.kl(q), kl_divergence(P, Q))
-    torch.testing.assert_close(q.kl(p), kl_divergence(Q, P))
-    assert p.kl(p).abs().max() < 1e-12
+    wider = 1.5 * factor
+    p, q = (head.distribution(*x, start, **state) for x in ((z, factor), (others, wider)))
+    found = p.kl(q, time, noise=0.1)
+    pairs = (dense(head, *x, time, start, **state) for x in ((z, factor), (others, wider)))
+    for i, normals in enumerate(zip(*pairs, strict=True)):
+        noisy = (
+            MultivariateNormal(mean, C + 0.01 * torch.eye(len(C)).to(C)) for mean, C in normals
+        )
+        torch.testing.assert_close(found[i], kl_divergence(*noisy))
+    assert p.kl(p).abs().max() < 1e-6
+    assert (p.kl(q) > 1).all()
 
 
 def test_samples_have_the_covariance(head, factor):
@@ -241,7 +245,7 @@ def test_maps_like_a_loop(head, factor):
     def density(z, factor, start):
         motions = head.distribution(z, factor, start)
         return motions.log_prob(TIME[::8], torch.ones(6, 2).double(), 0.1), motions.kl(
-            head.distribution(linear_zero(head, z), 2 * factor, start)
+            head.distribution(linear_zero(head, z), 2 * factor, start), TIME[::8], 0.1
         )
 
     expected = density(z, factor, start)
@@ -258,7 +262,7 @@ def test_gradients_reach_mean_and_factor(head, factor):
         reference = head.distribution(
             linear_zero(head, z), torch.eye(L).to(z), torch.zeros(2).double()
         )
-        return motions.log_prob(time, y, 0.3) + motions.kl(reference)
+        return motions.log_prob(time, y, 0.3) + motions.kl(reference, time, 0.3)
 
     inputs = z.requires_grad_(), factor.requires_grad_()
     assert torch.autograd.gradcheck(density, inputs, atol=1e-5, fast_mode=True)

@@ -1,0 +1,218 @@
+"""Several routes of a motion, each a Gaussian over primitives.
+
+The mean of demonstrations that pass an obstacle on either side collides with it. A mixture
+separates them by expectation-maximisation on their paths. What is known before the motion
+(start and goal, or another context) or observed during it determines the likely mode.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Unpack
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
+from hrc_learn.dmp.linear_primitive import LinearPrimitive
+from hrc_learn.dmp.motion_primitive import MotionPrimitive, ViaOptions
+from hrc_learn.dmp.probabilistic_dmp import (
+    PATH_TIMES,
+    ProbabilisticDMP,
+    gaussians_of_modes,
+    with_common_reference,
+)
+from hrc_learn.geometry import Pose
+
+EXPLAINED, MAXIMUM_DIRECTIONS = 0.9, 3
+"""Fraction of the variance of paths in the directions of comparison, and the largest number of
+these: with few demonstrations, further directions are chance."""
+MINIMUM_SPREAD = 0.1
+"""Spread within a mode, relative to the total: two demonstrations that agree by chance must not
+form a mode."""
+STRONG_EVIDENCE = 10.0
+"""Difference of the criterion that is very strong evidence for more modes (Kass and Raftery
+1995, "Bayes factors"); with few demonstrations, chance alone makes half of it."""
+MAXIMUM_ITERATIONS, SETTLED = 100, 1e-6
+"""Limit of expectation-maximisation, and change of responsibilities at which it ends."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MixtureDMP[P: MotionPrimitive]:
+    """Modes of a motion, each a `ProbabilisticDMP`, and their probabilities.
+
+    `at` and `condition` return the updated mixture.
+    """
+
+    modes: tuple[ProbabilisticDMP[P], ...]
+    probability: Float[Tensor, "K"]
+    """Probability of each mode; a priori, its fraction of the demonstrations."""
+    responsibilities: Float[Tensor, "n K"]
+    """Probability of each mode for each demonstration; rows sum to one."""
+    contexts: Float[Tensor, "K C"]
+    """Mean context of each mode."""
+    precision: Float[Tensor, "C C"]
+    """Inverse covariance of contexts around these means."""
+
+    @classmethod
+    def fit(
+        cls,
+        primitives: P,
+        context: Vectors | None = None,
+        n_modes: int | None = None,
+        *,
+        slack: float = 0.0,
+    ) -> "MixtureDMP[P]":
+        """Separate a batch of primitives into modes.
+
+        Args:
+            primitives: Primitives of several demonstrations, fitted with `scaling="none"`.
+            context: (n, C) known before the motion; by default starts and goals, in columns.
+            n_modes: K. None: the smallest number without strong evidence against it by the
+                Bayesian information criterion (Schwarz 1978), at most half the demonstrations.
+            slack: Freedom beyond the variation of the demonstrations; see
+                `ProbabilisticDMP.fit`.
+
+        Raises:
+            ValueError: Fewer than two primitives, more modes than primitives, or another number
+                of contexts.
+        """
+        motion = with_common_reference(primitives).motion
+        n = motion.weights.shape[:-2].numel()
+        if n < 2:
+            raise ValueError("a distribution needs a batch of at least 2 primitives")
+        x = motion.coordinates().detach().double().flatten(0, -3)
+        if n_modes is not None and not 1 <= n_modes <= n:
+            raise ValueError(f"{n} primitives have 1 to {n} modes, not {n_modes}")
+        r = _responsibilities(principal_components(_paths(motion)), n_modes)
+        if context is None:
+            c = x[..., -2:].flatten(1)
+        else:
+            c = to_tensor(context, torch.float64).reshape(n, -1)
+        return cls(
+            modes=tuple(gaussians_of_modes(primitives, r, slack)),
+            probability=r.mean(0),
+            responsibilities=r,
+            contexts=(r / r.sum(0)).mT @ c,
+            precision=_context_precision(c, r),
+        )
+
+    @property
+    def most_likely(self) -> ProbabilisticDMP[P]:
+        """Mode of the largest probability."""
+        return self.modes[int(self.probability.argmax())]
+
+    def mean_primitive(self) -> P:
+        """Mean of the most likely mode; the mean of all modes would take none of the routes."""
+        return self.most_likely.mean_primitive()
+
+    def at(self, context: Vectors) -> "MixtureDMP[P]":
+        """Mixture given a context, (C,): modes with similar contexts become more likely."""
+        c = to_tensor(context, torch.float64)
+        if c.shape != self.contexts.shape[1:]:
+            raise ValueError(
+                f"context must be {tuple(self.contexts.shape[1:])}, got {tuple(c.shape)}"
+            )
+        off = c - self.contexts
+        return self._updated((off @ self.precision * off).sum(-1) / -2)
+
+    def condition(
+        self,
+        time: Times,
+        value: Points | Pose,
+        velocity: Points | None = None,
+        *,
+        noise: float = 1e-6,
+        **options: Unpack[ViaOptions],
+    ) -> "MixtureDMP[P]":
+        """Mixture conditioned on via points; see `ProbabilisticDMP.condition`.
+
+        The density of the values under each mode updates the probabilities, and each mode is
+        conditioned.
+        """
+        body = options.get("body")
+        densities = [mode.log_prob(time, value, noise=noise, body=body) for mode in self.modes]
+        modes = [
+            mode.condition(time, value, velocity, noise=noise, **options) for mode in self.modes
+        ]
+        return replace(self._updated(torch.stack(densities)), modes=tuple(modes))
+
+    def _updated(self, log_likelihood: Float[Tensor, "K"]) -> "MixtureDMP[P]":
+        """Mixture with probabilities updated by Bayes' rule."""
+        score = self.probability.log() + log_likelihood
+        return replace(self, probability=torch.softmax(score, 0))
+
+
+def _paths(motion: LinearPrimitive) -> Float[Tensor, "n DT"]:
+    s = torch.linspace(0, 1, PATH_TIMES, dtype=torch.float64)
+    rows = motion.response.evaluate(s.to(motion.start.device))[:, 0]
+    x = motion.coordinates().detach().double().flatten(0, -3)
+    return (x @ rows.mT).flatten(1)
+
+
+def principal_components(paths: Float[Tensor, "n F"]) -> Float[Tensor, "n d"]:
+    """Coordinates of paths in the directions of largest variance."""
+    U, sigma, _ = torch.linalg.svd(paths - paths.mean(0), full_matrices=False)
+    explained = sigma.square().cumsum(0) / sigma.square().sum().clamp(min=1e-300)
+    d = min(int((explained < EXPLAINED).sum()) + 1, MAXIMUM_DIRECTIONS)
+    return U[:, :d] * sigma[:d]
+
+
+def _responsibilities(z: Float[Tensor, "n d"], n_modes: int | None) -> Float[Tensor, "n K"]:
+    """Responsibilities of K modes, or of as many as the evidence supports."""
+    n, d = z.shape
+    if n_modes is not None:
+        return _expectation_maximisation(z, n_modes)[0]
+    found = []
+    for K in range(1, max(n // 2, 1) + 1):
+        r, log_likelihood = _expectation_maximisation(z, K)
+        # Parameters: probabilities and means of the modes, and one spread per direction.
+        criterion = ((K - 1) + K * d + d) * math.log(n) - 2 * log_likelihood
+        found.append((criterion, r))
+    least = min(criterion for criterion, _ in found)
+    return next(r for criterion, r in found if criterion <= least + STRONG_EVIDENCE)
+
+
+def _expectation_maximisation(
+    z: Float[Tensor, "n d"], K: int
+) -> tuple[Float[Tensor, "n K"], float]:
+    """Responsibilities of K Gaussians with one diagonal covariance, and the log likelihood.
+
+    It starts from the samples farthest from each other (Gonzalez 1985), which is deterministic.
+    """
+    centres = z.square().sum(-1).argmax()[None]
+    while len(centres) < K:
+        distance = torch.cdist(z, z[centres]).amin(-1)
+        centres = torch.cat([centres, distance.argmax()[None]])
+    least = MINIMUM_SPREAD**2 * z.var(0, correction=0) + torch.finfo(z.dtype).tiny
+    r = torch.nn.functional.one_hot(torch.cdist(z, z[centres]).argmin(-1), K).to(z)
+    log_density = torch.zeros_like(r)
+    for _ in range(MAXIMUM_ITERATIONS):
+        weight = r.sum(0).clamp(min=torch.finfo(z.dtype).tiny)
+        means = r.mT @ z / weight[:, None]
+        square = (z[:, None] - means).square()
+        # Each mean takes one degree of freedom, which matters for few samples.
+        spread = (r[..., None] * square).sum((0, 1)) / max(len(z) - K, 1)
+        variance = torch.maximum(spread, least)
+        log_density = (weight / len(z)).log() - (
+            square / variance + (2 * torch.pi * variance).log()
+        ).sum(-1) / 2
+        before, r = r, torch.softmax(log_density, -1)
+        if (r - before).abs().amax() < SETTLED:
+            break
+    return r, torch.logsumexp(log_density, -1).sum().item()
+
+
+def _context_precision(
+    c: Float[Tensor, "n C"], r: Float[Tensor, "n K"]
+) -> Float[Tensor, "C C"]:
+    """Inverse covariance of contexts around the means of their modes.
+
+    The standard deviation is at least `MINIMUM_SPREAD` of that over all demonstrations, in the
+    mean of the coordinates, because a context is evidence and not proof.
+    """
+    off = (c[:, None] - (r / r.sum(0)).mT @ c) * r.sqrt()[..., None]
+    within = off.flatten(0, 1)
+    covariance = within.mT @ within / max(len(c) - r.shape[1], 1)
+    floor = MINIMUM_SPREAD**2 * c.var(0, correction=0).mean() + torch.finfo(c.dtype).tiny
+    return torch.linalg.inv(covariance + floor * torch.eye(c.shape[1]).to(c))
