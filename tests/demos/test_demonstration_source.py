@@ -111,9 +111,8 @@ def test_nothing_is_read_where_no_unit_must_be_guessed(tmp_path, monkeypatch):
     dataset = open_dataset(write(tmp_path / "set"))
     entries = dataset.folder.episodes
     rows = count_rows(monkeypatch)
-    assert (
-        dataset.decide_units(entries, {"joint_position": "rad"})["joint_position"].unit == "rad"
-    )
+    decisions, _ = dataset.decide_units(entries, {"joint_position": "rad"})
+    assert decisions["joint_position"].unit == "rad"
     assert not rows
     dataset.decide_units(entries, {})
     assert sum(rows) == sum(LENGTHS)

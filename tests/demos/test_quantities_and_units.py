@@ -15,6 +15,7 @@ from hrc_learn.demos.read.naming import (
     role_of_key,
     without_unit,
 )
+from hrc_learn.demos.read.unit_evidence import Sizes
 from hrc_learn.demos.read.units import decide_units, units_from_episodes
 
 
@@ -91,6 +92,18 @@ def test_keys(key, role):
     assert role_of_key(key) == role
 
 
+def decided(peaks, stated=None, step=1.0):
+    """Decisions on quantities of one component, of which only the largest value is known."""
+    no, sizes = np.zeros(1, bool), {}
+    for role, peak in peaks.items():
+        sizes[role] = Sizes(np.array([peak]), np.zeros(1), no, no, no)
+    selections = {
+        role: ColumnSelection(role=role, columns=((role, 0),), labels=("a",)) for role in peaks
+    }
+    guessed = {r: s for r, s in sizes.items() if "velocity" not in r and r != "time"}
+    return decide_units(selections, guessed, stated or {}, step)
+
+
 @pytest.mark.parametrize(
     ("role", "largest", "unit"),
     [
@@ -117,7 +130,7 @@ def test_keys(key, role):
     ],
 )
 def test_units_are_guessed_by_how_far_values_reach(role, largest, unit):
-    decision = decide_units({role: largest}, {}, {})[role]
+    decision = decided({role: largest})[role]
     assert decision.unit == unit
     assert decision.converts == (unit not in ("rad", "m"))
     assert f"taken for {unit}" in str(decision.note)
@@ -127,7 +140,7 @@ def test_units_are_guessed_by_how_far_values_reach(role, largest, unit):
     ("role", "unit"), [("joint_velocity", "deg/s"), ("command_velocity", "deg/s")]
 )
 def test_velocities_follow_the_unit_of_positions(role, unit):
-    decisions = decide_units({role: 1.0, "joint_position": 90.0}, {}, {})
+    decisions = decided({role: 1.0, "joint_position": 90.0})
     assert decisions[role].unit == unit
     assert decisions[role].factor == pytest.approx(math.pi / 180)
 
@@ -135,7 +148,7 @@ def test_velocities_follow_the_unit_of_positions(role, unit):
 @pytest.mark.parametrize("unit", ["%", "1"])
 @pytest.mark.parametrize("role", ["joint_velocity", "command_velocity"])
 def test_velocities_of_joints_given_as_a_share_keep_their_own_unit(role, unit):
-    decisions = decide_units({role: 1.0, "joint_position": 90.0}, {}, {"joint_position": unit})
+    decisions = decided({role: 1.0, "joint_position": 90.0}, {"joint_position": unit})
     assert decisions[role].unit == "rad/s"
     assert decisions[role].evidence == ""
 
@@ -151,7 +164,7 @@ def test_velocities_of_joints_given_as_a_share_keep_their_own_unit(role, unit):
     ],
 )
 def test_the_unit_of_stamps_is_the_nearest_to_the_frame_rate(step, unit, factor):
-    decision = decide_units({"time": 1.0}, {}, {}, step)["time"]
+    decision = decided({"time": 1.0}, step=step)["time"]
     assert (decision.unit, decision.factor) == (unit, factor)
 
 
@@ -270,7 +283,7 @@ def test_a_quaternion_among_numbered_joints_is_noticed():
 
 
 def test_lengths_of_a_few_ten_are_asked_about():
-    decision = decide_units({"position": 45.0}, {}, {})["position"]
+    decision = decided({"position": 45.0})["position"]
     assert "--units position cm or --units position mm" in decision.doubt
 
 

@@ -24,12 +24,7 @@ from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quant
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
 from hrc_learn.demos.read.source import OpenedDataset
-from hrc_learn.demos.read.units import (
-    Quantities,
-    UnitDecision,
-    unit_factor,
-    units_from_episodes,
-)
+from hrc_learn.demos.read.units import Quantities, UnitDecision, unit_factor
 
 METADATA_CHECKS = (
     structure_checks.statistics_exist,
@@ -145,14 +140,7 @@ def _check_content(
     if dataset.contract_note is not None:
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
     episodes = _first_pass(folder, report, columns, profiles)
-    decisions, faults = units_from_episodes(
-        columns.selections,
-        episodes,
-        folder.fps,
-        dataset.declared_units,
-        units,
-        robot_type=folder.robot_type or "",
-    )
+    decisions, faults = dataset.units_from(episodes, units)
     for fault in faults:
         report.add_error(fault)
     report.run(_meaning, columns, decisions if profiles else {})

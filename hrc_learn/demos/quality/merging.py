@@ -16,7 +16,7 @@ from hrc_learn.demos.quality.episode_edits import ColumnSemantics, EpisodeEdit
 from hrc_learn.demos.quality.repair import RepairOptions, repair_dataset
 from hrc_learn.demos.read.contract import fingerprint, keep_contract
 from hrc_learn.demos.read.dataset_folder import open_folder
-from hrc_learn.demos.read.frames import RawFrames, read_each
+from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset, open_dataset
@@ -117,7 +117,10 @@ class _Source:
 
     @classmethod
     def of(cls, dataset: OpenedDataset) -> "_Source":
-        return cls(dataset=dataset, units=dataset.decide_units(dataset.sample(32), {}))
+        units, faults = dataset.decide_units(dataset.sample(32), {})
+        for fault in faults:
+            raise fault
+        return cls(dataset=dataset, units=units)
 
     @property
     def root(self) -> Path:
@@ -337,11 +340,7 @@ class _Merge:
             units=dict(source.units),
         )
         keys = [*source.places, *({"task_index"} & source.features.keys())]
-        for entry, frames in zip(
-            entries, read_each(dataset.folder, entries, keys), strict=True
-        ):
-            if isinstance(frames, DatasetError):
-                raise frames
+        for entry, frames in read_frames(dataset.folder, entries, keys):
             yield EpisodeEdit(
                 entry=entry,
                 semantics=semantics,

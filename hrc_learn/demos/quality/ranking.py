@@ -12,13 +12,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.issues import DatasetError, Issue, aligned
+from hrc_learn.demos.issues import Issue, aligned
 from hrc_learn.demos.preprocessing import resting
 from hrc_learn.demos.quality.check import check_dataset
 from hrc_learn.demos.quality.episode_checks import motion_sketch
 from hrc_learn.demos.read.dataset_folder import Progress, open_folder
-from hrc_learn.demos.read.frames import each_or_fault
-from hrc_learn.demos.read.source import open_demos
+from hrc_learn.demos.read.source import DemonstrationSource, open_dataset
 
 MEASURES = {
     "distance": "distance from the most similar episodes, relative to the usual one",
@@ -174,19 +173,12 @@ def _demonstrations(
     root: Path, qualities: Mapping[int, EpisodeQuality], progress: Progress | None
 ) -> Iterator[tuple[EpisodeQuality, Demonstration]]:
     """Readable episodes, one at a time; the error of each other one becomes its doubt."""
-    entries = open_folder(root).episodes
-    try:
-        source = open_demos(root)
-    except DatasetError as error:
-        if error.episode is None:
-            raise
-        entries = tuple(e for e in entries if not qualities[e.index].broken)
-        if not entries:
-            return
-        source = open_demos(root, [e.index for e in entries])
-    shown = progress(entries) if progress else entries
-    demos = each_or_fault(len(source), lambda first: source[first:], source.__getitem__)
-    for entry, demo in zip(shown, demos, strict=True):
+    dataset = open_dataset(root)
+    entries = dataset.folder.episodes
+    # Episodes in other units than the rest are errors of the check.
+    decisions, _ = dataset.decide_units(entries, {})
+    demos = DemonstrationSource(dataset, entries, decisions).each()
+    for entry, demo in zip(progress(entries) if progress else entries, demos, strict=True):
         quality = qualities[entry.index]
         if isinstance(demo, Demonstration):
             yield quality, demo

@@ -18,7 +18,7 @@ from hrc_learn.demos.read.dataset_folder import EpisodeEntry, Progress, open_fol
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
-from hrc_learn.demos.read.units import Quantities, units_from_episodes
+from hrc_learn.demos.read.units import Quantities
 from hrc_learn.demos.recorded_episode import episode_path
 from hrc_learn.demos.videos import Segments, read_segments
 from hrc_learn.store import DATASET, Count, read_json, replacing, write_json
@@ -148,15 +148,7 @@ class _Repair:
             raise DatasetError("the dataset holds no episodes", file=dataset.folder.root)
         self.dataset, self.folder, self.units, self.kept = dataset, dataset.folder, units, kept
         self.out, self.options, columns = out, options, dataset.columns
-        declared, fps = dataset.declared_units, dataset.folder.fps
-        decisions, faults = units_from_episodes(
-            columns.selections,
-            self._readable(),
-            fps,
-            declared,
-            units,
-            robot_type=dataset.folder.robot_type or "",
-        )
+        decisions, faults = dataset.units_from(self._readable(), units)
         self.faults = {fault.episode: fault for fault in faults}
         """Episodes that contradict the units of the others."""
         self.semantics = edits.ColumnSemantics(

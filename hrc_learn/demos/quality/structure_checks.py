@@ -25,7 +25,7 @@ from hrc_learn.demos.read.dataset_folder import (
     read_info,
     read_tasks,
 )
-from hrc_learn.demos.read.frames import RawFrames, read_each, read_frames, require_rows
+from hrc_learn.demos.read.frames import RawFrames, read_each, require_rows
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, read_features
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.store import MANIFEST, changed_files
@@ -96,11 +96,11 @@ def _sound_columns(
     """Columns of one episode that can be read, one at a time."""
     columns: RawFrames = {}
     for key in keys:
-        try:
-            for _, frames in read_frames(folder, [entry], [key], strict=False):
-                columns |= frames
-        except DatasetError as error:
-            report.add_error(error)
+        for found in read_each(folder, [entry], [key], strict=False):
+            if isinstance(found, DatasetError):
+                report.add_error(found)
+            else:
+                columns |= found
     return columns
 
 

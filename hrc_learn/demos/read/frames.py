@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, repeat
 
 import numpy as np
 import pyarrow as pa
@@ -20,62 +20,84 @@ RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]
 
 _BATCH_ROWS = 2**16
 """Frames read at a time: enough for the speed of the disk, few enough for any memory."""
-_ALONE = 64
-"""Episodes read one by one after a batch that cannot be read."""
 
 
 def read_frames(
-    folder: DatasetFolder,
-    entries: Sequence[EpisodeEntry],
-    keys: Sequence[str],
-    strict: bool = True,
+    folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    """Read columns of episodes, in the order of `entries`.
-
-    At most about 65,000 frames are held at a time, or one row group if that is larger; no row
-    group is read twice.
-
-    Args:
-        folder: The dataset.
-        entries: Episodes wanted, in the order they lie on disk.
-        keys: Columns wanted; LeRobot's own index columns are added where they exist.
-        strict: Check that the rows are those that the metadata promise. False reads the wanted
-            columns alone, as they are.
+    """Columns of episodes; arguments as in `read_each`.
 
     Raises:
         DatasetError: A file or column is missing or damaged, a column is not as wide as
             declared, or the rows are not those that the metadata promise.
     """
+    yield from zip(entries, raising(read_each(folder, entries, keys)), strict=True)
+
+
+def raising[T](found: Iterable[T | DatasetError]) -> Iterator[T]:
+    """The items before the first error among them, which is raised."""
+    for item in found:
+        if isinstance(item, DatasetError):
+            raise item
+        yield item
+
+
+def read_each(
+    folder: DatasetFolder,
+    entries: Sequence[EpisodeEntry],
+    keys: Sequence[str],
+    strict: bool = True,
+) -> Iterator[RawFrames | DatasetError]:
+    """Read columns of every episode, or give the error of one that cannot be read.
+
+    At most about 65,000 frames are held at a time, or one row group if that is larger; no row
+    group of sound data is read twice.
+
+    Args:
+        folder: The dataset.
+        entries: Episodes wanted, in any order; that on disk is the fastest.
+        keys: Columns wanted; LeRobot's own index columns are added where they exist.
+        strict: Check that the rows are those that the metadata promise. False reads the wanted
+            columns alone, as they are.
+    """
     for file, group in groupby(entries, key=lambda entry: entry.file):
         listed = list(group)
-        parquet = open_parquet(folder.root, file, listed[0].index)
-        if strict:
-            require_rows(file, listed, parquet.metadata.num_rows, folder.promised_rows[file])
-        existing = parquet.schema_arrow.names
-        for key in keys:
-            if key not in existing:
-                raise DatasetError(
-                    "the column is declared in meta/info.json, but missing", file=file, key=key
-                )
-        indices = ("timestamp", "episode_index", "task_index") if strict else ()
-        wanted = [*dict.fromkeys([*keys, *(k for k in indices if k in existing)])]
+        try:
+            parquet = open_parquet(folder.root, file, listed[0].index)
+            if strict:
+                rows = parquet.metadata.num_rows
+                require_rows(file, listed, rows, folder.promised_rows[file])
+            wanted = _columns(parquet, file, keys, strict)
+        except DatasetError as error:
+            yield from repeat(error, len(listed))
+            continue
         for batch in _batches(listed, row_group_starts(parquet.metadata)):
-            for entry, frames in _read_batch(folder, parquet, batch, wanted):
-                if strict:
-                    _require_episode(entry, frames)
-                yield entry, frames
+            yield from _read_batch(folder, parquet, batch, wanted, strict)
+
+
+def _columns(
+    parquet: pq.ParquetFile, file: str, keys: Sequence[str], strict: bool
+) -> list[str]:
+    """Columns to read: those wanted, and the existing ones that tell episode and time."""
+    existing = parquet.schema_arrow.names
+    for key in keys:
+        if key not in existing:
+            text = "the column is declared in meta/info.json, but missing"
+            raise DatasetError(text, file=file, key=key)
+    indices = ("timestamp", "episode_index", "task_index") if strict else ()
+    return [*dict.fromkeys([*keys, *(key for key in indices if key in existing)])]
 
 
 def _batches(
     entries: Sequence[EpisodeEntry], group_starts: Sequence[int]
 ) -> Iterator[list[EpisodeEntry]]:
-    """Split episodes, in the order of their rows, at boundaries of row groups."""
+    """Split episodes of a file at boundaries of row groups, gaps and steps back."""
     batch: list[EpisodeEntry] = []
     rows, last_group = 0, -1
     for entry in entries:
         ends = [entry.start, entry.start + max(entry.length, 1) - 1]
         first, last = np.searchsorted(group_starts, ends, side="right") - 1
-        skips = first > last_group + 1
+        skips = first > last_group + 1 or (batch and entry.start <= batch[-1].start)
         if batch and (skips or (rows >= _BATCH_ROWS and first > last_group)):
             yield batch
             batch, rows = [], 0
@@ -91,8 +113,32 @@ def _read_batch(
     parquet: pq.ParquetFile,
     entries: list[EpisodeEntry],
     keys: Sequence[str],
-) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    """Episodes of one file, read together."""
+    strict: bool,
+) -> Iterator[RawFrames | DatasetError]:
+    """Episodes of one file, read together; one by one if that fails."""
+    first = min(entry.start for entry in entries)
+    try:
+        columns = _read_rows(folder, parquet, entries, keys)
+    except DatasetError as error:
+        if len(entries) == 1:
+            yield error
+            return
+        for entry in entries:
+            yield from _read_batch(folder, parquet, [entry], keys, strict)
+        return
+    for entry in entries:
+        own = slice(entry.start - first, entry.start - first + entry.length)
+        frames = {key: values[own] for key, values in columns.items()}
+        yield (_misplaced(entry, frames) if strict else None) or frames
+
+
+def _read_rows(
+    folder: DatasetFolder,
+    parquet: pq.ParquetFile,
+    entries: list[EpisodeEntry],
+    keys: Sequence[str],
+) -> RawFrames:
+    """Columns of a file from the first frame of the episodes to the last."""
     file, first = entries[0].file, min(entry.start for entry in entries)
     rows = slice(first, max(entry.start + entry.length for entry in entries))
     table = read_table(parquet, file, keys, rows)
@@ -110,9 +156,7 @@ def _read_batch(
             shape = list(feature.shape)
             text = f"has {width} components, but meta/info.json declares the shape {shape}"
             raise DatasetError(text, file=file, key=key)
-    for entry in entries:
-        own = slice(entry.start - first, entry.start - first + entry.length)
-        yield entry, {key: values[own] for key, values in columns.items()}
+    return columns
 
 
 def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised: int) -> None:
@@ -130,76 +174,19 @@ def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised
         raise DatasetError(text, file=file, episode=episode)
 
 
-def _require_episode(entry: EpisodeEntry, frames: RawFrames) -> None:
+def _misplaced(entry: EpisodeEntry, frames: RawFrames) -> DatasetError | None:
+    """Fault of an episode without frames, or with frames of another episode."""
     if not entry.length:
-        raise entry.error("has no frames")
-    if "episode_index" not in frames:
-        return
-    wrong = np.flatnonzero(frames["episode_index"] != entry.index)
-    if len(wrong):
-        text = (
-            f"the frame belongs to episode {int(frames['episode_index'][wrong[0], 0])} by its "
-            f"episode_index: the offsets in the list of episodes are wrong"
-        )
-        raise entry.error(text, frame=int(wrong[0]), key="episode_index")
-
-
-def each_or_fault[T](
-    count: int, following: Callable[[int], Iterable[T]], alone: Callable[[int], T]
-) -> Iterator[T | DatasetError]:
-    """Read every episode, many together, and give the error of each that cannot be read.
-
-    Args:
-        count: Number of episodes.
-        following: Reads all episodes from a place on; an error may belong to a later episode,
-            as many are read together.
-        alone: Reads one episode.
-    """
-    done = 0
-    while done < count:
-        try:
-            for found in following(done):
-                yield found
-                done += 1
-        except DatasetError:
-            for place in range(done, min(done + _ALONE, count)):
-                try:
-                    read: T | DatasetError = alone(place)
-                except DatasetError as error:
-                    read = error
-                yield read
-                done += 1
-
-
-def read_each(
-    folder: DatasetFolder,
-    entries: Sequence[EpisodeEntry],
-    keys: Sequence[str],
-    strict: bool = True,
-) -> Iterator[RawFrames | DatasetError]:
-    """Read columns of every episode, in any order; a fault does not stop the others."""
-
-    def following(first: int) -> Iterator[RawFrames]:
-        for run in disk_runs(entries[first:]):
-            yield from (frames for _, frames in read_frames(folder, run, keys, strict))
-
-    def alone(place: int) -> RawFrames:
-        ((_, frames),) = read_frames(folder, [entries[place]], keys, strict)
-        return frames
-
-    return each_or_fault(len(entries), following, alone)
-
-
-def disk_runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
-    """Split a sequence into runs of episodes that lie on disk in this order."""
-    run: list[EpisodeEntry] = []
-    for entry in entries:
-        if run and (entry.file, entry.start) <= (run[-1].file, run[-1].start):
-            yield run
-            run = []
-        run.append(entry)
-    if run:
-        yield run
+        return entry.error("has no frames")
+    owners = frames.get("episode_index", np.full((1, 1), entry.index))[:, 0]
+    wrong = np.flatnonzero(owners != entry.index)
+    if not len(wrong):
+        return None
+    text = (
+        f"the frame belongs to episode {int(owners[wrong[0]])} by its episode_index: the "
+        f"offsets in the list of episodes are wrong"
+    )
+    return entry.error(text, frame=int(wrong[0]), key="episode_index")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,33 +203,33 @@ def read_quantities(
     columns: ColumnMapping,
     entries: Sequence[EpisodeEntry],
     roles: Iterable[str] | None = None,
-) -> Iterator[RawEpisode]:
-    """Read the quantities of episodes one after another, in the order they lie on disk.
+) -> Iterator[RawEpisode | DatasetError]:
+    """Read the quantities of every episode, or give the error of one that cannot be read.
 
     Args:
         folder: The dataset.
         columns: Meaning of its columns.
-        entries: Episodes wanted, in any order, once each.
+        entries: Episodes wanted, as in `read_each`.
         roles: Quantities wanted; None for all, and all extra columns.
-
-    Raises:
-        DatasetError: An episode cannot be read, or holds values that are not finite.
     """
     selections, extra = columns.selections, columns.extra
     if roles is not None:
         selections, extra = {role: selections[role] for role in roles}, ()
     keys = {key for s in selections.values() for key, _ in s.columns} | {*extra}
-    on_disk = sorted(entries, key=lambda entry: (entry.file, entry.start))
-    for entry, frames in read_frames(folder, on_disk, sorted(keys)):
+    read = read_each(folder, entries, sorted(keys))
+    for entry, frames in zip(entries, read, strict=True):
+        if isinstance(frames, DatasetError):
+            yield frames
+            continue
         quantities = select_quantities(frames, selections)
-        _require_finite(entry, quantities, selections)
-        yield RawEpisode(entry=entry, frames=frames, quantities=quantities)
+        fault = _not_finite(entry, quantities, selections)
+        yield fault or RawEpisode(entry=entry, frames=frames, quantities=quantities)
 
 
-def _require_finite(
+def _not_finite(
     entry: EpisodeEntry, quantities: Quantities, selections: Mapping[str, ColumnSelection]
-) -> None:
-    """Check all values; those of a feature that was not seen become 0."""
+) -> DatasetError | None:
+    """Fault of a value that is not finite; those of a feature that was not seen become 0."""
     seen = quantities.get("feature_visible")
     for role, values in quantities.items():
         # The sum is finite unless a value is not: far cheaper than a mask.
@@ -258,7 +245,8 @@ def _require_finite(
                 f"{role} is {values[frame, component]} there; leave the episode out "
                 f"(episodes=[...]) or repair the recording"
             )
-            raise entry.error(text, frame=frame, key=selections[role].column_name(component))
+            return entry.error(text, frame=frame, key=selections[role].column_name(component))
+    return None
 
 
 def select_quantities(

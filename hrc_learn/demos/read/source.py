@@ -1,8 +1,7 @@
 """Demonstrations read from a LeRobot dataset, at once or one after another."""
 
-import contextlib
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -28,14 +27,18 @@ from hrc_learn.demos.read.dataset_folder import (
     open_folder,
     select_episodes,
 )
-from hrc_learn.demos.read.frames import RawEpisode, disk_runs, frame_timestamps, read_quantities
+from hrc_learn.demos.read.frames import (
+    RawEpisode,
+    frame_timestamps,
+    raising,
+    read_quantities,
+)
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar, read_sidecar
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
 from hrc_learn.demos.read.units import (
     Quantities,
     UnitDecision,
     guessed_from_values,
-    unit_factor,
     units_from_episodes,
 )
 
@@ -102,60 +105,54 @@ class OpenedDataset:
 
     def decide_units(
         self, entries: Sequence[EpisodeEntry], given: Mapping[str, str]
-    ) -> dict[str, UnitDecision]:
+    ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
         """Unit of every quantity, by a pass over the columns whose unit must be guessed.
 
         Undeclared units are guessed from a sample of the dataset, so that the guess does not
-        depend on the episodes that are loaded.
+        depend on the episodes that are loaded. Episodes that cannot be read decide nothing.
 
         Args:
             entries: Episodes that must not contradict the decision.
             given: Units from the caller.
 
+        Returns:
+            The decisions, and the faults of those of the episodes that contradict them.
+
         Raises:
-            DatasetError: A unit is unknown or does not fit its quantity, or one of the episodes
-                cannot be read, or is in another unit than the rest.
+            DatasetError: A unit is unknown or does not fit its quantity.
         """
-        for role, unit in given.items():  # before any long read
-            unit_factor(role, unit)
-        selections, declared = self.columns.selections, self.declared_units
-        guessed = guessed_from_values(selections, {*declared, *given})
-        sample = {entry.index: entry for entry in self.sample(_SAMPLED_EPISODES)}
-        wanted = {entry.index: entry for entry in entries}
-        roles, first = [*guessed], [*wanted.values()]
-        if "time" in selections and "time" not in {*declared, *given}:
-            roles.append("time")
-            first = first if guessed else first[:1]
+        known = {*self.declared_units, *given}
+        guessed = guessed_from_values(self.columns.selections, known)
+        roles = [*guessed, *({"time"} & self.columns.selections.keys() - known)]
+        sample = {entry.index for entry in self.sample(_SAMPLED_EPISODES)}
+        wanted = {entry.index for entry in entries}
+        chosen = wanted | sample if guessed else {entries[0].index} if roles else set()
 
         def episodes() -> Iterator[tuple[EpisodeEntry, Quantities]]:
-            for episode in self.read(first, roles) if roles else ():
-                yield episode.entry, episode.quantities
-            for index in sorted(sample.keys() - wanted.keys()) if guessed else ():
-                # Faults are raised when the episode itself is read.
-                with contextlib.suppress(DatasetError):
-                    for episode in self.read([sample[index]], guessed):
-                        yield episode.entry, episode.quantities
+            listed = [entry for entry in self.folder.episodes if entry.index in chosen]
+            for found in read_quantities(self.folder, self.columns, listed, roles):
+                if not isinstance(found, DatasetError):
+                    yield found.entry, found.quantities
 
-        fps = self.folder.fps
-        decisions, faults = units_from_episodes(
-            selections,
-            episodes(),
-            fps,
-            declared,
+        decisions, faults = self.units_from(episodes(), given, sample)
+        return decisions, [fault for fault in faults if fault.episode in wanted]
+
+    def units_from(
+        self,
+        episodes: Iterable[tuple[EpisodeEntry, Quantities]],
+        given: Mapping[str, str],
+        sample: Collection[int] | None = None,
+    ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
+        """Decide on units as `units_from_episodes` does."""
+        return units_from_episodes(
+            self.columns.selections,
+            episodes,
+            self.folder.fps,
+            self.declared_units,
             given,
-            sample.keys(),
+            sample,
             self.folder.robot_type or "",
         )
-        for fault in faults:
-            if fault.episode in wanted:
-                raise fault
-        return decisions
-
-    def read(
-        self, entries: Sequence[EpisodeEntry], roles: Iterable[str] | None = None
-    ) -> Iterator[RawEpisode]:
-        """Episodes one after another; arguments and errors as in `read_quantities`."""
-        return read_quantities(self.folder, self.columns, entries, roles)
 
 
 def _spread(entries: Sequence[EpisodeEntry], most: int) -> list[EpisodeEntry]:
@@ -263,7 +260,9 @@ def open_demos(
     entries = select_episodes(dataset.folder, episodes, tasks, where)
     if joint_names is not None:  # before any long read
         joint_columns(dataset.columns.joint_names, joint_names)
-    decisions = dataset.decide_units(entries, units or {})
+    decisions, faults = dataset.decide_units(entries, units or {})
+    for fault in faults:
+        raise fault
     doubts = [decision.doubt for decision in decisions.values() if decision.doubt]
     if doubts and refuse_doubt:
         raise DatasetError(f"{dataset.folder.root}: {'; '.join(doubts)}")
@@ -332,7 +331,7 @@ class DemonstrationSource(Sequence[Demonstration]):
     def __getitem__(self, index):
         if isinstance(index, slice):
             return self._part(self._entries[index])
-        (demo,) = self._read([self._entries[index]])
+        (demo,) = self._part([self._entries[index]])
         return demo
 
     def spread(self, most: int) -> "DemonstrationSource":
@@ -348,11 +347,16 @@ class DemonstrationSource(Sequence[Demonstration]):
         return len(self._entries)
 
     def __iter__(self) -> Iterator[Demonstration]:
-        for run in disk_runs(self._entries):
-            yield from self._read(run)
+        return raising(self.each())
 
-    def _read(self, entries: Sequence[EpisodeEntry]) -> Iterator[Demonstration]:
-        return map(self._convert, self._dataset.read(entries))
+    def each(self) -> Iterator[Demonstration | DatasetError]:
+        """Every demonstration, or the error of one that cannot be read."""
+        dataset = self._dataset
+        for found in read_quantities(dataset.folder, dataset.columns, self._entries):
+            try:
+                yield found if isinstance(found, DatasetError) else self._convert(found)
+            except DatasetError as error:
+                yield error
 
     def __repr__(self) -> str:
         return (

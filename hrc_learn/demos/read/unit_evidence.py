@@ -13,8 +13,8 @@ CONFIDENT = 0.75
 
 # Two turns: wrists turn further than one, and no demonstration stays within 13 degrees.
 _RADIANS, _DEGREES = 4 * math.pi, 400.0
-# Largest fraction of a range, allowing for noise, and widest opening of a gripper [m].
-_FINGER_RATIO, _GRIPPER_RATIO, _PERCENT, _WIDEST_GRIPPER = 1.05, 2.0, 105.0, 0.2
+# Largest fraction of a range, allowing for noise.
+_FINGER_RATIO, _PERCENT = 1.05, 105.0
 _BYTE = 255.5
 _SLIDE = 0.12
 """Longest stroke of a gripper's finger [m]."""
@@ -25,14 +25,31 @@ _SHORTEST_ARM, _POSE_AND_FINGERS = 5, 8
 # LeRobot clips normalised positions at exactly 100.
 _CLIP, _CLIPPED = 100.0, 0.002
 """Value, and fraction of the frames at it from which a column counts as clipped."""
-# Reach of an arm on a fixed base: 5 m, and what 1.5 m are in cm; poses below 60 mm are rare.
-_REACH = (5.0, 60.0, 150.0)
-# One turn and some noise; two turns for an unwrapped vector.
-ROTATION_LIMITS = {
-    "euler_xyz": 2 * math.pi + 0.1,
-    "euler_intrinsic_xyz": 2 * math.pi + 0.1,
-    "rotation_vector": 4 * math.pi,
+# Rows of largest value, unit, confidence, and second candidate.
+_TURN = ((2 * math.pi + 0.1, "rad", 0.95, "deg"), (math.inf, "deg", 0.8, ""))
+_SIZES: dict[str, tuple[tuple[float, str, float, str], ...]] = {
+    # Reach of an arm on a fixed base: 5 m, and what 1.5 m are in cm; poses below 60 mm are
+    # rare.
+    "position": (
+        (5.0, "m", 0.95, ""),
+        (60.0, "cm", 0.5, "mm"),
+        (150.0, "cm", 0.6, "mm"),
+        (math.inf, "mm", 0.9, "cm"),
+    ),
+    "gripper": (
+        (0.2, "m", 0.8, "1"),
+        (2.0, "1", 0.8, "m"),
+        (_PERCENT, "%", 0.8, "mm"),
+        (_BYTE, "byte", 0.8, "mm"),
+        (math.inf, "mm", 0.8, "tick"),
+    ),
+    # One turn and some noise; two turns for an unwrapped vector.
+    "euler_xyz": _TURN,
+    "euler_intrinsic_xyz": _TURN,
+    "rotation_vector": ((_RADIANS, "rad", 0.95, "deg"), (math.inf, "deg", 0.8, "")),
 }
+GUESSED_BY_SIZE = tuple(_SIZES)
+"""Quantities, apart from joints, whose unit their size tells."""
 _UNIT_LENGTH = 2e-3
 """Deviation of a quaternion's length, of float32 and of few printed digits."""
 # Arms of hobby servos, whose positions LeRobot stores in degrees or as -100..100.
@@ -56,13 +73,6 @@ class Sizes(NamedTuple):
     opening: Bool[np.ndarray, " components"]
     """True where the values go from exactly 0 to exactly 1, as a gripper's opening does."""
 
-    @classmethod
-    def of_peaks(cls, peak: float | Sequence[float]) -> "Sizes":
-        """Sizes of which only the peaks are known."""
-        peaks = np.atleast_1d(np.asarray(peak, float))
-        no = np.zeros(len(peaks), bool)
-        return cls(peaks, np.zeros(len(peaks)), no, no, no)
-
 
 class Guess(NamedTuple):
     """Unit that the evidence speaks for."""
@@ -72,8 +82,6 @@ class Guess(NamedTuple):
     evidence: str
     other: str = ""
     """Second candidate; "" if there is none."""
-    outliers: tuple[int, ...] = ()
-    """Components that do not fit the unit of the rest."""
 
 
 def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
@@ -132,11 +140,13 @@ def guess_joints(
         return Guess("rad", 0.9, "the joints do not move")
     quaternion = np.flatnonzero(sizes.unit_length & arm)
     if len(quaternion):
-        return _as_quaternion(int(quaternion[0]), labels)
+        first, last = (labels[quaternion[0] + i] for i in (0, 3))
+        text = f"{first} .. {last} always have unit length, as a quaternion has"
+        return Guess("rad", 0.3, text)
     most = np.median(peaks[moving])
     limit = next((x for x in (_RADIANS, _DEGREES) if most <= x), math.inf)
     fitting = moving & (peaks <= limit)
-    outliers = tuple(np.flatnonzero(moving & ~fitting).tolist())
+    outliers = np.flatnonzero(moving & ~fitting).tolist()
     largest = float(peaks[fitting].max())
     reach = f"values usually reach {largest:.3g}"
     if limit == _RADIANS:
@@ -149,19 +159,12 @@ def guess_joints(
         guess = Guess("tick", 0.8 if whole else 0.4, reach, "deg")
     if not outliers:
         return guess
-    beyond = ", ".join(f"{labels[i] if labels else i} {peaks[i]:.3g}" for i in outliers)
+    beyond = ", ".join(f"{labels[i]} {peaks[i]:.3g}" for i in outliers)
     return guess._replace(
         confidence=0.3,
         evidence=f"{reach}, but not those of all joints ({beyond})",
-        outliers=outliers,
         other="" if guess.unit == "deg" else "deg",
     )
-
-
-def _as_quaternion(first: int, labels: Sequence[str]) -> Guess:
-    named = [labels[i] if labels else f"component {i}" for i in (first, first + 3)]
-    text = f"{named[0]} .. {named[1]} always have unit length, as a quaternion has"
-    return Guess("rad", 0.3, text, outliers=tuple(range(first, first + 4)))
 
 
 def _degrees_or_range(
@@ -200,7 +203,7 @@ def guess_fingers(
     # A hand counts all its fingers alike, also those that move little.
     counted = hand & sizes.whole & (sizes.peak > _FINGER_RATIO) & (sizes.peak <= _BYTE)
     counts = bool((sizes.peak[counted] > _PERCENT).any())
-    slides = np.array([("finger" in label.lower()) for label in labels] or [False] * len(hand))
+    slides = np.array(["finger" in label.lower() for label in labels])
     units = [
         _finger_unit(float(peak), bool(whole), arm_unit, hobby)
         for peak, whole in zip(sizes.peak, sizes.whole, strict=True)
@@ -222,7 +225,7 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
         numbered: True if the dataset gives no names.
     """
     count, largest = len(sizes.peak), float(sizes.peak.max())
-    named_alike = bool(labels) and all(map(_MOTOR.fullmatch, labels))
+    named_alike = all(map(_MOTOR.fullmatch, labels))
     if not (named_alike or numbered) or count > _POSE_AND_FINGERS:
         return guess
     last = float(sizes.peak[-1])
@@ -252,42 +255,10 @@ def _finger_unit(peak: float, whole: bool, arm_unit: str, hobby: bool) -> str:
     return arm_unit
 
 
-def guess_gripper(sizes: Sizes) -> Guess:
-    """Unit of the opening of a gripper."""
+def guess_by_size(role: str, sizes: Sizes) -> Guess:
+    """Unit of an opening, a position or the angles of an orientation."""
     largest, whole = float(sizes.peak.max()), bool(sizes.whole.all())
-    reach = f"values usually reach {largest:.3g}"
-    if largest <= _WIDEST_GRIPPER:
-        return Guess("m", 0.8, reach, "1")
-    if largest <= _GRIPPER_RATIO:
-        return Guess("1", 0.8, reach, "m")
-    if largest <= _PERCENT:
-        return Guess("%", 0.8, reach, "mm")
-    if whole and largest <= _BYTE:
-        return Guess("byte", 0.8, reach, "mm")
-    return Guess("mm", 0.8, reach, "tick")
-
-
-def guess_position(sizes: Sizes) -> Guess:
-    """Unit of a position of the end effector."""
-    largest = float(sizes.peak.max())
-    reach = f"values usually reach {largest:.3g}"
-    metres, few, arm = _REACH
-    if largest <= metres:
-        return Guess("m", 0.95, reach)
-    if largest <= few:
-        return Guess("cm", 0.5, reach, "mm")
-    if largest <= arm:
-        return Guess("cm", 0.6, reach, "mm")
-    return Guess("mm", 0.9, reach, "cm")
-
-
-def guess_rotation(role: str, sizes: Sizes) -> Guess:
-    """Unit of the angles of an orientation."""
-    largest = float(sizes.peak.max())
-    radians = largest <= ROTATION_LIMITS[role]
-    return Guess(
-        "rad" if radians else "deg",
-        0.95 if radians else 0.8,
-        f"values usually reach {largest:.3g}",
-        "deg" if radians else "",
+    unit, confidence, other = next(
+        row for most, *row in _SIZES[role] if largest <= most and (whole or row[0] != "byte")
     )
+    return Guess(unit, confidence, f"values usually reach {largest:.3g}", other)

@@ -19,15 +19,13 @@ from hrc_learn.demos.read.naming import is_hand, role_of_key
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
 from hrc_learn.demos.read.unit_evidence import (
     CONFIDENT,
-    ROTATION_LIMITS,
+    GUESSED_BY_SIZE,
     Guess,
     Sizes,
     doubt_meaning,
+    guess_by_size,
     guess_fingers,
-    guess_gripper,
     guess_joints,
-    guess_position,
-    guess_rotation,
     is_hobby_arm,
     measure,
     typical,
@@ -53,7 +51,7 @@ _FOLLOWERS = {
 }
 """Quantity -> quantity whose unit it takes over if nothing is declared."""
 _JOINTS = ("joint_position", "command_position")
-_GUESSABLE = (*_JOINTS, "position", "gripper", *ROTATION_LIMITS)
+_GUESSABLE = (*_JOINTS, *GUESSED_BY_SIZE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +63,8 @@ class UnitDecision:
     """Unit of all components, or of most of them."""
     units: tuple[str, ...] = ()
     """Unit of each component if they differ: an arm in degrees, its fingers from 0 to 1."""
-    note: str | None = None
-    """The guess and how to overrule it; None if nothing was guessed."""
-    converts: bool = False
-    """True if a guess changes the values."""
+    guessed: bool = False
+    """True if neither the caller, the dataset nor a name states the unit."""
     confidence: float = 1.0
     """Confidence, 0 to 1."""
     evidence: str = ""
@@ -84,6 +80,25 @@ class UnitDecision:
         if not self.units:
             return unit_factor(self.role, self.unit)
         return np.array([unit_factor(self.role, unit) for unit in self.units])
+
+    @property
+    def converts(self) -> bool:
+        """True if a guess changes the values."""
+        return self.guessed and bool(np.any(self.factor != 1))
+
+    @property
+    def note(self) -> str | None:
+        """The guess and how to overrule it; None if nothing worth a word was guessed."""
+        # A gripper in metres or as a fraction of its opening is the usual case.
+        if not self.guessed or (self.role == "gripper" and not self.converts):
+            return None
+        sure = f" ({100 * self.confidence:.0f} % sure)" if self.confidence < CONFIDENT else ""
+        others = sorted({*self.units} - {self.unit})
+        fingers = f", others for {', '.join(others)}" if others else ""
+        return (
+            f"{self.role}: no unit declared, {self.evidence}: taken for {self.unit}{sure}"
+            f"{fingers}; overrule with units={{{self.role!r}: ...}}"
+        )
 
     @property
     def doubt(self) -> str | None:
@@ -143,45 +158,28 @@ def guessed_from_values(roles: Iterable[str], stated: Collection[str]) -> list[s
 
 
 def decide_units(
-    sizes: Mapping[str, float | Sequence[float] | Sizes],
-    declared: Mapping[str, str | Sequence[str]],
-    given: Mapping[str, str],
+    selections: Mapping[str, ColumnSelection],
+    sizes: Mapping[str, Sizes],
+    stated: Mapping[str, str | Sequence[str]],
     frame_step: float = 1.0,
-    selections: Mapping[str, ColumnSelection] | None = None,
     robot_type: str = "",
 ) -> dict[str, UnitDecision]:
     """Decide on a unit for every quantity.
 
     Args:
-        sizes: Values on disk by role: their sizes, or the usual largest absolute value of all
-            components or of each.
-        declared: Units by role, or of each component, from the sidecar.
-        given: Units by role from the caller, which take precedence.
-        frame_step: Step of the true stamps on disk, as a multiple of the nominal period [s].
         selections: Columns of the quantities, whose names are evidence.
+        sizes: Sizes of the values on disk of the quantities that must be guessed.
+        stated: Units by role, or of each component, from the caller or the dataset.
+        frame_step: Step of the true stamps on disk, as a multiple of the nominal period [s].
         robot_type: Robot type of the dataset, "" if unknown.
-
-    Raises:
-        DatasetError: A unit is unknown, or does not fit its quantity.
     """
-    for role, unit in given.items():
-        unit_factor(role, unit)
-    for role, unit in declared.items():
-        for one in (unit,) if isinstance(unit, str) else unit:
-            try:
-                unit_factor(role, one)
-            except DatasetError as error:
-                raise DatasetError(
-                    str(error), file=SIDECAR_PATH, key=f"units.{role}"
-                ) from error
-    stated = {**declared, **given}
     decisions: dict[str, UnitDecision] = {}
-    for role in sorted(sizes, key=lambda role: role in _FOLLOWERS):
-        own, selection = sizes[role], (selections or {}).get(role)
-        named = _named_units(role, selection)
+    for role in sorted(selections, key=lambda role: role in _FOLLOWERS):
+        selection = selections[role]
+        named = _named_units(selection)
         if role in stated:
             decisions[role] = _stated(role, stated[role])
-        elif all(named) and named:
+        elif all(named):
             decisions[role] = replace(
                 _stated(role, named), confidence=0.99, evidence="the names state it"
             )
@@ -189,35 +187,25 @@ def decide_units(
             decisions[role] = _following(role, leader)
         elif role == "time":
             decisions[role] = _guess_time(frame_step)
-        elif role in _GUESSABLE:
-            known = own if isinstance(own, Sizes) else Sizes.of_peaks(own)
-            command = sizes.get("command_position") if role == "joint_position" else None
-            if isinstance(command, Sizes) and len(command.peak) == len(known.peak):
-                # Commands are clipped at exactly 100 where the motion stops before.
-                clipped = np.maximum(known.clipped, command.clipped)
-                near = (known.peak > 90) & (command.peak > 90)
-                peak = np.where(near, np.maximum(known.peak, command.peak), known.peak)
-                known = known._replace(clipped=clipped, peak=peak)
-            decisions[role] = _guess(role, known, selection, robot_type, named)
+        elif role in sizes:
+            decisions[role] = _guess(selection, sizes, robot_type, named)
         else:
-            assumed = "" if selection is None else selection.assumed
             decisions[role] = UnitDecision(
                 role=role,
                 unit=ROLES[role].unit,
-                confidence=0.8 if assumed else 0.95,
-                evidence=assumed or "by its name",
+                confidence=0.8 if selection.assumed else 0.95,
+                evidence=selection.assumed or "by its name",
             )
     return decisions
 
 
-def _named_units(role: str, selection: ColumnSelection | None) -> tuple[str, ...]:
+def _named_units(selection: ColumnSelection) -> tuple[str, ...]:
     """Unit of each component that its name states and the quantity can have; "" for none."""
-    units = () if selection is None else selection.units
-    rate = "/s" if role.endswith("velocity") else ""
-    known = units_of(role)
+    rate = "/s" if selection.role.endswith("velocity") else ""
+    known = units_of(selection.role)
     return tuple(
         next((u for u in (unit, unit.removesuffix("/s") + rate) if unit and u in known), "")
-        for unit in units
+        for unit in selection.units or ("",) * len(selection.columns)
     )
 
 
@@ -245,64 +233,55 @@ def _following(role: str, leader: UnitDecision) -> UnitDecision:
 
 
 def _guess(
-    role: str,
-    sizes: Sizes,
-    selection: ColumnSelection | None,
+    selection: ColumnSelection,
+    sizes: Mapping[str, Sizes],
     robot_type: str,
     named: Sequence[str],
 ) -> UnitDecision:
     """Guess from the values of each component, and the names that state a unit."""
+    role, own = selection.role, sizes[selection.role]
     units: tuple[str, ...] = ()
     if role in _JOINTS:
-        guess, units = _guess_joint_units(sizes, selection, robot_type, named)
-    elif role == "position":
-        guess = guess_position(sizes)
-    elif role == "gripper":
-        guess = guess_gripper(sizes)
+        if role == "joint_position" and "command_position" in sizes:
+            own = _with_command(own, sizes["command_position"])
+        guess, units = _guess_joint_units(own, selection, robot_type, named)
     else:
-        guess = guess_rotation(role, sizes)
-    others = sorted({*units} - {guess.unit})
-    fingers = f", others for {', '.join(others)}" if others else ""
-    sure = f" ({100 * guess.confidence:.0f} % sure)" if guess.confidence < CONFIDENT else ""
-    converts = any(unit_factor(role, unit) != 1 for unit in (guess.unit, *units))
-    note = (
-        f"{role}: no unit declared, {guess.evidence}: taken for {guess.unit}{sure}{fingers}; "
-        f"overrule with units={{{role!r}: ...}}"
-    )
-    # A gripper in metres or as a fraction of its opening is the usual case.
-    silent = role == "gripper" and not converts
+        guess = guess_by_size(role, own)
     return UnitDecision(
         role=role,
         unit=guess.unit,
-        units=units if others else (),
-        note=None if silent else note,
-        converts=converts,
+        units=units if {*units} - {guess.unit} else (),
+        guessed=True,
         confidence=guess.confidence,
         evidence=guess.evidence,
         other=guess.other,
     )
 
 
+def _with_command(joints: Sizes, command: Sizes) -> Sizes:
+    """Sizes of joints and their commands, which are clipped at 100 where joints stop before."""
+    if len(command.peak) != len(joints.peak):
+        return joints
+    near = (joints.peak > 90) & (command.peak > 90)
+    return joints._replace(
+        clipped=np.maximum(joints.clipped, command.clipped),
+        peak=np.where(near, np.maximum(joints.peak, command.peak), joints.peak),
+    )
+
+
 def _guess_joint_units(
-    sizes: Sizes, selection: ColumnSelection | None, robot_type: str, named: Sequence[str]
+    sizes: Sizes, selection: ColumnSelection, robot_type: str, named: Sequence[str]
 ) -> tuple[Guess, tuple[str, ...]]:
     """Unit of the arm, and of each joint and finger."""
-    labels = () if selection is None else selection.labels
-    hand = np.array([is_hand(label) for label in labels] or [False] * len(sizes.peak))
-    if len(hand) != len(sizes.peak) or hand.all():
-        hand = np.zeros(len(sizes.peak), bool)
+    labels = selection.labels
+    hand = np.array([is_hand(label) for label in labels])
+    hand &= not hand.all()
     # A gripper without a name of its own comes last.
     hand[-1] |= sizes.opening[-1] and not sizes.opening.all()
-    stated = np.array([bool(unit) for unit in named] or [False] * len(hand))
-    if len(stated) != len(hand):
-        stated = np.zeros(len(hand), bool)
+    stated = np.array([bool(unit) for unit in named])
     guess = guess_joints(sizes, ~hand & ~stated, labels, robot_type)
     # The key of a whole feature may tell its content, such as `qpos`.
-    unnamed = (
-        selection is not None
-        and selection.numbered
-        and role_of_key(selection.columns[0][0]) is None
-    )
+    unnamed = selection.numbered and role_of_key(selection.columns[0][0]) is None
     guess = doubt_meaning(guess, sizes, labels, unnamed)
     fingers = guess_fingers(sizes, hand, labels, guess.unit, is_hobby_arm(robot_type, labels))
     units = tuple(
@@ -320,23 +299,14 @@ def _guess_time(frame_step: float) -> UnitDecision:
     unit = min(off, key=off.__getitem__)
     if unit == "s":
         return UnitDecision(role="time", unit=unit)
-    note = (
-        f"time: no unit declared, steps are {frame_step:.3g} times 1/fps: taken for {unit}; "
-        f"overrule with units={{'time': ...}}"
-    )
-    return UnitDecision(role="time", unit=unit, note=note, converts=True)
+    evidence = f"steps are {frame_step:.3g} times 1/fps"
+    return UnitDecision(role="time", unit=unit, guessed=True, evidence=evidence)
 
 
 Quantities = dict[str, Float64[np.ndarray, "_frames _components"]]
 """Role -> values during one episode, in the units on disk."""
 _SAMPLED_FRAMES = 1000
 """Frames that suffice to estimate the size of an episode's values."""
-
-
-def _sampled(
-    values: Float64[np.ndarray, "frames components"],
-) -> Float64[np.ndarray, "sampled components"]:
-    return values[:: 1 + len(values) // _SAMPLED_FRAMES]
 
 
 def units_from_episodes(
@@ -368,32 +338,42 @@ def units_from_episodes(
     Raises:
         DatasetError: A unit is unknown, or does not fit its quantity.
     """
+    for role, unit in given.items():
+        unit_factor(role, unit)
+    _require_declared(declared)
     guessed = guessed_from_values(selections, {*declared, *given})
     steps: list[float] = []
     measured: list[tuple[EpisodeEntry, dict[str, Sizes]]] = []
     for entry, quantities in episodes:
-        known = {r: _sampled(quantities[r]) for r in guessed if r in quantities}
-        measured.append((entry, {r: measure(v) for r, v in known.items() if len(v)}))
+        known = {r: quantities[r] for r in guessed if r in quantities}
+        some = {r: values[:: 1 + len(values) // _SAMPLED_FRAMES] for r, values in known.items()}
+        measured.append((entry, {r: measure(v) for r, v in some.items() if len(v)}))
         time = quantities.get("time", np.empty((0, 1)))
         if len(time) > 1:
             # As a multiple of the nominal period.
             steps.append(float(np.nanmedian(np.diff(time[:, 0]))) * fps)
-    sizes: dict[str, float | Sizes] = dict.fromkeys(selections, 0.0)
     deciding = [m for entry, m in measured if sample is None or entry.index in sample]
     deciding = deciding or [m for _, m in measured]
-    for role in guessed:
-        found = [own[role] for own in deciding if role in own]
-        if found:
-            sizes[role] = typical(found)
+    found = {role: [own[role] for own in deciding if role in own] for role in guessed}
+    sizes = {role: typical(known) for role, known in found.items() if known}
     step = float(np.median(steps)) if steps else 1.0
-    decisions = decide_units(sizes, declared, given, step, selections, robot_type)
+    decisions = decide_units(selections, sizes, {**declared, **given}, step, robot_type)
     faults = [
         fault
-        for role in guessed
-        if isinstance(own := sizes[role], Sizes)
+        for role, own in sizes.items()
         for fault in _contradictions(selections[role], own.peak, decisions[role], measured)
     ]
     return decisions, faults
+
+
+def _require_declared(declared: Mapping[str, str | Sequence[str]]) -> None:
+    for role, unit in declared.items():
+        for one in (unit,) if isinstance(unit, str) else unit:
+            try:
+                unit_factor(role, one)
+            except DatasetError as error:
+                key = f"units.{role}"
+                raise DatasetError(str(error), file=SIDECAR_PATH, key=key) from error
 
 
 _DEGREES = math.log(180 / math.pi)
