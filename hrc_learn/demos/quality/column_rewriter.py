@@ -1,21 +1,23 @@
-"""Columns of a repaired dataset: features, statistics, tasks and videos in version 3.0."""
+"""Copies of a dataset with other frames: features, statistics, tasks and videos."""
 
-from collections.abc import Mapping
-from dataclasses import replace
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Int64
 
 from hrc_learn.demos import recorded_episode as recorded
+from hrc_learn.demos.dataset_assembly import assemble
+from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.episode_edits import EpisodeEdit
+from hrc_learn.demos.read.contract import Contract, fingerprint, keep_contract
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table
-from hrc_learn.demos.read.dataset_folder import recorded_statistics
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, open_folder, recorded_statistics
 from hrc_learn.demos.read.metadata import (
     INDEX_FEATURES,
     NUMERIC,
-    Sidecar,
     SidecarColumn,
     episode_statistics,
     image_statistics,
@@ -28,113 +30,161 @@ from hrc_learn.demos.videos import (
     decode_image,
     image_at,
     subsampled,
-    video_keys,
 )
+from hrc_learn.store import DATASET, replacing
 
-_NO_TASK = "unnamed task"
+NO_TASK = "unnamed task"
+_IN_TABLES = ("video", *NUMERIC)
 _STATISTICS_IMAGES = 20
 """Images of an episode that enter its statistics, as in LeRobot for short episodes."""
+_LARGEST_NOTE = 2**20
+"""Largest card, licence or foreign metadata file that is copied [bytes]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rewritten:
+    """One episode of the new dataset: its frames, its videos, and the task of each frame."""
+
+    writer: "ColumnRewriter"
+    edit: EpisodeEdit
+    videos: Segments
+    tasks: list[str]
+
+
+def write_copy(
+    out: Path,
+    episodes: Iterable[Rewritten],
+    tasks: Sequence[str],
+    contract: Contract | None,
+    notes_of: Path | None = None,
+) -> None:
+    """Write rewritten episodes into a new dataset.
+
+    Args:
+        out: Folder of the new dataset, which must not exist.
+        episodes: The episodes, all of one header.
+        tasks: Task texts in order of their indices.
+        contract: Contract of the new dataset; its fingerprint is renewed.
+        notes_of: Dataset whose card, licence and metadata of other programs are copied.
+
+    Raises:
+        DatasetError: There are no episodes.
+        FileExistsError: `out` exists.
+    """
+    with replacing(out, DATASET) as target:
+        staging = target / "episodes"
+        staging.mkdir(parents=True)
+        paths: list[Path] = []
+        videos: list[Segments] = []
+        numbers, frames = {text: n for n, text in enumerate(tasks)}, 0
+        for episode in episodes:
+            paths.append(recorded.episode_path(staging, len(videos)))
+            episode.writer.stage(paths[-1], episode, numbers, frames)
+            videos.append(episode.videos)
+            frames += len(episode.edit)
+        if not paths:
+            raise DatasetError("no episode could be repaired", file=notes_of)
+        assemble(paths, target, videos=videos, tasks=tasks, link_videos=False)
+        if notes_of is not None:
+            _copy_notes(notes_of, target)
+        if contract is not None:
+            renewed = fingerprint(open_folder(target))
+            keep_contract(target, replace(contract, fingerprint=renewed))
+        shutil.rmtree(staging)
+
+
+def _copy_notes(source: Path, target: Path) -> None:
+    """Copy the card, the licence and metadata of other programs."""
+    for path in (*source.glob("*.md"), *source.glob("LICENSE*"), *source.glob("meta/*.json")):
+        there = target / path.relative_to(source)
+        ordinary = path.is_file() and not path.is_symlink()
+        if ordinary and not there.exists() and path.stat().st_size < _LARGEST_NOTE:
+            shutil.copyfile(path, there)
+
+
+def listed_tasks(folder: DatasetFolder) -> list[str]:
+    """Task texts of a dataset, those of the list of tasks in order of their indices first."""
+    listed = [folder.tasks[index] for index in sorted(folder.tasks)]
+    listed += [task for entry in folder.episodes for task in entry.tasks]
+    return [*dict.fromkeys(listed)] or [NO_TASK]
+
+
+def new_header(
+    dataset: OpenedDataset,
+    units: Mapping[str, str],
+    segments: Mapping[int, Segments],
+    *,
+    fps: float | int | None = None,
+    add_time: bool = False,
+) -> recorded.RecordingHeader:
+    """Properties of a copy of a dataset.
+
+    Args:
+        dataset: The old dataset.
+        units: Units from the caller.
+        segments: Video segments by episode index; cameras without any are left out.
+        fps: Rate that episodes are resampled to [1/s]; None for the old one.
+        add_time: Add the old stamps as `time`.
+    """
+    folder, old, features = dataset.folder, dataset.sidecar, {}
+    cameras = {key for shown in segments.values() for key in shown}
+    for key, feature in folder.features.items():
+        declared = folder.info["features"][key]
+        if key in INDEX_KEYS or (feature.dtype == "video" and key not in cameras):
+            continue
+        if feature.numeric:
+            names = list(feature.names) if feature.names else None
+            declared = declared | {"shape": list(feature.shape) or [1], "names": names}
+        features[key] = declared
+    columns, declared_units = dict(old.columns), {**old.units, **units}
+    if add_time:
+        features[recorded.TIME_KEY] = {"dtype": "float64", "shape": [1], "names": ["time"]}
+        if columns:
+            columns["time"] = SidecarColumn(key=recorded.TIME_KEY, names=("time",))
+            declared_units["time"] = "s"
+    return recorded.RecordingHeader(
+        fps=float(fps or folder.fps),
+        robot_type=folder.robot_type or "unknown",
+        features={**features, **INDEX_FEATURES},
+        sidecar=replace(old, columns=columns, units=declared_units),
+    )
 
 
 class ColumnRewriter:
-    """Writer of repaired episodes of one dataset.
-
-    Attributes:
-        tasks: Task texts by index.
-        notes: Changes to all episodes.
-        header: Properties of the new dataset.
-    """
+    """Writer of the episodes of one dataset into a new one."""
 
     def __init__(
         self,
-        dataset: OpenedDataset,
-        units: Mapping[str, str],
-        *,
-        fps: float | int | None,
-        segments: Mapping[int, Segments] | None,
-        add_time: bool = False,
+        folder: DatasetFolder,
+        header: recorded.RecordingHeader,
+        segments: Mapping[int, Segments],
     ):
         """
         Args:
-            dataset: The old dataset.
-            units: Units from the caller.
-            fps: Rate that episodes are resampled to [1/s]; None for the old one.
-            segments: Video segments by episode index; None leaves the videos out.
-            add_time: Add the old stamps as `time`.
+            folder: The old dataset.
+            header: Properties of the new dataset.
+            segments: Video segments by episode index.
         """
-        folder = self._folder = dataset.folder
-        self.notes: list[str] = [dataset.contract_note] if dataset.contract_note else []
-        self._segments = segments or {}
-        self._cameras = self._choose_cameras(videos=segments is not None)
-        self._image_columns = [k for k, f in folder.features.items() if f.dtype == "image"]
+        self._folder, self._header, self._segments = folder, header, segments
+        types = {key: feature["dtype"] for key, feature in header.features.items()}
+        self._cameras = [key for key, dtype in types.items() if dtype == "video"]
+        self._image_columns = [key for key, dtype in types.items() if dtype == "image"]
+        self._others = [k for k, dtype in types.items() if not dtype.startswith(_IN_TABLES)]
         pictures = self._cameras or self._image_columns
         self._recorded = recorded_statistics(folder) if pictures else {}
-        self._task_index = {index: n for n, index in enumerate(sorted(folder.tasks))}
-        self.tasks = self._task_texts()
-        self._unlisted = self.tasks[:1]
-        self._add_time = add_time
-        self.header = recorded.RecordingHeader(
-            fps=float(fps or folder.fps),
-            robot_type=folder.robot_type or "unknown",
-            features=self._features(),
-            sidecar=self._sidecar(dataset.sidecar, units),
-        )
 
-    def _choose_cameras(self, videos: bool) -> list[str]:
-        there = {key for segments in self._segments.values() for key in segments}
-        reason = (
-            "declared, but no video of it is here; left out" if videos else "videos left out"
-        )
-        keys = video_keys(self._folder)
-        self.notes += [f"{key}: {reason}" for key in keys if key not in there]
-        return [key for key in keys if key in there]
-
-    def _task_texts(self) -> list[str]:
-        tasks = [self._folder.tasks[index] for index in self._task_index]
-        listed = (task for entry in self._folder.episodes for task in entry.tasks)
-        tasks += [text for text in dict.fromkeys(listed) if text not in tasks]
-        if not tasks:
-            tasks = [_NO_TASK]
-            self.notes.append(f"no task is listed: every episode shows {_NO_TASK!r} now")
-        return tasks
-
-    def _features(self) -> dict[str, dict]:
-        declared = self._folder.info["features"]
-        features = {}
-        for key, feature in self._folder.features.items():
-            if key in INDEX_KEYS:
-                continue
-            if feature.numeric:
-                features[key] = declared[key] | {
-                    "shape": list(feature.shape) or [1],
-                    "names": list(feature.names) if feature.names else None,
-                }
-            elif feature.dtype != "video" or key in self._cameras:
-                features[key] = declared[key]
-        if self._add_time:
-            features[recorded.TIME_KEY] = {"dtype": "float64", "shape": [1], "names": ["time"]}
-        return {**features, **INDEX_FEATURES}
-
-    def _sidecar(self, old: Sidecar, given: Mapping[str, str]) -> Sidecar:
-        columns, units = dict(old.columns), {**old.units, **given}
-        if self._add_time and columns:
-            columns["time"] = SidecarColumn(key=recorded.TIME_KEY, names=("time",))
-            units["time"] = "s"
-        return replace(old, columns=columns, units=units)
-
-    def join(self, header: recorded.RecordingHeader, tasks: list[str]) -> None:
-        """Write the episodes as those of a dataset with this header and these tasks."""
-        self._task_index = {n: tasks.index(text) for n, text in self._folder.tasks.items()}
-        self.tasks, self.header = tasks, header
-        self._cameras = [key for key in self._cameras if key in header.features]
-        self._image_columns = [key for key in self._image_columns if key in header.features]
-
-    def videos_of(self, edit: EpisodeEdit) -> Segments:
-        """Parts of the old videos that show the remaining frames.
+    def rewritten(self, edit: EpisodeEdit) -> Rewritten:
+        """An edited episode with the parts of the old videos and its tasks.
 
         Raises:
-            DatasetError: A video is missing, or the frames are not contiguous.
+            DatasetError: A video is missing or would have to be encoded anew, or a task is not
+                listed.
         """
+        videos, tasks = self._videos_of(edit), self._tasks_of(edit)
+        return Rewritten(writer=self, edit=edit, videos=videos, tasks=tasks)
+
+    def _videos_of(self, edit: EpisodeEdit) -> Segments:
+        """Parts of the old videos that show the remaining frames."""
         found, fps = self._segments.get(edit.entry.index, {}), self._folder.fps
         for key in self._cameras:
             if key not in found:
@@ -155,36 +205,55 @@ class ColumnRewriter:
         begin = int(edit.kept[0]) / fps
         end = begin + len(edit) / fps
         return {
-            key: replace(old, start=old.start + begin, stop=old.start + end)
-            for key, old in found.items()
-            if key in self._cameras
+            key: replace(
+                found[key], start=found[key].start + begin, stop=found[key].start + end
+            )
+            for key in self._cameras
         }
 
+    def _tasks_of(self, edit: EpisodeEdit) -> list[str]:
+        """Task of each frame."""
+        listed = self._folder.tasks
+        if "task_index" not in edit.frames or not listed:
+            first = (*edit.entry.tasks, *listed_tasks(self._folder))[0]
+            return [first] * len(edit)
+        indices = edit.frames["task_index"][:, 0].tolist()
+        for frame, index in enumerate(indices):
+            if index not in listed:
+                text = (
+                    f"task {index:g} is not in the list of tasks: leave the episode out "
+                    f"(drop_bad_episodes)"
+                )
+                raise edit.fault(text, frame=frame, key="task_index")
+        return [listed[index] for index in indices]
+
     def stage(
-        self,
-        path: Path,
-        edit: EpisodeEdit,
-        videos: Segments,
-        tasks: Int64[np.ndarray, " frames"],
-        frames_before: int,
+        self, path: Path, episode: Rewritten, numbers: Mapping[str, int], frames_before: int
     ) -> None:
-        """Write one episode, with `videos_of` and `tasks_of` it, to a staged file."""
-        values = edit.frames | (
-            {recorded.TIME_KEY: edit.time[:, None]} if self._add_time else {}
-        )
-        number, features = recorded.episode_number(path), self.header.features
-        values |= recorded.index_columns(self.header.fps, number, frames_before, tasks)
+        """Write one episode to a staged file.
+
+        Args:
+            path: The file.
+            episode: Result of `rewritten`.
+            numbers: Index of each task text.
+            frames_before: Number of frames of the episodes before.
+        """
+        edit, features = episode.edit, self._header.features
+        tasks = np.array([numbers[text] for text in episode.tasks])
+        number = recorded.episode_number(path)
+        values = {recorded.TIME_KEY: edit.time[:, None]} | edit.frames
+        values |= recorded.index_columns(self._header.fps, number, frames_before, tasks)
         numeric = {key: values[key] for key in features if key in values}
         others = self._other_columns(edit)
         statistics = episode_statistics(
             {key: v.reshape(-1, *features[key]["shape"]) for key, v in numeric.items()}
         )
         for key in (*self._cameras, *self._image_columns):
-            images = others.get(key, videos.get(key))
+            images = others[key] if key in others else episode.videos[key]
             statistics[key] = self._image_statistics(edit, key, images)
         staged = recorded.StagedEpisode(
-            header=self.header,
-            tasks=[self.tasks[i] for i in dict.fromkeys(tasks.tolist())],
+            header=self._header,
+            tasks=[*dict.fromkeys(episode.tasks)],
             statistics=statistics,
             table=recorded.to_table(numeric, features, others),
         )
@@ -192,18 +261,16 @@ class ColumnRewriter:
 
     def _other_columns(self, edit: EpisodeEdit) -> dict[str, pa.ChunkedArray]:
         """Columns that hold no numbers, for the remaining frames."""
-        types = {key: feature["dtype"] for key, feature in self.header.features.items()}
-        keys = [key for key, kind in types.items() if not kind.startswith(("video", *NUMERIC))]
-        if not keys:
+        if not self._others:
             return {}
         entry = edit.entry
         parquet = open_parquet(self._folder.root, entry.file, entry.index)
         rows = slice(entry.start, entry.start + entry.length)
-        table = read_table(parquet, entry.file, keys, rows).take(pa.array(edit.kept))
-        return {key: table.column(key) for key in keys}
+        table = read_table(parquet, entry.file, self._others, rows).take(pa.array(edit.kept))
+        return {key: table.column(key) for key in self._others}
 
     def _image_statistics(
-        self, edit: EpisodeEdit, key: str, images: pa.ChunkedArray | VideoSegment | None
+        self, edit: EpisodeEdit, key: str, images: pa.ChunkedArray | VideoSegment
     ) -> dict[str, list]:
         """Recorded statistics if all frames remain, else those of some images."""
         known = self._recorded.get(edit.entry.index, {}).get(key)
@@ -213,25 +280,5 @@ class ColumnRewriter:
         if isinstance(images, VideoSegment):
             some = [image_at(images, int(i), self._folder.fps) for i in chosen]
         else:
-            assert images is not None
             some = [decode_image(images[int(i)].as_py()["bytes"]) for i in chosen]
         return image_statistics(np.stack([subsampled(image) for image in some]))
-
-    def tasks_of(self, edit: EpisodeEdit) -> Int64[np.ndarray, " frames"]:
-        """Index of the task of each frame.
-
-        Raises:
-            DatasetError: A task is not in the list of tasks.
-        """
-        texts = edit.entry.tasks or self._unlisted
-        if "task_index" not in edit.frames or not self._folder.tasks:
-            return np.full(len(edit), self.tasks.index(texts[0]))
-        indices = edit.frames["task_index"][:, 0]
-        unknown = np.flatnonzero(~np.isin(indices, list(self._task_index)))
-        if len(unknown):
-            text = (
-                f"task {indices[unknown[0]]:g} is not in the list of tasks: leave the episode "
-                f"out (drop_bad_episodes)"
-            )
-            raise edit.fault(text, frame=int(unknown[0]), key="task_index")
-        return np.array([self._task_index[int(i)] for i in indices])

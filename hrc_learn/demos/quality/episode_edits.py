@@ -1,6 +1,6 @@
 """Edits of an episode: frames removed, values mended, and a regular grid of frames."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.preprocessing import nearest_frames, regular_grid, trim_rest
 from hrc_learn.demos.quality.episode_checks import is_clock, repeated_frames
-from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, select_quantities
 from hrc_learn.demos.read.naming import is_hand
@@ -34,33 +34,13 @@ _SMOOTH = ("joint_position", "joint_velocity", "position")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColumnSemantics:
-    """Meaning and units of the columns of a dataset."""
-
-    selections: dict[str, ColumnSelection]
-    """Columns by role."""
-    joint_names: tuple[str, ...]
-    units: dict[str, UnitDecision]
-
-    def turn(self, role: str) -> Float64[np.ndarray, " components"]:
-        """A full turn in the unit of each component."""
-        width = len(self.selections[role].columns)
-        return 2 * np.pi / np.broadcast_to(self.units[role].factor, width)
-
-    def hands(self, role: str) -> Bool[np.ndarray, " components"]:
-        """Mask of the fingers and grippers among the columns of a role."""
-        labels = self.selections[role].labels
-        named = [label in self.joint_names and is_hand(label) for label in labels]
-        return np.array(named) | (role == "gripper")
-
-
-@dataclass(frozen=True, kw_only=True)
 class EpisodeEdit:
     """One episode during its repair."""
 
     entry: EpisodeEntry
     """Entry in the old dataset."""
-    semantics: ColumnSemantics
+    columns: ColumnMapping
+    units: Mapping[str, UnitDecision]
     frames: RawFrames
     """Columns to be written; of LeRobot's own, only `task_index`."""
     time: Float64[np.ndarray, " _frames"]
@@ -74,9 +54,25 @@ class EpisodeEdit:
         return len(self.time)
 
     @property
+    def selections(self) -> dict[str, ColumnSelection]:
+        """Columns by role."""
+        return self.columns.selections
+
+    @property
     def quantities(self) -> Quantities:
         """Quantities in the units on disk."""
-        return select_quantities(self.frames, self.semantics.selections)
+        return select_quantities(self.frames, self.selections)
+
+    def turn(self, role: str) -> Float64[np.ndarray, " components"]:
+        """A full turn in the unit of each component."""
+        width = len(self.selections[role].columns)
+        return 2 * np.pi / np.broadcast_to(self.units[role].factor, width)
+
+    def hands(self, role: str) -> Bool[np.ndarray, " components"]:
+        """Mask of the fingers and grippers among the columns of a role."""
+        labels, joints = self.selections[role].labels, self.columns.joint_names
+        named = [label in joints and is_hand(label) for label in labels]
+        return np.array(named) | (role == "gripper")
 
     def only(self, wanted: Bool[np.ndarray, " _frames"], change: str) -> "EpisodeEdit":
         """The wanted frames alone.
@@ -101,7 +97,7 @@ class EpisodeEdit:
     ) -> "EpisodeEdit":
         """The episode with other values of a quantity, in the unit on disk."""
         columns: RawFrames = {}
-        for number, (key, index) in enumerate(self.semantics.selections[role].columns):
+        for number, (key, index) in enumerate(self.selections[role].columns):
             column = columns.setdefault(key, self.frames[key].copy())
             column[:, index] = values[:, number]
         return replace(self, frames=self.frames | columns, changes=(*self.changes, *changes))
@@ -132,7 +128,7 @@ def drop_bad_frames(edit: EpisodeEdit, allowed: bool) -> EpisodeEdit:
     Raises:
         DatasetError: There are such frames and `allowed` is False, or too few are left.
     """
-    selections, feature = edit.semantics.selections, set()
+    selections, feature = edit.selections, set()
     hidden = np.zeros(len(edit), dtype=bool)
     if {"feature", "feature_visible"} <= selections.keys():
         hidden = ~(edit.quantities["feature_visible"][:, 0] > 0)
@@ -191,12 +187,12 @@ def trim(edit: EpisodeEdit) -> EpisodeEdit:
     Raises:
         DatasetError: The arm never moves, or the stamps do not increase.
     """
-    quantities, semantics = edit.quantities, edit.semantics
+    quantities = edit.quantities
     role = next((r for r in ("joint_position", "position") if r in quantities), None)
     if role is None:
         return edit
-    moving: dict[str, Any] = {role: quantities[role] * semantics.units[role].factor}
-    names = semantics.joint_names if role == "joint_position" else ()
+    moving: dict[str, Any] = {role: quantities[role] * edit.units[role].factor}
+    names = edit.columns.joint_names if role == "joint_position" else ()
     time, number = edit.time - edit.time[0], edit.entry.index
     try:
         left = trim_rest(
@@ -235,30 +231,30 @@ def unwrap(edit: EpisodeEdit) -> EpisodeEdit:
     Only measurements of the arm change: commands, hands, grippers and switches stay as they
     are. A joint whose command jumps with it stays too, so that the two agree.
     """
-    semantics, quantities = edit.semantics, edit.quantities
+    quantities = edit.quantities
     for role in (*_MEASURED_ANGLES, "rotation_vector"):
         if role not in quantities:
             continue
-        values, turn = quantities[role], semantics.turn(role)
+        values, turn = quantities[role], edit.turn(role)
         if role == "rotation_vector":
             scaled = torch.from_numpy(values * 2 * np.pi / turn)
             smooth = quaternion.unwrap_log(scaled).numpy() * turn / (2 * np.pi)
         else:
             smooth = values - turn * _turns(values / turn)
             fixed = is_discrete(profile_columns({role: values})[role], len(edit))
-            fixed |= semantics.hands(role)
+            fixed |= edit.hands(role)
             if role == "joint_position" and "command_position" in quantities:
-                other = quantities["command_position"] / semantics.turn("command_position")
+                other = quantities["command_position"] / edit.turn("command_position")
                 fixed |= _turns(other).any(0)
             smooth[:, fixed] = values[:, fixed]
         # Scaling changes a rotation vector in its last digit.
         changed = np.abs(smooth - values).max(0) > 1e-6 * turn
         smooth[:, ~changed] = values[:, ~changed]
         if changed.any():
-            labels = semantics.selections[role].labels
+            labels = edit.selections[role].labels
             names = ", ".join(labels[int(i)] for i in np.flatnonzero(changed))
             old, new = (np.abs(np.diff(v[:, changed], axis=0)).max() for v in (values, smooth))
-            steps = f"largest step {old:.4g} -> {new:.4g} {semantics.units[role].unit}"
+            steps = f"largest step {old:.4g} -> {new:.4g} {edit.units[role].unit}"
             edit = edit.with_quantity(role, smooth, f"unwrapped {role} ({names}): {steps}")
     return edit
 
@@ -310,14 +306,14 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     """
     from scipy.interpolate import CubicSpline, make_interp_spline
 
-    known, semantics = edit.time - edit.time[0], edit.semantics
+    known = edit.time - edit.time[0]
     if (np.diff(known) <= 0).any():
         raise edit.fault("stamps must increase to be resampled")
     try:
         grid = regular_grid(float(known[-1]), fps)
     except ValueError as error:
         raise edit.fault(str(error)) from error
-    if "pose_matrix" in semantics.selections:
+    if "pose_matrix" in edit.selections:
         raise edit.fault(
             "holds poses as matrices, which are not resampled; map them away "
             "(mapping={'pose_matrix': None}) or leave the frames as they are (no fps)",
@@ -354,11 +350,11 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
 
 def _levels(edit: EpisodeEdit) -> Iterator[tuple[str, Bool[np.ndarray, " components"]]]:
     """Components of each column without values between: integers, switches and hands."""
-    semantics, profiles = edit.semantics, profile_columns(edit.frames)
+    profiles = profile_columns(edit.frames)
     hands: set[tuple[str, int]] = set()
-    for role in {"joint_position", "gripper", "command_position"} & semantics.selections.keys():
-        columns = semantics.selections[role].columns
-        hands |= {columns[i] for i in np.flatnonzero(semantics.hands(role))}
+    for role in {"joint_position", "gripper", "command_position"} & edit.selections.keys():
+        columns = edit.selections[role].columns
+        hands |= {columns[i] for i in np.flatnonzero(edit.hands(role))}
     for key, values in edit.frames.items():
         held = np.array([(key, index) in hands for index in range(values.shape[1])])
         if key in profiles:
@@ -379,9 +375,9 @@ def _unwrapped_all(
     for role in (*_MEASURED_ANGLES, "command_position"):
         if role not in quantities:
             continue
-        values, turn = quantities[role], edit.semantics.turn(role)
+        values, turn = quantities[role], edit.turn(role)
         turns = _turns(values / turn)
-        columns = edit.semantics.selections[role].columns
+        columns = edit.selections[role].columns
         for k in np.flatnonzero(turns.any(0)):
             middle = float(values[:, k].min() + values[:, k].max()) / 2
             wrapped.append((columns[k], (float(turn[k]), middle)))

@@ -1,6 +1,5 @@
 """One dataset of several: columns by name, units and tasks as in the first, videos copied."""
 
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -9,21 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
-from hrc_learn.demos.quality.episode_edits import ColumnSemantics, EpisodeEdit
+from hrc_learn.demos.quality.column_rewriter import (
+    ColumnRewriter,
+    Rewritten,
+    listed_tasks,
+    new_header,
+    write_copy,
+)
+from hrc_learn.demos.quality.episode_edits import EpisodeEdit
 from hrc_learn.demos.quality.repair import RepairOptions, repair_dataset
-from hrc_learn.demos.read.contract import fingerprint, keep_contract
-from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset, open_dataset
 from hrc_learn.demos.read.units import UnitDecision, unit_factor
-from hrc_learn.demos.recorded_episode import RecordingHeader, episode_path
+from hrc_learn.demos.recorded_episode import RecordingHeader
 from hrc_learn.demos.videos import Segments, read_segments, video_keys
-from hrc_learn.store import DATASET, replacing
 
 _ESSENTIAL = ("action", "observation.state")
 """Features without which no policy learns; others may be left out."""
@@ -277,48 +278,38 @@ class _Merge:
 
     def write(self) -> None:
         """Write the merged dataset."""
-        writers, tasks = self._writers()
-        report, segments = self.report, []
-        with replacing(self.report.path, DATASET) as target:
-            staging = target / "episodes"
-            staging.mkdir(parents=True)
-            paths: list[Path] = []
-            for source, writer in zip(self.sources, writers, strict=True):
-                for edit in self._episodes(source, writer.header.features):
-                    shown = writer.videos_of(edit)
-                    paths.append(episode_path(staging, len(paths)))
-                    writer.stage(paths[-1], edit, shown, writer.tasks_of(edit), report.frames)
-                    segments.append(shown)
-                    report.frames += len(edit)
-            assemble(paths, target, videos=segments, tasks=tasks, link_videos=False)
-            self._carry_contract(target)
-            shutil.rmtree(staging)
-        report.episodes, report.tasks = len(paths), len(tasks)
+        report, folders = self.report, [source.dataset.folder for source in self.sources]
+        segments = [self._segments(source) for source in self.sources]
+        tasks = [*dict.fromkeys(text for folder in folders for text in listed_tasks(folder))]
+        header = self._header(new_header(self.first.dataset, {}, segments[0]))
+        contract = self.first.dataset.contract
+        if contract is not None:
+            parts = tuple(part for part in contract.components if part.key in self.features)
+            contract = replace(contract, components=parts)
 
-    def _writers(self) -> tuple[list[ColumnRewriter], list[str]]:
-        """Writer of each dataset's episodes, and the tasks of all."""
-        writers = []
-        for source in self.sources:
-            folder = source.dataset.folder
-            found = read_segments(folder) if self.videos else {}
-            kept: dict[int, Segments] = {
-                index: {key: segment for key, segment in shown.items() if key in self.features}
-                for index, shown in found.items()
-            }
-            for key in video_keys(folder) if self.videos else ():
-                if key in self.features and not any(key in shown for shown in kept.values()):
-                    text = "its videos are missing: copy them, or leave all out (--no-videos)"
-                    raise DatasetError(text, file=folder.root, key=key)
-            writers.append(
-                ColumnRewriter(
-                    source.dataset, {}, fps=None, segments=kept if self.videos else None
-                )
-            )
-        tasks = [*dict.fromkeys(text for writer in writers for text in writer.tasks)]
-        header = self._header(writers[0].header)
-        for writer in writers:
-            writer.join(header, tasks)
-        return writers, tasks
+        def rewritten() -> Iterator[Rewritten]:
+            for source, shown in zip(self.sources, segments, strict=True):
+                writer = ColumnRewriter(source.dataset.folder, header, shown)
+                for edit in self._episodes(source, header.features):
+                    report.episodes += 1
+                    report.frames += len(edit)
+                    yield writer.rewritten(edit)
+
+        write_copy(report.path, rewritten(), tasks, contract)
+        report.tasks = len(tasks)
+
+    def _segments(self, source: _Source) -> dict[int, Segments]:
+        """Video segments of a dataset, of the cameras that all have."""
+        folder = source.dataset.folder
+        kept: dict[int, Segments] = {
+            index: {key: segment for key, segment in shown.items() if key in self.features}
+            for index, shown in (read_segments(folder) if self.videos else {}).items()
+        }
+        for key in video_keys(folder):
+            if key in self.features and not any(key in shown for shown in kept.values()):
+                text = "its videos are missing: copy them, or leave all out (--no-videos)"
+                raise DatasetError(text, file=folder.root, key=key)
+        return kept
 
     def _header(self, own: RecordingHeader) -> RecordingHeader:
         """Header of the first dataset without the features that are left out."""
@@ -334,27 +325,16 @@ class _Merge:
     def _episodes(self, source: _Source, features: Mapping[str, dict]) -> Iterator[EpisodeEdit]:
         """Episodes of a dataset as those of the first one, unedited."""
         dataset, entries = source.dataset, source.dataset.folder.episodes
-        semantics = ColumnSemantics(
-            selections=dataset.columns.selections,
-            joint_names=dataset.columns.joint_names,
-            units=dict(source.units),
-        )
         keys = [*source.places, *({"task_index"} & source.features.keys())]
         for entry, frames in read_frames(dataset.folder, entries, keys):
             yield EpisodeEdit(
                 entry=entry,
-                semantics=semantics,
+                columns=dataset.columns,
+                units=source.units,
                 frames=source.converted(frames, features),
                 time=np.arange(entry.length) / dataset.folder.fps,
                 kept=np.arange(entry.length),
             )
-
-    def _carry_contract(self, target: Path) -> None:
-        contract = self.first.dataset.contract
-        if contract is not None:
-            parts = tuple(part for part in contract.components if part.key in self.features)
-            renewed = fingerprint(open_folder(target))
-            keep_contract(target, replace(contract, components=parts, fingerprint=renewed))
 
 
 def _agreed(infos: Sequence[Mapping[str, object]]) -> dict[str, object]:

@@ -1,32 +1,34 @@
 """Repaired and curated copies of a dataset, and the decisions kept next to it."""
 
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality import episode_edits as edits
-from hrc_learn.demos.quality.column_rewriter import ColumnRewriter
+from hrc_learn.demos.quality.column_rewriter import (
+    NO_TASK,
+    ColumnRewriter,
+    Rewritten,
+    listed_tasks,
+    new_header,
+    write_copy,
+)
 from hrc_learn.demos.read.columns import MappingSpec
-from hrc_learn.demos.read.contract import fingerprint, keep_contract
+from hrc_learn.demos.read.contract import Contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry, Progress, open_folder
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities
-from hrc_learn.demos.recorded_episode import episode_path
-from hrc_learn.demos.videos import Segments, read_segments
-from hrc_learn.store import DATASET, Count, read_json, replacing, write_json
+from hrc_learn.demos.videos import read_segments, video_keys
+from hrc_learn.store import Count, read_json, write_json
 
 _STAMP_TOLERANCE = 1e-3
 """Deviation from a regular clock that is kept [s]: above the rounding of float32 stamps."""
-_LARGEST_NOTE = 2**20
-"""Largest card, licence or foreign metadata file that is copied [bytes]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +65,7 @@ class RepairOptions:
 class RepairReport:
     """Changes made to each episode."""
 
-    path: Path
+    path: Path = Path()
     """The new dataset."""
     changes: dict[int, tuple[str, ...]] = field(default_factory=dict)
     """Index of a kept episode in the old dataset -> its changes."""
@@ -128,8 +130,17 @@ def repair_dataset(
         FileExistsError: `out` exists.
     """
     dataset = OpenedDataset.of(open_folder(path), mapping)
-    repair = _Repair(dataset, Path(out), options or RepairOptions(), units or {}, kept)
-    repair.run(progress)
+    if not dataset.folder.episodes:
+        raise DatasetError("the dataset holds no episodes", file=dataset.folder.root)
+    repair = _Repair(dataset, options or RepairOptions(), units or {}, kept)
+    repair.report.path = Path(out)
+    rewritten = repair.episodes(progress)
+    if repair.options.dry_run:
+        for _ in rewritten:
+            pass
+    else:
+        root = dataset.folder.root
+        write_copy(Path(out), rewritten, repair.tasks, repair.contract(), notes_of=root)
     return repair.report
 
 
@@ -139,51 +150,46 @@ class _Repair:
     def __init__(
         self,
         dataset: OpenedDataset,
-        out: Path,
         options: RepairOptions,
         units: Mapping[str, str],
         kept: Mapping[int, slice] | None,
     ):
-        if not dataset.folder.episodes:
-            raise DatasetError("the dataset holds no episodes", file=dataset.folder.root)
         self.dataset, self.folder, self.units, self.kept = dataset, dataset.folder, units, kept
-        self.out, self.options, columns = out, options, dataset.columns
-        decisions, faults = dataset.units_from(self._readable(), units)
+        self.options, self.tasks = options, listed_tasks(dataset.folder)
+        self._regular = True
+        """True if the increasing stamps of LeRobot are 1/fps apart in all episodes."""
+        self.decisions, faults = dataset.units_from(self._readable(), units)
         self.faults = {fault.episode: fault for fault in faults}
         """Episodes that contradict the units of the others."""
-        self.semantics = edits.ColumnSemantics(
-            selections=columns.selections, joint_names=columns.joint_names, units=decisions
-        )
-        segments = read_segments(self.folder) if options.videos else None
         add_time = (
-            "time" not in columns.selections
+            "time" not in dataset.columns.selections
             and options.fps is None
-            and (options.drop_bad_frames or options.drop_repeats or not self._regular())
+            and (options.drop_bad_frames or options.drop_repeats or not self._regular)
         )
-        self.rewriter = ColumnRewriter(
-            dataset, units, fps=options.fps, segments=segments, add_time=add_time
-        )
-        self.report = RepairReport(path=out, notes=self.rewriter.notes, dry_run=options.dry_run)
+        segments = read_segments(self.folder) if options.videos else {}
+        header = new_header(dataset, units, segments, fps=options.fps, add_time=add_time)
+        self.writer = ColumnRewriter(self.folder, header, segments)
+        self.report = RepairReport(notes=self._notes(header.features), dry_run=options.dry_run)
+
+    def _notes(self, features: Collection[str]) -> list[str]:
+        """Changes to the whole dataset."""
+        missing = "declared, but no video of it is here; left out"
+        reason = missing if self.options.videos else "videos left out"
+        notes = [self.dataset.contract_note] if self.dataset.contract_note else []
+        notes += [f"{key}: {reason}" for key in video_keys(self.folder) if key not in features]
+        if self.tasks == [NO_TASK]:
+            notes.append(f"no task is listed: every episode shows {NO_TASK!r} now")
+        return notes
 
     def _readable(self) -> Iterator[tuple[EpisodeEntry, Quantities]]:
         """Quantities of the readable episodes; the others are reported when repaired."""
         for entry, frames in zip(self.folder.episodes, self._read(), strict=True):
             if not isinstance(frames, DatasetError):
+                time = recorded_stamps(self.folder, frames)
+                off = np.abs(time - time[0] - np.arange(len(time)) / self.folder.fps).max()
+                if off > _STAMP_TOLERANCE and (np.diff(time) > 0).all():
+                    self._regular = False
                 yield entry, select_quantities(frames, self.dataset.columns.selections)
-
-    def _regular(self) -> bool:
-        """True if LeRobot's stamps that increase are 1/fps apart in every readable episode."""
-        if "timestamp" not in self.folder.features:
-            return True
-        for frames in read_each(self.folder, self.folder.episodes, ["timestamp"]):
-            if isinstance(frames, DatasetError):
-                continue
-            time = frames["timestamp"][:, 0].astype(float)
-            expected = time[0] + np.arange(len(time)) / self.folder.fps
-            off = np.abs(time - expected).max()
-            if off > _STAMP_TOLERANCE and (np.diff(time) > 0).all():
-                return False
-        return True
 
     def _read(self) -> Iterator[RawFrames | DatasetError]:
         """Numeric columns of every episode."""
@@ -191,36 +197,8 @@ class _Repair:
         keys = [key for key, f in features if f.numeric and key not in INDEX_KEYS]
         return read_each(self.folder, self.folder.episodes, keys)
 
-    def run(self, progress: Progress | None) -> None:
-        """Repair every episode, and write the new dataset unless it is a dry run."""
-        if self.options.dry_run:
-            for _ in self._edits(progress):
-                pass
-            return
-        with replacing(self.out, DATASET) as target:
-            staging = target / "episodes"
-            staging.mkdir(parents=True)
-            paths: list[Path] = []
-            videos: list[Segments] = []
-            for edit, shown, tasks in self._edits(progress):
-                paths.append(episode_path(staging, len(paths)))
-                before = self.report.frames - len(edit)
-                self.rewriter.stage(paths[-1], edit, shown, tasks, before)
-                videos.append(shown)
-            if not paths:
-                raise DatasetError("no episode could be repaired", file=self.folder.root)
-            assemble(paths, target, videos=videos, tasks=self.rewriter.tasks, link_videos=False)
-            _copy_notes(self.folder.root, target)
-            self._carry_contract(target)
-            shutil.rmtree(staging)
-
-    def _edits(
-        self, progress: Progress | None
-    ) -> Iterator[tuple[edits.EpisodeEdit, Segments, np.ndarray]]:
-        """Repaired episodes with their videos and the task of each frame.
-
-        The report counts them, and those that are left out.
-        """
+    def episodes(self, progress: Progress | None) -> Iterator[Rewritten]:
+        """Repaired episodes; the report counts them, and those that are left out."""
         report = self.report
         entries = progress(self.folder.episodes) if progress else self.folder.episodes
         for entry, frames in zip(entries, self._read(), strict=True):
@@ -229,16 +207,15 @@ class _Repair:
                 report.left_out[entry.index] = "not kept"
                 continue
             try:
-                edit = self._repaired(entry, frames)
-                videos, tasks = self.rewriter.videos_of(edit), self.rewriter.tasks_of(edit)
+                rewritten = self.writer.rewritten(self._repaired(entry, frames))
             except DatasetError as error:
                 if not self.options.drop_bad_episodes:
                     raise
                 report.left_out[entry.index] = error.issue.message
                 continue
-            report.changes[entry.index] = edit.changes
-            report.frames += len(edit)
-            yield edit, videos, tasks
+            report.changes[entry.index] = rewritten.edit.changes
+            report.frames += len(rewritten.edit)
+            yield rewritten
 
     def _repaired(
         self, entry: EpisodeEntry, frames: RawFrames | DatasetError
@@ -250,7 +227,7 @@ class _Repair:
         if isinstance(frames, DatasetError):
             raise frames
         edit = self._unedited(entry, frames)
-        if "time" not in edit.semantics.selections:
+        if "time" not in edit.selections:
             edit = edits.renew_stamps(edit, self.folder.fps)
         edit = edits.drop_bad_frames(edit, options.drop_bad_frames)
         for name in ("drop_late", "trim", "drop_repeats", "unwrap", "fix_signs"):
@@ -269,15 +246,16 @@ class _Repair:
 
     def _unedited(self, entry: EpisodeEntry, frames: RawFrames) -> edits.EpisodeEdit:
         """The frames of an episode that are to be kept."""
-        semantics = self.semantics
+        columns = self.dataset.columns
         time = recorded_stamps(self.folder, frames)
-        if "time" in semantics.selections:
-            ((key, index),) = semantics.selections["time"].columns
-            time = frames[key][:, index].astype(float) * semantics.units["time"].factor
+        if "time" in columns.selections:
+            ((key, index),) = columns.selections["time"].columns
+            time = frames[key][:, index].astype(float) * self.decisions["time"].factor
         unused = {*INDEX_KEYS} - {"task_index"}
         edit = edits.EpisodeEdit(
             entry=entry,
-            semantics=semantics,
+            columns=columns,
+            units=self.decisions,
             frames={key: values for key, values in frames.items() if key not in unused},
             time=time,
             kept=np.arange(entry.length),
@@ -287,32 +265,22 @@ class _Repair:
         wanted[part] = True
         return edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
 
-    def _carry_contract(self, target: Path) -> None:
-        """Keep the old dataset's contract with the new one, in the units given."""
-        contract = self.dataset.contract
+    def contract(self) -> Contract | None:
+        """The old dataset's contract, in the units given."""
+        contract, selections = self.dataset.contract, self.dataset.columns.selections
         if contract is None:
-            return
+            return None
         given = {
             column: unit
             for role, unit in self.units.items()
-            if role in self.semantics.selections
-            for column in self.semantics.selections[role].columns
+            if role in selections
+            for column in selections[role].columns
         }
         parts = tuple(
             replace(part, unit=given.get((part.key, part.index), part.unit))
             for part in contract.components
         )
-        renewed = fingerprint(open_folder(target))
-        keep_contract(target, replace(contract, components=parts, fingerprint=renewed))
-
-
-def _copy_notes(source: Path, target: Path) -> None:
-    """Copy the card, the licence and metadata of other programs."""
-    for path in (*source.glob("*.md"), *source.glob("LICENSE*"), *source.glob("meta/*.json")):
-        there = target / path.relative_to(source)
-        ordinary = path.is_file() and not path.is_symlink()
-        if ordinary and not there.exists() and path.stat().st_size < _LARGEST_NOTE:
-            shutil.copyfile(path, there)
+        return replace(contract, components=parts)
 
 
 Verdict = Literal["accept", "cut", "reject"]

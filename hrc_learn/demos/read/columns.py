@@ -269,57 +269,47 @@ class _Conventions:
         whole: dict[str, ColumnSelection] = {}
         by_component: dict[str, ColumnSelection] = {}
         for feature in features.values():
-            selections = self._whole_feature(feature)
-            known = whole if selections else by_component
-            for selection in selections or self._components(feature):
+            meanings, known = self._whole_feature(feature), whole
+            if meanings is None:
+                meanings, known = self._components(feature), by_component
+            for selection in self._grouped(feature, meanings):
                 known.setdefault(selection.role, selection)
         return by_component | whole
 
-    def _whole_feature(self, feature: Feature) -> list[ColumnSelection]:
-        """Selections of a feature whose key tells its content; [] for all others."""
-        role = role_of_key(feature.key)
+    def _whole_feature(self, feature: Feature) -> list[ComponentMeaning | None] | None:
+        """Meanings of the components where the key of the feature tells them; else None."""
+        role, width = role_of_key(feature.key), feature.width
         if role is None or (_is_command(feature) and role not in _COMMANDS):
-            return []
+            return None
         named = [meaning_of_component(name) for name in feature.names or ()]
         if any(meaning and meaning.role in _ORIENTATIONS for meaning in named):
-            return [*self._grouped(feature, named)]
-        indices = range(feature.width)
-        if role == "cartesian":
-            return self._unnamed_pose(feature)
-        if role == "feature":
-            visible = [_select("feature_visible", feature, [2])] if feature.width == 3 else []
-            return [_select("feature", feature, indices[:2]), *visible]
-        if role == "quaternion_xyzw" and feature.width == 4:
-            self._encoding(feature, "quaternion", dict.fromkeys(range(4), 0))
-            return [replace(_select(role, feature, indices), assumed=f"{role}, by its width")]
-        if role == "gripper" and feature.width == 2:  # two fingers, as in robomimic
+            return named
+        if role == "cartesian" and width in (16, *_CARTESIAN):
+            role = "pose_matrix"
+        elif role == "cartesian" and width == 3:
+            role = "position"
+        elif role == "quaternion_xyzw" and width == 4:
+            role = "quaternion"
+        elif role == "gripper" and width == 2:  # two fingers, as in robomimic
             self._notes.append(f"{feature.key}: its first finger is taken for the gripper")
-            return [_select(role, feature, indices[:1])]
-        width = ROLES[role].width
-        if width is not None and width != feature.width:
-            return []
-        return [_select(_COMMANDS[role] if _is_command(feature) else role, feature, indices)]
+            return [ComponentMeaning(role, 0), None]
+        elif role == "feature":
+            point = [ComponentMeaning(role, 0), ComponentMeaning(role, 1)]
+            visible = ComponentMeaning("feature_visible", 0) if width == 3 else None
+            return [*point, *[visible] * (width - 2)][:width]
+        elif role not in ROLES or ROLES[role].width not in (None, width):
+            return None
+        names = feature.names or tuple(f"joint_{k + 1}" for k in range(width))
+        slots = map(joint_of, names) if role in JOINT_FIELDS else range(width)
+        return [ComponentMeaning(role, slot) for slot in slots]
 
-    def _unnamed_pose(self, feature: Feature) -> list[ColumnSelection]:
-        indices = range(feature.width)
-        if feature.width == 16:
-            return [_select("pose_matrix", feature, indices)]
-        if feature.width not in (3, *_CARTESIAN):
-            return []
-        selections = [_select("position", feature, indices[:3])]
-        if feature.width in _CARTESIAN:
-            role, content = _CARTESIAN[feature.width]
-            self._notes.append(f"{feature.key}: assumed to be {content}")
-            selections.append(_select(role, feature, indices[3:]))
-        return selections
-
-    def _components(self, feature: Feature) -> Iterator[ColumnSelection]:
-        """Selections of a feature of mixed content, such as `observation.state`."""
+    def _components(self, feature: Feature) -> list[ComponentMeaning | None]:
+        """Meanings in a feature of mixed content, such as `observation.state`."""
         mixed = feature.key in (*_STATE_KEYS, *_ACTION_KEYS)
         names = feature.names
         if names is None:
             if not mixed:
-                return
+                return []
             names = tuple(f"joint_{i + 1}" for i in range(feature.width))
             self._notes.append(
                 f"{feature.key} names no components: taken for {feature.width} joints"
@@ -327,20 +317,17 @@ class _Conventions:
         meanings = [meaning_of_component(name) for name in names]
         if not mixed:
             # In other features x, y, z may belong to an object: only explicit names count.
-            meanings = [
+            return [
                 meaning if names_joint_quantity(name) or name.lower().startswith("ee") else None
                 for name, meaning in zip(names, meanings, strict=True)
             ]
-        else:
-            suffixed = any(map(names_joint_quantity, names))
-            usual = None if suffixed else "joint_position"
-            meanings = [
-                self._joint(feature, name, meaning)
-                if (meaning.role if meaning else usual) == "joint_position"
-                else meaning
-                for name, meaning in zip(names, meanings, strict=True)
-            ]
-        yield from self._grouped(feature, meanings)
+        usual = None if any(map(names_joint_quantity, names)) else "joint_position"
+        return [
+            self._joint(feature, name, meaning)
+            if (meaning.role if meaning else usual) == "joint_position"
+            else meaning
+            for name, meaning in zip(names, meanings, strict=True)
+        ]
 
     def _joint(
         self, feature: Feature, name: str, meaning: ComponentMeaning | None
@@ -429,16 +416,6 @@ class _Conventions:
 def _slot(slot: str | int) -> int:
     """Place of a component in its role: a number, or that of w, x, y, z."""
     return slot if isinstance(slot, int) else "wxyz".find(slot)
-
-
-def _select(role: str, feature: Feature, indices: Sequence[int]) -> ColumnSelection:
-    names = feature.names or tuple(f"joint_{i + 1}" for i in range(feature.width))
-    return ColumnSelection(
-        role=role,
-        columns=tuple((feature.key, index) for index in indices),
-        labels=tuple(joint_of(names[i]) for i in indices),
-        numbered=feature.names is None,
-    )
 
 
 def _is_command(feature: Feature) -> bool:

@@ -258,7 +258,7 @@ def _finger_unit(peak: float, whole: bool, arm_unit: str, hobby: bool) -> str:
 def guess_by_size(role: str, sizes: Sizes) -> Guess:
     """Unit of an opening, a position or the angles of an orientation."""
     largest, whole = float(sizes.peak.max()), bool(sizes.whole.all())
-    unit, confidence, other = next(
-        row for most, *row in _SIZES[role] if largest <= most and (whole or row[0] != "byte")
+    _, unit, confidence, other = next(
+        row for row in _SIZES[role] if largest <= row[0] and (whole or row[1] != "byte")
     )
     return Guess(unit, confidence, f"values usually reach {largest:.3g}", other)
