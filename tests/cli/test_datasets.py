@@ -416,12 +416,14 @@ def test_demonstrations_are_opened_from_a_recording_that_does_not_stay(
     assert not Path(viewer[0][-1]).exists()
 
 
-def test_demonstrations_are_streamed_to_the_browser(viewer, recording, tmp_path):
+def test_demonstrations_are_served_to_the_browser(viewer, recording, tmp_path):
     hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")
-    shown = hrc("show", tmp_path / "set", "--web")
+    shown = hrc("show", tmp_path / "set", "--web", "--json", tmp_path / "figures.json")
     assert shown.status == 0
     assert "/#token=" in shown.output
-    assert not viewer
+    assert viewer[0][0] == "serve"
+    assert not Path(viewer[0][1]).exists()
+    assert json.loads((tmp_path / "figures.json").read_text())["episodes"] == 1
 
 
 def test_a_dataset_is_shown_with_the_arm_that_is_named(recording, tmp_path):

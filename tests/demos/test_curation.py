@@ -16,13 +16,13 @@ from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.images import load_images
 from hrc_learn.demos.quality.ranking import gripper_moves, log_dimensionless_jerk, rank_episodes
 from hrc_learn.demos.quality.repair import (
-    Decision,
     decide,
     decisions_path,
     keep_decisions,
     read_decisions,
     write_curated,
 )
+from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.teleoperation.curation_page import CurationPage
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
@@ -70,7 +70,7 @@ def test_every_odd_episode_comes_before_every_sound_one(ranking):
     ("episode", "reason"),
     [
         (2, "unlike all others"),
-        (3, "nearly repeats episode 1"),
+        (3, "shows the same motion as episode 1"),
         (5, "standing still"),
         (7, "jerkily"),
         (9, "exchanged"),
@@ -152,7 +152,8 @@ def test_jerk_knows_neither_units_nor_pace():
 def test_decisions_are_kept_beside_the_dataset(odd, tmp_path):
     root = shutil.copytree(odd, tmp_path / "set")
     before = sorted(root.rglob("*"))
-    decided = {3: Decision(verdict="reject"), 5: Decision(verdict="cut", start=85, stop=200)}
+    lengths = [entry.length for entry in open_folder(root).episodes]
+    decided = {3: decide("reject", lengths[3]), 5: decide("cut", lengths[5], 85, 200)}
     keep_decisions(root, decided)
     assert read_decisions(root) == decided
     assert sorted(root.rglob("*")) == before
@@ -166,10 +167,9 @@ def test_decisions_are_kept_beside_the_dataset(odd, tmp_path):
         read_decisions(root)
 
 
-def test_the_name_of_an_episode_is_its_number_whatever_the_caller_gives(tmp_path):
+def test_the_name_of_an_episode_is_its_number(tmp_path):
     root = write_set(tmp_path / "set", "v3.0")
-    keep_decisions(root, {True: Decision(verdict="reject")})  # True is equal to 1
-    assert [*read_decisions(root)] == [1]
+    keep_decisions(root, {1: decide("reject", 100)})
     text = decisions_path(root).read_text()
     decisions_path(root).write_text(text.replace('"1"', '"True"'))
     with pytest.raises(DatasetError, match="delete it to begin anew"):
@@ -187,7 +187,7 @@ def test_cuts_that_leave_nothing_or_do_not_exist_are_refused(cut):
 def test_the_cleaned_set_is_what_was_decided_and_the_source_as_it_was(tmp_path, version):
     root = write_set(tmp_path / "set", version, camera=True)
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
-    decided = {1: Decision(verdict="reject"), 2: Decision(verdict="cut", start=20, stop=90)}
+    decided = {1: decide("reject", 100), 2: decide("cut", 100, 20, 90)}
     report = write_curated(root, tmp_path / "out", decided)
     old, new = load_demos(root), load_demos(tmp_path / "out")
     assert [*report.changes] == [0, 2, 3, 4]
@@ -225,11 +225,11 @@ def test_an_episode_is_not_decided_on_twice(odd, one, other):
 
 
 def test_all_rejected_and_unknown_episodes_are_refused(odd, tmp_path):
-    everything = dict.fromkeys(range(14), Decision(verdict="reject"))
+    everything = dict.fromkeys(range(14), decide("reject", 100))
     with pytest.raises(DatasetError, match="every episode"):
         write_curated(odd, tmp_path / "out", everything)
     with pytest.raises(DatasetError, match="no such episode"):
-        write_curated(odd, tmp_path / "out", {14: Decision(verdict="reject")})
+        write_curated(odd, tmp_path / "out", {14: decide("reject", 100)})
     assert not (tmp_path / "out").exists()
 
 

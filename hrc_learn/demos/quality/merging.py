@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -74,80 +73,71 @@ def merge_datasets(
     if len(paths) < 2:
         raise ValueError("give two datasets or more to merge")
     report = MergeReport(path=Path(out))
-    with ExitStack() as stack:
-        opened = [open_dataset(path) for path in paths]
-        rate = opened[0].folder.fps if fps is None else float(fps)
+    opened = [open_dataset(path) for path in paths]
+    rate = opened[0].folder.fps if fps is None else float(fps)
+    with tempfile.TemporaryDirectory() as folder:
         for number, dataset in enumerate(opened):
-            if not np.isclose(dataset.folder.fps, rate):
-                if fps is None:
-                    raise _other_rate(dataset, opened[0])
-                folder = stack.enter_context(tempfile.TemporaryDirectory())
-                opened[number] = _resampled(dataset, Path(folder), rate, videos, report)
+            root, own = dataset.folder.root, dataset.folder.fps
+            if np.isclose(own, rate):
+                continue
+            if fps is None:
+                raise DatasetError(
+                    f"runs at {own:g} fps, but {opened[0].folder.root} at {rate:g}: "
+                    f"--fps {rate:g} --no-videos resamples it",
+                    file=root,
+                )
+            options = RepairOptions(
+                trim=False, unwrap=False, fix_signs=False, fps=rate, videos=videos
+            )
+            resampled = Path(folder) / f"{number}" / root.resolve().name
+            repair_dataset(root, resampled, options)
+            report.notes.append(f"{root}: resampled from {own:g} to {rate:g} fps")
+            opened[number] = open_dataset(resampled)
         _Merge(opened, videos, report).write()
     return report
 
 
-def _other_rate(dataset: OpenedDataset, first: OpenedDataset) -> DatasetError:
-    return DatasetError(
-        f"runs at {dataset.folder.fps:g} fps, but {first.folder.root} at {first.folder.fps:g}: "
-        f"--fps {first.folder.fps:g} --no-videos resamples it",
-        file=dataset.folder.root,
-    )
+_Column = tuple[str, int]
+"""Feature, and index of a component."""
 
 
-def _resampled(
-    dataset: OpenedDataset, folder: Path, fps: float, videos: bool, report: MergeReport
-) -> OpenedDataset:
-    root = dataset.folder.root
-    options = RepairOptions(trim=False, unwrap=False, fix_signs=False, fps=fps, videos=videos)
-    repair_dataset(root, folder / root.resolve().name, options)
-    report.notes.append(f"{root}: resampled from {dataset.folder.fps:g} to {fps:g} fps")
-    return open_dataset(folder / root.resolve().name)
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Source:
-    """One of the datasets, and the way from its columns to those of the first."""
+    """One of the datasets, and the way from its columns to those of the first.
 
-    dataset: OpenedDataset
-    units: Mapping[str, UnitDecision]
-    places: dict[str, list[int]] = field(default_factory=dict)
-    """Component of the source for each component of a feature of the first dataset."""
-    factors: dict[str, np.ndarray] = field(default_factory=dict)
-    """Factor to the unit of the first dataset for each of them."""
+    Attributes:
+        folder: Its metadata.
+        meanings: Quantity and joint of each component that has one.
+        places: Component of this dataset for each component of a feature of the first one.
+        factors: Factor to the unit of the first dataset for each of them.
+    """
 
-    @classmethod
-    def of(cls, dataset: OpenedDataset) -> "_Source":
-        units, faults = dataset.decide_units(dataset.sample(32), {})
+    def __init__(self, dataset: OpenedDataset):
+        self.dataset, self.folder = dataset, dataset.folder
+        self.root, self.features = dataset.folder.root, dataset.folder.features
+        self.units, faults = dataset.decide_units(dataset.sample(32), {})
         for fault in faults:
             raise fault
-        return cls(dataset=dataset, units=units)
-
-    @property
-    def root(self) -> Path:
-        return self.dataset.folder.root
-
-    @property
-    def features(self) -> dict[str, Feature]:
-        return self.dataset.folder.features
-
-    def meanings(self, key: str) -> list[tuple[str, str] | None]:
-        """Quantity and label of each component of a feature; None where they are unknown."""
-        known = {
+        selections = dataset.columns.selections.items()
+        self.meanings: dict[_Column, tuple[str, str]] = {
             column: (role, label.removesuffix(".pos"))
-            for role, selection in self.dataset.columns.selections.items()
+            for role, selection in selections
             for column, label in zip(selection.columns, selection.labels, strict=True)
         }
-        return [known.get((key, index)) for index in range(self.features[key].width)]
+        self.places: dict[str, list[int]] = {}
+        self.factors: dict[str, np.ndarray] = {}
 
-    def unit(self, key: str, index: int) -> UnitDecision | None:
-        """Decision on one component, in its own unit."""
-        for role, selection in self.dataset.columns.selections.items():
-            if (key, index) in selection.columns and role in self.units:
-                decision = self.units[role]
-                own = decision.unit_of(selection.columns.index((key, index)))
-                return replace(decision, unit=own, units=())
-        return None
+    def unit(self, column: _Column) -> UnitDecision | None:
+        """Decision on one component, in its own unit; None without a meaning."""
+        if column not in self.meanings:
+            return None
+        role = self.meanings[column][0]
+        number = self.dataset.columns.selections[role].columns.index(column)
+        decision = self.units[role]
+        return replace(decision, unit=decision.unit_of(number), units=())
+
+    def fault(self, message: str, key: str) -> DatasetError:
+        """Error about a feature of this dataset."""
+        return DatasetError(message, file=self.root, key=key)
 
     def converted(self, frames: RawFrames, features: Mapping[str, dict]) -> RawFrames:
         """Columns of an episode in the order and units of the first dataset."""
@@ -164,17 +154,18 @@ class _Merge:
     """One merge: the datasets, the features of all of them, and the report."""
 
     def __init__(self, opened: Sequence[OpenedDataset], videos: bool, report: MergeReport):
-        self.sources, self.report, self.videos = [*map(_Source.of, opened)], report, videos
+        self.sources, self.report, self.videos = [*map(_Source, opened)], report, videos
         self.first = self.sources[0]
         self.features = self._common_features()
+        robot = self.first.folder.robot_type
         for source in self.sources:
             for key, feature in self.features.items():
                 if feature.numeric:
                     self._match(source, key)
-            if source.dataset.folder.robot_type != self.first.dataset.folder.robot_type:
+            if source.folder.robot_type != robot:
                 self.report.notes.append(
-                    f"{source.root}: robot {source.dataset.folder.robot_type}; the merged "
-                    f"dataset names {self.first.dataset.folder.robot_type}"
+                    f"{source.root}: robot {source.folder.robot_type}; the merged dataset "
+                    f"names {robot}"
                 )
 
     def _common_features(self) -> dict[str, Feature]:
@@ -202,14 +193,12 @@ class _Merge:
             other = source.features[key]
             if own.numeric and other.numeric and own.width == other.width:
                 continue
-            if other.dtype != own.dtype or other.shape != own.shape:
-                raise DatasetError(
+            if (other.dtype, other.shape) != (own.dtype, own.shape):
+                advice = "; --no-videos leaves videos out" if own.is_picture else ""
+                raise source.fault(
                     f"is {other.dtype} of shape {list(other.shape)}, but {own.dtype} of shape "
-                    f"{list(own.shape)} in {self.first.root}"
-                    + "; --no-videos leaves videos out"
-                    * own.is_picture,
-                    file=source.root,
-                    key=key,
+                    f"{list(own.shape)} in {self.first.root}{advice}",
+                    key,
                 )
 
     def _match(self, source: _Source, key: str) -> None:
@@ -221,55 +210,52 @@ class _Merge:
         own, other = self.first.features[key], source.features[key]
         places = [*range(own.width)]
         if own.names and other.names and own.names != other.names:
-            names, meanings = list(other.names), source.meanings(key)
-            places = []
-            for name, meaning in zip(own.names, self.first.meanings(key), strict=True):
-                if name in names:
-                    places.append(names.index(name))
-                elif meaning is not None and meaning in meanings:
-                    places.append(meanings.index(meaning))
-                else:
-                    raise DatasetError(
-                        f"has no component {name} of {self.first.root}; there are "
-                        f"{', '.join(names)}: rename it in {source.root}/meta/info.json",
-                        file=source.root,
-                        key=key,
-                    )
-            if len({*places}) < len(places):
-                raise DatasetError(
-                    f"its components do not name those of {self.first.root} one to one: "
-                    f"{', '.join(names)}",
-                    file=source.root,
-                    key=key,
-                )
+            places = [self._place(source, key, index) for index in places]
             self.report.notes.append(f"{source.root}: {key} matched by name to {own.names}")
         elif source is not self.first and own.width > 1 and not (own.names and other.names):
             text = f"{source.root}: {key} taken in its order, as not both datasets name it"
             self.report.notes.append(text)
-        source.places[key] = places
-        source.factors[key] = np.array(
-            [self._factor(source, key, index, place) for index, place in enumerate(places)]
+        if len({*places}) < len(places):
+            raise source.fault(
+                f"its components do not name those of {self.first.root} one to one: "
+                f"{', '.join(other.names or ())}",
+                key,
+            )
+        factors = [
+            self._factor(source, key, index, place) for index, place in enumerate(places)
+        ]
+        source.places[key], source.factors[key] = places, np.array(factors)
+
+    def _place(self, source: _Source, key: str, index: int) -> int:
+        """Component of a source with the name, or the meaning, of one of the first dataset."""
+        name = self.first.features[key].component(index)
+        wanted = self.first.meanings.get((key, index))
+        names = source.features[key].names or ()
+        if name in names:
+            return names.index(name)
+        for place in range(len(names)):
+            if wanted is not None and source.meanings.get((key, place)) == wanted:
+                return place
+        raise source.fault(
+            f"has no component {name} of {self.first.root}; there are {', '.join(names)}: "
+            f"rename it in {source.root}/meta/info.json",
+            key,
         )
 
     def _factor(self, source: _Source, key: str, index: int, place: int) -> float:
-        own, other = self.first.unit(key, index), source.unit(key, place)
+        own, other = self.first.unit((key, index)), source.unit((key, place))
         if own is None or other is None or own.unit == other.unit:
             return 1.0
-        for dataset, decision in ((self.first, own), (source, other)):
+        for asked, decision in ((self.first, own), (source, other)):
             if decision.doubt:
-                raise DatasetError(
-                    f"{decision.doubt}; `hrc check {dataset.root} --units {decision.role} UNIT "
-                    f"--keep-contract` declares it",
-                    file=dataset.root,
-                    key=key,
-                )
+                advice = f"hrc check {asked.root} --units {decision.role} UNIT --keep-contract"
+                raise asked.fault(f"{decision.doubt}; `{advice}` declares it", key)
         if own.role != other.role or own.si_unit != other.si_unit:
-            raise DatasetError(
+            raise source.fault(
                 f"{source.features[key].component(place)} is {other.role} in {other.unit}, but "
                 f"{own.role} in {own.unit} in {self.first.root}: one does not follow from the "
                 f"other",
-                file=source.root,
-                key=key,
+                key,
             )
         note = f"{source.root}: {key} converted from {other.unit} to {own.unit}"
         if note not in self.report.notes:
@@ -278,9 +264,10 @@ class _Merge:
 
     def write(self) -> None:
         """Write the merged dataset."""
-        report, folders = self.report, [source.dataset.folder for source in self.sources]
-        segments = [self._segments(source) for source in self.sources]
-        tasks = [*dict.fromkeys(text for folder in folders for text in listed_tasks(folder))]
+        report, segments = self.report, [self._segments(source) for source in self.sources]
+        tasks = [
+            *dict.fromkeys(t for source in self.sources for t in listed_tasks(source.folder))
+        ]
         header = self._header(new_header(self.first.dataset, {}, segments[0]))
         contract = self.first.dataset.contract
         if contract is not None:
@@ -289,7 +276,7 @@ class _Merge:
 
         def rewritten() -> Iterator[Rewritten]:
             for source, shown in zip(self.sources, segments, strict=True):
-                writer = ColumnRewriter(source.dataset.folder, header, shown)
+                writer = ColumnRewriter(source.folder, header, shown)
                 for edit in self._episodes(source, header.features):
                     report.episodes += 1
                     report.frames += len(edit)
@@ -300,7 +287,7 @@ class _Merge:
 
     def _segments(self, source: _Source) -> dict[int, Segments]:
         """Video segments of a dataset, of the cameras that all have."""
-        folder = source.dataset.folder
+        folder = source.folder
         kept: dict[int, Segments] = {
             index: {key: segment for key, segment in shown.items() if key in self.features}
             for index, shown in (read_segments(folder) if self.videos else {}).items()
@@ -308,7 +295,7 @@ class _Merge:
         for key in video_keys(folder):
             if key in self.features and not any(key in shown for shown in kept.values()):
                 text = "its videos are missing: copy them, or leave all out (--no-videos)"
-                raise DatasetError(text, file=folder.root, key=key)
+                raise source.fault(text, key)
         return kept
 
     def _header(self, own: RecordingHeader) -> RecordingHeader:
@@ -316,7 +303,7 @@ class _Merge:
         wanted = {*self.features, *INDEX_KEYS}
         features = {key: dict(value) for key, value in own.features.items() if key in wanted}
         for key, feature in features.items():
-            declared = [s.dataset.folder.info["features"].get(key, {}) for s in self.sources]
+            declared = [s.folder.info["features"].get(key, {}) for s in self.sources]
             if feature["dtype"] == "video":
                 feature["info"] = _agreed([d.get("info") or {} for d in declared])
         columns = {r: c for r, c in own.sidecar.columns.items() if c.key in features}
@@ -324,15 +311,15 @@ class _Merge:
 
     def _episodes(self, source: _Source, features: Mapping[str, dict]) -> Iterator[EpisodeEdit]:
         """Episodes of a dataset as those of the first one, unedited."""
-        dataset, entries = source.dataset, source.dataset.folder.episodes
+        entries, fps = source.folder.episodes, source.folder.fps
         keys = [*source.places, *({"task_index"} & source.features.keys())]
-        for entry, frames in read_frames(dataset.folder, entries, keys):
+        for entry, frames in read_frames(source.folder, entries, keys):
             yield EpisodeEdit(
                 entry=entry,
-                columns=dataset.columns,
+                columns=source.dataset.columns,
                 units=source.units,
                 frames=source.converted(frames, features),
-                time=np.arange(entry.length) / dataset.folder.fps,
+                time=np.arange(entry.length) / fps,
                 kept=np.arange(entry.length),
             )
 

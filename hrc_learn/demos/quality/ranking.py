@@ -30,7 +30,7 @@ MEASURES = {
 """Measure of an episode -> its meaning or unit."""
 
 # Doubt added by one finding: an error alone outranks all that is merely unusual.
-_ERROR, _WARNING, _REPEAT = 10.0, 1.0, 3.0
+_ERROR, _WARNING = 10.0, 1.0
 _UNUSUAL = 4.0
 """Robust spreads (1.4826 times the median deviation) above which a measure is unusual: one in
 16,000 for a normal distribution."""
@@ -41,8 +41,6 @@ _DIMENSIONS = 16
 _NEIGHBOURS = 3
 _REACH = 2.0
 """Distance of neighbours in a cluster, in usual distances to the third neighbour."""
-_SAME = 0.05
-"""Fraction of the usual distance to the nearest episode below which an episode is a repeat."""
 
 
 @dataclass(kw_only=True)
@@ -269,7 +267,7 @@ def _compare(
     qualities: Mapping[int, EpisodeQuality],
     shapes: Mapping[int, Float64[np.ndarray, " numbers"]],
 ) -> None:
-    """Find clusters, repeats, and the distance of each episode from its neighbours."""
+    """Find clusters, and the distance of each episode from its neighbours."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
@@ -280,7 +278,6 @@ def _compare(
     points = _principal_components(np.stack([*shapes.values()]))
     distances, found = KDTree(points).query(points, k=_NEIGHBOURS + 1)
     neighbours = np.asarray(found)
-    usual = float(np.median(distances[:, 1]))
     reach = float(np.median(distances[:, -1]))
     if reach <= 0:
         return
@@ -295,11 +292,6 @@ def _compare(
             quality.cluster = clusters.index(labels[number])
         quality.place = float(points[number, 0]), float(points[number, 1])
         quality.measures["distance"] = float(distances[number, 1:].mean() / reach)
-        # The later one of two similar episodes is the repeat.
-        near = neighbours[number][distances[number] < _SAME * usual]
-        earlier = [indices[i] for i in near if indices[i] < index]
-        if earlier:
-            quality.doubt(_REPEAT, f"nearly repeats episode {min(earlier)}")
 
 
 def _principal_components(

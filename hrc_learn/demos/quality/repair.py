@@ -291,26 +291,22 @@ class Decision:
     """Decision on one episode."""
 
     verdict: Verdict
+    length: Count
+    """Number of frames of the episode."""
     start: Count = 0
     """First frame kept by a cut."""
     stop: Count = 0
     """End of the frames kept by a cut (exclusive)."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _KeptDecision(Decision):
-    length: Count
-    """Number of frames of the episode."""
+Decisions = dict[int, Decision]
+"""Episode index -> decision; episodes without one are accepted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _DecisionFile:
-    decisions: dict[Count, _KeptDecision]
+    decisions: dict[Count, Decision]
     format: Literal[1] = 1
-
-
-Decisions = dict[int, Decision]
-"""Episode index -> decision; episodes without one are accepted."""
 
 
 def decide(verdict: str, length: int, start: int = 0, stop: int = 0) -> Decision:
@@ -319,16 +315,16 @@ def decide(verdict: str, length: int, start: int = 0, stop: int = 0) -> Decision
     Raises:
         ValueError: The verdict is unknown, or the cut keeps fewer than two frames.
     """
+    if verdict == "cut":
+        if not 0 <= start < stop - 1 < length:
+            raise ValueError(
+                f"frames {start} to {stop} are no part of two frames or more of an episode of "
+                f"{length} frames"
+            )
+        return Decision(verdict=verdict, length=length, start=start, stop=stop)
     if verdict not in get_args(Verdict):
         raise ValueError(f"{verdict!r} is none of {', '.join(get_args(Verdict))}")
-    if verdict != "cut":
-        return Decision(verdict=verdict)  # type: ignore[arg-type]
-    if not 0 <= start < stop - 1 < length:
-        raise ValueError(
-            f"frames {start} to {stop} are no part of two frames or more of an episode of "
-            f"{length} frames"
-        )
-    return Decision(verdict="cut", start=start, stop=stop)
+    return Decision(verdict=verdict, length=length)  # type: ignore[arg-type]
 
 
 def decisions_path(root: Path) -> Path:
@@ -367,13 +363,7 @@ def read_decisions(root: Path) -> Decisions:
 
 def keep_decisions(root: Path, decisions: Mapping[int, Decision]) -> None:
     """Write the decisions next to the dataset, which is not changed."""
-    kept = {
-        # The index of the dataset: True is equal to 1, but no name of an episode.
-        entry.index: _KeptDecision(**vars(decisions[entry.index]), length=entry.length)
-        for entry in open_folder(root).episodes
-        if entry.index in decisions
-    }
-    write_json(decisions_path(root), _DecisionFile(decisions=kept))
+    write_json(decisions_path(root), _DecisionFile(decisions=dict(decisions)))
 
 
 def write_curated(
