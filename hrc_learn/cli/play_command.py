@@ -107,7 +107,6 @@ def _figures(motion: PlayedMotion) -> dict[str, float]:
         "duration_s": float(motion.time[-1]),
         "planned_duration_s": motion.planned_duration,
         "samples": float(len(motion.time)),
-        "beyond_limits": 0.0,
         "path_deviation_rad": motion.deviation,
         **motion.goal_errors,
     }

@@ -14,7 +14,6 @@ from hrc_learn.cli._run import with_settings, write_values
 from hrc_learn.cli.arguments import Tokens, refuse_given, sibling
 from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
 from hrc_learn.demos.read.frames import read_frames
-from hrc_learn.dmp.motion_components import MARGIN
 from hrc_learn.dmp.tokens import MotionTokenizer
 from hrc_learn.store import new_folder, read_made_by, write_json
 from hrc_learn.viz.report import Measurement, show_measurements
@@ -23,8 +22,6 @@ MODEL = "tokens"
 """Folder of the tokenizer in the results of `hrc tokens fit`."""
 MOST_FITTED, MOST_MEASURED = 20_000, 500
 """Largest number of chunks that are fitted and measured, evenly spread."""
-RANDOM = 1000
-"""Random sequences that are decoded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,32 +134,17 @@ def held_out(episodes: list[int], number: int) -> list[int]:
 def _measured(
     tokenizer: MotionTokenizer, dataset: Path, settings: TokenSettings, every: list[int]
 ) -> dict[str, float]:
-    """Length, error and seams of the tokens of unseen chunks; limits of random tokens."""
+    """Length and error of the tokens of unseen chunks."""
     episodes = held_out(every, settings.held_out) or every
     time, recorded, velocity = read_chunks(
         dataset, settings.feature, settings.seconds, episodes, MOST_MEASURED
     )
     motions = torch.from_numpy(recorded)
-    state = (motions[:, 0], torch.from_numpy(velocity))
     ids = tokenizer.encode(time, motions, velocity)
     counts = [tokenizer.length(row) for row in ids.tolist()]
-    known = state if tokenizer.components.known else ()
-    error = (tokenizer.decode(ids, time, *known) - motions)[:, 1:]
+    state = (motions[:, 0], velocity) if tokenizer.components.known else ()
+    error = (tokenizer.decode(ids, time, *state) - motions)[:, 1:]
     span = (motions.amax((0, 1)) - motions.amin((0, 1))).clamp(min=1e-12)
-    rng = torch.Generator().manual_seed(0)
-    drawn = torch.randint(0, tokenizer.vocabulary_size, (RANDOM, max(counts)), generator=rng)
-    smooth = [i for i in range(motions.shape[-1]) if i not in tokenizer.steps]
-    low, high = tokenizer.components.low, tokenizer.components.high
-    # Starts beyond the demonstrated range move the limits with them.
-    inner = MARGIN / (1 + 2 * MARGIN) * (high - low) - 1e-9
-    start = state[0][:, smooth]
-    inside = ((start >= low + inner) & (start <= high - inner)).all(1).nonzero()[:, 0]
-    chosen = inside[torch.arange(RANDOM) % max(1, len(inside))]
-    states = [x[chosen] for x in state]
-    made = tokenizer.decode(drawn, time, *states)
-    seams = [tokenizer.decode(drawn, time[:1], *states, order=order)[:, 0] for order in (0, 1)]
-    gaps = [(a - b)[:, smooth].abs().max() for a, b in zip(seams, states, strict=True)]
-    excess = torch.maximum(low - made[..., smooth], made[..., smooth] - high)
     bits = math.log2(tokenizer.vocabulary_size)
     return {
         "chunks": float(len(motions)),
@@ -171,10 +153,6 @@ def _measured(
         "bits_per_s": float(np.mean(counts)) * bits / tokenizer.duration,
         "rmse": float(error.square().mean().sqrt()),
         "rmse_of_range": float((error / span).square().mean().sqrt()),
-        "undecodable_share": float((~made.isfinite()).flatten(1).any(1).double().mean()),
-        "beyond_limits": float((excess.amax((0, 1)) / span[smooth] - 1e-9).clamp(min=0).amax()),
-        "seam": float(gaps[0]),
-        "seam_velocity": float(gaps[1]),
     }
 
 
@@ -185,8 +163,4 @@ _ROWS = {
     "bits_per_s": "bits per second",
     "rmse": "RMSE in the dataset's units",
     "rmse_of_range": "RMSE relative to the range of each column",
-    "undecodable_share": "share of random sequences without a motion",
-    "beyond_limits": "their excess beyond the demonstrated range and a tenth, of the range",
-    "seam": "largest gap where chunks meet",
-    "seam_velocity": "largest gap of velocities there",
 }

@@ -1,7 +1,7 @@
 """Rerun recordings and reports of fits: primitives with their demonstrations, image Jacobians.
 
-Primitives are shown over their demonstrations, image Jacobians by the convergence and neurons
-of their learning rounds.
+Primitives are shown over their demonstrations, image Jacobians by a map of their errors and the
+convergence of their learning rounds.
 """
 
 import os
@@ -16,7 +16,7 @@ import rerun.blueprint as rrb
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.jacobian import CellErrors, EvidenceResult, RBFCenters
+from hrc_learn.jacobian import CellErrors, EvidenceResult
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.demonstration_dashboard import panda_ranges
 from hrc_learn.learning.primitive_fitting import FittedPrimitives
@@ -243,7 +243,7 @@ def record_learning(
     watched = islice(feature_trajectories(demos), _MOST_PATHS)
     paths = [demo.pose.position.numpy() for demo in watched]
     tab = Tab(title="", plots=()) if skill.learned is None else _convergence(skill.learned)
-    name = "End effector (grey), neurons (orange), held-out error (blue)"
+    name = "End effector (grey), held-out error (blue)"
     # Near and steep, so that every cell can be read.
     eye = frame_view(np.concatenate(paths), base=False, direction=(0.75, 0.2, 1.0), nearest=0.2)
     left = [
@@ -257,16 +257,14 @@ def record_learning(
         send_strips(stream, "world/demonstrations", paths, palette.DEMO, 0.0008)
         lowest = min(float(path[:, 2].min()) for path in paths) - _BELOW
         stream.log("world/errors", _error_map(skill.cells, lowest), static=True)
-        if skill.learned is not None:
-            height = float(np.mean([path[:, 2].mean() for path in paths]))
-            _send_neurons(stream, skill.learned, height)
-            for plot in tab.plots:
-                curve, kept = plot.curves
-                stream.log(curve.path, style(curve), static=True)
-                send_rows(stream, _rounds(np.arange(len(curve.values))), curve)
-                dot = rr.SeriesPoints(names=kept.names, colors=kept.colours, marker_sizes=[6.0])
-                stream.log(kept.path, dot, static=True)
-                send_rows(stream, _rounds(np.array([skill.learned.best])), kept)
+        for plot in tab.plots:
+            assert skill.learned is not None
+            curve, kept = plot.curves
+            stream.log(curve.path, style(curve), static=True)
+            send_rows(stream, _rounds(np.arange(len(curve.values))), curve)
+            dot = rr.SeriesPoints(names=kept.names, colors=kept.colours, marker_sizes=[6.0])
+            stream.log(kept.path, dot, static=True)
+            send_rows(stream, _rounds(np.array([skill.learned.best])), kept)
 
 
 def _convergence(learned: EvidenceResult) -> Tab:
@@ -286,25 +284,6 @@ def _convergence(learned: EvidenceResult) -> Tab:
         dot = single(f"{path}/kept", "kept", values[[learned.best]], palette.LIMIT)
         plots.append(Plot(title=name, curves=(curve, dot)))
     return Tab(title="Convergence over rounds, red: kept", plots=tuple(plots), columns=2)
-
-
-def _send_neurons(stream: rr.RecordingStream, learned: EvidenceResult, height: float) -> None:
-    places = [_places(state.neurons, height) for state in learned.rounds]
-    look = rr.Points3D.from_fields(radii=[0.008], colors=[palette.rgba(palette.ORANGE)])
-    stream.log("world/neurons", look, static=True)
-    columns = rr.Points3D.columns(positions=np.concatenate(places))
-    when = _rounds(np.arange(len(places)))
-    stream.send_columns("world/neurons", when, columns.partition([len(p) for p in places]))
-
-
-def _places(neurons: RBFCenters, height: float) -> Float[np.ndarray, "neurons 3"]:
-    """Positions of the neurons [m]; coordinates that they do not use are set to a mean."""
-    centers, places = neurons.centers.numpy(), np.zeros((len(neurons.centers), 3))
-    places[:, 2] = height
-    for column, component in enumerate(neurons.input_indices):
-        if component < 3:
-            places[:, component] = centers[:, column]
-    return places
 
 
 def _rounds(numbers: np.ndarray) -> list[rr.TimeColumn]:

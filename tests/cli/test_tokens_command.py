@@ -45,14 +45,6 @@ def test_a_fit_measures_episodes_that_it_left_out(dataset, fitted):
     assert figures["bits_per_s"] == pytest.approx(figures["tokens_mean"] * 6 / 0.5, rel=1e-3)
 
 
-def test_no_random_tokens_fail(fitted):
-    _, figures = fitted
-    assert figures["undecodable_share"] == 0
-    assert figures["beyond_limits"] == 0
-    assert figures["seam"] < 1e-12
-    assert figures["seam_velocity"] < 1e-12
-
-
 def test_a_report_repeats_the_figures_of_the_fit(dataset, fitted, tmp_path):
     folder, figures = fitted
     file = tmp_path / "report.json"

@@ -345,12 +345,6 @@ def test_every_round_is_one_step_and_the_one_kept_is_marked(skill, learning):
     np.testing.assert_allclose(learning.scalars(name)[:, 0], widths)
 
 
-def test_neurons_are_followed_from_round_to_round(skill, learning):
-    positions = np.array(learning.column("world/neurons", "Points3D:positions"))
-    centres = np.stack([state.neurons.centers[:, :3] for state in skill.learned.rounds])
-    np.testing.assert_allclose(positions, centres, atol=1e-6)
-
-
 def test_cells_show_their_error_in_percent(skill, learning):
     (labels,) = learning.column("world/errors", "Boxes3D:labels", static=True)
     relative = skill.cells.relative[skill.cells.relative.isfinite()]
@@ -374,6 +368,6 @@ def test_a_fit_without_rounds_shows_where_it_errs(skill, watched, tmp_path):
     record_learning(tmp_path / "fit.rrd", replace(skill, learned=None), watched, "Bare")
     rrd = Rrd(tmp_path / "fit.rrd")
     assert "world/errors" in rrd.entities
-    assert not {e for e in rrd.entities if e.startswith(("learning", "world/neurons"))}
+    assert not {e for e in rrd.entities if e.startswith("learning")}
     ((text,),) = rrd.column("summary", "TextDocument:text", static=True)
     assert "Round" not in text
