@@ -55,7 +55,7 @@ def view(frames):
 motions = [motion(100 + 7 * i) for i in range(5)]
 views = [view(80 + 3 * i) for i in range(5)]
 with distributed.processes() as rank:
-    shared = fit_shared(motions, 20)
+    shared, rmse = fit_shared(motions, 20)
     poses, features = [pose for pose, _ in views], [pixel for _, pixel in views]
     demonstrations = [
         ImageDemonstration(pose=pose, feature=x, visible=torch.ones(len(x), dtype=torch.bool))
@@ -69,8 +69,8 @@ with distributed.processes() as rank:
     )
     result = {
         "processes": torch.tensor(distributed.count()),
-        "primitive": shared.primitive.rollout().position,
-        "rmse": shared.rmse,
+        "primitive": shared.rollout().position,
+        "rmse": rmse,
         "around": around.centers,
         "centers": network.centers,
         "weight": network.weight,

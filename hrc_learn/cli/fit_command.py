@@ -153,8 +153,8 @@ def _fit_streamed(args: FitPrimitives) -> None:
         if rank:
             return
         with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
-            for channel, fit in fits.items():
-                fit.primitive.save(folder / channel)
+            for channel, primitive in fits.items():
+                primitive.save(folder / channel)
             _finish(args, metrics, folder)
 
 

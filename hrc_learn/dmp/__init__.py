@@ -19,7 +19,6 @@ from hrc_learn.dmp.interaction_primitive import InteractionPrimitive as Interact
 from hrc_learn.dmp.joint_dmp import BasisSelection as BasisSelection
 from hrc_learn.dmp.joint_dmp import FitOptions as FitOptions
 from hrc_learn.dmp.joint_dmp import JointDMP as JointDMP
-from hrc_learn.dmp.joint_dmp import SharedFit as SharedFit
 from hrc_learn.dmp.joint_dmp import fit_shared as fit_shared
 from hrc_learn.dmp.joint_dmp import select_basis_count as select_basis_count
 from hrc_learn.dmp.learned_motion import LearnedMotion as LearnedMotion

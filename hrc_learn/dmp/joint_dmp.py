@@ -299,26 +299,13 @@ def _held_out(mask: Bool[Tensor, "B T"], fold: int, n_folds: int) -> Bool[Tensor
     return mask & inner & (order % n_folds == fold)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SharedFit:
-    """Result of one pass over the demonstrations."""
-
-    primitive: JointDMP
-    demonstrations: int
-    """Number of demonstrations."""
-    samples: int
-    """Number of samples in all demonstrations."""
-    rmse: Float[Tensor, "D"]
-    """RMSE over all samples, with the start, goal and duration of each demonstration."""
-
-
 def fit_shared(
     demonstrations: Sequence[tuple[Times, Points]],
     n_basis: int = 50,
     *,
     joint_names: Sequence[str] | None = None,
     units: str = "rad",
-) -> SharedFit:
+) -> tuple[JointDMP, Float[Tensor, "D"]]:
     """Fit one primitive to all demonstrations, in one pass and bounded memory.
 
     The rows [A B] of min |A X - B|^2 enter through their products [A B]'[A B], which add up in
@@ -335,6 +322,10 @@ def fit_shared(
         n_basis: N.
         joint_names: D names, stored with the primitive.
         units: Units of the coordinates.
+
+    Returns:
+        The primitive, and its RMSE over all samples with the start, goal and duration of each
+        demonstration.
 
     Raises:
         ValueError: No demonstrations, or one that cannot be fitted; the message names it.
@@ -359,12 +350,7 @@ def fit_shared(
         joint_names=joint_names,
         units=units,
     )
-    return SharedFit(
-        primitive=primitive,
-        demonstrations=len(demonstrations),
-        samples=rows,
-        rmse=(square[0] / rows).sqrt(),
-    )
+    return primitive, (square[0] / rows).sqrt()
 
 
 def _accumulate(

@@ -143,15 +143,10 @@ class ProbabilisticDMP[P: MotionPrimitive]:
     mean: Float[Tensor, "D M"]
     spread: Float[Tensor, "DM rank"]
     """Square root of the covariance, with the rank of the demonstrations."""
-    timing: Float[Tensor, "rank"] = None  # pyright: ignore[reportAssignmentType]
-    """Deviation of the logarithm of the duration for each column of `spread`; zero by default:
-    the duration is certain."""
+    timing: Float[Tensor, "rank"]
+    """Deviation of the logarithm of the duration for each column of `spread`."""
     dependence: float = 1.0
     """Factor on the dependence of paths on start and goal in `at`."""
-
-    def __post_init__(self):
-        if self.timing is None:
-            object.__setattr__(self, "timing", torch.zeros_like(self.spread[0]))
 
     @classmethod
     def fit(cls, primitives: P, slack: float = 0.0) -> "ProbabilisticDMP[P]":
@@ -186,7 +181,9 @@ class ProbabilisticDMP[P: MotionPrimitive]:
         certain = _linear_coordinates(motion)
         if certain.ndim != 2:
             raise ValueError(f"needs one primitive, got a batch {tuple(certain.shape[:-2])}")
-        return cls(primitive=primitive, mean=certain, spread=_free_forcing(motion, slack))
+        spread = _free_forcing(motion, slack)
+        certain_time = torch.zeros_like(spread[0])
+        return cls(primitive=primitive, mean=certain, spread=spread, timing=certain_time)
 
     def mean_primitive(self) -> P:
         """Most likely primitive."""

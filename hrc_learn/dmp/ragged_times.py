@@ -338,9 +338,9 @@ class _Motion(torch.autograd.Function):
     def backward(ctx, grad):
         s, x = ctx.saved_tensors
         by_s = by_x = None
-        if _needs_gradient(ctx, 0):
+        if ctx.needs_input_grad[0]:
             by_s = _by_time(grad, _Motion.apply(s, x, ctx.response, ctx.order + 1), s)
-        if _needs_gradient(ctx, 1):
+        if ctx.needs_input_grad[1]:
             by_x = _Adjoint.apply(s, grad, ctx.response, ctx.order)
         return by_s, by_x, None, None
 
@@ -404,9 +404,9 @@ class _Adjoint(torch.autograd.Function):
     def backward(ctx, weight):
         s, grad = ctx.saved_tensors
         by_s = by_grad = None
-        if _needs_gradient(ctx, 0):
+        if ctx.needs_input_grad[0]:
             by_s = _by_time(grad, _Motion.apply(s, weight, ctx.response, ctx.order + 1), s)
-        if _needs_gradient(ctx, 1):
+        if ctx.needs_input_grad[1]:
             by_grad = _Motion.apply(s, weight, ctx.response, ctx.order)
         return by_s, by_grad, None, None
 
@@ -424,21 +424,6 @@ class _Adjoint(torch.autograd.Function):
     @staticmethod
     def vmap(info, in_dims, s, grad, response, order):
         return _flattened(_Adjoint, info, in_dims, s, grad, response, order)
-
-
-def _needs_gradient(ctx: Any, index: int) -> bool:
-    """True if the backward pass continues to an input.
-
-    `needs_input_grad` only says whether it could: the gradient by times alone would then
-    compute that by the coordinates too, which takes most of the time.
-    """
-    if not ctx.needs_input_grad[index]:
-        return False
-    try:
-        return torch._C._will_engine_execute_node(ctx.next_functions[index][0])
-    except (AttributeError, IndexError, RuntimeError, TypeError):
-        # A leaf, a function of `torch.func`, or a PyTorch version without this query.
-        return True
 
 
 def _by_time(grad: Any, rate: Any, s: Tensor) -> Tensor:

@@ -381,9 +381,8 @@ def _smooth(s: Float[Tensor, "T"], y: Float[Tensor, "C T"]) -> tuple[Tensor, Ten
 def densified(samples: Samples, n_basis: int) -> Samples:
     """Samples dense enough to determine all functions, in each demonstration.
 
-    Between recorded samples they follow the cubic spline through them, which is exact for
-    polynomials of degree three, or two for three samples; with recorded velocities, the cubic
-    with these velocities.
+    Between recorded samples they follow cubics with the recorded velocities, or with slopes of
+    second order, which are exact for parabolas.
     """
     few = samples.mask.sum(-1) <= SAMPLES_EACH * n_basis
     if not few.any():
@@ -403,9 +402,12 @@ def densified(samples: Samples, n_basis: int) -> Samples:
         velocity[~few, ..., :T] = recorded[~few].double()
     for i in few.nonzero()[:, 0].tolist():
         valid, tau = samples.mask[i], samples.duration[i]
-        rate = None if recorded is None else recorded[i][:, valid].double() * tau
-        y = samples.position[i][:, valid].double()
-        position[i, :, :G], slope = _cubic(samples.s[i, valid], y, rate, grid)
+        knots, y = samples.s[i, valid], samples.position[i][:, valid].double()
+        if recorded is None:
+            (rate,) = torch.gradient(y, spacing=(knots,), dim=-1, edge_order=2)
+        else:
+            rate = recorded[i][:, valid].double() * tau
+        position[i, :, :G], slope = _cubic(knots, y, rate, grid)
         velocity[i, :, :G] = slope / tau
     velocity = None if recorded is None else velocity
     whole = {"mask": mask, "complete": bool(mask.all())}
@@ -415,45 +417,16 @@ def densified(samples: Samples, n_basis: int) -> Samples:
 def _cubic(
     knots: Float[Tensor, "T"],
     y: Float[Tensor, "C T"],
-    rate: Float[Tensor, "C T"] | None,
+    rate: Float[Tensor, "C T"],
     s: Float[Tensor, "G"],
 ) -> tuple[Float[Tensor, "C G"], Float[Tensor, "C G"]]:
-    """Value and derivative of the cubic spline through samples (not-a-knot; de Boor 1978)."""
-    h = knots.diff()
-    d = y.diff() / h
-    r = torch.linalg.solve(*_slope_equations(knots, h, d)).mT if rate is None else rate
+    """Value and derivative of the cubics between samples with these rates (Hermite)."""
     k = torch.searchsorted(knots, s, right=True).clamp(1, len(knots) - 1) - 1
-    u, h, y0, d, r0, r1 = (
-        (s - knots[k]) / h[k],
-        h[k],
-        y[:, k],
-        d[:, k],
-        r[:, k],
-        r[:, k + 1],
-    )
-    b, c = 3 * d - 2 * r0 - r1, r0 + r1 - 2 * d
-    return y0 + h * u * (r0 + u * (b + u * c)), r0 + u * (2 * b + 3 * u * c)
-
-
-def _slope_equations(
-    knots: Float[Tensor, "T"], h: Float[Tensor, "n"], d: Float[Tensor, "C n"]
-) -> tuple[Float[Tensor, "T T"], Float[Tensor, "T C"]]:
-    """Equations of the slopes at knots, from the spacings and the slopes of the chords."""
-    T = len(knots)
-    A, right = torch.zeros(T, T).to(h), torch.zeros(T, len(d)).to(h)
-    i = torch.arange(1, T - 1)
-    A[i, i - 1], A[i, i], A[i, i + 1] = h[1:], 2 * (h[1:] + h[:-1]), h[:-1]
-    right[1:-1] = 3 * (h[1:] * d[:, :-1] + h[:-1] * d[:, 1:]).mT
-    for end, near, far, k, m in ((0, 1, 2, 0, 1), (-1, -2, -3, -1, -2)):
-        if T == 3:  # the slope of a parabola is linear
-            A[end, end] = A[end, near] = 1.0
-            right[end] = 2 * d[:, k]
-            continue
-        # No third derivative jumps at the second and at the last knot but one.
-        span = (knots[far] - knots[end]).abs()
-        A[end, end], A[end, near] = h[m], span
-        right[end] = ((h[k] + 2 * span) * h[m] * d[:, k] + h[k] ** 2 * d[:, m]) / span
-    return A, right
+    h = knots.diff()[k]
+    u, chord = (s - knots[k]) / h, y.diff()[:, k] / h
+    r0, r1 = rate[:, k], rate[:, k + 1]
+    b, c = 3 * chord - 2 * r0 - r1, r0 + r1 - 2 * chord
+    return y[:, k] + h * u * (r0 + u * (b + u * c)), r0 + u * (2 * b + 3 * u * c)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
-from hrc_learn.dmp import SharedFit, fit_shared
+from hrc_learn.dmp import JointDMP, fit_shared
 from hrc_learn.learning.primitive_fitting import CHANNELS, require_motion
 
 HELD_AT_ONCE = 700_000
@@ -79,7 +79,7 @@ def _thinned(demo: Demonstration, longest: int) -> Demonstration:
 
 def fit_streamed(
     demos: DemonstrationSource, n_basis: int, *, channels: Sequence[str] = ()
-) -> tuple[dict[str, SharedFit], dict[str, float]]:
+) -> tuple[dict[str, JointDMP], dict[str, float]]:
     """Fit one primitive to all demonstrations in a single pass, one in memory at a time.
 
     Args:
@@ -88,7 +88,7 @@ def fit_streamed(
         channels: "joint", "position" or both. Default: joint.
 
     Returns:
-        Fits by channel, and measured values by name.
+        Primitives by channel, and measured values by name.
 
     Raises:
         ValueError: Another channel, whose coordinates depend on the goal of a demonstration.
@@ -101,14 +101,13 @@ def fit_streamed(
             )
         names = demos.joint_names if channel == "joint" else ("x", "y", "z")
         column = partial(_stamped_column, name=CHANNELS[channel][0], source=demos.source)
-        fit = fit_shared(
+        fits[channel], rmse = fit_shared(
             LazyMap(demos, column),
             n_basis,
             joint_names=names,
             units=demos.joint_unit if channel == "joint" else "m",
         )
-        fits[channel] = fit
-        metrics[f"mean_{channel}_rmse"] = float(fit.rmse.square().mean().sqrt())
+        metrics[f"mean_{channel}_rmse"] = float(rmse.square().mean().sqrt())
     return fits, metrics
 
 

@@ -82,7 +82,7 @@ REACH = torch.stack([0.5 * minimum_jerk(S), -0.3 * minimum_jerk(S)], -1)
 
 def by_default(kind):
     if kind == "shared":
-        return fit_shared([(2 * S, REACH), (2 * S, REACH)]).primitive
+        return fit_shared([(2 * S, REACH), (2 * S, REACH)])[0]
     return JointDMP.fit(2 * S, REACH, **{"scaling": kind})
 
 

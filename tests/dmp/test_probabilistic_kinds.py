@@ -1,5 +1,7 @@
 """Distributions over orientations, poses and limited joints: the kinds beyond `JointDMP`."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -150,7 +152,7 @@ def test_conditioning_has_exact_gradients():
     prior = ProbabilisticDMP.fit(OrientationDMP.fit(time[::10], q[:, ::10], n_basis=2))
 
     def conditioned(at, vector, omega, mean, spread):
-        given = ProbabilisticDMP(primitive=prior.primitive, mean=mean, spread=spread)
+        given = replace(prior, mean=mean, spread=spread)
         given = given.condition(at, quaternion.exp(vector), omega, noise=0.05)
         return given.mean_primitive().rollout(time=[1.4]).orientation
 
