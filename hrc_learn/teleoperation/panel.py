@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -19,7 +19,8 @@ from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.page_operator import HeldGizmos
 from hrc_learn.teleoperation.page_scene import PageScene, ViserServer, in_loop
 from hrc_learn.teleoperation.region_editor import RegionEditor
-from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed_colour
+from hrc_learn.viz import palette
+from hrc_learn.viz.report import page_templates
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,105 +49,16 @@ class PageStatus:
     """Way that the end effector is about to take [m]; None: it has none."""
 
 
-def can_do(status: PageStatus, task: str) -> str:
-    """Instruction for the person; empty next to an autonomous arm.
-
-    Args:
-        status: Status of the session.
-        task: Description of the task.
-    """
-    if status.doing:
-        return ""
-    if status.recording == "ready":
-        return "Press Start, then guide the arm: drag its gripper, a link or a knob."
-    if status.recording == "recording":
-        return "Guide the arm, then press Stop."
-    return (
-        "Save it or discard it." if task.strip() else "Say in Task what is shown, then save it."
-    )
-
-
-def state_html(status: PageStatus, people: int, task: str = "") -> str:
-    """Name of the arm, its activity, and the number of viewers, as HTML.
-
-    Args:
-        status: Status of the session.
-        people: Number of browsers that show the page.
-        task: Description of the task.
-    """
-    if status.doing:
-        doing = f"{_badge(BLUE, status.doing)}&ensp;{status.seconds:.1f} s"
-    else:
-        colour, words = {
-            "ready": (GREY, "ready"),
-            "recording": (VERMILION, f"recording {status.seconds:.1f} s"),
-            "stopped": (PERSON, f"stopped at {status.seconds:.1f} s"),
-        }[status.recording]
-        doing = f"{_badge(colour, words)}&ensp;{status.saved} saved"
-    return (
-        '<div style="padding:.2em .9em .5em;line-height:1.5">'
-        f'<div style="font-size:1.15em;font-weight:600">{html.escape(status.title)}</div>'
-        f"{doing}"
-        f"<div>{can_do(status, task)}</div>"
-        f'<div style="opacity:.75;font-size:.85em">{html.escape(status.note) or "&nbsp;"}</div>'
-        f'<div style="opacity:.75;font-size:.85em">{people} connected</div></div>'
-    )
-
-
-def _badge(colour: str, words: str) -> str:
-    return (
-        f'<span style="color:white;background:{colour};border-radius:.8em;padding:.1em .7em">'
-        f"{html.escape(words)}</span>"
-    )
-
-
-def nullspace_input_html(d: Float[np.ndarray, " joints"], largest: float) -> str:
-    """A bar to the left or right for each joint.
-
-    Args:
-        d: Null-space input of each joint [N m].
-        largest: Value that fills half the width [N m].
-    """
-    rows = []
-    for k, value in enumerate(d):
-        width = 50 * min(abs(value) / largest, 1.0)
-        left = 50 - (width if value < 0 else 0)
-        rows.append(
-            f'<div style="display:flex;align-items:center;height:1.15em">'
-            f'<span style="width:1.4em;opacity:.7">{k + 1}</span>'
-            '<div style="flex:1;position:relative;height:.7em;background:rgba(128,128,128,.15);'
-            'border-radius:.2em"><div style="position:absolute;height:100%;'
-            f"left:{left:.1f}%;width:{width:.1f}%;background:{PERSON};"
-            'border-radius:.2em"></div></div>'
-            f'<span style="width:3.4em;text-align:right">{value:+.1f}</span></div>'
-        )
-    return _block("Null-space input d [N m]", "".join(rows))
+@cache
+def panel_texts() -> Any:
+    """Macros of `panel.html`, which write the texts of the panel."""
+    templates = page_templates("hrc_learn.teleoperation")
+    return templates.get_template("panel.html", globals=vars(palette)).module
 
 
 # Smallest contact force shown [N]: simulated joint friction feels like 17 N. And the smallest
 # change of a gripper's opening that is a slip rather than noise [m].
 _LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
-
-
-def feedback_html(feedback: Feedback) -> str:
-    """Fraction of the input that the arm follows, the reason, and contact, as HTML; may be
-    empty.
-
-    Numbers are rounded to steady digits, so that the text changes only when something does.
-
-    Args:
-        feedback: Feedback of the arm.
-    """
-    rows = []
-    if feedback.pushed:
-        percent = round(10 * feedback.followed) * 10
-        badge = _badge(followed_colour(feedback.followed), f"follows by {percent} %")
-        why = "; ".join(html.escape(reason.text) for reason in feedback.reasons)
-        rows.append(f"{badge}&ensp;{why}")
-    rows += [
-        f'<div style="opacity:.75">{html.escape(words)}</div>' for words in felt_words(feedback)
-    ]
-    return f'<div style="padding:.2em .9em .4em">{"".join(rows)}</div>' if rows else ""
 
 
 def felt_words(feedback: Feedback) -> list[str]:
@@ -168,47 +80,6 @@ def felt_words(feedback: Feedback) -> list[str]:
         where = f"{max(distance, 0.0):.1f} m away" if known else "at an unknown distance"
         felt.append(f"nearest person: {where}, pace {10 * round(10 * feedback.pace)} %")
     return felt
-
-
-def interventions_html(status: PageStatus, latest: str) -> str:
-    """Interventions of the safety filter, as HTML.
-
-    Args:
-        status: Status of the session.
-        latest: Kind of the latest intervention, shown in red; empty if there was none.
-    """
-    red = f"color:{VERMILION};font-weight:600"
-    rows: list[tuple[str, int | str, str]] = [
-        (name.replace("_", " "), count, red if name == latest else "")
-        for name, count in status.interventions.items()
-        if count
-    ]
-    rows = rows or [("the filter has not had to act", "", f"color:{GREEN}")]
-    if status.contacts:
-        rows.append(("touches of the surroundings", status.contacts, f"color:{VERMILION}"))
-    table = "".join(
-        f'<tr style="{style}"><td>{name}</td><td style="text-align:right">{count}</td></tr>'
-        for name, count, style in rows
-    )
-    return _block(
-        "Safety filter, steps", f'<table style="width:100%;border-spacing:0">{table}</table>'
-    )
-
-
-def _block(title: str, content: str) -> str:
-    return (
-        '<div style="padding:.2em .9em .4em;font-size:.85em">'
-        f'<div style="opacity:.75;margin-bottom:.2em">{title}</div>'
-        f"{content}</div>"
-    )
-
-
-def _turn_words(turn: tuple[float, float, float] | None) -> str:
-    """Rotation added to the orientation of the end effector, as text."""
-    if turn is None:
-        return "Turned by its rings: not at all."
-    x, y, z = np.rad2deg(turn)
-    return f"Turned by its rings: {x:.0f}, {y:.0f}, {z:.0f} degrees about x, y, z."
 
 
 LONGEST_TEXT = 200
@@ -283,7 +154,7 @@ class Panel:
                 self.editor = RegionEditor(server, boxes)
                 clear = gui.add_button("Clear the turn", color="gray")
                 clear.on_click(in_loop(lambda _: held.clear_turn()))
-                self._turn_text = gui.add_markdown(_turn_words(None))
+                self._turn_text = gui.add_markdown("")
         self._seen: Mapping[str, int] = {}
         self._latest = ""
 
@@ -388,7 +259,8 @@ class Panel:
             nullspace_input: d that is asked for now [N m].
             people: Browsers that show the page.
         """
-        self._told.content = feedback_html(feedback)
+        texts = panel_texts()
+        self._told.content = str(texts.feedback(feedback, felt_words(feedback)))
         if self._switch is not None:
             self._next = "stop" if status.recording == "recording" else "start"
             self._switch.label = self._next.capitalize()
@@ -398,11 +270,13 @@ class Panel:
             if self._keep is not None:
                 self._keep.visible = status.recording == "stopped"
         largest = self._initial_forces.max_nullspace_input
-        self._state.content = state_html(status, people, self.task)
-        self._bars.content = nullspace_input_html(nullspace_input, largest)
+        self._state.content = str(texts.state(status, people, self.task))
+        self._bars.content = str(texts.nullspace_input(nullspace_input.tolist(), largest))
         if self.editor is not None:
-            self._turn_text.content = _turn_words(self._held.turn_vector)
+            turn = self._held.turn_vector
+            degrees = None if turn is None else tuple(np.rad2deg(turn).tolist())
+            self._turn_text.content = str(texts.turn(degrees))
         counts, seen = status.interventions, self._seen
         more = [name for name, count in counts.items() if count > seen.get(name, 0)]
         self._seen, self._latest = dict(counts), more[-1] if more else self._latest
-        self._safety.content = interventions_html(status, self._latest)
+        self._safety.content = str(texts.safety(status, self._latest))

@@ -64,13 +64,13 @@ def reports_page(title: str, reports: Sequence[Report], linked: Sequence[str] = 
     )
 
 
-def page_templates() -> Any:
-    """Templates of pages, in this folder."""
+def page_templates(package: str = "hrc_learn.viz") -> Any:
+    """Templates of pages, in the folder of a package."""
     # Used only here; it takes some hundredths of a second to import.
     from jinja2 import Environment, PackageLoader
 
     return Environment(
-        loader=PackageLoader("hrc_learn.viz", ""),
+        loader=PackageLoader(package, ""),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -6,13 +6,7 @@ import numpy as np
 
 from hrc_learn.protocols import Feedback, Reason
 from hrc_learn.teleoperation.page import PageStatus
-from hrc_learn.teleoperation.panel import (
-    can_do,
-    feedback_html,
-    interventions_html,
-    nullspace_input_html,
-    state_html,
-)
+from hrc_learn.teleoperation.panel import felt_words, panel_texts
 from hrc_learn.viz.palette import GREEN, VERMILION
 
 
@@ -24,7 +18,7 @@ def bars(html):
 
 
 def test_efforts_are_bars_from_the_middle_to_either_side():
-    html = nullspace_input_html(np.array([10.0, -5.0, 0.0, 40.0]), largest=20.0)
+    html = panel_texts().nullspace_input([10.0, -5.0, 0.0, 40.0], 20.0)
     assert bars(html) == [(50.0, 25.0), (37.5, 12.5), (50.0, 0.0), (50.0, 50.0)]
     assert "+10.0" in html
     assert "-5.0" in html
@@ -32,7 +26,7 @@ def test_efforts_are_bars_from_the_middle_to_either_side():
 
 def test_interventions_are_counted_and_the_new_ones_stand_out():
     status = PageStatus(interventions={"velocity": 3, "tcp_speed": 7, "jerk": 0}, contacts=2)
-    html = interventions_html(status, latest="tcp_speed")
+    html = panel_texts().safety(status, "tcp_speed")
     rows = re.findall(r"<tr.*?</tr>", html)
     assert [re.sub(r"<.*?>", " ", row).split() for row in rows] == [
         ["velocity", "3"],
@@ -43,23 +37,23 @@ def test_interventions_are_counted_and_the_new_ones_stand_out():
 
 
 def test_a_filter_that_has_not_acted_is_said_to():
-    html = interventions_html(PageStatus(interventions={"velocity": 0}), latest="")
+    html = panel_texts().safety(PageStatus(interventions={"velocity": 0}), "")
     assert "has not had to act" in html
 
 
 def test_what_others_have_written_is_not_taken_for_the_pages_own():
-    html = state_html(PageStatus(title="<script>", note="<b>"), people=2)
+    html = panel_texts().state(PageStatus(title="<script>", note="<b>"), 2, "")
     assert "<script>" not in html
     assert "<b>" not in html
     assert "2 connected" in html
-    assert "recording 1.5 s" in state_html(
-        PageStatus(recording="recording", seconds=1.5), people=0
-    )
+    recording = PageStatus(recording="recording", seconds=1.5)
+    assert "recording 1.5 s" in panel_texts().state(recording, 0, "")
 
 
 def test_what_can_be_done_now_is_said():
+    instruction = panel_texts().instruction
     said = {
-        (state, task): can_do(PageStatus(recording=state), task)
+        (state, task): instruction(PageStatus(recording=state), task)
         for state in ("ready", "recording", "stopped")
         for task in ("", "show it")
     }
@@ -67,16 +61,20 @@ def test_what_can_be_done_now_is_said():
     assert "press Stop" in said["recording", "show it"]
     assert said["stopped", "show it"] == "Save it or discard it."
     assert "Task" in said["stopped", ""]
-    assert can_do(PageStatus(doing="servo"), "") == ""
-    assert "Press Start" in state_html(PageStatus(), people=0)
+    assert instruction(PageStatus(doing="servo"), "") == ""
+    assert "Press Start" in panel_texts().state(PageStatus(), 0, "")
 
 
 def test_an_arm_that_works_by_itself_says_what_it_does_and_records_nothing():
-    html = state_html(PageStatus(doing="aim & wait", seconds=12.34), people=0)
+    html = panel_texts().state(PageStatus(doing="aim & wait", seconds=12.34), 0, "")
     assert "aim &amp; wait" in html
     assert "12.3 s" in html
     assert "saved" not in html
     assert "ready" not in html
+
+
+def feedback_html(feedback):
+    return panel_texts().feedback(feedback, felt_words(feedback))
 
 
 def words(feedback):
