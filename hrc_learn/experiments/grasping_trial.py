@@ -1,6 +1,6 @@
 """One grasp in simulation, from a random scene: camera, start of the arm, object."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from hrc_learn.experiments.simulated_cell import (
     simulated_cell,
 )
 from hrc_learn.geometry import quaternion
+from hrc_learn.protocols import Human
 from hrc_learn.sim import (
     CameraKind,
     Imperfections,
@@ -32,7 +33,7 @@ from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
 from hrc_learn.skills.marker_sensor import MarkerSensor, feature_sensor
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
-from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
+from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.vision import CameraModel
 
@@ -149,7 +150,7 @@ def simulate_grasp(
     config: GraspingConfig | None = None,
     rng: np.random.Generator,
     access: ArmAccess = SIMULATED,
-    drawings: Sequence[DrawnInterval] = (),
+    human: Human | None = None,
     page: PageConfig | None = None,
     observer: Observer = UNOBSERVED,
 ) -> GraspingRun:
@@ -162,7 +163,7 @@ def simulate_grasp(
         config: Configuration of the grasp.
         rng: Source of image noise and of lost images.
         access: Access to the arm.
-        drawings: Regions and targets that a scripted person draws, in the time of the run.
+        human: Person near the arm; None: nobody.
         page: Serves a page on which people draw and pull the arm too, in real time; None: no
             page.
         observer: Live dashboard and messages.
@@ -175,7 +176,7 @@ def simulate_grasp(
     result, failure = None, ""
     with simulated_cell(
         world,
-        human=ScriptedDrawing(drawings),
+        human=human or ScriptedPerturbation(workplace.robot.chain, ()),
         sensor=feature_sensor(
             eye,
             aiming.landmarks,

@@ -43,7 +43,7 @@ from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
 from hrc_learn.store import new_folder, write_json
-from hrc_learn.teleoperation import ScriptedDrawing, Touch
+from hrc_learn.teleoperation import ScriptedPerturbation, Touch
 from hrc_learn.viz.run_dashboard import record_run
 
 Driver = Literal["franky", "franka", "lerobot", "ros2"]
@@ -315,7 +315,7 @@ def run_on_arm(
             arm=arm,
             gripper=arm,
             sensor=None if camera is None else MarkerSensor(camera, workplace.scene.marker_ids),
-            human=Touch(site.chain) if site.touch else ScriptedDrawing(()),
+            human=Touch(site.chain) if site.touch else ScriptedPerturbation(site.chain, ()),
             advance=motion.advance,
             config=config,
             on_phase=on_phase,

@@ -18,9 +18,7 @@ from hrc_learn.teleoperation.hand_guiding import (
 )
 from hrc_learn.teleoperation.hand_guiding import gizmo_nullspace_input as gizmo_nullspace_input
 from hrc_learn.teleoperation.hand_guiding import guiding_twist as guiding_twist
-from hrc_learn.teleoperation.scripted_expert import DrawnInterval as DrawnInterval
 from hrc_learn.teleoperation.scripted_expert import GuidedPath as GuidedPath
-from hrc_learn.teleoperation.scripted_expert import ScriptedDrawing as ScriptedDrawing
 from hrc_learn.teleoperation.scripted_expert import ScriptedExpert as ScriptedExpert
 from hrc_learn.teleoperation.scripted_expert import ScriptedForce as ScriptedForce
 from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation as ScriptedPerturbation

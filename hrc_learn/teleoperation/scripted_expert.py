@@ -1,11 +1,10 @@
-"""Scripted people: one pulls the arm at given times, one draws regions, and the expert also
-guides the end effector along way points.
+"""Scripted people: one pulls the arm at given times, the expert also guides the end effector
+along way points.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.kinematics import SerialChain, coarse_orientation
-from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
+from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.teleoperation.hand_guiding import (
     TINY,
     InteractionForceConfig,
@@ -262,51 +261,3 @@ class ScriptedExpert(Human):
         if self._tremor is not None and state.time < self.path.end:
             twist[:3] += self._tremor.velocity(state.time)
         return HumanInput(nullspace_input=self._puller.read(state).nullspace_input, twist=twist)
-
-
-@dataclass(frozen=True, kw_only=True)
-class DrawnInterval:
-    """Region drawn during an interval.
-
-    Raises:
-        ValueError: The interval has no duration.
-    """
-
-    start: float
-    """[s]"""
-    duration: float
-    """[s]"""
-    region: DrawnRegion | None = None
-    """None: none."""
-    target: tuple[float, float, float] | None = None
-    """Point marked for the end effector, in the base frame [m]; None: none."""
-    turn: tuple[float, float, float] | None = None
-    """Rotation added to the end effector's orientation, as a rotation vector in the base frame
-    [rad]; None: none."""
-
-    def __post_init__(self) -> None:
-        if not self.duration > 0:
-            raise ValueError(f"duration must be positive, but is {self.duration}.")
-
-
-class ScriptedDrawing(Human):
-    """Person that only draws, by a script; can be combined with others."""
-
-    def __init__(self, script: Sequence[DrawnInterval]):
-        """Prepare.
-
-        Args:
-            script: Intervals with their drawn regions. If intervals overlap, the first that has
-                a region, a target or a turn decides about that.
-        """
-        self._script = tuple(script)
-
-    def read(self, state: ArmState) -> HumanInput:
-        """Region drawn at the state's time."""
-        now = [i for i in self._script if i.start <= state.time < i.start + i.duration]
-
-        def first(name: str) -> Any:
-            found = (getattr(one, name) for one in now)
-            return next((value for value in found if value is not None), None)
-
-        return HumanInput(**{name: first(name) for name in ("region", "target", "turn")})

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scripted_drawing import DrawnInterval, ScriptedDrawing
 from seen_cameras import camera_network, camera_vector
 from unchecked import shapes_unchecked
 
@@ -43,7 +44,6 @@ from hrc_learn.skills.grasping import Grasping, GraspingConfig
 from hrc_learn.skills.placing import check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
-from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
 
 pytestmark = pytest.mark.simulation
 
@@ -366,7 +366,7 @@ def test_an_object_is_grasped_within_the_region_that_a_person_has_drawn(skill):
             turned(110.0),
             camera="synthetic",
             rng=np.random.default_rng(1),
-            drawings=(replace(over, start=6.0), aside),
+            human=ScriptedDrawing((replace(over, start=6.0), aside)),
         )
     assert succeeded(run)
     log = run.cell.log
