@@ -180,65 +180,41 @@ def _drawn(report: Report) -> Report:
     return replace(report, sections=sections)
 
 
-def _as_file(report: Report) -> _ReportFile:
+def _as_file(report: Report) -> dict[str, object]:
+    """Content of `report.json`, which fits `_ReportFile`; pictures and film are files."""
+    sections = [
+        {**vars(s), "figures": [{"name": p.name, "caption": p.caption} for p in s.figures]}
+        for s in report.sections
+    ]
     configuration = flatten(report.configuration)
-    return _ReportFile(
-        title=report.title,
-        summary=report.summary,
-        command=report.command,
-        film=None if report.film is None else report.film.caption,
-        table=[_Row(**vars(row)) for row in report.table],
-        sections=[
-            _SectionFile(
-                heading=section.heading,
-                text=section.text,
-                figures=[_PictureFile(name=p.name, caption=p.caption) for p in section.figures],
-            )
-            for section in report.sections
-        ],
-        configuration={key: _plain(value) for key, value in configuration.items()},
-        versions=dict(report.versions),
-    )
+    return {
+        "format": "hrc_learn report",
+        "version": 1,
+        **vars(report),
+        "film": None if report.film is None else report.film.caption,
+        "sections": sections,
+        "configuration": {key: _plain(value) for key, value in configuration.items()},
+    }
 
 
 def _from_file(content: _ReportFile, folder: Path) -> Report:
-    sections = [
-        Section(
-            heading=section.heading,
-            text=section.text,
-            figures=[
-                Picture(
-                    figure.name,
-                    (folder / FIGURES / f"{figure.name}.png").read_bytes(),
-                    figure.caption,
-                    _bytes_if_there(folder / FIGURES / f"{figure.name}.svg"),
-                )
-                for figure in section.figures
-            ],
-        )
-        for section in content.sections
+    def picture(shown: _PictureFile) -> Picture:
+        png, svg = (folder / FIGURES / f"{shown.name}.{kind}" for kind in ("png", "svg"))
+        vector = svg.read_bytes() if svg.is_file() else None
+        return Picture(shown.name, png.read_bytes(), shown.caption, vector)
+
+    fields = {k: v for k, v in vars(content).items() if k not in ("format", "version")}
+    fields["sections"] = [
+        Section(heading=s.heading, text=s.text, figures=[*map(picture, s.figures)])
+        for s in content.sections
     ]
-    table = [
+    fields["table"] = [
         Measurement(**{**vars(row), "value": math.nan if row.value is None else row.value})
         for row in content.table
     ]
-    film = None
     if content.film is not None:
-        film = Film((folder / FILM).read_bytes(), content.film)
-    return Report(
-        title=content.title,
-        summary=content.summary,
-        command=content.command,
-        table=table,
-        sections=sections,
-        film=film,
-        configuration=content.configuration,
-        versions=content.versions,
-    )
-
-
-def _bytes_if_there(path: Path) -> bytes | None:
-    return path.read_bytes() if path.is_file() else None
+        fields["film"] = Film((folder / FILM).read_bytes(), content.film)
+    return Report(**fields)
 
 
 def _plain(value: object) -> bool | int | float | str | None:
