@@ -15,7 +15,6 @@ from hrc_learn.cli.arguments import Record
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
 from hrc_learn.experiments.real_arm import ArmSite, opened_arm
-from hrc_learn.experiments.simulated_cell import SIMULATED
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.hardware.driver_process import StoppableArm
 from hrc_learn.hardware.lerobot_device import GRIPPER, LeaderArm
@@ -90,7 +89,7 @@ def _record_placing(args: Record, episodes: int, seed: int) -> None:
     def demonstrate() -> list[Frame]:
         nonlocal discarded
         frames, contacts = demonstrate_placing_without_contact(
-            world, workplace, args.shelf, config, rng, SIMULATED.open
+            world, workplace, args.shelf, config, rng
         )
         discarded += contacts
         errors.append(1e3 * float(np.linalg.norm(frames[-1]["position"] - goal)))
@@ -116,7 +115,7 @@ def _record_servoing(args: Record, episodes: int, seed: int) -> None:
     visible = []
 
     def demonstrate() -> list[Frame]:
-        frames = demonstrate_servoing(world, workplace, sensor, config, rng, SIMULATED.open)
+        frames = demonstrate_servoing(world, workplace, sensor, config, rng)
         visible.append(float(np.mean([bool(f["feature_visible"]) for f in frames])))
         return frames
 

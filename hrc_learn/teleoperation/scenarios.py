@@ -72,10 +72,7 @@ class Placing:
         return f"place the box on the {self.shelf} shelf"
 
     def begin(self, world: World, rng: np.random.Generator) -> Human:
-        expert = placing_expert(self.workplace, self.shelf, _PLACING, rng)
-        offset = torch.from_numpy(expert.path.position(0.0)) - self.workplace.home().position
-        joints = self.workplace.home_joints(offset).numpy()
-        world.hold(self.workplace.scene.objects[0].name, joints)
+        expert = placing_expert(world, self.workplace, self.shelf, _PLACING, rng)
         return SequencedInput([(0.0, expert, CLOSED), (_LET_GO, expert, OPEN)])
 
     def succeeded(self, world: World) -> bool:

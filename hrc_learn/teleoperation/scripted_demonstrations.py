@@ -4,8 +4,7 @@ posture; and how they are recorded and written as a LeRobot dataset.
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,8 @@ from jaxtyping import Float
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import (
-    Arm,
-    SerialChain,
-    UnreachableError,
-    coarse_orientation,
-    gripper_down,
-)
-from hrc_learn.protocols import Camera, Human, OpenedArm
+from hrc_learn.kinematics import Arm, UnreachableError, coarse_orientation, gripper_down
+from hrc_learn.protocols import Camera, Human, HumanInput
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
@@ -30,7 +23,12 @@ from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import DATASET, replacing
-from hrc_learn.teleoperation.hand_guiding import Frame, HandGuidedArm, HandGuidingConfig
+from hrc_learn.teleoperation.hand_guiding import (
+    Frame,
+    GuidedStep,
+    HandGuidedArm,
+    HandGuidingConfig,
+)
 from hrc_learn.teleoperation.scripted_expert import (
     GuidedPath,
     ScriptedExpert,
@@ -63,26 +61,16 @@ class DemonstrationConfig:
         return 1.0 / (HandGuidingConfig.dt * self.record_every)
 
 
-type OpenArm = Callable[[World], AbstractContextManager[OpenedArm]]
-"""Connects to the arm of a world that is at rest, until a demonstration ends."""
-
-
-def _directly(world: World) -> AbstractContextManager[OpenedArm]:
-    return nullcontext(world.opened_arm)
-
-
 def guided_frames(
-    chain: SerialChain,
-    opened: OpenedArm,
+    world: World,
     human: Human,
     config: DemonstrationConfig,
-    observe: Callable[[], Frame] = dict,
-) -> Iterator[Frame]:
-    """Let a person guide the arm, and yield what is to be recorded.
+    observe: Callable[[], Mapping[str, Any]] = dict,
+) -> Iterator[dict[str, Any]]:
+    """Let a person guide the arm of a world, and yield what is to be recorded.
 
     Args:
-        chain: The arm's kinematics.
-        opened: The arm, where the demonstration starts.
+        world: World whose arm is where the demonstration starts.
         human: Gives end-effector motion and null-space input.
         config: Duration and rate.
         observe: Further columns of a frame, called when it is recorded.
@@ -90,13 +78,13 @@ def guided_frames(
     Yields:
         A frame every `record_every` control steps.
     """
-    arm = HandGuidedArm(chain, opened.arm, human)
+    arm = HandGuidedArm(world.arm.robot.chain, world.arm, human)
     dt = arm.config.dt
     for k in range(round((config.duration + config.settle) / dt)):
         step = arm.step()
         if k % config.record_every == 0:
             yield {**step.frame(), **observe()}
-        opened.advance(dt)
+        world.advance(dt)
 
 
 def write_demonstrations(
@@ -217,7 +205,6 @@ def demonstrate_servoing(
     sensor: MarkerSensor,
     config: ServoDemonstrationConfig,
     rng: np.random.Generator,
-    open_arm: OpenArm = _directly,
 ) -> list[Frame]:
     """Demonstrate one motion that ends above an object.
 
@@ -230,7 +217,6 @@ def demonstrate_servoing(
         sensor: The camera's markers.
         config: Timing and heights.
         rng: Source of objects, paths and tremor.
-        open_arm: Function that opens the arm's driver.
 
     Raises:
         ValueError: If the camera does not see the object anywhere.
@@ -249,8 +235,7 @@ def demonstrate_servoing(
             ANGLE_FEATURE: np.array([angle(last), angle(target)]),
         }
 
-    with open_arm(world) as opened:
-        return list(guided_frames(world.arm.robot.chain, opened, expert, config, observe))
+    return list(guided_frames(world, expert, config, observe))
 
 
 def film_servoing(
@@ -275,28 +260,24 @@ def film_servoing(
         A frame with the camera's image.
     """
     expert, _ = _arranged(world, workplace, sensor, config, rng)
-    chain, name = world.arm.robot.chain, workplace.scene.objects[0].name
-    pose, dt = world.object_pose(name), 1 / config.fps
+    name, dt = workplace.scene.objects[0].name, 1 / config.fps
+    pose = world.object_pose(name)
+
+    def image() -> dict[str, Any]:
+        return {"images": {FILM: camera.read()}}
+
     start = torch.from_numpy(world.arm.read().joint_position)
     # On the way from home the camera sees the object.
     path = joint_line(workplace.home_joints(), start, _LEAD_SPEED, dt).numpy()
     for k, (q, velocity) in enumerate(zip(path, np.gradient(path, dt, axis=0), strict=True)):
         world.reset(q, {name: pose})
-        tool = chain.forward(q)
-        yield {
-            "time": k * dt,
-            "joint_position": q,
-            "joint_velocity": velocity,
-            "position": tool.position.numpy(),
-            "orientation": tool.orientation.numpy(),
-            "gripper": world.arm.read().gripper_width,
-            "human_effort": 0 * q,
-            "command_velocity": velocity,
-            "images": {FILM: camera.read()},
-        }
+        state = replace(world.arm.read(), time=k * dt, joint_velocity=velocity)
+        tool = world.arm.robot.chain.forward(q)
+        step = GuidedStep(state=state, human_input=HumanInput(), pose=tool, command=velocity)
+        yield {**step.frame(), **image()}
     shift = len(path) * dt - world.time
-    for frame in guided_frames(chain, world.opened_arm, expert, config):
-        yield {**frame, "time": frame["time"] + shift, "images": {FILM: camera.read()}}
+    for frame in guided_frames(world, expert, config, image):
+        yield {**frame, "time": frame["time"] + shift}
 
 
 def _arranged(
@@ -377,14 +358,16 @@ class PlacingDemonstrationConfig(DemonstrationConfig):
 
 
 def placing_expert(
+    world: World,
     workplace: Workplace,
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
 ) -> ScriptedExpert:
-    """Expert that puts an object on a shelf.
+    """Reset a world for placing, and return the expert that puts the object on a shelf.
 
     Args:
+        world: World whose arm then stands near home, with the object in its gripper.
         workplace: Workplace with the shelves.
         shelf: Index of the shelf.
         config: Timing and heights.
@@ -396,7 +379,9 @@ def placing_expert(
     lifted = torch.tensor([0.0, 0.0, size * config.lift], dtype=torch.float64)
     inside = goal + 0.3 * (front - goal)
     spread = size * config.spread
-    start = workplace.home().position + spread * torch.from_numpy(rng.standard_normal(3))
+    offset = spread * torch.from_numpy(rng.standard_normal(3))
+    world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
+    start = workplace.home().position + offset
     waypoints = torch.stack([start, front + lifted, inside + lifted, goal]).numpy()
     # Whose elbow is where it has to be, once the hand is, cannot be pulled aside.
     pulled = config.pull_elbow and workplace.robot.null_space == "arm angle"
@@ -415,7 +400,6 @@ def demonstrate_placing(
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
-    open_arm: OpenArm = _directly,
 ) -> tuple[list[Frame], list[Touch]]:
     """Demonstrate one placing motion, from home to a shelf with the object in the gripper.
 
@@ -425,16 +409,12 @@ def demonstrate_placing(
         shelf: Index of the shelf.
         config: Timing and heights.
         rng: Source of the tremor and of the initial position.
-        open_arm: Function that opens the arm's driver.
 
     Returns:
         The recorded frames, and all contacts of arm or object with the cabinet on the way.
     """
-    expert = placing_expert(workplace, shelf, config, rng)
-    offset = torch.from_numpy(expert.path.position(0.0)) - workplace.home().position
-    world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
-    with open_arm(world) as opened:
-        frames = list(guided_frames(world.arm.robot.chain, opened, expert, config))
+    expert = placing_expert(world, workplace, shelf, config, rng)
+    frames = list(guided_frames(world, expert, config))
     return frames, world.cabinet_contacts.touches + world.object_contacts.touches
 
 
@@ -444,7 +424,6 @@ def demonstrate_placing_without_contact(
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
-    open_arm: OpenArm = _directly,
 ) -> tuple[list[Frame], int]:
     """Demonstrate until the shelf is reached and nothing touched on the way, as people would.
 
@@ -454,7 +433,6 @@ def demonstrate_placing_without_contact(
         shelf: Index of the shelf.
         config: Timing and heights.
         rng: Source of the tremor and of the initial position.
-        open_arm: Function that opens the arm's driver.
 
     Returns:
         The recorded frames, and how many demonstrations were discarded.
@@ -464,7 +442,7 @@ def demonstrate_placing_without_contact(
     """
     goal, why = workplace.shelf(shelf).position.numpy(), ""
     for attempt in range(_ATTEMPTS):
-        frames, touches = demonstrate_placing(world, workplace, shelf, config, rng, open_arm)
+        frames, touches = demonstrate_placing(world, workplace, shelf, config, rng)
         off = float(np.linalg.norm(np.asarray(frames[-1]["position"]) - goal))
         if not touches and off < _ARRIVED:
             return frames, attempt
