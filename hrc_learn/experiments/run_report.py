@@ -23,16 +23,14 @@ from hrc_learn.viz.figures import (
     active_intervals,
     demonstrated_joints,
     draw_box,
-    finite_span,
     frame_space,
-    image_jacobian_figure,
     joint_grid_figure,
     joints_figure,
     near,
-    needed,
-    person_figure,
+    plots_figure,
     space,
 )
+from hrc_learn.viz.panels import image_jacobian_plots, person_plots, worker_plots
 from hrc_learn.viz.report import Picture, Section
 
 Spans = Mapping[str, tuple[float, float]]
@@ -105,7 +103,7 @@ def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -
                 "if necessary. The expert drags joint 4 forward and back twice to make space.",
                 (
                     "worker",
-                    worker_figure(run),
+                    plots_figure(run.time, worker_plots(run)),
                     "Smallest distance from the robot and its load: true, as the robot sees "
                     "it, and the protective distance of the part with the smallest margin.",
                 ),
@@ -122,21 +120,21 @@ def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -
     return sections
 
 
-def worker_figure(run: RunRecording) -> Figure:
-    """Distance of the worker from the robot over time, with the last 30 cm enlarged."""
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 3.8))
-        far, near = figure.subplots(2, 1, sharex=True)
-        for axes in (far, near):
-            for name, distance in run.worker_distance.items():
-                axes.plot(run.time, distance, label=name, lw=0.9)
-            axes.axhline(0.0, color=palette.LIMIT, lw=0.8)
-            axes.set_ylabel("distance [m]")
-            axes.margins(x=0)
-        far.legend(loc="center right")
-        far.set_title("Distance of the worker from the robot and its load", loc="left")
-        near.set(ylim=(-0.05, 0.30), xlabel="time [s] (red: contact)")
-    return figure
+def person_figure(run: RunRecording) -> Figure:
+    """Curves of the person, from the first to the last action; the actions are shaded."""
+    assert run.nullspace_input is not None
+    acting = np.asarray(run.nullspace_input.any(axis=1))
+    present = acting
+    if run.position_deviation is not None:  # known while a person is present
+        present = acting | np.isfinite(run.position_deviation)
+    return plots_figure(run.time, person_plots(run), shown=present, shaded=acting)
+
+
+def image_jacobian_figure(run: RunRecording) -> Figure:
+    """Entries of the estimated image Jacobian, with the true ones if known."""
+    assert run.image_jacobian is not None
+    known = np.asarray(np.isfinite(run.image_jacobian).all(axis=(1, 2)))
+    return plots_figure(run.time, image_jacobian_plots(run), columns=2, shown=known)
 
 
 def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
@@ -170,7 +168,9 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
 
 def marker_figure(run: RunRecording, objects: Spans) -> Figure:
     """Paths of the gripper's marker in the image, and its distance from the target."""
-    camera = needed(run.camera, "camera")
+    camera = run.camera
+    if camera is None:
+        raise ValueError("this figure needs camera, which the recording does not have.")
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 6.0))
         grid = figure.add_gridspec(2, 1, height_ratios=[2.1, 1])
@@ -207,7 +207,8 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
             ylabel="distance [px]",
             title="Distance to the target",
         )
-        finite_span(error, run.time, hidden | np.isfinite(camera.error))
+        if (known := hidden | np.isfinite(camera.error)).any():
+            error.set_xlim(run.time[known][0], run.time[known][-1])
     return figure
 
 

@@ -1,7 +1,7 @@
 """Figures of runs, fits and sweeps for reports and papers.
 
-Plain matplotlib `Figure` objects: no pyplot, no global state, no window. Those of runs and fits
-take the recording that the dashboards take, and raise ValueError where it lacks the data.
+Plain matplotlib `Figure` objects: no pyplot, no global state, no window. Curves of runs are the
+plots that the dashboards show (`panels.py`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,6 +22,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from hrc_learn.geometry import Box
 from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
+from hrc_learn.viz.panels import Plot
 
 STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -44,28 +45,6 @@ WIDTH = 7.2
 """Width of a figure [inch]: the text width of a page."""
 
 _SURROUNDINGS = 0.22  # how far around the paths boxes are drawn [m]
-
-
-def needed[T](value: T | None, name: str) -> T:
-    """The value, or an error that names the missing field of the recording."""
-    if value is None:
-        raise ValueError(f"this figure needs {name}, which the recording does not have.")
-    return value
-
-
-def scaled(
-    values: Float[np.ndarray, " time"] | None, factor: float
-) -> Float[np.ndarray, " time"] | None:
-    """Values in another unit; None without values."""
-    return None if values is None else factor * values
-
-
-def finite_span(
-    axes: Axes, time: Float[np.ndarray, " time"], known: Bool[np.ndarray, " time"]
-) -> None:
-    """Limit the time axis to the span of known values."""
-    if known.any():
-        axes.set_xlim(time[known][0], time[known][-1])
 
 
 def active_intervals(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
@@ -234,73 +213,49 @@ def joints_figure(run: RunRecording) -> Figure:
     return joint_grid_figure(run.joint_names, motions, run.joint_limits)
 
 
-def person_figure(run: RunRecording) -> Figure:
-    """Effort of the person, elbow motion, and deviation of the end effector.
+def plots_figure(
+    time: Float[np.ndarray, " time"],
+    plots: Sequence[Plot],
+    *,
+    columns: int = 1,
+    shown: Bool[np.ndarray, " time"] | None = None,
+    shaded: Bool[np.ndarray, " time"] | None = None,
+) -> Figure:
+    """Plots of a dashboard on white paper, with a common time axis.
 
-    The intervals in which the person acted are shaded.
+    Args:
+        time: Time of the curves [s].
+        plots: Plots; their titles name the units.
+        columns: Number of columns.
+        shown: Samples that the time axis has to show; None, or none of them: all.
+        shaded: Samples in which the background is shaded; None: none.
     """
-    effort = needed(run.nullspace_input, "nullspace_input")
-    acting = np.linalg.norm(effort, axis=1) > 0
-    rows = [
-        ("effort d [N m]", "Null-space effort of the person, by joint", effort),
-        ("elbow [mm]", "Elbow moved", scaled(run.elbow_motion, 1e3)),
-        ("position [mm]", "Deviation of the end effector", scaled(run.position_deviation, 1e3)),
-        ("rotation [deg]", "", scaled(run.rotation_deviation, 180 / np.pi)),
-    ]
-    shown = [row for row in rows if row[2] is not None]
-    # Deviations are known while a person is present; without them the whole run is shown.
-    known = [np.isfinite(values) for _, _, values in shown[1:] if values is not None]
-    about = np.logical_or.reduce([acting, *known])
+    rows = -(-len(plots) // columns)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.0 + 1.35 * len(shown)))
-        column = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
-        for axes, (label, title, values) in zip(column, shown, strict=True):
-            assert values is not None
-            shade(axes, run.time, acting)
-            axes.plot(run.time, values, color=None if values.ndim == 2 else palette.RUN)
-            axes.set(ylabel=label, title=title)
+        figure = Figure(figsize=(WIDTH, 0.6 + 1.6 * rows))
+        grid = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
+        for axes, plot in zip(grid, plots, strict=False):
+            for curves in plot.curves:
+                columned = zip(curves.names, curves.values.T, curves.colours, strict=True)
+                for name, values, colour in columned:
+                    look = palette.on_white(colour)
+                    axes.plot(time, values, color=look, lw=0.8 * curves.width, label=name)
+            if shaded is not None:
+                shade(axes, time, shaded)
+            axes.set_title(plot.title, fontsize=10 if columns == 1 else 8)
+            axes.set_ylim(plot.range)
             axes.margins(x=0)
-            if values.ndim == 1:
-                axes.set_ylim(bottom=0)
-        column[0].legend(
-            column[0].get_lines(),
-            run.joint_names,
-            ncols=1,
-            loc="center left",
-            bbox_to_anchor=(1.0, 0.5),
-        )
-        finite_span(column[-1], run.time, about)
-        column[-1].set_xlabel("time [s] (shaded: the person acts)")
-        figure.align_ylabels()
-    return figure
-
-
-def image_jacobian_figure(run: RunRecording) -> Figure:
-    """The twelve entries of the estimated image Jacobian, against the true ones if known."""
-    estimate = needed(run.image_jacobian, "image_jacobian")
-    true = run.true_image_jacobian
-    known = np.asarray(np.isfinite(estimate).all(axis=(1, 2)))
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 4.6))
-        grid = figure.subplots(2, 2, sharex=True)
-        for row, pixel in enumerate("uv"):
-            for column, (symbol, unit) in enumerate((("v", "px/m"), ("ω", "px/rad"))):
-                axes = grid[row, column]
-                for k, axis in enumerate("xyz"):
-                    colour, entry = palette.SERIES[k], 3 * column + k
-                    if true is not None:
-                        values = np.where(known, true[:, row, entry], np.nan)
-                        axes.plot(run.time, values, color=colour, lw=4, alpha=0.3)
-                    axes.plot(run.time, estimate[:, row, entry], color=colour, label=axis)
-                of = "linear" if column == 0 else "angular"
-                axes.set_title(f"∂{pixel} by {of} velocity {symbol}")
-                axes.set_ylabel(unit)
-                finite_span(axes, run.time, known)
-        grid[0, 0].legend(ncols=3, loc="best")
-        against = "" if true is None else " (wide and pale: true, thin: estimate)"
-        for axes in grid[1]:
-            axes.set_xlabel("time [s]")
-        figure.suptitle(f"Image Jacobian{against}", x=0.01, ha="left", fontsize=10)
+            if plot.legend:
+                handles, names = axes.get_legend_handles_labels()
+                once = dict(zip(names, handles, strict=True))  # curves may have one name
+                beside = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
+                place = beside if columns == 1 else {"loc": "best", "ncols": 2}
+                axes.legend(once.values(), once, **place)
+        for axes in grid[len(plots) :]:
+            axes.set_axis_off()
+        if shown is not None and shown.any():
+            grid[0].set_xlim(time[shown][0], time[shown][-1])
+        figure.supxlabel("time [s]", fontsize=9)
     return figure
 
 

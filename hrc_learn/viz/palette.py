@@ -53,3 +53,15 @@ def lighten(colour: str) -> tuple[int, int, int, int]:
     """A colour mixed with white, for the curve that lies behind."""
     r, g, b, a = rgba(colour)
     return *(round(c + 0.55 * (255 - c)) for c in (r, g, b)), a  # pyright: ignore[reportReturnType]
+
+
+_ON_WHITE = {
+    mixed(dark): mixed(light)
+    for mixed in (rgba, lighten)
+    for dark, light in zip(SERIES_ON_DARK, SERIES, strict=True)
+}
+
+
+def on_white(colour: tuple[int, int, int, int]) -> tuple[float, ...]:
+    """Colour on white paper, 0 to 1, for the bytes of one on a dark screen."""
+    return tuple(channel / 255 for channel in _ON_WHITE.get(colour, colour))

@@ -103,7 +103,7 @@ def _servoing(run: RunRecording) -> Tab:
     plots = [
         Plot(title="Distance from feature to target [px]", curves=(error,)),
         Plot(title="Feature minus target [px]", curves=(parts,), legend=True),
-        *_image_jacobian(run),
+        *image_jacobian_plots(run),
     ]
     return Tab(title="Servoing", plots=tuple(plots), columns=2)
 
@@ -123,7 +123,7 @@ def _lyapunov(run: RunRecording) -> Tab:
     return Tab(title="Lyapunov", plots=plots)
 
 
-def _image_jacobian(run: RunRecording) -> list[Plot]:
+def image_jacobian_plots(run: RunRecording) -> list[Plot]:
     """Plots of the entries of the image Jacobian, with the true ones if known."""
     plots = []
     if run.image_jacobian is not None:
@@ -155,12 +155,13 @@ def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
 
 
 def _person_and_worker(run: RunRecording) -> Tab:
-    plots = (*_person(run), *_worker(run))
+    plots = (*person_plots(run), *worker_plots(run))
     # In two columns: eight plots above one another are too low to be read.
     return Tab(title="Person and worker", plots=plots, columns=2)
 
 
-def _person(run: RunRecording) -> list[Plot]:
+def person_plots(run: RunRecording) -> list[Plot]:
+    """Plots of what a person does, how far the arm follows, and how elbow and tool move."""
     plots = []
     if run.nullspace_input is not None:
         effort = several("person/effort", run.joint_names, run.nullspace_input)
@@ -195,7 +196,8 @@ def _person(run: RunRecording) -> list[Plot]:
     return plots
 
 
-def _worker(run: RunRecording) -> list[Plot]:
+def worker_plots(run: RunRecording) -> list[Plot]:
+    """Plots of the distances from a worker, also enlarged; none without a worker."""
     if not run.worker_distance:
         return []
     values = 1e3 * np.column_stack(list(run.worker_distance.values()))

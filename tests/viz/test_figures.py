@@ -2,15 +2,26 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from PIL import Image
 from sample_runs import NAMES, STEPS, sample_run
 
 from hrc_learn.geometry import Box
-from hrc_learn.viz import figures
+from hrc_learn.viz import figures, palette
 from hrc_learn.viz.figures import active_intervals, draw_limits, near
+from hrc_learn.viz.panels import image_jacobian_plots, person_plots
 
-FIGURES = [figures.joints_figure, figures.person_figure, figures.image_jacobian_figure]
+
+def person_figure(run, **options):
+    return figures.plots_figure(run.time, person_plots(run), **options)
+
+
+def jacobian_figure(run):
+    return figures.plots_figure(run.time, image_jacobian_plots(run), columns=2)
+
+
+FIGURES = [figures.joints_figure, person_figure, jacobian_figure]
 RESIDUAL = {10: 1e-2, 30: 1e-3, 50: 1e-4}
 
 
@@ -25,7 +36,7 @@ def test_figures_are_drawn_with_units(draw):
     figure.savefig(buffer, format="png", dpi=60)
     assert np.asarray(Image.open(buffer).convert("L")).std() > 10
     drawn = [axes for axes in figure.axes if axes.axison]
-    assert all(axes.get_ylabel() for axes in drawn)
+    assert all(axes.get_ylabel() or axes.get_title(loc="left") for axes in drawn)
     assert any("[s]" in text for text in _words(figure))
 
 
@@ -69,37 +80,45 @@ def test_limits_are_drawn_where_the_motion_is_near_them(lower, upper, drawn, sai
     assert axes.get_title(loc="right") == said
 
 
-def test_person_figure_shades_the_push_and_shows_millimetres():
+def test_shaded_intervals_and_curves_of_a_dashboard_are_drawn():
     run = sample_run()
-    effort, elbow, position, rotation = figures.person_figure(run).axes
-    assert elbow.get_lines()[0].get_ydata().max() == pytest.approx(100.0)
-    assert position.get_lines()[0].get_ydata().max() == pytest.approx(0.1)
-    assert rotation.get_lines()[0].get_ydata().max() == pytest.approx(0.01)
-    assert len(effort.get_lines()) == 7
-    (span,) = effort.patches
-    assert span.get_x() == pytest.approx(run.time[80])
-    assert span.get_x() + span.get_width() == pytest.approx(run.time[119])
+    acting = run.nullspace_input.any(axis=1)
+    plots = person_plots(run)
+    figure = figures.plots_figure(run.time, plots, shaded=acting)
+    for axes, plot in zip(figure.axes, plots, strict=True):
+        assert axes.get_title(loc="left") == plot.title
+        (curves,) = plot.curves
+        drawn = [line.get_ydata() for line in axes.get_lines()]
+        np.testing.assert_array_equal(np.transpose(drawn), curves.values)
+        (span,) = axes.patches
+        assert span.get_x() == pytest.approx(run.time[80])
+        assert span.get_x() + span.get_width() == pytest.approx(run.time[119])
+        assert (axes.get_legend() is not None) == plot.legend
+    assert figure.axes[1].get_ylim() == plots[1].range
 
 
-def test_person_figure_shows_the_time_with_a_person_present():
+def test_the_time_axis_can_be_limited_to_what_is_known():
     run = sample_run()
-    whole = figures.person_figure(run).axes[-1].get_xlim()
-    assert whole == (run.time[0], run.time[-1])
-    unknown = np.where(run.nullspace_input[:, 3] > 0, run.position_deviation, np.nan)
-    known_at = dict.fromkeys(
-        ("elbow_motion", "position_deviation", "rotation_deviation"), unknown
-    )
-    spell = figures.person_figure(sample_run(**known_at)).axes[-1].get_xlim()
+    acting = run.nullspace_input.any(axis=1)
+    for shown in (None, np.zeros(STEPS, bool)):
+        whole = person_figure(run, shown=shown).axes[-1].get_xlim()
+        assert whole == (run.time[0], run.time[-1])
+    spell = person_figure(run, shown=acting).axes[-1].get_xlim()
     assert spell == (run.time[80], run.time[119])
 
 
 def test_jacobian_figure_shows_twelve_estimates_and_twelve_truths():
     run = sample_run()
-    axes = figures.image_jacobian_figure(run).axes
-    assert [len(a.get_lines()) for a in axes] == [6, 6, 6, 6]
-    np.testing.assert_array_equal(lines(axes[3])["z"], run.image_jacobian[:, 1, 5])
-    alone = figures.image_jacobian_figure(sample_run(true_image_jacobian=None)).axes
-    assert [len(a.get_lines()) for a in alone] == [3, 3, 3, 3]
+    axes = jacobian_figure(run).axes
+    assert [len(a.get_lines()) for a in axes] == [6, 6, 6, 6, 1, 0]
+    assert [a.axison for a in axes] == [True] * 5 + [False]
+    np.testing.assert_array_equal(lines(axes[3])["∂v/∂ωz"], run.image_jacobian[:, 1, 5])
+    # One entry of the legend for the three true curves, which are pale.
+    texts = [text.get_text() for text in axes[0].get_legend().get_texts()]
+    assert texts == ["true", "∂u/∂vx", "∂u/∂vy", "∂u/∂vz"]
+    pale, thin = (np.array(axes[0].get_lines()[k].get_color()) for k in (0, 3))
+    assert thin == pytest.approx(to_rgba(palette.BLUE))
+    assert (pale[:3] > thin[:3]).all()
 
 
 def test_residual_figure_marks_the_number_used():
@@ -108,18 +127,6 @@ def test_residual_figure_marks_the_number_used():
     assert curve.get_xdata().tolist() == [10, 30, 50]
     assert curve.get_ydata().tolist() == [1e-2, 1e-3, 1e-4]
     assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (50, 1e-4)
-
-
-@pytest.mark.parametrize(
-    ("draw", "field"),
-    [
-        (figures.person_figure, "nullspace_input"),
-        (figures.image_jacobian_figure, "image_jacobian"),
-    ],
-)
-def test_a_figure_names_the_field_it_lacks(draw, field):
-    with pytest.raises(ValueError, match=f"needs {field}"):
-        draw(sample_run(**{field: None}))
 
 
 def test_active_intervals_are_runs_of_true_samples():
