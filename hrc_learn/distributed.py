@@ -1,15 +1,32 @@
-"""Work divided over the processes that `torchrun` starts, with one common result.
+"""Work divided over processes.
 
-In a single process every function here does nothing, so that the same code serves both.
+The functions join the processes that `torchrun` starts; in a single process they do nothing, so
+that the same code serves both. `ByValue` serves processes that a program starts by itself.
 """
 
 import os
+import pickle
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+
+
+class ByValue:
+    """An argument for another process, which receives a copy of it.
+
+    Without this, `multiprocessing` moves each tensor of an argument to shared memory and frees
+    its old memory, while NumPy arrays that view the tensor still read it.
+    """
+
+    def __init__(self, value: object):
+        """Copy the argument."""
+        self._content = pickle.dumps(value)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return pickle.loads, (self._content,)
 
 
 @contextmanager

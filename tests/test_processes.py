@@ -1,10 +1,12 @@
 """Several processes give the answer of one; started as a user starts them."""
 
 import os
+import pickle
 import runpy
 import subprocess
 import sys
 import textwrap
+from multiprocessing.reduction import ForkingPickler
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from safetensors.torch import load_file
 from torch.testing import assert_close
 
 from hrc_learn import distributed
+from hrc_learn.distributed import ByValue
 
 PROGRAM = """
 import sys
@@ -117,3 +120,13 @@ def test_alone_everything_is_as_without():
     with distributed.processes() as rank:
         assert rank == 0
         assert not torch.distributed.is_initialized()
+
+
+def test_an_argument_by_value_leaves_the_memory_of_its_tensors():
+    tensor = torch.arange(7.0)
+    view, address = tensor.numpy(), tensor.data_ptr()
+    received = pickle.loads(ForkingPickler.dumps(ByValue({"limits": tensor})))
+    assert_close(received["limits"], tensor, rtol=0, atol=0)
+    assert tensor.data_ptr() == address == view.ctypes.data
+    ForkingPickler.dumps(tensor)
+    assert tensor.data_ptr() != address  # or `ByValue` would not be needed any more

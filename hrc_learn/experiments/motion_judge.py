@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.distributed import ByValue
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import PhysicsError
@@ -273,9 +274,10 @@ _JUDGE: list[_Judge] = []
 """Judge of this process."""
 
 
-def _begin(config: JudgeConfig, robot: ArmChoice, fps: float, widest: float) -> None:
+def _begin(given: tuple[JudgeConfig, ArmChoice, float, float]) -> None:
+    config, *settings = given
     torch.set_num_threads(1)
-    _JUDGE[:] = [config.open(robot, fps, widest)]
+    _JUDGE[:] = [config.open(*settings)]
 
 
 def _replay(trial: Trial) -> Replay:
@@ -293,13 +295,13 @@ class Judges:
     def __enter__(self) -> Judges:
         config = self._given[0]
         # Opened here first, so that a mistake is one error of this process.
-        _begin(*self._given)
+        _begin(self._given)
         if config.processes > 1:
             self._pool = ProcessPoolExecutor(
                 config.processes,
                 multiprocessing.get_context("spawn"),
                 initializer=_begin,
-                initargs=self._given,
+                initargs=(ByValue(self._given),),
             )
         return self
 
@@ -309,4 +311,8 @@ class Judges:
 
     def replays(self, trials: Sequence[Trial]) -> Iterator[Replay]:
         """Replays in the order of the motions."""
-        return map(_replay, trials) if self._pool is None else self._pool.map(_replay, trials)
+        return (
+            map(_replay, trials)
+            if self._pool is None
+            else self._pool.map(_replay, map(ByValue, trials))
+        )

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from hrc_learn.distributed import ByValue
 from hrc_learn.store import Claim, json_text, naming, new_file, parse_json, sync_file
 
 # Keys of a line of the file: one JSON object per trial. The first line of the file holds the
@@ -211,7 +212,8 @@ def _trials(
     with ProcessPoolExecutor(
         processes, context, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        waiting = {pool.submit(_trial, run, seed, failures) for seed in seeds}
+        sent = ByValue(run)
+        waiting = {pool.submit(_trial, sent, seed, failures) for seed in seeds}
         try:
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)

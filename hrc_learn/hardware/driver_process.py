@@ -23,6 +23,7 @@ from typing import Any, Protocol, final, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.distributed import ByValue
 from hrc_learn.protocols import Arm, ArmState, Gripper
 from hrc_learn.watchdog import (
     Report,
@@ -69,7 +70,7 @@ class DriverProcess:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self.process = context.Process(
-            target=serve, args=(theirs, *arguments), name=name, daemon=True
+            target=serve, args=(theirs, *map(ByValue, arguments)), name=name, daemon=True
         )
         self.process.start()
         theirs.close()  # or its end would never be noticed here

@@ -10,7 +10,6 @@ NOT RUN ON HARDWARE.
 
 from __future__ import annotations
 
-import copy
 import math
 import multiprocessing
 import os
@@ -33,6 +32,7 @@ from hrc_learn.deploy import (
     StepRunner,
     export_step,
 )
+from hrc_learn.distributed import ByValue
 from hrc_learn.hardware.driver_process import DriverError
 from hrc_learn.hardware.franka_loop import import_pylibfranka, serve
 from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
@@ -127,7 +127,7 @@ class FrankaArm:
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
             target=serve,
-            args=(self._shared, ip, config, step_of(chain, config), os.getpid()),
+            args=(self._shared, ip, config, ByValue(step_of(chain, config)), os.getpid()),
             name="franka",
             daemon=True,
         )
@@ -371,6 +371,4 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
     )
     if config.compiled:
         return partial(PackageRunner, export_step(step, example))
-    # Copies: on its way to another process the memory of a tensor is replaced by shared memory,
-    # and NumPy's views of it would be left behind.
-    return partial(EagerRunner, *copy.deepcopy((step, example)))
+    return partial(EagerRunner, step, example)

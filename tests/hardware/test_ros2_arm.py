@@ -29,8 +29,7 @@ from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import joint_plan
 
-# The simulated robot does not always follow its commands: see the note in CONTRIBUTING.md.
-pytestmark = [pytest.mark.realtime, pytest.mark.simulation, pytest.mark.slow]
+pytestmark = [pytest.mark.realtime, pytest.mark.simulation]
 NAMES = panda.chain.joint_names
 READY = panda.chain.ready.numpy()
 

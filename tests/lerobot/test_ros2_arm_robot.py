@@ -25,8 +25,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.ros2_arm_robot import Ros2ArmRobotConfig, Ros2CameraConfig
 from hrc_learn.sim import SceneConfig, World
 
-# The simulated robot does not always follow its commands: see the note in CONTRIBUTING.md.
-pytestmark = [pytest.mark.realtime, pytest.mark.simulation, pytest.mark.slow]
+pytestmark = [pytest.mark.realtime, pytest.mark.simulation]
 READY = panda.chain.ready.numpy()
 COLOUR = (250, 120, 20)
 
