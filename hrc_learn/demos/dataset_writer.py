@@ -1,7 +1,6 @@
 """Recording demonstrations as a LeRobot dataset of version 3.0."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -22,7 +21,6 @@ from hrc_learn.demos.read.metadata import (
     INDEX_FEATURES,
     Sidecar,
     SidecarColumn,
-    episode_statistics,
     read_sidecar,
 )
 from hrc_learn.demos.read.quantities import ROLES
@@ -101,11 +99,17 @@ class DatasetWriter:
         self.robot_type = robot_type
         self.joint_names = tuple(joint_names)
         self.features = {key: tuple(names) for key, names in (features or {}).items()}
-        self._frames_of_poses = dict(frames or {})
+        self._pose_frames = dict(frames or {})
         self._details = dict(details or {})
-        self._columns: list[recorded.RecordedColumn] = []
+        self._given: tuple[str, ...] = ()
         self._task: str | None = None
-        self._buffer = recorded.EpisodeBuffer(self.joint_names, self.features)
+        self._widths = {
+            **{
+                name: width or len(joint_names) for name, width in recorded.FRAME_WIDTHS.items()
+            },
+            **{key: len(names) for key, names in self.features.items()},
+        }
+        self._frames: list[recorded.Episode] = []
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0
         self.episodes = 0
@@ -176,9 +180,9 @@ class DatasetWriter:
             ValueError: A quantity is unknown, missing, new, or of the wrong length.
         """
         self._open_task()
-        self._images.validate(images or {})
-        self._buffer.append(values)
+        row = recorded.frame_row(values, self._widths, self._frames)
         self._images.append(images or {})
+        self._frames.append(row)
 
     def save_episode(self) -> int:
         """Save the open episode to disk.
@@ -191,27 +195,32 @@ class DatasetWriter:
             ValueError: The episode is empty, holds values that are not finite, or its time
                 does not increase. It is then discarded.
         """
-        task, episode = self._open_task(), self._buffer.arrays()
+        task = self._open_task()
         try:
-            return self._save(episode, task)
+            return self._save(recorded.stacked(self._frames), task)
         finally:
             self.discard_episode()
 
-    def add_episode(self, demonstration: Demonstration) -> int:
+    def add_episode(
+        self,
+        demonstration: Demonstration,
+        images: Mapping[str, Iterable[Image]] | None = None,
+    ) -> int:
         """Save a whole demonstration as one episode.
 
-        The declared features are taken from its `extra`.
+        Args:
+            demonstration: The episode; its `extra` holds the declared features.
+            images: Camera name -> RGB image of each frame.
 
         Returns:
             Index of the episode in the dataset.
 
         Raises:
             RuntimeError: An episode is open.
-            ValueError: The joints differ from the dataset's, or as in `save_episode`.
+            ValueError: The joints differ from the dataset's, images are missing or of the wrong
+                size, or as in `save_episode`.
         """
         self._require_no_open_episode("first")
-        if self._video_features:
-            raise ValueError("a demonstration holds no images: add its frames one by one")
         if demonstration.joint_names != self.joint_names:
             raise ValueError(
                 f"the demonstration's joints {demonstration.joint_names} are not the "
@@ -220,7 +229,13 @@ class DatasetWriter:
         episode = {name: getattr(demonstration, name) for name in demonstration.recorded}
         episode["time"] = demonstration.time + demonstration.start_time
         episode |= {key: demonstration.extra[key] for key in self.features}
-        return self._save(episode, demonstration.task)
+        cameras = images or {}
+        try:
+            for _, *shown in zip(demonstration.time, *cameras.values(), strict=True):
+                self._images.append(dict(zip(cameras, shown, strict=True)))
+            return self._save(episode, demonstration.task)
+        finally:
+            self._images.discard()
 
     def write_draft(self, task: str, frames: Sequence[Mapping[str, Any]]) -> None:
         """Save the frames of an unfinished episode, so that a power failure does not lose them.
@@ -238,11 +253,10 @@ class DatasetWriter:
         """
         if self._video_features:
             raise RuntimeError("a draft holds no images: save episodes instead")
-        buffer = recorded.EpisodeBuffer(self.joint_names, self.features)
+        rows: list[recorded.Episode] = []
         for values in frames:
-            buffer.append(values)
-        _, staged = self._staged(buffer.arrays(), task, self._tasks.get(task, len(self._tasks)))
-        recorded.write_episode(recorded.episode_path(self._staging, self.episodes), staged)
+            rows.append(recorded.frame_row(values, self._widths, rows))
+        self._write(recorded.stacked(rows), task)
 
     def discard_draft(self) -> None:
         """Delete the draft, if any."""
@@ -250,7 +264,7 @@ class DatasetWriter:
 
     def discard_episode(self) -> None:
         """Delete the open episode, if any."""
-        self._task, self._buffer = None, recorded.EpisodeBuffer(self.joint_names, self.features)
+        self._task, self._frames = None, []
         self._images.discard()
 
     def finalize(self) -> Path:
@@ -300,7 +314,7 @@ class DatasetWriter:
     def _require_no_open_episode(self, when: str) -> None:
         if self._task is not None:
             raise RuntimeError(
-                f"an episode with {len(self._buffer)} unsaved frames is open: call "
+                f"an episode with {len(self._frames)} unsaved frames is open: call "
                 f"save_episode() or discard_episode() {when}"
             )
 
@@ -310,81 +324,53 @@ class DatasetWriter:
         return self._task
 
     def _save(self, episode: recorded.Episode, task: str) -> int:
-        number = self._tasks.get(task, len(self._tasks))
-        self._columns, staged = self._staged(episode, task, number)
-        self._tasks[task] = number
-        staged.statistics.update(self._images.finish(self.episodes))
-        recorded.write_episode(recorded.episode_path(self._staging, self.episodes), staged)
-        self._saved_frames += len(staged.table)
+        self._given, frames = self._write(episode, task)
+        self._tasks.setdefault(task, len(self._tasks))
+        self._saved_frames += frames
         self.episodes += 1
         return self.episodes - 1
 
-    def _staged(
-        self, episode: recorded.Episode, task: str, number: int
-    ) -> tuple[list[recorded.RecordedColumn], recorded.StagedEpisode]:
-        """Columns of an episode, and the episode ready to be written.
-
-        Args:
-            episode: Quantities of the episode.
-            task: Task in words.
-            number: Index of the task.
-        """
+    def _write(self, episode: recorded.Episode, task: str) -> tuple[tuple[str, ...], int]:
+        """Write an episode with the images encoded so far; its quantities and length."""
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
         episode = recorded.complete(episode, self.fps)
-        columns = recorded.columns_for(episode.keys(), self.joint_names, self.features)
-        if self._earlier is not None and recorded.OLD_TIME_KEY in self._earlier.features:
-            columns = [
-                replace(c, key=recorded.OLD_TIME_KEY) if c.role == "time" else c
-                for c in columns
-            ]
         try:
-            if self._columns and columns != self._columns:
-                first = [column.given for column in self._columns]
-                raise ValueError(recorded.describe_difference(episode.keys(), first))
+            if self._given and episode.keys() != {*self._given}:
+                raise ValueError(recorded.describe_difference(episode.keys(), self._given))
             recorded.require_valid(episode)
         except ValueError as error:
             raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
-        values = recorded.encode(columns, episode) | recorded.index_columns(
-            self.fps, self.episodes, self._saved_frames, np.full(len(episode["time"]), number)
+        columns = recorded.columns_for(episode.keys(), self.joint_names, self.features)
+        header, frames = self._header(columns), len(episode["time"])
+        recorded.write_episode(
+            recorded.episode_path(self._staging, self.episodes),
+            header,
+            recorded.encode(columns, episode),
+            ([task], np.full(frames, self._tasks.get(task, len(self._tasks)))),
+            self._saved_frames,
+            statistics=self._images.finish(self.episodes),
         )
-        header = self._header(columns)
-        if self._earlier is not None:
-            self._require_same_columns(self._earlier.info["features"], header.features)
-        staged = recorded.StagedEpisode(
-            header=header,
-            tasks=[task],
-            statistics=episode_statistics(values),
-            table=recorded.to_table(values, header.features),
-        )
-        return columns, staged
+        return tuple(episode), frames
 
     def _header(self, columns: Sequence[recorded.RecordedColumn]) -> recorded.RecordingHeader:
-        known = {column.role: column for column in columns if column.role is not None}
-        return recorded.RecordingHeader(
-            fps=self.fps,
-            robot_type=self.robot_type,
-            features={
-                **recorded.lerobot_features(columns),
-                **self._video_features,
-                **INDEX_FEATURES,
-            },
-            sidecar=Sidecar(
-                units={role: ROLES[role].unit for role in known},
-                columns={
-                    role: SidecarColumn(key=column.key, names=column.names)
-                    for role, column in known.items()
-                },
-                joint_names=self.joint_names,
-                frames=self._frames_of_poses,
-                details=self._details,
-            ),
-        )
-
-    def _require_same_columns(self, theirs: dict, ours: dict) -> None:
-        for key in theirs | ours:
-            if theirs.get(key) != ours.get(key):
+        """Properties of the dataset; those of a dataset to append to must be the same."""
+        features = recorded.lerobot_features(columns) | self._video_features | INDEX_FEATURES
+        theirs = features if self._earlier is None else self._earlier.info["features"]
+        for key in theirs | features:
+            if theirs.get(key) != features.get(key):
                 raise ValueError(
                     f"cannot append to {self.root}: {key} there is {theirs.get(key)}, here "
-                    f"{ours.get(key)}; record the same quantities, or a dataset of its own"
+                    f"{features.get(key)}; record the same quantities, or a dataset of its own"
                 )
+        known = {column.role: column for column in columns if column.role is not None}
+        sidecar = Sidecar(
+            units={role: ROLES[role].unit for role in known},
+            columns={r: SidecarColumn(key=c.key, names=c.names) for r, c in known.items()},
+            joint_names=self.joint_names,
+            frames=self._pose_frames,
+            details=self._details,
+        )
+        return recorded.RecordingHeader(
+            fps=self.fps, robot_type=self.robot_type, features=features, sidecar=sidecar
+        )

@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64, Shaped
 from hrc_learn.demos.demonstration import float_array
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
-from hrc_learn.demos.read.metadata import Sidecar, Statistics
+from hrc_learn.demos.read.metadata import Sidecar, Statistics, episode_statistics
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json
@@ -22,8 +22,6 @@ STATE_KEY = "observation.state"
 TIME_KEY = "time"
 """Feature of the true stamps. A policy would take `observation.time` for an input, and no robot
 has such an observation."""
-OLD_TIME_KEY = "observation.time"
-"""Feature of the true stamps in datasets that were written before."""
 _METADATA_KEY = b"hrc_learn"
 
 Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]
@@ -42,12 +40,6 @@ class RecordedColumn:
     """Feature of the dataset that holds it."""
     names: tuple[str, ...]
     """Component names within that feature; in `_COLUMNS`, `{joint}` stands for each joint."""
-
-    def of_joints(self, joints: Sequence[str]) -> "RecordedColumn":
-        """The column with `{joint}` replaced."""
-        if "{joint}" not in self.names[0]:
-            return self
-        return replace(self, names=tuple(self.names[0].format(joint=j) for j in joints))
 
 
 # One `observation.state` for every quantity of the robot, distinguished by name, as written by
@@ -86,7 +78,12 @@ def columns_for(
         joint_names: Joints of the robot.
         features: User-defined features: key -> component names.
     """
-    columns = [column.of_joints(joint_names) for column in _COLUMNS if column.given in given]
+    columns = []
+    for column in (column for column in _COLUMNS if column.given in given):
+        if "{joint}" in column.names[0]:
+            names = tuple(column.names[0].format(joint=joint) for joint in joint_names)
+            column = replace(column, names=names)
+        columns.append(column)
     return columns + [
         RecordedColumn(given=key, role=None, key=key, names=tuple(names))
         for key, names in features.items()
@@ -101,7 +98,7 @@ def lerobot_features(columns: Sequence[RecordedColumn]) -> dict[str, dict]:
     return {
         key: {
             # Policies expect float32, in which a Unix stamp has a resolution of two minutes.
-            "dtype": "float64" if key in (TIME_KEY, OLD_TIME_KEY) else "float32",
+            "dtype": "float64" if key == TIME_KEY else "float32",
             "shape": [len(components)],
             "names": components,
         }
@@ -134,54 +131,42 @@ def rotation_vectors(
     return quaternion.unwrap_log(shortest).numpy()
 
 
-class EpisodeBuffer:
-    """Frames of one episode, all with the same quantities."""
+def frame_row(
+    values: Mapping[str, object], widths: Mapping[str, int], earlier: Sequence[Episode]
+) -> Episode:
+    """Copy of the quantities of one frame.
 
-    def __init__(self, joint_names: Sequence[str], features: Mapping[str, Sequence[str]]):
-        """
-        Args:
-            joint_names: Joints of the robot.
-            features: User-defined features: key -> component names.
-        """
-        self._widths = {
-            **{name: width or len(joint_names) for name, width in FRAME_WIDTHS.items()},
-            **{key: len(names) for key, names in features.items()},
-        }
-        self._rows: dict[str, list[np.ndarray]] = {}
+    Args:
+        values: Quantity -> numbers.
+        widths: Known quantities and their numbers of components.
+        earlier: Frames of the episode so far, of the same quantities.
 
-    def __len__(self) -> int:
-        return len(next(iter(self._rows.values()), ()))
-
-    def append(self, values: Mapping[str, object]) -> None:
-        """Copy one frame.
-
-        Raises:
-            ValueError: A quantity is unknown, missing, new, or of the wrong length; the frame
-                is then not added.
-        """
-        if not len(self):
-            self._rows = {name: [] for name in values}
-        if values.keys() != self._rows.keys():
-            difference = describe_difference(values.keys(), self._rows.keys())
-            raise ValueError(f"frame {len(self)} {difference}")
-        for name, row in [(name, self._row(name, value)) for name, value in values.items()]:
-            self._rows[name].append(row)
-
-    def arrays(self) -> Episode:
-        """The frames so far, stacked."""
-        return {name: np.stack(rows) for name, rows in self._rows.items()}
-
-    def _row(self, name: str, value: object) -> Float64[np.ndarray, " width"]:
-        if name not in self._widths:
+    Raises:
+        ValueError: A quantity is unknown, missing, new, or of the wrong length.
+    """
+    number = len(earlier)
+    if earlier and values.keys() != earlier[0].keys():
+        difference = describe_difference(values.keys(), earlier[0].keys())
+        raise ValueError(f"frame {number} {difference}")
+    row = {}
+    for name, value in values.items():
+        if name not in widths:
             raise ValueError(
-                f"{name!r} is no quantity of a frame; known are {', '.join(self._widths)}. "
+                f"{name!r} is no quantity of a frame; known are {', '.join(widths)}. "
                 f"Declare others as features={{'observation.{name}': [names of components]}}."
             )
-        row, width = float_array(value).copy(), self._widths[name]
-        if row.size != width or row.ndim > 1:
-            text = f"frame {len(self)}: {name} needs {width} numbers, got shape {row.shape}"
+        numbers, width = float_array(value).copy(), widths[name]
+        if numbers.size != width or numbers.ndim > 1:
+            text = f"frame {number}: {name} needs {width} numbers, got shape {numbers.shape}"
             raise ValueError(text)
-        return row.reshape(width)
+        row[name] = numbers.reshape(width)
+    return row
+
+
+def stacked(frames: Sequence[Episode]) -> Episode:
+    """Frames as one episode; {} without frames."""
+    names = frames[0] if frames else ()
+    return {name: np.stack([frame[name] for frame in frames]) for name in names}
 
 
 def describe_difference(given: Collection[str], expected: Collection[str]) -> str:
@@ -269,14 +254,44 @@ def episode_number(path: Path) -> int:
     return int(path.stem.rpartition("_")[2])
 
 
-def write_episode(path: Path, episode: StagedEpisode) -> None:
-    """Write one episode; `path` exists only once it is complete and on disk."""
-    described = {
-        name: getattr(episode, name) for name in ("header", "tasks", "statistics", "provenance")
-    }
+def write_episode(
+    path: Path,
+    header: RecordingHeader,
+    values: Mapping[str, np.ndarray],
+    tasks: tuple[Sequence[str], Int64[np.ndarray, " _frames"]],
+    frames_before: int,
+    *,
+    others: Mapping[str, pa.ChunkedArray] | None = None,
+    statistics: Statistics | None = None,
+    provenance: str = "",
+) -> None:
+    """Write one episode; `path` exists only once it is complete and on disk.
+
+    Args:
+        path: File, as in `episode_path`.
+        header: Properties of the recording.
+        values: Feature -> numbers (frames, components), without LeRobot's index columns.
+        tasks: Texts of its tasks, and the index of the task of each frame.
+        frames_before: Number of frames of the episodes before it.
+        others: Columns that hold no numbers, such as images and texts.
+        statistics: Statistics of its images.
+        provenance: Origin of an episode that was made from others, as JSON.
+    """
+    texts, indices = tasks
+    number, features = episode_number(path), header.features
+    found = {**values, **index_columns(header.fps, number, frames_before, indices)}
+    shapes = {key: features[key]["shape"] for key in features if key in found}
+    own = episode_statistics({k: found[k].reshape(-1, *shape) for k, shape in shapes.items()})
+    described = EpisodeDescription(
+        header=header,
+        tasks=[*texts],
+        statistics=own | (statistics or {}),
+        provenance=provenance,
+    )
+    table = to_table(found, features, others)
     metadata = {_METADATA_KEY: json.dumps(described, default=asdict)}
     with new_file(path) as part:
-        write_parquet(episode.table.replace_schema_metadata(metadata), part)
+        write_parquet(table.replace_schema_metadata(metadata), part)
 
 
 def read_episode(path: Path) -> StagedEpisode:

@@ -203,28 +203,18 @@ def write_plan(
     with DatasetWriter(out, demo.fps, robot_type, names, features, cameras=sizes) as writer:
         for one in plan.episodes():
             one = _with_next_states(one) if made else one
-            _add(writer, one, sizes)
+            writer.add_episode(
+                one.demonstration,
+                {c: _cropped(_images(*one.images[c]), *size) for c, size in sizes.items()},
+            )
             count += len(one.demonstration)
             seconds += one.demonstration.duration
     counts = {"episodes": len(plan.recordings), "frames": count}
     return {**counts, "seconds": seconds, "fps": demo.fps}
 
 
-def _add(writer: DatasetWriter, one: Episode, sizes: dict[str, tuple[int, int]]) -> None:
-    demo = one.demonstration
-    if not one.images:
-        writer.add_episode(demo)
-        return
-    rows = {name: getattr(demo, name) for name in demo.recorded}
-    rows |= {"time": demo.time + demo.start_time, **demo.extra}
-    streams = {camera: _images(*images) for camera, images in one.images.items()}
-    writer.start_episode(demo.task)
-    for k in range(len(demo)):
-        shown = {}
-        for camera, (height, width) in sizes.items():
-            shown[camera] = next(streams[camera])[:height, :width]
-        writer.add_frame(images=shown, **{name: row[k] for name, row in rows.items()})
-    writer.save_episode()
+def _cropped(images: Iterator[Image], height: int, width: int) -> Iterator[Image]:
+    return (image[:height, :width] for image in images)
 
 
 def _with_next_states(one: Episode) -> Episode:

@@ -318,12 +318,12 @@ class CameraRecorder:
         self._folder = folder
         self._videos: dict[str, _Video] = {}
 
-    def validate(self, images: Mapping[str, Image]) -> None:
-        """Check that one frame's images can be encoded.
+    def append(self, images: Mapping[str, Image]) -> None:
+        """Encode one frame's images.
 
         Raises:
             ValueError: A camera is missing or unknown, or its image is of the wrong size or
-                type.
+                type; no image of the frame is then encoded.
         """
         if images.keys() != self._cameras.keys():
             raise ValueError(
@@ -336,9 +336,6 @@ class CameraRecorder:
                 raise ValueError(f"images of {camera} are {expected}, got {np.shape(image)}")
             if (dtype := np.asarray(image).dtype) != np.uint8:
                 raise ValueError(f"images of {camera} must be uint8 (0 to 255), got {dtype}")
-
-    def append(self, images: Mapping[str, Image]) -> None:
-        """Encode one frame's images, which `validate` has passed."""
         for camera, image in images.items():
             if camera not in self._videos:
                 path = self._folder / f"{camera}.unfinished.mp4"

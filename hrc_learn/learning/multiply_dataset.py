@@ -21,7 +21,6 @@ from hrc_learn.demos.dataset_assembly import begin, discard, finish
 from hrc_learn.demos.read.dataset_folder import staging_folder
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.metadata import INDEX_FEATURES, Sidecar, read_sidecar
-from hrc_learn.demos.read.metadata import episode_statistics as statistics
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm
@@ -348,30 +347,25 @@ class MultipliedWriter:
                     f"{self._staging} holds an interrupted recording with other settings: "
                     "continue it with those, remove it, or choose another --out"
                 )
-            self._add(staged)
+            self._add(staged.provenance, staged.tasks[0], len(staged.table))
 
-    def _add(self, staged: recorded.StagedEpisode) -> None:
-        self.provenance.append(parse_json(staged.provenance))
-        self._tasks.setdefault(staged.tasks[0], len(self._tasks))
-        self._frames += len(staged.table)
+    def _add(self, provenance: str, task: str, frames: int) -> None:
+        self.provenance.append(parse_json(provenance))
+        self._tasks.setdefault(task, len(self._tasks))
+        self._frames += frames
 
     def write(
         self, values: Mapping[str, np.ndarray], task: str, provenance: Mapping[str, Any]
     ) -> None:
         """Write one episode; it is on disk when this returns."""
-        number, at = len(self.provenance), self._tasks.get(task, len(self._tasks))
-        length = len(next(iter(values.values())))
-        tasks = np.full(length, at)
-        index = recorded.index_columns(self.header.fps, number, self._frames, tasks)
-        staged = recorded.StagedEpisode(
-            header=self.header,
-            tasks=[task],
-            statistics=statistics({**values, **index}),
-            table=recorded.to_table({**values, **index}, self.header.features),
-            provenance=json_text(provenance, indent=False).strip(),
+        path = recorded.episode_path(self._staging, len(self.provenance))
+        frames = len(next(iter(values.values())))
+        index = np.full(frames, self._tasks.get(task, len(self._tasks)))
+        origin = json_text(provenance, indent=False).strip()
+        recorded.write_episode(
+            path, self.header, values, ([task], index), self._frames, provenance=origin
         )
-        recorded.write_episode(recorded.episode_path(self._staging, number), staged)
-        self._add(staged)
+        self._add(origin, task, frames)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._claim:

@@ -222,28 +222,6 @@ def test_videos_are_appended_too(tmp_path):
     assert check_dataset(root).ok
 
 
-def test_a_set_with_stamps_among_its_observations_is_continued_so(tmp_path):
-    """Datasets of earlier versions kept them in `observation.time`."""
-    root = record(tmp_path / "set", [0], ["reach"])
-    info = read_info(root)
-    info["features"] = {
-        {"time": "observation.time"}.get(key, key): feature
-        for key, feature in info["features"].items()
-    }
-    (root / "meta/info.json").write_text(json.dumps(info))
-    sidecar = json.loads((root / "meta/hrc_learn.json").read_text())
-    sidecar["columns"]["time"]["key"] = "observation.time"
-    (root / "meta/hrc_learn.json").write_text(json.dumps(sidecar))
-    for file in (root / "data").glob("*/*.parquet"):
-        table = pq.read_table(file)
-        names = [{"time": "observation.time"}.get(n, n) for n in table.column_names]
-        pq.write_table(table.rename_columns(names), file)
-    record(root, [1], ["place"], append=True)
-    demos = load_demos(root)
-    np.testing.assert_allclose(demos[1].time, 0.02 * np.arange(41), atol=1e-9)
-    assert "time" not in read_info(root)["features"]
-
-
 def test_nothing_is_added_to_the_observations(tmp_path):
     features = read_info(record(tmp_path / "set", [0], ["reach"]))["features"]
     assert [key for key in features if key.startswith("observation")] == ["observation.state"]

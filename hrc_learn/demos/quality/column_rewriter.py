@@ -19,7 +19,6 @@ from hrc_learn.demos.read.metadata import (
     INDEX_FEATURES,
     NUMERIC,
     SidecarColumn,
-    episode_statistics,
     image_statistics,
 )
 from hrc_learn.demos.read.quantities import INDEX_KEYS
@@ -238,26 +237,21 @@ class ColumnRewriter:
             numbers: Index of each task text.
             frames_before: Number of frames of the episodes before.
         """
-        edit, features = episode.edit, self._header.features
-        tasks = np.array([numbers[text] for text in episode.tasks])
-        number = recorded.episode_number(path)
-        values = {recorded.TIME_KEY: edit.time[:, None]} | edit.frames
-        values |= recorded.index_columns(self._header.fps, number, frames_before, tasks)
-        numeric = {key: values[key] for key in features if key in values}
-        others = self._other_columns(edit)
-        statistics = episode_statistics(
-            {key: v.reshape(-1, *features[key]["shape"]) for key, v in numeric.items()}
-        )
-        for key in (*self._cameras, *self._image_columns):
-            images = others[key] if key in others else episode.videos[key]
-            statistics[key] = self._image_statistics(edit, key, images)
-        staged = recorded.StagedEpisode(
-            header=self._header,
-            tasks=[*dict.fromkeys(episode.tasks)],
+        edit, others = episode.edit, self._other_columns(episode.edit)
+        statistics = {
+            key: self._image_statistics(edit, key, others.get(key, episode.videos.get(key)))
+            for key in (*self._cameras, *self._image_columns)
+        }
+        indices = np.array([numbers[text] for text in episode.tasks])
+        recorded.write_episode(
+            path,
+            self._header,
+            {recorded.TIME_KEY: edit.time[:, None]} | edit.frames,
+            ([*dict.fromkeys(episode.tasks)], indices),
+            frames_before,
+            others=others,
             statistics=statistics,
-            table=recorded.to_table(numeric, features, others),
         )
-        recorded.write_episode(path, staged)
 
     def _other_columns(self, edit: EpisodeEdit) -> dict[str, pa.ChunkedArray]:
         """Columns that hold no numbers, for the remaining frames."""
