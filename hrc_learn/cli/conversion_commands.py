@@ -44,7 +44,7 @@ def _import_options(args: Import, mapping: Path | None) -> ImportOptions:
     said = ImportOptions()
     if mapping is not None:
         read = read_toml if mapping.suffix == ".toml" else read_json
-        known = {one.name for one in fields(ImportOptions)} - {"hinted"}
+        known = {one.name for one in fields(ImportOptions)}
         if unknown := read(mapping).keys() - known:
             text = f"{mapping}: there is no field {min(unknown)!r} in a mapping file"
             raise ValueError(f"{text}; known are {', '.join(sorted(known))}")

@@ -47,12 +47,7 @@ def clock_of_state(recording: Recording, meaning: Meaning, options: ImportOption
     """
     place = f"{recording.file.name} {recording.label}".strip()
     time, notes = _stamps_of_state(recording, meaning, options)
-    names = [n for s in meaning.selections.values() for n, _ in s.columns]
-    names += [n for places, _ in meaning.kept.values() for n, _ in places]
-    frames = {
-        name: _latest(recording, name, time, meaning.time)
-        for name in dict.fromkeys((*names, *meaning.cameras.values()))
-    }
+    frames = {name: _latest(recording, name, time, meaning.time) for name in meaning.fields}
     known = np.all([index >= 0 for index in frames.values()], axis=0)
     partial = [name for name, index in frames.items() if (index < 0).any()]
     inside = np.flatnonzero(known)

@@ -1,9 +1,10 @@
 """Recordings as fields whose frames are read when they are used, and their episodes."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +22,8 @@ UNNAMED = "array"
 """Name of an array that has none."""
 _SMALLEST_IMAGE = 16
 """Shorter side from which an array of whole numbers is an image [px]."""
+_SKIPPED = 100
+"""Largest number of images that are passed over; above, the stream is opened anew."""
 _EPISODE = re.compile(r"(?:[a-z]+[_\- ]?)*\d+", re.IGNORECASE)
 """Names of groups that hold one episode each: demo_0, episode_12, traj_3, 7."""
 _EPISODE_ENDS = ("episode_ends", "traj_ends", "trajectory_ends")
@@ -54,10 +57,8 @@ class Field:
     """Unit that the file declares; "" if none."""
     names: tuple[str, ...] | None = None
     """Names of the components, if the file gives any."""
-    video: Path | None = None
-    """Video file that holds the images."""
     rate: float = 0.0
-    """Frame rate of the video [1/s]."""
+    """Frame rate of a video [1/s]."""
     clock: str = ""
     """Field of its stamps, if the file says which."""
 
@@ -221,6 +222,28 @@ def _with_last_row(read: Read, start: int, stop: int) -> np.ndarray:
     upper = np.asarray(read(start, stop), np.float64)
     last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(upper), 1, 4))
     return np.concatenate([upper, last], axis=1)
+
+
+class StreamRead:
+    """Read function of images that come one after another, such as those of a video."""
+
+    def __init__(self, images: Callable[[int], Iterator[Any]]):
+        """
+        Args:
+            images: Function that gives the images from a frame on.
+        """
+        self._images, self._next = images, 0
+        self._stream: Iterator[Any] | None = None
+
+    def __call__(self, start: int, stop: int) -> Shaped[np.ndarray, " _frames"]:
+        """Images from a first to a last one (exclusive)."""
+        if self._stream is None or not self._next <= start <= self._next + _SKIPPED:
+            self._stream, self._next = self._images(start), start
+        found = [*islice(self._stream, stop - self._next)][start - self._next :]
+        self._next = stop
+        whole = np.empty(len(found), object)
+        whole[:] = found
+        return whole
 
 
 def is_encoded(content: Any) -> bool:

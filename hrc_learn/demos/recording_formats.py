@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from hrc_learn.demos.recording_files import (
     UNNAMED,
     Field,
     Recording,
+    StreamRead,
     array_field,
     bytes_field,
     is_encoded,
@@ -31,6 +33,7 @@ from hrc_learn.demos.recording_files import (
     unit_in_words,
 )
 from hrc_learn.demos.recording_tables import read_parquet_table, read_text_table
+from hrc_learn.demos.videos import Image, VideoSegment, decode
 
 _VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm")
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
@@ -254,13 +257,12 @@ def read_zarr(path: Path) -> list[Recording]:
             continue
         if any("pickle" in str(c).lower() for c in (*node.filters, *node.compressors)):
             raise DatasetError(_PICKLED, file=path, key=name)
-        read = partial(_read_zarr, node)
         dtype = np.dtype(object) if node.dtype.kind == "O" else np.dtype(node.dtype)
-        fields[name] = make_field(name, node.shape, dtype, read)
+        fields[name] = make_field(name, node.shape, dtype, partial(_rows, node))
     return split_episodes(path, fields, **details)
 
 
-def _read_zarr(node: Any, start: int, stop: int) -> np.ndarray:
+def _rows(node: Any, start: int, stop: int) -> np.ndarray:
     return np.asarray(node[start:stop])
 
 
@@ -440,6 +442,16 @@ def _video_field(path: Path) -> Field:
         rate = float(stream.average_rate or 0)
         frames = stream.frames or round((container.duration or 0) / av.time_base * rate)
         shape = (frames, stream.height, stream.width, 3)
-    # Images of videos are decoded one by one, and not through `read`.
-    empty = np.zeros(0, np.uint8)
-    return Field(shape=shape, kind="image", read=lambda a, b: empty, video=path, rate=rate)
+    segment = VideoSegment(file=path, start=0.0, stop=frames / rate)
+
+    def images(start: int) -> Iterator[Image]:
+        image, number = None, start
+        for frame, image in decode(segment, rate, frames=range(start, frames)):
+            yield from repeat(image, frame + 1 - number)
+            number = frame + 1
+        if image is None:
+            raise DatasetError("holds no images", file=path)
+        # The container may promise more images than it holds.
+        yield from repeat(image)
+
+    return Field(shape=shape, kind="image", read=StreamRead(images), rate=rate)

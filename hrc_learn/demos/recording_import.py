@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +14,17 @@ from hrc_learn.demos.dataset_writer import DatasetWriter
 from hrc_learn.demos.demonstration import JOINT_FIELDS, Demonstration
 from hrc_learn.demos.issues import DatasetError, aligned
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
-from hrc_learn.demos.recorded_episode import rotation_vectors
-from hrc_learn.demos.recording_clock import Clock, clock_of_state
+from hrc_learn.demos.recorded_episode import columns_for, rotation_vectors
+from hrc_learn.demos.recording_clock import clock_of_state
 from hrc_learn.demos.recording_files import Field, Recording
 from hrc_learn.demos.recording_formats import open_recordings
 from hrc_learn.demos.recording_meaning import Meaning, read_columns, understand
 from hrc_learn.demos.recording_names import ImportOptions, Place
-from hrc_learn.demos.videos import Image, VideoSegment, decode, decode_image
+from hrc_learn.demos.videos import Image, decode_image
 
+_POSE = ("position", "orientation")
 _BATCH = 32
 """Images read at a time."""
-_POSE_ACTION = {
-    "position": ("ee.x", "ee.y", "ee.z"),
-    "orientation": ("ee.wx", "ee.wy", "ee.wz"),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,18 +126,14 @@ class ImportPlan:
 
     def _tokens(self, places: Sequence[Place]) -> list[str]:
         """Fields and ranges of fields that name the columns."""
-        runs: list[tuple[str, int, int]] = []
-        for name, index in places:
-            if runs and (runs[-1][0], runs[-1][2]) == (name, index):
-                runs[-1] = (name, runs[-1][1], index + 1)
-            else:
-                runs.append((name, index, index + 1))
-        fields = self.recordings[0].fields
-        whole = [stop - start == fields[name].width for name, start, stop in runs]
-        ranges = zip(runs, whole, strict=True)
-        return [
-            name if all_ else f"{name}[{start}:{stop}]" for (name, start, stop), all_ in ranges
-        ]
+        fields, tokens = self.recordings[0].fields, []
+        # Within a run, places count as their indices do.
+        runs = groupby(enumerate(places), key=lambda one: (one[1][0], one[1][1] - one[0]))
+        for (name, _), run in runs:
+            indices = [index for _, (_, index) in run]
+            whole = len(indices) == fields[name].width
+            tokens.append(name if whole else f"{name}[{indices[0]}:{indices[-1] + 1}]")
+        return tokens
 
 
 def plan_import(
@@ -158,7 +152,7 @@ def plan_import(
     recordings = [one for path in paths for one in open_recordings(path, columns)]
     if not recordings:
         raise DatasetError("holds no episodes", file=paths[0])
-    meaning = understand(recordings, replace(options, hinted=bool(columns)))
+    meaning = understand(recordings, options, hinted=bool(columns))
     return ImportPlan(recordings=tuple(recordings), meaning=meaning, options=options)
 
 
@@ -192,49 +186,39 @@ def write_plan(
     features = {key: names for key, (_, names) in plan.meaning.kept.items()}
     made = actions and not plan.has_actions
     if made and demo.joint_position is None:
-        parts = [part for part in _POSE_ACTION if getattr(demo, part) is not None]
-        names = [name for part in parts for name in _POSE_ACTION[part]]
-        features["action"] = tuple(names) or features["observation.state"]
+        columns = columns_for([p for p in _POSE if p in demo.recorded], (), {})
+        names = tuple(name for column in columns for name in column.names)
+        features["action"] = names or features["observation.state"]
     for camera, images in first.images.items():
         height, width = next(_images(*images)).shape[:2]
         sizes[camera] = (height - height % 2, width - width % 2)  # videos need even sizes
-    count, seconds = 0, 0.0
-    names = demo.joint_names
-    with DatasetWriter(out, demo.fps, robot_type, names, features, cameras=sizes) as writer:
+    count, seconds, joints = 0, 0.0, demo.joint_names
+    with DatasetWriter(out, demo.fps, robot_type, joints, features, cameras=sizes) as writer:
         for one in plan.episodes():
-            one = _with_next_states(one) if made else one
-            writer.add_episode(
-                one.demonstration,
-                {c: _cropped(_images(*one.images[c]), *size) for c, size in sizes.items()},
-            )
-            count += len(one.demonstration)
-            seconds += one.demonstration.duration
+            shown = {c: _images(*one.images[c], size) for c, size in sizes.items()}
+            shot = one.demonstration
+            writer.add_episode(_with_next_states(shot) if made else shot, shown)
+            count += len(shot)
+            seconds += shot.duration
     counts = {"episodes": len(plan.recordings), "frames": count}
     return {**counts, "seconds": seconds, "fps": demo.fps}
 
 
-def _cropped(images: Iterator[Image], height: int, width: int) -> Iterator[Image]:
-    return (image[:height, :width] for image in images)
-
-
-def _with_next_states(one: Episode) -> Episode:
+def _with_next_states(demo: Demonstration) -> Demonstration:
     """Take the joints, the pose or the state of the next frame as action; the last repeats."""
-    demo, joints = one.demonstration, one.demonstration.joint_position
-    if joints is not None:
-        return replace(one, demonstration=replace(demo, command_position=_next(joints)))
-    columns = [getattr(demo, p) for p in _POSE_ACTION if getattr(demo, p) is not None]
+    following = np.minimum(np.arange(len(demo)) + 1, len(demo) - 1)
+    if demo.joint_position is not None:
+        return replace(demo, command_position=demo.joint_position[following])
+    columns = [getattr(demo, part) for part in _POSE if part in demo.recorded]
     columns = [rotation_vectors(c) if c.shape[1] == 4 else c for c in columns]
-    action = _next(np.concatenate(columns or [demo.extra["observation.state"]], axis=1))
-    return replace(one, demonstration=replace(demo, extra={**demo.extra, "action": action}))
-
-
-def _next(values: np.ndarray) -> np.ndarray:
-    return np.concatenate([values[1:], values[-1:]])
+    states = np.concatenate(columns or [demo.extra["observation.state"]], axis=1)
+    return replace(demo, extra={**demo.extra, "action": states[following]})
 
 
 def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> Episode:
     """One recording on the clock of its state, in SI units."""
     clock = clock_of_state(recording, meaning, options)
+    time, step = clock.time, max(float(np.median(np.diff(clock.time))), 1e-9)
 
     def rows(places: Sequence[Place]) -> np.ndarray:
         values = read_columns(recording, places)[clock.frames[places[0][0]]]
@@ -245,9 +229,20 @@ def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> 
         return values
 
     quantities = {r: rows(s.columns) for r, s in meaning.selections.items() if r != "time"}
-    kept = {key: rows(places) for key, (places, _) in meaning.kept.items()}
+    extra = {key: rows(places) for key, (places, _) in meaning.kept.items()}
+    if meaning.kept.get("action", ((), ()))[1] == ("gripper.pos",) and "gripper" in quantities:
+        extra["action"] = extra["action"] * meaning.decisions["gripper"].factor
     try:
-        demo = _demonstration(quantities, kept, clock, recording, meaning, options)
+        demo = Demonstration(
+            time=time - time[0],
+            start_time=float(time[0]),
+            joint_names=meaning.joint_names,
+            task=options.task or recording.task or recording.file.stem,
+            # LeRobot counts frames at a whole rate; true stamps are kept in their own column.
+            fps=options.fps or max(1, round(1 / step)),
+            extra=extra,
+            **_fields(quantities, meaning),
+        )
     except ValueError as error:
         raise recording.error(str(error)) from error
     cameras = meaning.cameras.items()
@@ -255,16 +250,9 @@ def _episode(recording: Recording, meaning: Meaning, options: ImportOptions) -> 
     return Episode(demonstration=demo, images=images, notes=clock.notes)
 
 
-def _demonstration(
-    quantities: dict[str, np.ndarray],
-    kept: dict[str, np.ndarray],
-    clock: Clock,
-    recording: Recording,
-    meaning: Meaning,
-    options: ImportOptions,
-) -> Demonstration:
-    units, time, extra = meaning.decisions, clock.time, dict(kept)
-    values = {r: v * units[r].factor for r, v in quantities.items() if r != "pose_matrix"}
+def _fields(quantities: dict[str, np.ndarray], meaning: Meaning) -> dict[str, Any]:
+    """Fields of a demonstration in SI units, from quantities in the units on disk."""
+    values = {r: v * meaning.decisions[r].factor for r, v in quantities.items()}
     known = (*JOINT_FIELDS, "position", "feature")
     fields: dict[str, Any] = {r: values[r] for r in known if r in values}
     if "gripper" in values:
@@ -272,46 +260,32 @@ def _demonstration(
         # Two fingers of opposite signs, as robomimic keeps them, open by their distance.
         two = opening.shape[1] == 2
         fields["gripper"] = opening[:, 0] - opening[:, 1] if two else opening[:, 0]
-        if meaning.kept.get("action", ((), ()))[1] == ("gripper.pos",):
-            extra["action"] = kept["action"] * units["gripper"].factor
-    if "pose_matrix" in quantities:  # in a transform, the translation alone has a unit
+    if "pose_matrix" in values:  # in a transform, the translation alone has a unit
+        values["pose_matrix"] = quantities["pose_matrix"]
         moved = transforms(quantities["pose_matrix"])[:, :3, 3].numpy()
-        fields.setdefault("position", moved * units["pose_matrix"].factor)
-    values |= {r: v for r, v in quantities.items() if r == "pose_matrix"}
+        fields.setdefault("position", moved * meaning.decisions["pose_matrix"].factor)
     for role in [role for role in ORIENTATION_ROLES if role in values][:1]:
         fields["orientation"] = to_quaternion(role, values[role])
-    step = max(float(np.median(np.diff(time))), 1e-9)
-    return Demonstration(
-        time=time - time[0],
-        start_time=float(time[0]),
-        joint_names=meaning.joint_names,
-        task=options.task or recording.task or recording.file.stem,
-        # LeRobot counts frames at a whole rate; true stamps are kept in their own column.
-        fps=options.fps or max(1, round(1 / step)),
-        extra=extra,
-        **fields,
-    )
+    return fields
 
 
-def _images(images: Field, index: Int64[np.ndarray, " frames"]) -> Iterator[Image]:
-    """RGB image of each frame, read in batches."""
-    if images.video is not None:
-        yield from _video_images(images, images.video, index)
-        return
+def _images(
+    images: Field,
+    index: Int64[np.ndarray, " frames"],
+    size: tuple[int | None, int | None] = (None, None),
+) -> Iterator[Image]:
+    """RGB image of each frame, cropped to a height and width and read in batches."""
     scale = 0.0
-    for start in range(0, len(index), _BATCH):
-        wanted = index[start : start + _BATCH]
+    for wanted in np.split(index, np.flatnonzero(np.diff(index // _BATCH)) + 1):
         batch = images.read(int(wanted[0]), int(wanted[-1]) + 1)
-        for k in wanted - wanted[0]:
-            image = batch[k]
+        for image in batch[wanted - wanted[0]]:
             if images.kind == "encoded":
-                yield decode_image(bytes(image))
-                continue
-            if image.dtype != np.uint8:
+                image = decode_image(bytes(image))
+            elif image.dtype != np.uint8:
                 # Of real numbers, 0 to 1 or 0 to 255.
                 scale = scale or (255.0 if float(batch.max()) <= 1.0 else 1.0)
                 image = np.clip(np.rint(image * scale), 0, 255).astype(np.uint8)
-            yield _rgb(image)
+            yield _rgb(image)[: size[0], : size[1]]
 
 
 def _rgb(image: np.ndarray) -> Image:
@@ -320,18 +294,3 @@ def _rgb(image: np.ndarray) -> Image:
     image = image if image.shape[-1] in (1, 3, 4) else np.moveaxis(image, 0, -1)
     image = np.repeat(image, 3, axis=-1) if image.shape[-1] == 1 else image
     return np.ascontiguousarray(image[..., :3])
-
-
-def _video_images(
-    images: Field, file: Path, index: Int64[np.ndarray, " frames"]
-) -> Iterator[Image]:
-    segment = VideoSegment(file=file, start=0.0, stop=images.frames / images.rate)
-    decoded = decode(segment, images.rate, frames=sorted({*index.tolist()}))
-    number, image = next(decoded, (-1, None))
-    if image is None:
-        raise DatasetError("holds no images", file=file)
-    for wanted in index.tolist():
-        while number < wanted:
-            # The container may promise more images than it holds.
-            number, image = next(decoded, (wanted, image))
-        yield image

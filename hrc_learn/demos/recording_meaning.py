@@ -37,9 +37,9 @@ _SLOPES = (0.5, 2.0)
 """Change of the joints per change of the command, if both are in the same unit."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Meaning:
-    """What the fields of recordings were understood as."""
+    """Meaning of the fields of recordings, found step by step."""
 
     selections: dict[str, ColumnSelection]
     """Columns of each quantity, by role; their keys are fields."""
@@ -54,8 +54,8 @@ class Meaning:
     """Field of the stamps; "" if there is none."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Field -> reason."""
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     """Doubts that may have changed the values."""
 
     @property
@@ -67,17 +67,23 @@ class Meaning:
         return self.kept["observation.state"][0][0][0]
 
     @property
-    def content(self) -> tuple[str, ...]:
-        """Names of all that is understood or kept."""
-        return (*self.selections, *self.kept, *self.cameras)
+    def fields(self) -> list[str]:
+        """Fields that are understood or kept, each once."""
+        columns = [s.columns for s in self.selections.values()]
+        columns += [places for places, _ in self.kept.values()]
+        names = [name for places in columns for name, _ in places]
+        return [*dict.fromkeys([*names, *self.cameras.values()])]
 
 
-def understand(recordings: Sequence[Recording], options: ImportOptions) -> Meaning:
+def understand(
+    recordings: Sequence[Recording], options: ImportOptions, hinted: bool = False
+) -> Meaning:
     """Find the quantities among the fields of recordings, and their units.
 
     Args:
         recordings: Episodes of one robot.
         options: The caller's word, which comes before names and values.
+        hinted: True if the caller named the columns of a file: unknown ones are then joints.
 
     Raises:
         DatasetError: A named field does not exist, nothing was understood, a quantity has a
@@ -85,33 +91,30 @@ def understand(recordings: Sequence[Recording], options: ImportOptions) -> Meani
         ValueError: The recordings hold different quantities.
     """
     first = recordings[0]
-    meaning, search = _by_name(first, options)
+    meaning, search = _by_name(first, options, hinted)
     alike = {_signature(first)}
     for other in recordings[1:]:
         if (signature := _signature(other)) in alike:
             continue
         alike.add(signature)
-        theirs, _ = _by_name(other, options)
+        theirs, _ = _by_name(other, options, hinted)
+        contents = [(*m.selections, *m.kept, *m.cameras) for m in (meaning, theirs)]
         for what, one, two in (
             ("joints", meaning.joint_names, theirs.joint_names),
-            ("arrays", meaning.content, theirs.content),
+            ("arrays", *contents),
         ):
             if one != two:
                 text = f"{other.file} and {first.file} do not fit into one dataset: {what}"
                 raise ValueError(f"{text} {', '.join(two)} and {', '.join(one)}")
-    meaning = _with_units(meaning, options, recordings)
-    meaning = _with_commands(
-        meaning, recordings, "command_position" in options.columns, search.actions
-    )
-    used = {n for s in meaning.selections.values() for n, _ in s.columns} | {meaning.time}
-    used |= {n for places, _ in meaning.kept.values() for n, _ in places}
-    used |= {*meaning.cameras.values(), *meaning.left_out}
-    more = {
+    _decide_units(meaning, options, recordings)
+    _decide_commands(meaning, recordings, "command_position" in options.columns, search.actions)
+    used = {*meaning.fields, meaning.time, *meaning.left_out}
+    meaning.left_out |= {
         name: "stamps" if is_time(name, one) else "not understood; to keep it: observation.NAME"
         for name, one in first.fields.items()
         if name not in used
     }
-    return replace(meaning, left_out=meaning.left_out | more)
+    return meaning
 
 
 def _signature(recording: Recording) -> frozenset[tuple[str, str, int]]:
@@ -119,11 +122,13 @@ def _signature(recording: Recording) -> frozenset[tuple[str, str, int]]:
     return frozenset((n, f.kind, f.width if f.kind == "number" else 0) for n, f in fields)
 
 
-def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSearch]:
+def _by_name(
+    first: Recording, options: ImportOptions, hinted: bool
+) -> tuple[Meaning, FieldSearch]:
     """Meaning of the fields of one episode by the caller's word and by their names."""
     explicit = _explicit(first, options)
     given = {place[0] for places in explicit.values() for place in places}
-    search = FieldSearch(first, options.hinted)
+    search = FieldSearch(first, hinted)
     search.add_fields(
         {
             name: one
@@ -133,37 +138,35 @@ def _by_name(first: Recording, options: ImportOptions) -> tuple[Meaning, FieldSe
     )
     found = map_columns(search.features, Sidecar())
     taken = replaced_roles(dict.fromkeys(explicit))
-    selections = {
-        role: search.located(selection)
-        for role, selection in found.selections.items()
-        if role not in taken
-    }
-    kept = {}
-    for role, places in explicit.items():
-        if role in ROLES:
-            selections[role] = _selection(first, role, places)
-        else:
-            kept[role] = (tuple(places), column_names(first, places))
     meaning = Meaning(
-        selections=selections,
-        kept=kept,
+        selections={
+            role: search.located(selection)
+            for role, selection in found.selections.items()
+            if role not in taken
+        },
         cameras=find_cameras(first, options.images),
         left_out=search.left_out,
-        notes=(
-            *map(search.explained, filter(_is_news, found.notes)),
-            *_question_of_angles(selections, explicit),
-        ),
+        notes=[search.explained(note) for note in found.notes if _is_news(note)],
     )
-    meaning = _with_fingers(_with_bare_vectors(meaning, first, search.states), search)
+    for role, places in explicit.items():
+        if role in ROLES:
+            meaning.selections[role] = _selection(first, role, places)
+        else:
+            meaning.kept[role] = (tuple(places), column_names(first, places))
+    meaning.notes += _question_of_angles(meaning.selections, explicit)
+    _add_bare_vectors(meaning, first, search.states)
+    _add_fingers(meaning, search)
     states = {"joint_position", "position", *ORIENTATION_ROLES}
     if not meaning.selections.keys() & states and "observation.state" not in meaning.kept:
         there = ", ".join(name for name, one in first.fields.items() if one.kind == "number")
         text = "name the arrays of joints or poses (joints, position); it holds"
         raise first.error(f"{text} {there}")
-    time = first.known(options.time, "time") if options.time else ""
-    if not time and options.duration is None:
-        time = first.clock_of(meaning.main)
-    return _with_joints(replace(meaning, time=time), options.joint_names, first), search
+    if options.time:
+        meaning.time = first.known(options.time, "time")
+    elif options.duration is None:
+        meaning.time = first.clock_of(meaning.main)
+    _name_joints(meaning, options.joint_names, first)
+    return meaning, search
 
 
 def _question_of_angles(
@@ -205,67 +208,61 @@ def _selection(first: Recording, role: str, places: Sequence[Place]) -> ColumnSe
     return ColumnSelection(role=role, columns=tuple(places), labels=labels, numbered=numbered)
 
 
-def _with_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str]) -> Meaning:
+def _add_bare_vectors(meaning: Meaning, first: Recording, states: Sequence[str]) -> None:
     """Keep vectors whose names tell no content as recorded, as the state."""
-    kept, left_out = dict(meaning.kept), dict(meaning.left_out)
-    selections, notes = dict(meaning.selections), list(meaning.notes)
     for name in states:
-        places = [(name, index) for index in range(first.fields[name].width)]
-        if name == UNNAMED and not selections:
-            notes.append("nothing names the columns: taken for joints (--columns names them)")
+        places = first.places(name, "state")
+        if name == UNNAMED and not meaning.selections:
+            meaning.notes.append(
+                "nothing names the columns: taken for joints (--columns names them)"
+            )
             joints = _selection(first, "joint_position", places)
-            selections["joint_position"] = replace(joints, numbered=True)
-        elif selections.keys() & {"joint_position", "position"} or "observation.state" in kept:
-            left_out[name] = "a state of unknown content; to keep it: observation.NAME"
+            meaning.selections["joint_position"] = replace(joints, numbered=True)
+        elif (
+            meaning.selections.keys() & {"joint_position", "position"}
+            or "observation.state" in meaning.kept
+        ):
+            meaning.left_out[name] = "a state of unknown content; to keep it: observation.NAME"
         else:
-            kept["observation.state"] = (tuple(places), column_names(first, places))
-            notes.append(f"{name} is kept as recorded: its name tells no quantity")
-    return replace(
-        meaning, kept=kept, left_out=left_out, selections=selections, notes=tuple(notes)
-    )
+            meaning.kept["observation.state"] = (tuple(places), column_names(first, places))
+            meaning.notes.append(f"{name} is kept as recorded: its name tells no quantity")
 
 
-def _with_fingers(meaning: Meaning, search: FieldSearch) -> Meaning:
+def _add_fingers(meaning: Meaning, search: FieldSearch) -> None:
     """Add grippers that were found among the joints, or as two fingers."""
-    selections, kept = dict(meaning.selections), dict(meaning.kept)
-    for command in (False, True):
+    for command, key in ((False, "observation.state"), (True, "action")):
         fingers = [(name, place) for c, name, place in search.fingers if c == command]
-        if not command and len(fingers) == 1 and "gripper" not in selections:
-            places = (fingers[0][1],)
-            selections["gripper"] = ColumnSelection(
-                role="gripper", columns=places, labels=("gripper",)
+        if not command and len(fingers) == 1 and "gripper" not in meaning.selections:
+            meaning.selections["gripper"] = ColumnSelection(
+                role="gripper", columns=(fingers[0][1],), labels=("gripper",)
             )
         elif fingers:
-            key = "action" if command else "observation.state"
             names = tuple(f"{name}.pos" for name, _ in fingers)
-            kept[key] = (tuple(place for _, place in fingers), names)
-    if search.two_fingers:
-        name = search.two_fingers
-        selections["gripper"] = ColumnSelection(
+            meaning.kept[key] = (tuple(place for _, place in fingers), names)
+    if name := search.two_fingers:
+        meaning.selections["gripper"] = ColumnSelection(
             role="gripper", columns=((name, 0), (name, 1)), labels=("left", "right")
         )
-    return replace(meaning, selections=selections, kept=kept)
 
 
-def _with_joints(meaning: Meaning, given: tuple[str, ...], first: Recording) -> Meaning:
+def _name_joints(meaning: Meaning, given: tuple[str, ...], first: Recording) -> None:
     """Give the joints their names; quantities of other joints are left out."""
     chosen = {r: s for r, s in meaning.selections.items() if r in JOINT_FIELDS}
     if not chosen:
-        return meaning
+        return
     main = chosen.get("joint_position") or next(iter(chosen.values()))
     width = len(main.columns)
     counted = tuple(f"joint{i + 1}" for i in range(width))
     names = given or (counted if main.numbered else main.labels)
     if len(names) != width:
         raise first.error(f"{len(names)} joint names for {width} columns of joints", "joints")
-    selections, left_out = dict(meaning.selections), dict(meaning.left_out)
+    meaning.joint_names = names
     for role, selection in chosen.items():
-        selections[role] = replace(selection, labels=names)
+        meaning.selections[role] = replace(selection, labels=names)
         if len(selection.columns) != width:
-            del selections[role]
+            del meaning.selections[role]
             text = f"{len(selection.columns)} columns for {width} joints"
-            left_out |= {name: text for name, _ in selection.columns}
-    return replace(meaning, joint_names=names, selections=selections, left_out=left_out)
+            meaning.left_out |= {name: text for name, _ in selection.columns}
 
 
 def read_columns(
@@ -285,9 +282,9 @@ def read_columns(
     return np.stack([read[name][:, index] for name, index in places], axis=1)
 
 
-def _with_units(
+def _decide_units(
     meaning: Meaning, options: ImportOptions, recordings: Sequence[Recording]
-) -> Meaning:
+) -> None:
     """Decide on the unit of each quantity; doubtful ones are refused."""
     for role, unit in options.units.items():
         unit_factor(role, unit)
@@ -309,7 +306,7 @@ def _with_units(
     decisions, faults = units_from_episodes(selections, episodes(), 1.0, declared, given)
     for fault in faults:
         raise fault
-    warned: list[str] = []
+    meaning.decisions, warned = decisions, meaning.warnings
     for role, decision in decisions.items():
         stated = role in given or role in declared
         doubt = None if stated else decision.doubt
@@ -331,7 +328,6 @@ def _with_units(
             warned.append(f"{role}: rad are given, but values reach {largest:.4g}: degrees?")
     if "joint_position" in selections and "gripper" not in selections:
         warned += _gripper_among(first, selections["joint_position"])
-    return replace(meaning, decisions=decisions, warnings=tuple(warned))
 
 
 def _gripper_among(first: Recording, joints: ColumnSelection) -> list[str]:
@@ -357,47 +353,46 @@ def _largest(first: Recording, selection: ColumnSelection, columns: Sequence[int
     return float(np.max(values, where=np.isfinite(values), initial=0.0))
 
 
-def _with_commands(
+def _decide_commands(
     meaning: Meaning, recordings: Sequence[Recording], named: bool, actions: Sequence[str]
-) -> Meaning:
-    """Take a recorded action for commands of the joints if the joints follow it."""
-    selections, kept = dict(meaning.selections), dict(meaning.kept)
-    decisions, left_out = dict(meaning.decisions), dict(meaning.left_out)
-    notes, first = list(meaning.notes), recordings[0]
+) -> None:
+    """Take a recorded action for commands of the joints if the joints follow it.
+
+    Args:
+        meaning: Receives the commands.
+        recordings: Episodes.
+        named: True if the caller named the commands.
+        actions: Vectors that are named as an action, but not by their content.
+    """
+    selections, kept, first = meaning.selections, meaning.kept, recordings[0]
     joints, command = selections.get("joint_position"), selections.get("command_position")
-    if command is None or joints is None or named:
-        pass
-    elif not _followed(recordings, command.columns, joints.columns):
-        del selections["command_position"], decisions["command_position"]
+    if (
+        command is not None
+        and joints is not None
+        and not named
+        and not _followed(recordings, command.columns, joints.columns)
+    ):
+        del selections["command_position"], meaning.decisions["command_position"]
         kept.setdefault("action", (command.columns, column_names(first, command.columns)))
-        notes.append("the joints do not follow the recorded action: kept as recorded")
+        meaning.notes.append("the joints do not follow the recorded action: kept as recorded")
     for name in actions:
         if "command_position" in selections or "action" in kept:
-            left_out[name] = "another action"
+            meaning.left_out[name] = "another action"
             continue
-        places = [(name, index) for index in range(first.fields[name].width)]
+        places = first.places(name, "action")
         width = len(joints.columns) if joints else 0
         arm, rest = places[:width], places[width:]
         fits = len(arm) == width and (not rest or (len(rest) == 1 and "gripper" in selections))
         if joints and fits and _followed(recordings, arm, joints.columns):
-            command = replace(joints, role="command_position", columns=tuple(arm))
-            selections["command_position"] = command
-            unit, why = decisions["joint_position"], "the joints follow it"
-            decisions["command_position"] = replace(unit, role=command.role, evidence=why)
+            role, unit = "command_position", meaning.decisions["joint_position"]
+            selections[role] = replace(joints, role=role, columns=tuple(arm))
+            meaning.decisions[role] = replace(unit, role=role, evidence="the joints follow it")
             if rest:
                 kept["action"] = (tuple(rest), ("gripper.pos",))
             continue
         kept["action"] = (tuple(places), column_names(first, places))
         if joints:
-            notes.append(f"the joints do not follow {name}: it is kept as recorded")
-    return replace(
-        meaning,
-        selections=selections,
-        decisions=decisions,
-        kept=kept,
-        left_out=left_out,
-        notes=tuple(notes),
-    )
+            meaning.notes.append(f"the joints do not follow {name}: it is kept as recorded")
 
 
 def _followed(

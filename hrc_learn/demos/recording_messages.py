@@ -5,15 +5,16 @@ Types of any ROS version, JSON and protobuf are read alike, whether they are ins
 
 import base64
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.recording_files import Field
+from hrc_learn.demos.recording_files import Field, StreamRead
 from hrc_learn.demos.videos import Image, decode_image
 
 _JOINTS = {"position": "joint_positions", "velocity": "joint_velocities"}
@@ -137,72 +138,46 @@ def poses_of_frames(edges: Mapping[tuple[str, str], list[tuple]]) -> dict[str, T
 
 
 def image_field(name: str, one: Topic, messages: Messages, notes: list[str]) -> Field | None:
+    """Field of a topic of images; None if they cannot be read, which a note says."""
     first, count = one.sample, len(one.received)
     kind = str(getattr(first, "encoding", "") or getattr(first, "format", "")).lower()
-    empty = lambda a, b: np.zeros(0)  # noqa: E731
     raw, codec = hasattr(first, "width"), next((c for w, c in _CODECS.items() if w in kind), "")
     if "depth" in kind or kind in ("16uc1", "32fc1", "mono16"):
-        return Field(shape=(count,), kind="depth", read=empty)
+        return Field(shape=(count,), kind="depth", read=lambda a, b: np.zeros(0))
     if raw and not codec and kind not in _PIXELS:
         notes.append(f"{name} is left out: images of encoding {kind} are not read")
         return None
-    read = _ImageReader(name, one.received, messages, codec, _PIXELS.get(kind))
+
+    def contents(start: int) -> Iterator[tuple[Any, bytes]]:
+        since = int(one.received[start] * 1e9) - 1000  # rounded to a microsecond
+        for _, _, message in messages([name, f"/{name}"], since):
+            data = message.data
+            yield message, base64.b64decode(data) if isinstance(data, str) else bytes(data)
+
+    def decoded(start: int) -> Iterator[Any]:
+        if codec:  # every image may need all before it
+            yield from islice(_decoded(name, codec, contents(0)), start, None)
+        for message, data in contents(start):
+            yield _rgb(message, data, *_PIXELS[kind]) if raw else data
+
+    read = StreamRead(decoded)
     if not raw and not codec:
         return Field(shape=(count,), kind="encoded", read=read)
-    shape = read(0, 1)[0].shape
-    return Field(shape=(count, *shape), kind="image", read=read)
+    return Field(shape=(count, *read(0, 1)[0].shape), kind="image", read=read)
 
 
-class _ImageReader:
-    """Reads the images of a topic in order, and starts again where they go back."""
+def _decoded(name: str, codec: str, contents: Iterator[tuple[Any, bytes]]) -> Iterator[Image]:
+    """RGB images of a video of one packet a message."""
+    import av
 
-    def __init__(
-        self,
-        name: str,
-        received: Sequence[float],
-        messages: Messages,
-        codec: str,
-        pixels: tuple[int, str] | None,
-    ):
-        self._name, self._messages, self._codec, self._pixels = name, messages, codec, pixels
-        self._received, self._next = received, -1
-        self._stream: Iterator = iter(())
-
-    def __call__(self, start: int, stop: int) -> np.ndarray:
-        """Images from a first to a last one (exclusive)."""
-        if not 0 <= self._next <= start or (start > self._next + 100 and not self._codec):
-            self._next = 0 if self._codec else start
-            since = int(self._received[self._next] * 1e9) - 1000  # rounded to a microsecond
-            self._stream = self._decoded(since)
-        found = []
-        while self._next < stop:
-            image = next(self._stream)
-            if self._next >= start:
-                found.append(image)
-            self._next += 1
-        whole = np.empty(len(found), object)
-        whole[:] = found
-        return whole
-
-    def _decoded(self, since: int) -> Iterator[Any]:
-        import av
-
-        decoder: Any = av.CodecContext.create(self._codec, "r") if self._codec else None
-        image = None
-        topics = [self._name, f"/{self._name}"]
-        for _, _, message in self._messages(topics, since):
-            data = message.data
-            data = base64.b64decode(data) if isinstance(data, str) else bytes(data)
-            if decoder is not None:
-                for frame in decoder.decode(av.Packet(data)):
-                    image = frame.to_ndarray(format="rgb24")
-                if image is None:
-                    raise DatasetError("begins without a key frame", key=self._name)
-                yield image
-            elif self._pixels is None:
-                yield data
-            else:
-                yield _rgb(message, data, *self._pixels)
+    decoder: Any = av.CodecContext.create(codec, "r")
+    image = None
+    for _, data in contents:
+        for frame in decoder.decode(av.Packet(data)):
+            image = frame.to_ndarray(format="rgb24")
+        if image is None:
+            raise DatasetError("begins without a key frame", key=name)
+        yield image
 
 
 def image_of(message: Any) -> Image:

@@ -87,8 +87,6 @@ class ImportOptions:
     """Duration of each episode [s] where there are no stamps."""
     task: str | None = None
     """Task in words."""
-    hinted: bool = False
-    """True if the caller named the columns of a file: unknown ones are then joints."""
 
     def __post_init__(self) -> None:
         for name, value in (("duration", self.duration), ("fps", self.fps)):
