@@ -66,25 +66,43 @@ class FeatureCache:
         with new_file(path) as part:
             write_parquet(table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), part)
 
-    def read(self, episode: int, frames: int) -> Track:
-        """Track of an episode.
+    def attach(self, demo: Demonstration, *, if_known: bool = False) -> Demonstration:
+        """The demonstration with the feature of its episode.
+
+        Args:
+            demo: Demonstration from the dataset.
+            if_known: Count the feature as not visible if it was not extracted from the episode.
 
         Raises:
             DatasetError: The feature was not extracted, or belongs to another recording.
         """
-        path = self.path(episode)
+        path, frames = self.path(demo.episode), len(demo)
 
         def fault(row: int | None, message: str) -> DatasetError:
-            return DatasetError(message, file=path, episode=episode, frame=row)
+            return DatasetError(message, file=path, episode=demo.episode, frame=row)
 
         if not path.is_file():
-            raise fault(None, f"{self.name} was not extracted from this episode: {_ADVICE}")
-        table = read_table(open_parquet(self._folder, path.name, episode), str(path))
+            if not if_known:
+                raise fault(None, f"{self.name} was not extracted from this episode: {_ADVICE}")
+            hidden = np.zeros(frames, dtype=bool)
+            return replace(demo, feature=np.zeros((frames, 2)), feature_visible=hidden)
+        table = read_table(open_parquet(self._folder, path.name, demo.episode), str(path))
         u, v, visible = (to_numpy(table[c], fault)[:, 0] for c in ("u", "v", "visible"))
         if len(u) != frames:
             text = f"{self.name} has {len(u)} frames, the episode {frames}: {_ADVICE}"
             raise fault(None, text)
-        return np.stack([u, v], axis=1), visible.astype(bool)
+        pixels = np.stack([u, v], axis=1)
+        return replace(demo, feature=pixels, feature_visible=visible.astype(bool))
+
+    def note(self, episodes: Sequence[int]) -> tuple[str, ...]:
+        """Note on the episodes from which it was not extracted; empty if there are none."""
+        without = [episode for episode in episodes if not self.path(episode).is_file()]
+        first = ", ".join(map(str, without[:5])) + ", ..." * (len(without) > 5)
+        text = (
+            f"{self.name} was not extracted from {len(without)} episodes ({first}) and counts "
+            f"as not visible there: {_ADVICE}"
+        )
+        return (text,) if without else ()
 
 
 def _features_folder(root: Path) -> Path:
@@ -93,10 +111,11 @@ def _features_folder(root: Path) -> Path:
     return root.with_name(root.name + ".features")
 
 
-def _feature_names(root: Path) -> list[str]:
-    """Features that were extracted, in whole or in part."""
-    folders = {file.parent for file in _features_folder(root).glob("[!.]*/episode_*.parquet")}
-    return sorted(folder.name for folder in folders)
+def extracted_features(root: str | Path) -> list[FeatureCache]:
+    """Features that were extracted from a dataset, in whole or in part, by their names."""
+    folder = _features_folder(Path(root))
+    names = {file.parent.name for file in folder.glob("[!.]*/episode_*.parquet")}
+    return [FeatureCache(Path(root), name) for name in sorted(names)]
 
 
 def _fingerprint(segment: VideoSegment) -> bytes:
@@ -211,50 +230,10 @@ def attach_features(demos: DemonstrationSet, name: str | None = None) -> Demonst
     Raises:
         DatasetError: There is no such feature, or it was not extracted from all episodes.
     """
-    root = Path(demos.source)
-    known = _feature_names(root) if demos.source else []
-    chosen = [feature for feature in known if name in (None, feature)]
+    known = extracted_features(demos.source) if demos.source else []
+    chosen = [cache for cache in known if name in (None, cache.name)]
     if len(chosen) != 1:
         what = "name the feature" if name is None else f"there is no feature {name!r}"
-        text = f"{what}; extracted are {', '.join(known) or 'none'}"
-        raise DatasetError(text, file=demos.source)
-    cache = FeatureCache(root, chosen[0])
-    return demos.map(lambda demo: with_feature(demo, cache))
-
-
-def only_feature(root: Path) -> FeatureCache | None:
-    """The single feature extracted from a dataset; None if there are none or several."""
-    names = _feature_names(root)
-    return FeatureCache(root, names[0]) if len(names) == 1 else None
-
-
-def missing_note(cache: FeatureCache, episodes: Sequence[int]) -> tuple[str, ...]:
-    """Note on the episodes from which a feature was not extracted; empty if there are none."""
-    without = [episode for episode in episodes if not cache.path(episode).is_file()]
-    if not without:
-        return ()
-    first = ", ".join(map(str, without[:5])) + ", ..." * (len(without) > 5)
-    return (
-        f"{cache.name} was not extracted from {len(without)} episodes ({first}) and counts as "
-        f"not visible there: {_ADVICE}",
-    )
-
-
-def with_feature(
-    demo: Demonstration, cache: FeatureCache, *, if_known: bool = False
-) -> Demonstration:
-    """The demonstration with the feature of its episode.
-
-    Args:
-        demo: Demonstration from the dataset of the cache.
-        cache: Files of the feature.
-        if_known: Count the feature as not visible if it was not extracted from the episode.
-
-    Raises:
-        DatasetError: The feature was not extracted from this episode.
-    """
-    if if_known and not cache.path(demo.episode).is_file():
-        hidden = np.zeros(len(demo), dtype=bool)
-        return replace(demo, feature=np.zeros((len(demo), 2)), feature_visible=hidden)
-    pixels, visible = cache.read(demo.episode, len(demo))
-    return replace(demo, feature=pixels, feature_visible=visible)
+        names = ", ".join(cache.name for cache in known) or "none"
+        raise DatasetError(f"{what}; extracted are {names}", file=demos.source)
+    return demos.map(chosen[0].attach)

@@ -19,6 +19,7 @@ from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry, ope
 from hrc_learn.demos.videos import (
     Image,
     Segments,
+    VideoSegment,
     decode,
     decode_image,
     encoded_samples,
@@ -73,14 +74,9 @@ class ImageReader:
             or (key in segments and segments[key].file.is_file())
         )
 
-    def encoded(self, episode: int, camera: str) -> tuple[str, list[float], list[bytes]] | None:
-        """Encoded images of an episode, see `encoded_samples`; None for images in columns.
-
-        Raises:
-            DatasetError: The video cannot be read.
-        """
-        segment = self._segments.get(episode, {}).get(camera)
-        return None if segment is None else encoded_samples(segment)
+    def segment(self, episode: int, camera: str) -> VideoSegment | None:
+        """Part of a video that shows an episode; None for images in columns."""
+        return self._segments.get(episode, {}).get(camera)
 
     def size(self, camera: str) -> tuple[int, int]:
         """Declared height and width of a camera's images [px].
@@ -160,9 +156,23 @@ class ImageReader:
         if len(wanted) and not (wanted[0] >= 0 and wanted[-1] < entry.length):
             text = f"has no frames {wanted[0]} to {wanted[-1]}: it has {entry.length}"
             raise entry.error(text)
-        in_column = self._folder.features[camera].dtype == "image"
-        read = self._from_column if in_column else self._from_video
-        yield from read(entry, camera, wanted, size)
+        if self._folder.features[camera].dtype == "image":
+            yield from self._from_column(entry, camera, wanted, size)
+            return
+        segment, place = self.segment(episode, camera), {"episode": episode, "key": camera}
+        if segment is None or not segment.file.is_file():
+            file = None if segment is None else segment.file
+            raise DatasetError("its video is missing", file=file, **place)
+        missing = dict.fromkeys(wanted)
+        for frame, image in decode(segment, self._folder.fps, size, wanted):
+            del missing[frame]
+            yield frame, image
+        for frame in missing:
+            text = (
+                f"holds no image of frame {frame}: the recording was interrupted, or the "
+                f"video is that of another episode"
+            )
+            raise DatasetError(text, file=segment.file, frame=frame, **place)
 
     def entry(self, episode: int) -> EpisodeEntry:
         """An episode of the dataset.
@@ -174,29 +184,6 @@ class ImageReader:
             text = f"there is no such episode; the dataset has {len(self._entries)}"
             raise DatasetError(text, file=self._folder.root, episode=episode)
         return self._entries[episode]
-
-    def _from_video(
-        self,
-        entry: EpisodeEntry,
-        camera: str,
-        wanted: Sequence[int],
-        size: tuple[int, int] | None,
-    ) -> Iterator[tuple[int, Image]]:
-        segment, fps = self._segments.get(entry.index, {}).get(camera), self._folder.fps
-        place: dict[str, Any] = {"episode": entry.index, "key": camera}
-        if segment is None or not segment.file.is_file():
-            file = None if segment is None else segment.file
-            raise DatasetError("its video is missing", file=file, **place)
-        missing = dict.fromkeys(wanted)
-        for frame, image in decode(segment, fps, size, wanted):
-            del missing[frame]
-            yield frame, image
-        for frame in missing:
-            text = (
-                f"holds no image of frame {frame}: the recording was interrupted, or the "
-                f"video is that of another episode"
-            )
-            raise DatasetError(text, file=segment.file, frame=frame, **place)
 
     def _from_column(
         self,
@@ -233,9 +220,9 @@ class CameraImages:
     """Images of a camera during an episode."""
 
     codec: str
-    """jpeg, av1, h264, hevc or vp9."""
+    """Codec: jpeg, av1, h264, hevc or vp9."""
     time: Float[np.ndarray, " images"]
-    """[s]"""
+    """Times since the first image [s]."""
     samples: tuple[bytes, ...]
     """Files, or samples of a video in the order of decoding."""
 
@@ -250,13 +237,13 @@ def camera_images(
     for camera in reader.available(demo.episode):
         # The whole rest of the key: left.rgb and right.rgb are two cameras.
         name = camera.removeprefix("observation.images.")
+        segment = reader.segment(demo.episode, camera)
         try:
-            encoded = reader.encoded(demo.episode, camera)
+            encoded = None if segment is None else encoded_samples(segment)
             if encoded is None:
                 yield name, thumbnails(reader, demo, camera)
             else:
-                codec, time, samples = encoded
-                yield name, CameraImages(codec, np.array(time), tuple(samples))
+                yield name, CameraImages(*encoded)
         except DatasetError as error:
             yield name, error
 
@@ -285,9 +272,11 @@ def thumbnails(
     return CameraImages("jpeg", time, tuple(jpeg(image) for _, image in found))
 
 
-def thumbnail_size(height: int, width: int) -> tuple[int, int]:
+def thumbnail_size(
+    height: int, width: int, tallest: int = _THUMBNAIL_HEIGHT
+) -> tuple[int, int]:
     """Height and width of a thumbnail [px], even because chroma is halved."""
-    scale = min(1.0, _THUMBNAIL_HEIGHT / height) / 2
+    scale = min(1.0, tallest / height) / 2
     return 2 * max(1, round(scale * height)), 2 * max(1, round(scale * width))
 
 

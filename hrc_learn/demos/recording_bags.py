@@ -13,7 +13,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.recording_files import Field, Recording, array_field
@@ -58,25 +58,24 @@ def read_bag(path: Path) -> list[Recording]:
         DatasetError: The bag is damaged, or holds no topic that is understood.
     """
     types, messages = _opened_mcap(path) if path.suffix == ".mcap" else _opened_bag(path)
-    topics, order, notes = _gathered(types, messages)
+    topics, order = _gathered(types, messages)
     if not topics:
         kinds = ", ".join(f"{topic} ({kind})" for topic, kind in types.items())
         raise DatasetError(f"no topic holds joints, poses or images: {kinds}", file=path)
+    notes: list[str] = []
     times, fields = _times(topics, notes), {}
     for name, one in topics.items():
-        made = _field(name, one, messages, order, notes)
-        if made is None:
-            continue
-        clock = f"{name}/stamp"
         time, places = np.unique(times[name], return_index=True)
-        if made.kind == "number" and len(time) < made.frames:
-            notes.append(f"{name}: {made.frames - len(time)} messages with repeated stamps")
-        if made.kind in ("number", "pose"):
-            values = made.read(0, made.frames)[places]
-            made = replace(array_field(name, values, names=made.names), kind=made.kind)
-        elif len(time) < made.frames or (np.diff(places) < 0).any():
-            time = np.array(one.received)
-        fields |= {name: replace(made, clock=clock), clock: array_field(clock, time, unit="s")}
+        if one.values[0].size:
+            made = _numbers(name, one, places, order, notes)
+        else:
+            made = image_field(name, one, messages, notes)
+            if len(places) < len(one.received) or (np.diff(places) < 0).any():
+                time = np.array(one.received)
+        if made is not None:
+            clock = f"{name}/stamp"
+            fields[name] = replace(made, clock=clock)
+            fields[clock] = array_field(clock, time, unit="s")
     fields = _with_joints_of_commands(fields)
     used = " ".join(f"/{name}/" for name in topics)
     unread = [t for t in types if f"/{t.strip('/')}/" not in used]
@@ -149,8 +148,8 @@ def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
 
 def _gathered(
     types: Mapping[str, str], messages: Messages
-) -> tuple[dict[str, Topic], list[str], list[str]]:
-    """Topics by field, joints in the order of the robot's description, and notes."""
+) -> tuple[dict[str, Topic], list[str]]:
+    """Topics by field, and joints in the order of the robot's description."""
     sets: dict[str, dict[frozenset[str], Topic]] = {}
     edges: dict[tuple[str, str], list[tuple[float, float, np.ndarray]]] = {}
     order: list[str] = []
@@ -176,7 +175,7 @@ def _gathered(
             topics["/".join(filter(None, (parent, (one.names or "?")[0], last)))] = one
     joints = [one for name, one in topics.items() if name.endswith("joint_positions")]
     main = max(joints, key=lambda one: len(one.values), default=Topic())
-    return topics | poses_of_frames(edges), order or [*(main.names or ())], []
+    return topics | poses_of_frames(edges), order or [*(main.names or ())]
 
 
 def _times(
@@ -198,12 +197,22 @@ def _times(
     return times
 
 
-def _field(
-    name: str, one: Topic, messages: Messages, order: Sequence[str], notes: list[str]
+def _numbers(
+    name: str,
+    one: Topic,
+    places: Int64[np.ndarray, " _frames"],
+    order: Sequence[str],
+    notes: list[str],
 ) -> Field | None:
-    """Field of a topic; None if it cannot be used, which a note says."""
-    if not one.values[0].size:
-        return image_field(name, one, messages, notes)
+    """Field of a topic of numbers; None if it cannot be used, which a note says.
+
+    Args:
+        name: Name of the field.
+        one: Messages of the topic.
+        places: Messages in the order of their times, each time once.
+        order: Joints in the order of the robot's description.
+        notes: Receives what is left out.
+    """
     if len({value.shape for value in one.values}) > 1:
         notes.append(f"{name} is left out: its messages differ in size")
         return None
@@ -211,10 +220,12 @@ def _field(
     if not np.isfinite(values).all() and not name.endswith("joint_positions"):
         notes.append(f"{name} is left out: it holds NaN")
         return None
+    if len(places) < len(values):
+        notes.append(f"{name}: {len(values) - len(places)} messages with repeated stamps")
     if names and {*names} <= {*order}:
-        places = [names.index(name) for name in order if name in names]
-        values, names = values[:, places], tuple(names[i] for i in places)
-    made = array_field(name, values, names=names)
+        columns = [names.index(name) for name in order if name in names]
+        values, names = values[:, columns], tuple(names[i] for i in columns)
+    made = array_field(name, values[places], names=names)
     is_pose = values.shape[1:] == (4, 4) and not TOOL.search(name)
     return replace(made, kind="pose") if is_pose else made
 
@@ -224,27 +235,23 @@ def _with_joints_of_commands(fields: Mapping[str, Field]) -> dict[str, Field]:
 
     A controller has an order of its own, which such messages do not tell.
     """
-    from scipy.optimize import linear_sum_assignment
-
     found = dict(fields)
     states = [
-        name
+        one
         for name, one in fields.items()
         if name.endswith("joint_positions") and not _COMMAND.search(name)
     ]
     for name, one in fields.items():
-        same = [state for state in states if fields[state].width == one.width > 1]
-        if one.kind != "number" or one.names or not same or not _COMMAND.search(name):
+        state = next((s for s in states if s.width == one.width > 1 and s.names), None)
+        if one.kind != "number" or one.names or state is None or not _COMMAND.search(name):
             continue
-        state = fields[same[0]]
         time, own = (fields[f.clock].numbers()[:, 0] for f in (one, state))
         at = np.clip(np.searchsorted(own, time), 0, len(own) - 1)
         apart = np.abs(one.numbers()[:, :, None] - state.numbers()[at][:, None]).mean(0)
-        rows, columns = linear_sum_assignment(apart)
-        best, others = apart[rows, columns], apart.copy()
-        others[rows, columns] = np.inf
-        if (best < _ALIKE * others.min(1)).all() and state.names:
-            values = one.numbers()[:, np.argsort(columns)]
+        joints = apart.argmin(axis=1)
+        nearest, second = np.partition(apart, 1, axis=1)[:, :2].T
+        if len({*joints}) == one.width and (nearest < _ALIKE * second).all():
+            values = one.numbers()[:, np.argsort(joints)]
             made = array_field(name, values, names=state.names, clock=one.clock)
             found[f"{name}/joint_positions"] = made
             del found[name]
@@ -254,25 +261,24 @@ def _with_joints_of_commands(fields: Mapping[str, Field]) -> dict[str, Field]:
 def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     """The parts of a recording in which the joints and all images are present."""
     fields = whole.fields
-    if not any(one.kind == "number" and one.clock for one in fields.values()):
-        fields = {
-            n: replace(f, kind="number" if f.kind == "pose" else f.kind)
-            for n, f in fields.items()
-        }
-        whole = replace(whole, fields=fields)
-    numbers = [n for n, one in fields.items() if one.kind == "number" and one.clock]
+    clocked = {name: one for name, one in fields.items() if one.clock}
+    if not any(one.kind == "number" for one in clocked.values()):
+        # No name tells the tool: the pose of any frame may be its.
+        poses = {n: replace(f, kind="number") for n, f in fields.items() if f.kind == "pose"}
+        fields = {**fields, **poses}
+    numbers = [n for n in clocked if fields[n].kind == "number"]
     main = max(
         numbers, key=lambda n: (n.endswith("joint_positions"), fields[n].frames), default=""
     )
     if not main:
         raise whole.error("no topic holds joints or poses of a tool")
     steady = [main, *(n for n, one in fields.items() if one.kind in ("image", "encoded"))]
-    times = {n: fields[one.clock].numbers()[:, 0] for n, one in fields.items() if one.clock}
+    times = {n: fields[one.clock].numbers()[:, 0] for n, one in clocked.items()}
     if np.median(np.diff(times[main])) < _BURST:
         notes.append(
             f"{main}: its messages have no times of their own and were written at once"
         )
-        bare = {n: replace(one, clock="") for n, one in fields.items() if one.clock}
+        bare = {n: replace(fields[n], clock="") for n in clocked}
         return [replace(whole, fields=bare, streams=False, notes=tuple(notes))]
     gaps = {name: _gaps(time) for name, time in times.items()}
     start = max(times[name][0] for name in steady)
@@ -287,28 +293,19 @@ def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:
     parts = [(a, b) for a, b in parts if b - a >= _SHORTEST]
     if not parts:
         raise whole.error(f"{', '.join(steady)} are never present together for {_SHORTEST} s")
-    silent = [
-        name
-        for name, found in gaps.items()
-        if name not in steady
-        and any(a < right and left < b for left, right in found for a, b in parts)
-    ]
-    for name in silent:
-        longest = max(right - left for left, right in gaps[name])
-        notes.append(f"{name} is left out: it is silent for {longest:.2f} s")
-    kept = {n: one for n, one in fields.items() if n not in silent}
-    whole = replace(whole, fields=kept, notes=tuple(notes))
-    if len(parts) == 1 and parts[0] == (start, stop):
+    for name in [name for name in gaps if name not in steady]:
+        if any(a < right and left < b for left, right in gaps[name] for a, b in parts):
+            longest = max(right - left for left, right in gaps[name])
+            notes.append(f"{name} is left out: it is silent for {longest:.2f} s")
+            fields = {n: one for n, one in fields.items() if n != name}
+    whole = replace(whole, fields=fields, notes=tuple(notes))
+    if parts == [(start, stop)]:
         return [whole]
-    return [
-        replace(
-            whole,
-            label=f"part {k}",
-            fields=_during(kept, a, b),
-            notes=tuple(notes) if k == 0 else (),
-        )
+    episodes = [
+        replace(whole, label=f"part {k}", fields=_during(fields, a, b), notes=())
         for k, (a, b) in enumerate(parts)
     ]
+    return [replace(episodes[0], notes=whole.notes), *episodes[1:]]
 
 
 def _gaps(time: Float64[np.ndarray, " messages"]) -> list[tuple[float, float]]:

@@ -54,8 +54,10 @@ def open_recordings(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
     Raises:
         DatasetError: The path is missing, of another kind, damaged, or leads to other files.
     """
-    reader = _reader_of(path, columns)
+    reader = _reader_of(path)
     try:
+        if reader in (_read_text, read_numpy, _read_folder):
+            return reader(path, columns)
         return reader(path)
     except (DatasetError, ModuleNotFoundError):
         raise
@@ -63,27 +65,35 @@ def open_recordings(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
         raise DatasetError(f"cannot be read ({error}): copy it again", file=path) from error
 
 
-def _reader_of(path: Path, columns: Sequence[str]) -> Callable[[Path], list[Recording]]:
-    name = path.name.lower()
-    if path.is_dir():
-        if (path / "meta" / "info.json").is_file():
-            text = "is a LeRobot dataset already: `hrc check`, `repair` and `merge` take it"
-            raise DatasetError(text, file=path)
-        if is_bag(path):
-            return read_bag
-        return read_zarr if _is_zarr(path) else partial(_read_folder, columns=columns)
-    if not path.is_file():
+def _reader_of(path: Path) -> Callable[..., list[Recording]]:
+    if path.is_dir() and (path / "meta" / "info.json").is_file():
+        text = "is a LeRobot dataset already: `hrc check`, `repair` and `merge` take it"
+        raise DatasetError(text, file=path)
+    if not path.is_dir() and not path.is_file():
         raise DatasetError("not found", file=path)
-    for suffix, reader in READERS.items():
-        if name.endswith(suffix) or (suffix == ".tfrecord" and suffix in name):
-            named = reader in (_read_text, read_npy)
-            return partial(reader, columns=columns) if named else reader
+    if (reader := _known_reader(path)) or path.is_dir():
+        return reader or _read_folder
+    name = path.name.lower()
     if name.endswith(_VIDEOS):
         raise DatasetError("is a video: name the folder that holds its states, too", file=path)
     if name.endswith(_PICKLES):
         text = "is a pickle, which can run any program when it is opened: save it as .npz"
         raise DatasetError(text, file=path)
     raise DatasetError(f"is of no kind that is read here: {', '.join(READERS)}", file=path)
+
+
+def _known_reader(path: Path) -> Callable[..., list[Recording]] | None:
+    """Reader of a file, a bag or a zarr store; None for other files and folders."""
+    if path.is_dir():
+        stores = (".zgroup", "zarr.json", ".zarray")
+        is_zarr = any((path / name).is_file() for name in stores)
+        return read_bag if is_bag(path) else read_zarr if is_zarr else None
+    name = path.name.lower()
+    for suffix, reader in READERS.items():
+        # The files of one RLDS set are numbered behind the suffix.
+        if name.endswith(suffix) or (suffix == ".tfrecord" and suffix in name):
+            return reader
+    return None
 
 
 def _read_text(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
@@ -101,54 +111,47 @@ def read_parquet(path: Path) -> list[Recording]:
     return split_episodes(path, fields)
 
 
-def read_npy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
-    """Episodes of a .npy file, whose columns may be given names."""
-    if zipfile.is_zipfile(path):
-        raise DatasetError("holds several arrays: its name should end in .npz", file=path)
+def read_numpy(path: Path, columns: Sequence[str] = ()) -> list[Recording]:
+    """Episodes of a .npz file, or of a .npy file, whose columns may be given names."""
+    arrays, details = dict(_numpy_arrays(path)), {}
+    _attributes({n: a[()] for n, a in arrays.items() if not a.shape}, details)
+    if UNNAMED in arrays:
+        arrays = _columns_of(path, arrays[UNNAMED], columns)
+    fields = {name: array_field(name, array) for name, array in arrays.items() if array.shape}
+    return split_episodes(path, fields, **details)
+
+
+def _numpy_arrays(path: Path) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays of a file by its content, whatever its name ends in."""
+    name = None
+    with path.open("rb") as stream:
+        single = stream.read(6) == b"\x93NUMPY"
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        if zipfile.is_zipfile(path):
+            with np.load(path, allow_pickle=False) as file:
+                for name in file.files:
+                    yield name, np.asarray(file[name])
+        elif single:
+            yield UNNAMED, np.load(path, mmap_mode="r", allow_pickle=False)
+        else:
+            raise DatasetError("cannot be read: it is damaged", file=path)
     except ValueError as error:
-        if "Python objects" in str(error):
-            raise DatasetError(_PICKLED, file=path) from error
+        if "allow_pickle" in str(error) or "Python objects" in str(error):
+            raise DatasetError(_PICKLED, file=path, key=name) from error
         raise
+
+
+def _columns_of(path: Path, array: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Columns of an array without a name, or the whole array if no names are known."""
     if array.dtype.names:  # a table of named columns
-        columns, array = array.dtype.names, np.stack([array[n] for n in array.dtype.names], -1)
+        return {name: array[name][:, None] for name in array.dtype.names}
     if array.dtype.kind not in "fiub" or 0 in array.shape or array.ndim == 0:
         text = f"an array of shape {array.shape} and type {array.dtype} holds no frames"
         raise DatasetError(f"{text} of numbers", file=path)
-    if not columns:
-        return split_episodes(path, {UNNAMED: array_field(UNNAMED, array)})
-    if len(columns) != array.shape[-1]:
-        text = f"{len(columns)} column names for {array.shape[-1]} columns"
+    if names and len(names) != array.shape[-1]:
+        text = f"{len(names)} column names for {array.shape[-1]} columns"
         raise DatasetError(text, file=path)
-    fields = {}
-    for place, name in enumerate(columns):
-        one = array_field(name, array[..., place : place + 1])
-        fields[name] = replace(one, kind="other") if array.ndim == 3 else one
-    return split_episodes(path, fields)
-
-
-def read_npz(path: Path) -> list[Recording]:
-    """Episodes of a .npz file."""
-    fields: dict[str, Field] = {}
-    details: dict[str, Any] = {}
-    if not zipfile.is_zipfile(path):
-        with path.open("rb") as stream:
-            single = stream.read(6) == b"\x93NUMPY"
-        text = "holds a single array: its name should end in .npy"
-        raise DatasetError(text if single else "cannot be read: it is damaged", file=path)
-    with np.load(path, allow_pickle=False) as file:
-        for name in file.files:
-            try:
-                array = file[name]
-            except ValueError as error:
-                text = _PICKLED if "allow_pickle" in str(error) else f"cannot be read: {error}"
-                raise DatasetError(text, file=path, key=name) from error
-            if isinstance(array, np.ndarray) and array.shape:
-                fields[name] = array_field(name, array)
-            elif isinstance(array, np.ndarray):
-                _attributes({name: array[()]}, details)
-    return split_episodes(path, fields, **details)
+    return {n: array[..., k : k + 1] for k, n in enumerate(names)} or {UNNAMED: array}
 
 
 def read_hdf5(path: Path) -> list[Recording]:
@@ -166,7 +169,15 @@ def read_hdf5(path: Path) -> list[Recording]:
             elif node.shape == ():
                 _attributes({name: node[()]}, details)
             elif node.shape and 0 not in node.shape and not node.dtype.names:
-                _hdf5_field(path, node, fields)
+                place = node.name.strip("/")
+                read = partial(_read_hdf5, path, place)
+                if node.dtype.kind != "O":
+                    unit = unit_in_words(_text(node.attrs.get("units", "")))
+                    made = make_field(place, node.shape, node.dtype, read, unit=unit)
+                    fields[place] = made
+                elif h5py.check_string_dtype(node.dtype) or h5py.check_vlen_dtype(node.dtype):
+                    kind = "encoded" if is_encoded(node[0]) else "text"
+                    fields[place] = Field(shape=node.shape[:1], kind=kind, read=read)
 
     with h5py.File(path, "r") as file:
         visit(file)
@@ -198,41 +209,22 @@ def _read_hdf5(path: Path, place: str, start: int, stop: int) -> np.ndarray:
         return file[place][start:stop]  # type: ignore[index]
 
 
-def _hdf5_field(path: Path, node: Any, fields: dict[str, Field]) -> None:
-    import h5py
-
-    place = node.name.strip("/")
-    read = partial(_read_hdf5, path, place)
-    if node.dtype.kind == "O":  # texts, or arrays of bytes of any length
-        kind = "encoded" if is_encoded(node[0]) else "text"
-        known = h5py.check_string_dtype(node.dtype) or h5py.check_vlen_dtype(node.dtype)
-        if known is not None:
-            fields[place] = Field(shape=node.shape[:1], kind=kind, read=read)
-        return
-    unit, names = (node.attrs.get(name, "") for name in ("units", "names"))
-    unit = unit.decode() if isinstance(unit, bytes) else str(unit)
-    known = len(node.shape) == 2 and np.size(names) == node.shape[1] > 1
-    words = [n.decode() if isinstance(n, bytes) else str(n) for n in names] if known else []
-    details = {"unit": unit_in_words(unit), "names": tuple(words) or None}
-    fields[place] = make_field(place, node.shape, node.dtype, read, **details)
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
 
 
 def _attributes(attributes: Mapping[str, Any], details: dict[str, Any]) -> None:
     """Frame rate and task among the attributes of a group."""
     for name, value in attributes.items():
-        text, key = value.decode() if isinstance(value, bytes) else value, name.lower()
+        key = name.lower()
         with contextlib.suppress(TypeError, ValueError, AttributeError, ZeroDivisionError):
             if name == "env_args":  # robomimic: settings of the simulator
-                _attributes(json.loads(text).get("env_kwargs", {}), details)
-            elif key in _TASKS and isinstance(text, str) and len(text) < 500:
-                details.setdefault("task", str(text))
+                _attributes(json.loads(value).get("env_kwargs", {}), details)
+            elif key in _TASKS and isinstance(value, str | bytes) and len(value) < 500:
+                details.setdefault("task", _text(value))
             elif key in (*_RATES, "dt"):
-                number = float(np.asarray(text).item())
+                number = float(np.asarray(value).item())
                 details.setdefault("fps", 1 / number if key == "dt" else number)
-
-
-def _is_zarr(path: Path) -> bool:
-    return any((path / name).is_file() for name in (".zgroup", "zarr.json", ".zarray"))
 
 
 def read_zarr(path: Path) -> list[Recording]:
@@ -342,7 +334,10 @@ def _rlds_episode(path: Path, number: int, place: tuple[int, int]) -> Recording:
     for name, values in steps.items():
         short = name.removeprefix("steps/")
         if isinstance(values, list):
-            read = partial(_read_rlds, path, place, name)
+
+            def read(start: int, stop: int, name: str = name) -> np.ndarray:
+                return np.array(_rlds_record(path, *place)[name][start:stop], dtype=object)
+
             found[short] = replace(bytes_field(values), read=read)
             if short.split("/")[-1] in _TASKS:
                 task = task or values[0].decode(errors="replace")
@@ -352,12 +347,6 @@ def _rlds_episode(path: Path, number: int, place: tuple[int, int]) -> Recording:
         else:
             found[short] = array_field(name, values.reshape(frames, -1))
     return Recording(file=path, label=label, fields=found, task=task)
-
-
-def _read_rlds(
-    path: Path, place: tuple[int, int], name: str, start: int, stop: int
-) -> np.ndarray:
-    return np.array(_rlds_record(path, *place)[name][start:stop], dtype=object)
 
 
 @lru_cache(maxsize=2)
@@ -380,8 +369,7 @@ def _rlds_record(path: Path, offset: int, length: int) -> dict[str, Any]:
 
 READERS: dict[str, Callable[..., list[Recording]]] = {
     **dict.fromkeys((".csv", ".tsv", ".txt", ".log", ".dat"), _read_text),
-    ".npz": read_npz,
-    ".npy": read_npy,
+    **dict.fromkeys((".npz", ".npy"), read_numpy),
     ".parquet": read_parquet,
     **dict.fromkeys((".hdf5", ".h5"), read_hdf5),
     ".mat": read_mat,
@@ -402,10 +390,7 @@ def _read_folder(path: Path, columns: Sequence[str]) -> list[Recording]:
     for entry in entries:
         if entry.is_symlink():
             raise DatasetError(_LINK, file=entry)
-    known = [
-        p for p in entries if p.name.lower().endswith((*READERS,)) or ".tfrecord" in p.name
-    ]
-    tables = [p for p in entries if p in known or (p.is_dir() and (_is_zarr(p) or is_bag(p)))]
+    tables = [p for p in entries if _known_reader(p)]
     videos = [p for p in entries if p.suffix.lower() in _VIDEOS]
     if not tables:
         folders = [p for p in entries if p.is_dir()]

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Float64, Shaped, UInt8
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import path_in, read_rows
@@ -68,26 +68,19 @@ def read_segments(folder: DatasetFolder, missing: bool = False) -> dict[int, Seg
     Raises:
         DatasetError: The metadata name no file, a file outside the dataset, or no times.
     """
+    found: dict[int, dict[str, VideoSegment]] = {entry.index: {} for entry in folder.episodes}
+    for episode, key, segment in (_segments_v3 if folder.is_v3 else _segments_v2)(folder):
+        if episode in found and (missing or segment.file.is_file()):
+            found[episode][key] = segment
+    return {**found}
+
+
+def _segments_v3(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment]]:
+    """Episode index, video feature and segment, from the list of episodes."""
     keys = video_keys(folder)
-    if not keys:
-        return {}
-    segments = _segments_v3(folder, keys) if folder.is_v3 else _segments_v2(folder, keys)
-    return {
-        entry.index: {
-            key: segment
-            for key, segment in segments.get(entry.index, {}).items()
-            if missing or segment.file.is_file()
-        }
-        for entry in folder.episodes
-    }
-
-
-def _segments_v3(folder: DatasetFolder, keys: list[str]) -> Mapping[int, Segments]:
     columns = [f"videos/{key}/{name}" for key in keys for name in _PLACE]
-    found: dict[int, dict[str, VideoSegment]] = {}
-    for file in episode_lists(folder.root):
+    for file in episode_lists(folder.root) if keys else ():
         for row in read_rows(folder.root, file, ("episode_index",), columns):
-            shown = found.setdefault(row["episode_index"], {})
             for key in keys:
                 values: dict[str, Any] = {n: row.get(f"videos/{key}/{n}") for n in _PLACE}
                 if values["chunk_index"] is None:
@@ -100,20 +93,19 @@ def _segments_v3(folder: DatasetFolder, keys: list[str]) -> Mapping[int, Segment
                         place = {"episode": row["episode_index"], "key": f"videos/{key}/{name}"}
                         raise DatasetError(text, file=file, **place)
                 chunk, number, *times = values.values()
-                shown[key] = _segment(folder, key, times, chunk_index=chunk, file_index=number)
-    return found
+                segment = _segment(folder, key, times, chunk_index=chunk, file_index=number)
+                yield row["episode_index"], key, segment
 
 
-def _segments_v2(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
-    """Segments of the versions 2, which keep one file per episode and camera."""
+def _segments_v2(folder: DatasetFolder) -> Iterator[tuple[int, str, VideoSegment]]:
+    """The same for the versions 2, which keep one file per episode and camera."""
     size = int(folder.info.get("chunks_size", 1000))
-    segments = {}
     for entry in folder.episodes:
         chunk = entry.index // size
         places = {"episode_chunk": chunk, "chunk_index": chunk, "episode_index": entry.index}
-        times = (0.0, entry.length / folder.fps)
-        segments[entry.index] = {key: _segment(folder, key, times, **places) for key in keys}
-    return segments
+        for key in video_keys(folder):
+            times = (0.0, entry.length / folder.fps)
+            yield entry.index, key, _segment(folder, key, times, **places)
 
 
 def _segment(
@@ -130,7 +122,7 @@ _CODECS = {"av1": "av1", "h264": "h264_mp4toannexb", "hevc": "hevc_mp4toannexb",
 
 def encoded_samples(
     segment: VideoSegment,
-) -> tuple[str, list[float], list[bytes]] | None:
+) -> tuple[str, Float64[np.ndarray, " _images"], tuple[bytes, ...]] | None:
     """The images of a segment as they are encoded, for players that decode on demand.
 
     Returns:
@@ -169,7 +161,7 @@ def encoded_samples(
                     samples.append(bytes(part))
     except (av.FFmpegError, OSError, IndexError) as error:
         raise DatasetError(f"cannot be read as a video: {error}", file=segment.file) from error
-    return (codec, times, samples) if len(times) == len(samples) else None
+    return (codec, np.array(times), tuple(samples)) if len(times) == len(samples) else None
 
 
 def decode(

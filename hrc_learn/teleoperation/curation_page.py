@@ -18,7 +18,7 @@ import torch
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
 from hrc_learn.demos.dataset_arm import arm_of_dataset
-from hrc_learn.demos.images import ImageReader, jpeg
+from hrc_learn.demos.images import ImageReader, jpeg, thumbnail_size
 from hrc_learn.demos.issues import plain_text
 from hrc_learn.demos.quality.ranking import MEASURES, Ranking
 from hrc_learn.demos.quality.repair import (
@@ -200,9 +200,7 @@ class CurationPage:
 
     def _size(self, key: str) -> tuple[int, int]:
         """Height and width of the images sent [px]; even, as JPEG subsampling requires."""
-        height, width = self._images.size(key)
-        scale = min(1.0, _TALLEST / height)
-        return 2 * max(1, round(scale * height / 2)), 2 * max(1, round(scale * width / 2))
+        return thumbnail_size(*self._images.size(key), _TALLEST)
 
     async def _session(self, connection: Any, visitor: Visitor) -> None:
         """Take decisions, and answer each with the state or the reason of its refusal."""

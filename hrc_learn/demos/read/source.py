@@ -15,7 +15,7 @@ from hrc_learn.demos.demonstration import (
     DemonstrationSet,
     joint_columns,
 )
-from hrc_learn.demos.image_features import missing_note, only_feature, with_feature
+from hrc_learn.demos.image_features import extracted_features
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
 from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
 from hrc_learn.demos.read.contract import Contract, fingerprint, read_contract
@@ -318,10 +318,11 @@ class DemonstrationSource(Sequence[Demonstration]):
         noted = [*columns.notes]
         noted += [f"{role} {note}" for role, note in columns.unmatched.items()]
         noted += [dataset.contract_note, *(d.note for d in decisions.values())]
-        self._extracted = feature = None if dataset.own_feature else only_feature(root)
-        if feature is not None:
-            noted.append(f"feature: {feature.name}, extracted from the videos")
-            noted += missing_note(feature, [entry.index for entry in entries])
+        extracted = [] if dataset.own_feature else extracted_features(root)
+        self._extracted = extracted[0] if len(extracted) == 1 else None
+        if self._extracted is not None:
+            noted.append(f"feature: {self._extracted.name}, extracted from the videos")
+            noted += self._extracted.note([entry.index for entry in entries])
         self.notes = tuple(note for note in noted if note)
 
     @overload
@@ -446,7 +447,7 @@ class DemonstrationSource(Sequence[Demonstration]):
             **fields | self._pose(episode, values),
         )
         if self._extracted is not None:
-            demo = with_feature(demo, self._extracted, if_known=True)
+            demo = self._extracted.attach(demo, if_known=True)
         return demo.select_joints(self.joint_names)
 
     def _pose(
