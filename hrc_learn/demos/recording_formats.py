@@ -427,7 +427,7 @@ def _video_field(path: Path) -> Field:
         rate = float(stream.average_rate or 0)
         frames = stream.frames or round((container.duration or 0) / av.time_base * rate)
         shape = (frames, stream.height, stream.width, 3)
-    segment = VideoSegment(file=path, start=0.0, stop=frames / rate)
+        segment = VideoSegment(file=path, start=0.0, stop=frames / rate)
 
     def images(start: int) -> Iterator[Image]:
         image, number = None, start

@@ -238,8 +238,9 @@ class ColumnRewriter:
             frames_before: Number of frames of the episodes before.
         """
         edit, others = episode.edit, self._other_columns(episode.edit)
+        pictures = {**episode.videos, **others}
         statistics = {
-            key: self._image_statistics(edit, key, others.get(key, episode.videos.get(key)))
+            key: self._image_statistics(edit, key, pictures[key])
             for key in (*self._cameras, *self._image_columns)
         }
         indices = np.array([numbers[text] for text in episode.tasks])
