@@ -162,8 +162,7 @@ class Multiplication:
             file = Path(self.config.segments)
             self.segmentation = read_json(file, Segmentation, "correct it")
         else:
-            signals = [[d.gripper] if d.gripper is not None else [] for d in self.demos]
-            self.segmentation = find_segments(self.demos, objects, signals, tool)
+            self.segmentation = find_segments(self.demos, objects, tool)
         in_cell = self.judge.scene in ("grasping", "placing")
         if not same:
             shift = self.config.shift or (

@@ -93,33 +93,28 @@ class Segmentation:
 
 
 def find_segments(
-    demos: Sequence[Demonstration],
-    objects: Mapping[str, Pose],
-    signals: Sequence[Sequence[Float[np.ndarray, " frames"]]],
-    tool: Sequence[Pose],
+    demos: Sequence[Demonstration], objects: Mapping[str, Pose], tool: Sequence[Pose]
 ) -> Segmentation:
-    """Cut demonstrations where a signal begins to switch, and choose the frames.
+    """Cut demonstrations where the gripper begins to switch, and choose the frames.
 
     Args:
         demos: Demonstrations of one task.
         objects: Poses of each object at the start of each demonstration, (n).
-        signals: Signals of each demonstration, such as its gripper's opening.
         tool: Poses of the tool along each demonstration.
 
     Raises:
         ValueError: The demonstrations differ in the number of their switches.
     """
+    openings = [demo.gripper for demo in demos if demo.gripper is not None] or [np.zeros(1)]
+    low, high = min(x.min() for x in openings), max(x.max() for x in openings)
     cuts: dict[int, tuple[int, ...]] = {}
-    pooled = [np.concatenate(values) for values in zip(*signals, strict=True)]
-    for demo, own in zip(demos, signals, strict=True):
-        found = {0, len(demo) - 1}
-        for values, of_all in zip(own, pooled, strict=True):
-            found |= set(_switches(values, float(of_all.min()), float(of_all.max())))
-        kept: list[int] = []
-        for cut in sorted(found):
-            if not kept or cut - kept[-1] >= _SHORTEST:
+    for demo in demos:
+        last, kept = len(demo) - 1, [0]
+        switches = [] if demo.gripper is None else _switches(demo.gripper, low, high)
+        for cut in (*switches, last):
+            if cut - kept[-1] >= _SHORTEST:
                 kept.append(cut)
-        kept[-1] = len(demo) - 1
+        kept[-1] = last
         cuts[demo.episode] = tuple(kept)
     counts = {episode: len(each) - 2 for episode, each in cuts.items()}
     if len(set(counts.values())) > 1:
@@ -140,10 +135,10 @@ def _switches(values: Float[np.ndarray, " frames"], low: float, high: float) -> 
     if high - low <= _CONSTANT * max(abs(low), abs(high)):
         return []
     level = (values - low) / (high - low)
-    crossed = np.flatnonzero(np.diff(level > 0.5))
+    moving = np.abs(np.diff(level, prepend=level[0])) > _MOVING
     begun = []
-    for k in crossed.tolist():
-        while k > 0 and abs(level[k] - level[k - 1]) > _MOVING:
+    for k in np.flatnonzero(np.diff(level > 0.5)).tolist():
+        while k > 0 and moving[k]:
             k -= 1
         begun.append(k)
     return begun
@@ -319,36 +314,28 @@ class MotionSource:
         """
         segmentation.check(demos, objects)
         segments = []
+        fixed = isinstance(near, Tensor)
         for k, frame in enumerate(segmentation.frames):
             spans = [segmentation.cuts[demo.episode][k : k + 2] for demo in demos]
-            parts = [slice(a, b + 1) for a, b in spans]
-            local = [
-                frame_of(
-                    {name: pose[i] for name, pose in objects.items()}, frame, whole[0]
-                ).inverse()
-                @ whole[part]
-                for i, (whole, part) in enumerate(zip(tool, parts, strict=True))
-            ]
-            count = min(b - a for a, b in spans) // _PER_FUNCTION
-            body = (
-                None
-                if isinstance(near, Tensor)
-                else [q[part] for q, part in zip(near, parts, strict=True)]
-            )
+            parts = [slice(first, last + 1) for first, last in spans]
+            local = []
+            for i, (whole, part) in enumerate(zip(tool, parts, strict=True)):
+                scene = {name: pose[i] for name, pose in objects.items()}
+                local.append(frame_of(scene, frame, whole[0]).inverse() @ whole[part])
             times = [torch.from_numpy(d.time[p]) for d, p in zip(demos, parts, strict=True)]
+            body = None
+            if not fixed:
+                body = [q[part] for q, part in zip(near, parts, strict=True)]
+            shown = times, [p.position for p in local], [p.orientation for p in local]
+            count = min(last - first for first, last in spans) // _PER_FUNCTION
             options: Any = {"n_basis": min(max(count, _FEWEST), _MOST), "smooth": True}
-            parts = times, [p.position for p in local], [p.orientation for p in local]
-            dmp = PoseDMP.fit(*parts, **options)
-            dmp = PoseDMP.fit(*parts, body=body, approach=_free_fraction(dmp), **options)
+            dmp = PoseDMP.fit(*shown, **options)
+            dmp = PoseDMP.fit(*shown, body=body, approach=_free_fraction(dmp), **options)
             first, last = torch.tensor(spans, dtype=torch.float64).unbind(-1)
             segments.append(
                 _Segment(frame=frame, dmp=with_common_reference(dmp), first=first, last=last)
             )
-        posture = (
-            near.expand(len(demos), -1)
-            if isinstance(near, Tensor)
-            else torch.stack([q[0] for q in near])
-        )
+        posture = near.expand(len(demos), -1) if fixed else torch.stack([q[0] for q in near])
         return cls(
             robot=robot,
             fps=float(demos[0].fps),

@@ -1,5 +1,7 @@
 """New motions: their segments, their ends in new scenes, continuity and limits."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -36,7 +38,7 @@ def objects():
 
 @pytest.fixture(scope="module")
 def segments(demos, tool, objects):
-    return find_segments(demos, objects, [[demo.gripper] for demo in demos], tool)
+    return find_segments(demos, objects, tool)
 
 
 @pytest.fixture(scope="module")
@@ -76,21 +78,17 @@ def test_a_motion_that_does_not_turn_with_its_object_follows_its_position(demos,
         Pose(at.position, torch.tensor([1.0, 0, 0, 0]).double()) @ pose
         for at, pose in zip(BLOCKS, own, strict=True)
     ]
-    signals = [[demo.gripper] for demo in demos]
-    found = find_segments(demos, {"block": stacked(turned)}, signals, upright)
+    found = find_segments(demos, {"block": stacked(turned)}, upright)
     assert found.frames == ("block position", "block position")
 
 
 def test_a_motion_that_ends_where_no_object_is_stays_in_the_base(demos):
     fixed = Pose(torch.tensor([0.4, -0.3, 0.3]).double(), BLOCKS[2].orientation)
-    still = (
-        [fixed[[0] * END] for _ in demos]
-        if False
-        else [
-            Pose(fixed.position.expand(END, 3), fixed.orientation.expand(END, 4)) for _ in demos
-        ]
-    )
-    found = find_segments(demos, {"block": stacked(BLOCKS)}, [[] for _ in demos], still)
+    still = [
+        Pose(fixed.position.expand(END, 3), fixed.orientation.expand(END, 4)) for _ in demos
+    ]
+    bare = [replace(demo, gripper=None) for demo in demos]
+    found = find_segments(bare, {"block": stacked(BLOCKS)}, still)
     assert found.frames == ("base",)
 
 
@@ -180,6 +178,6 @@ def test_wrong_segments_are_refused(demos, objects, frames, cuts, message):
 
 
 def test_demonstrations_with_other_switches_are_refused(demos, tool, objects):
-    signals = [[demo.gripper] for demo in demos[:-1]] + [[np.full(END, 0.08)]]
+    other = [*demos[:-1], replace(demos[-1], gripper=np.full(END, 0.08))]
     with pytest.raises(ValueError, match="episode 2: 0"):
-        find_segments(demos, objects, signals, tool)
+        find_segments(other, objects, tool)
