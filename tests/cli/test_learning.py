@@ -26,6 +26,14 @@ def poses(tmp_path_factory):
     return folder / "set"
 
 
+@pytest.fixture(scope="module")
+def fitted(poses):
+    """Model of positions and orientations of all demonstrations, and the output of its fit."""
+    out = poses.with_name("fitted")
+    fit = ("fit", "--dataset", poses, "--n-basis", 20, "--channels", "position", "orientation")
+    return out, done(*fit, "--out", out).output
+
+
 def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     model = tmp_path / "model"
     done(
@@ -63,8 +71,8 @@ def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):
 
 def test_an_evaluation_on_what_was_learned_from_says_so(poses, tmp_path):
     model = tmp_path / "model"
-    fit = ("fit", "--dataset", poses, "--out", model, "--n-basis", 20, "--several", "mean")
-    done(*fit, "--episodes", 0, 1, 2, 3)
+    fit = ("fit", "--dataset", poses, "--out", model, "--n-basis", 10, "--several", "streamed")
+    done(*fit, "--channels", "position", "--episodes", 0, 1, 2, 3)
     output = done("evaluate", "--model", model, "--dataset", poses).output
     assert "all of these demonstrations were learned from" in output
     assert "not learned from" not in output
@@ -81,10 +89,8 @@ def test_a_model_that_names_no_dataset_is_refused(poses, tmp_path, content):
     assert str(model / "made_by.json") in error
 
 
-def test_an_error_of_nan_meets_no_limit(poses, tmp_path, monkeypatch):
-    model = tmp_path / "model"
-    fit = ("fit", "--dataset", poses, "--out", model, "--n-basis", 20, "--several", "mean")
-    done(*fit, "--channels", "position")
+def test_an_error_of_nan_meets_no_limit(poses, fitted, monkeypatch):
+    model, _ = fitted
     monkeypatch.setattr(
         ReproductionError, "summary", lambda *_: {"position_nrmse_median": math.nan}
     )
@@ -161,10 +167,9 @@ def test_an_evaluation_without_a_model_holds_demonstrations_out(poses, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
 
 
-def test_a_fit_shows_few_rows_with_units(poses, tmp_path):
-    fit = ("fit", "--dataset", poses, "--n-basis", 20, "--channels", "position", "orientation")
-    output = done(*fit, "--out", tmp_path / "model").output
-    metrics = json.loads((tmp_path / "model" / "metrics.json").read_text())
+def test_a_fit_shows_few_rows_with_units(fitted):
+    model, output = fitted
+    metrics = json.loads((model / "metrics.json").read_text())
     (row,) = [line for line in output.splitlines() if "worst NRMSE" in line]
     assert "< 0.01 %" in row
     assert "ok" in row
@@ -175,11 +180,8 @@ def test_a_fit_shows_few_rows_with_units(poses, tmp_path):
     assert f"{len(metrics) - len(rows)} more" in output
 
 
-def test_an_evaluation_uses_the_model_that_predicts_best(poses, tmp_path):
-    model = tmp_path / "model"
-    output = done(
-        *("fit", "--dataset", poses, "--n-basis", 20, "--channels", "position", "--out", model)
-    ).output
+def test_an_evaluation_uses_the_model_that_predicts_best(poses, fitted):
+    model, output = fitted
     assert "held out, by start and goal" in output
     metrics = json.loads((model / "metrics.json").read_text())
     kind = json.loads((model / "prediction.json").read_text())["models"]["position"]

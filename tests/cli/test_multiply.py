@@ -9,9 +9,17 @@ import torch
 from commands import hrc
 from multiply_samples import END, write_dataset
 
+from hrc_learn.cli import multiply_command
 from hrc_learn.demos import check_dataset, load_demos
 from hrc_learn.kinematics import arm, panda
 from hrc_learn.learning import multiply_dataset
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """Few motions are made at a time, and few failures end the work."""
+    monkeypatch.setattr(multiply_command, "_CHUNK", 8)
+    monkeypatch.setattr(multiply_command, "_ENOUGH", 12)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,9 @@ from commands import done, hrc
 
 from hrc_learn.demos import DatasetWriter, open_demos
 from hrc_learn.geometry import minimum_jerk
+from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.registry import arm
+from hrc_learn.learning.motion_playing import FittedModel, Target, arm_for, play_on_arm
 
 pin = pytest.importorskip("pinocchio")
 
@@ -88,19 +90,33 @@ def beyond(name, joints):
     return float(np.max(ratios))
 
 
-@pytest.mark.parametrize(
-    ("name", "goal"), [("panda", (0.5, -0.1, 0.4)), ("so101", (0.25, 0.1, 0.15))]
-)
-def test_an_arm_reaches_a_position_within_its_limits(name, goal, models, tmp_path):
-    out, values = tmp_path / "out", tmp_path / "values.json"
-    done("play", models[name], "--goal", *goal, "--robot", name, "--out", out, "--json", values)
-    names, rows = played(out)
-    robot = arm(name)
-    joints = rows[:, 1 : 1 + robot.joints]
-    assert names[1 : 1 + robot.joints] == [f"{n} [rad]" for n in robot.chain.joint_names]
+def moved(models, name, goal, start=None, duration=None):
+    """Motion of an arm by the model of its demonstrations."""
+    model = FittedModel.load(models[name])
+    return play_on_arm(model, arm_for(model, name), start, goal, duration)
+
+
+GOALS = {"panda": (0.5, -0.1, 0.4), "so101": (0.25, 0.1, 0.15)}
+
+
+@pytest.mark.parametrize("name", GOALS)
+def test_an_arm_reaches_a_position_within_its_limits(name, models):
+    goal = GOALS[name]
+    joints = moved(models, name, Target(position=torch.tensor(goal).double())).joints
     assert tool_by_pinocchio(name, joints[-1]) == pytest.approx(goal, abs=1e-3)
     assert beyond(name, joints) <= 1 + 1e-6
     assert np.abs(np.diff(joints, axis=0)).max() < 0.1  # continuous
+
+
+def test_a_motion_is_written_as_table_film_recording_and_episode(models, tmp_path):
+    out, values = tmp_path / "out", tmp_path / "values.json"
+    goal = ("--goal", *GOALS["panda"], "--robot", "panda")
+    done("play", models["panda"], *goal, "--out", out, "--json", values)
+    names, rows = played(out)
+    joints = rows[:, 1:8]
+    assert names[1:8] == [f"{n} [rad]" for n in panda.chain.joint_names]
+    expected = moved(models, "panda", Target(position=torch.tensor(GOALS["panda"]).double()))
+    assert joints == pytest.approx(expected.joints, abs=1e-6)
     measured = json.loads(values.read_text())
     assert measured["goal_position_error_mm"] < 1
     assert measured["duration_s"] == pytest.approx(rows[-1, 0])
@@ -110,33 +126,28 @@ def test_an_arm_reaches_a_position_within_its_limits(name, goal, models, tmp_pat
     assert episode.command_position[:-1] == pytest.approx(joints[1:], abs=1e-5)
 
 
-def test_a_pose_is_reached_with_its_orientation(models, tmp_path):
-    turned = arm("panda").forward(arm("panda").ready + 0.1)
-    pose = (*(turned.position + 0.05).tolist(), *turned.orientation.tolist())
-    out = tmp_path / "out"
-    done("play", models["panda"], "--goal", "pose", *pose, "--robot", "panda", "--out", out)
-    _, rows = played(out)
-    end = arm("panda").forward(torch.from_numpy(rows[-1, 1:8]))
-    assert end.position.tolist() == pytest.approx(pose[:3], abs=1e-3)
+def test_a_pose_is_reached_with_its_orientation(models):
+    turned = panda.forward(panda.ready + 0.1)
+    goal = Target(position=turned.position + 0.05, orientation=turned.orientation)
+    end = panda.forward(torch.from_numpy(moved(models, "panda", goal).joints[-1]))
+    assert end.position.tolist() == pytest.approx(goal.position.tolist(), abs=1e-3)
     assert abs(float(end.orientation @ turned.orientation)) == pytest.approx(1, abs=1e-5)
 
 
-def test_what_is_too_fast_takes_longer_and_says_why(models, tmp_path):
-    out = tmp_path / "out"
+def test_what_is_too_fast_takes_longer_and_says_why(models):
     goal = (0.6, 0.4, 0.3, -2.0, 0.2, 1.9, 1.2)
-    words = ("--goal", "joints", *goal, "--robot", "panda", "--duration", 0.3)
-    asked = done("play", models["panda"], *words, "--out", out)
-    assert re.search(r"s instead of 0.30 s, because the \w+ of panda_joint", asked.output)
-    _, rows = played(out)
-    assert rows[-1, 1:8] == pytest.approx(goal, abs=1e-3)
-    assert 0.9 * 0.3 < beyond("panda", rows[:, 1:8]) <= 1 + 1e-6
+    motion = moved(models, "panda", Target(joints=torch.tensor(goal).double()), duration=0.3)
+    assert re.fullmatch(r"\w+ of panda_joint\d", motion.slowed_by)
+    assert motion.planned_duration == 0.3
+    assert motion.joints[-1] == pytest.approx(goal, abs=1e-3)
+    assert 0.9 * 0.3 < beyond("panda", motion.joints) <= 1 + 1e-6
     # Its spring pulls it towards a distant goal: 1.2 rad take 4.4 s at 7.5 rad/s^2.
-    assert 0.5 < rows[-1, 0] < 6.0
+    assert 0.5 < motion.time[-1] < 6.0
 
 
 def test_a_demonstration_gives_start_and_goal(models, tmp_path):
     out = tmp_path / "out"
-    words = ("--start", "episode", 1, "--goal", "episode", 0, "--robot", "so101")
+    words = ("--start", "episode", 1, "--goal", "episode", 0)
     done("play", models["so101"], *words, "--out", out)
     _, rows = played(out)
     ready = arm("so101").ready.numpy()

@@ -20,7 +20,7 @@ GOAL = quaternion.exp(torch.tensor([0.9, -0.7, 0.6], dtype=torch.float64))
 TURN_RATE = torch.tensor([1.5, -2.0, 0.5], dtype=torch.float64)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def dmp():
     return OrientationDMP.fit(*turning_motion(), n_basis=15, formulation="ude", approach=0)
 
@@ -60,14 +60,14 @@ def test_rollouts_solve_the_printed_equation(dmp):
 def test_steps_are_of_fourth_order(dmp):
     expected, omega = printed(dmp, dmp.start, TURN_RATE, GOAL, 2.0, [0.0, 1.2])
     errors = []
-    for n_steps in (6, 12, 24, 200):
+    for n_steps in (6, 12, 24, 120):
         state = dmp.initial_state(None, GOAL, 2.0, TURN_RATE)
         with torch.no_grad():
             for _ in range(n_steps):
                 state = dmp.step(state, 1.2 / n_steps)
         errors.append((state.angular_velocity - omega[-1]).norm().item())
     assert quaternion.angle(state.orientation, expected[-1]) < 1e-6
-    assert errors[-1] < 1e-8
+    assert errors[-1] < 1e-7
     orders = np.log2(np.array(errors[:-2]) / errors[1:-1])
     assert ((orders > 3.5) & (orders < 4.5)).all(), orders
 
@@ -126,8 +126,8 @@ def test_a_goal_that_jumps_moves_nothing_and_a_filtered_one_pulls_no_harder(dmp)
     assert (acceleration(state, goal=GOAL) - before).norm() > 5
     late = dmp.step(state, 0.02, goal=GOAL, goal_filter=8.0)
     with torch.no_grad():
-        for _ in range(100):
-            late = dmp.step(late, 0.08, goal_filter=8.0)
+        for _ in range(40):
+            late = dmp.step(late, 0.2, goal_filter=8.0)
     assert quaternion.angle(late.orientation, GOAL) < 1e-6
 
 
@@ -144,7 +144,7 @@ def test_drift_agrees_with_the_derivative_of_the_exponential():
 
 @pytest.mark.gradients
 def test_angular_acceleration_is_that_of_the_error(dmp):
-    t = torch.linspace(0, 3, 1501, dtype=torch.float64)
+    t = torch.linspace(0, 1, 501, dtype=torch.float64)
     got = dmp.rollout(t, goal=GOAL)
     numeric = (got.angular_velocity[2:] - got.angular_velocity[:-2]) / (t[2] - t[0])
     torch.testing.assert_close(numeric, got.angular_acceleration[1:-1], rtol=0, atol=1e-2)
