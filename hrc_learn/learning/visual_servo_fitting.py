@@ -27,12 +27,12 @@ from hrc_learn.jacobian import (
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.learning.large_datasets import LazyMap
+from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import (
     ANGLE_FEATURE,
     OBJECT_FEATURE,
     MarkerAngle,
     VisualServoSkill,
-    VisualTarget,
 )
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 from hrc_learn.vision.landmarks import Landmarks

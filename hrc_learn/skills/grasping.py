@@ -6,6 +6,7 @@ The skill waits until the object is detected, up to a timeout. If the grasp miss
 times out, it starts again from home.
 """
 
+import copy
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -17,14 +18,14 @@ from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import CameraConfig
+from hrc_learn.jacobian import CameraConfig, CameraEstimator
 from hrc_learn.kinematics import GraspedBox, UnreachableError
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
 from hrc_learn.skills.visual_servoing import ServoStep, VisualServo
-from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill, camera_estimator
+from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
     MissedGraspError,
@@ -162,7 +163,10 @@ class Grasping:
         self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
         controller = AdaptiveController(
             cell.chain,
-            camera_estimator(skill.jacobian, None if skill.landmarks is None else _UNMARKED),
+            CameraEstimator(
+                copy.deepcopy(skill.jacobian).double(),
+                None if skill.landmarks is None else _UNMARKED,
+            ),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=replace(config.controller, safety=cell.watchful(cell.config.safety)),
         )

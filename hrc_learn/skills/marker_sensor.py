@@ -1,11 +1,10 @@
 """A fixed camera as a sensor of tool and objects, by markers or without; delay and loss."""
 
-from __future__ import annotations
-
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,47 +18,45 @@ from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, angle, centre
 from hrc_learn.vision.landmarks import LandmarkDetector, Landmarks
 
-# Standard deviation of a marker's centre [px], in images blurred as cameras blur them.
-_MARKER_NOISE = 0.1
 # Standard deviation beyond which a landmark counts as not found [px].
 _UNSURE = 2.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class SeenFeature:
-    """Pixel of a tool or an object in an image."""
+class SeenFeature(NamedTuple):
+    """Place of a tool or an object in an image."""
 
     pixel: Float[np.ndarray, "2"]
     """(u, v) [px]."""
     angle: float
     """Direction in the image [rad]; NaN: none."""
-    covariance: Float[np.ndarray, "2 2"]
-    """Covariance of the pixel [px^2]."""
 
 
-@runtime_checkable
-class FeatureSensor(Protocol):
+class FeatureSensor(ABC):
     """Camera that finds tool and objects, by the numbers that their markers would have."""
+
+    def __init__(self, camera: Camera):
+        """Take images from a camera."""
+        self._camera = camera
 
     @property
     def age(self) -> float:
-        """Age of the newest image when it was read [s]."""
-        ...
+        """Age of the newest image when it was read [s]; 0 if the camera has no time stamps."""
+        return self._camera.age if isinstance(self._camera, TimedCamera) else 0.0
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Take an image, RGB."""
-        ...
+        return self._camera.read()
 
+    @abstractmethod
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
-        """Take an image; what is found in it, by number. What is left out was not found.
+        """Take an image, and find features in it, by number; those not found are left out.
 
         Args:
             ids: Numbers to search for; None: all.
         """
-        ...
 
 
-class LandmarkSensor:
+class LandmarkSensor(FeatureSensor):
     """Finds tool and objects without markers, from landmarks of demonstrations."""
 
     def __init__(self, camera: Camera, landmarks: Landmarks, names: Mapping[int, str]):
@@ -70,24 +67,16 @@ class LandmarkSensor:
             landmarks: What is known of tool and objects.
             names: Landmark of each number.
         """
-        self._camera, self._names = camera, dict(names)
+        super().__init__(camera)
+        self._names = dict(names)
         self._detector = LandmarkDetector(landmarks)
-
-    @property
-    def age(self) -> float:
-        """Age of the newest image when it was read [s]; 0 if the camera has no time stamps."""
-        return _age(self._camera)
-
-    def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Take an image, RGB."""
-        return self._camera.read()
 
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
         """Take an image; landmarks found in it with a certain place, by number."""
         wanted = [i for i in (self._names if ids is None else ids) if i in self._names]
         found = self._detector.find(self.read(), [self._names[i] for i in wanted])
         return {
-            i: SeenFeature(pixel=one.pixel, angle=one.angle, covariance=one.covariance)
+            i: SeenFeature(one.pixel, one.angle)
             for i in wanted
             if (one := found.get(self._names[i])) is not None and one.deviation < _UNSURE
         }
@@ -110,11 +99,7 @@ def feature_sensor(
     return LandmarkSensor(camera, landmarks, {tool: "tool", **names})
 
 
-def _age(camera: Camera) -> float:
-    return camera.age if isinstance(camera, TimedCamera) else 0.0
-
-
-class MarkerSensor:
+class MarkerSensor(FeatureSensor):
     """Detects the centres of markers in a camera's images."""
 
     def __init__(self, camera: Camera, marker_ids: Iterable[int]):
@@ -124,25 +109,13 @@ class MarkerSensor:
             camera: Source of the images.
             marker_ids: ArUco numbers to report; others are ignored.
         """
-        self._camera = camera
-        self._detector = MarkerDetector(list(marker_ids))
-
-    @property
-    def age(self) -> float:
-        """Age of the newest image when it was read [s]; 0 if the camera has no time stamps."""
-        return _age(self._camera)
-
-    def read(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Take an image, RGB."""
-        return self._camera.read()
+        super().__init__(camera)
+        self._detector = MarkerDetector(marker_ids)
 
     def features(self, ids: Iterable[int] | None = None) -> dict[int, SeenFeature]:
         """Take an image; centre and direction of each marker in it, by number."""
-        covariance = _MARKER_NOISE**2 * np.eye(2)
-        return {
-            id: SeenFeature(pixel=centre(found), angle=angle(found), covariance=covariance)
-            for id, found in self.corners(ids).items()
-        }
+        found = self.corners(ids).items()
+        return {id: SeenFeature(centre(corners), angle(corners)) for id, corners in found}
 
     def detect(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "2"]]:
         """Take an image; return the pixel (u, v) of each marker in it, by number.
@@ -208,7 +181,7 @@ class DelayedDetection:
         """Start without detections.
 
         Args:
-            sensor: Camera with its detector; None: no camera.
+            sensor: Camera that finds tool and objects; None: no camera.
             latency: Delay and loss of images.
             dt: Control step [s].
             rng: Random generator of the losses.

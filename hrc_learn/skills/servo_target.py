@@ -1,14 +1,17 @@
-"""Goals of visual servoing: from the target in the image, and from what a person draws.
+"""Target of visual servoing in the image, learned from demonstrations, and the goals for it.
 
-The paper's expert draws the Cartesian region in the AR interface and adjusts the coarse
-orientation (section VII). The region is a box there (CaFun), and here: its walls are those that
-were drawn.
+Demonstrations end with the end effector right above an object. The target is the place of the
+object's marker in the tool frame there, learned from the pixels of both markers. In a new scene
+the camera, as estimated then, turns the object's pixel into a ray; the ray meets the height
+at which the demonstrations found objects; and the end effector belongs where the object has the
+learned place. The target in the image is the pixel of the end effector's marker there, so
+errors of calibration that move both markers alike cancel.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,254 +21,203 @@ from torch import Tensor
 from hrc_learn.controller import Goals
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraSpread
-from hrc_learn.protocols import DrawnRegion, HumanInput
-from hrc_learn.regions import OrientationRegion, PositionRegion
-from hrc_learn.skills.visual_skill import VisualTarget, object_heading
+from hrc_learn.jacobian.perspective import MARKER, SIZE, marker_pixels, on_plane
+from hrc_learn.regions import OrientationRegion
+from hrc_learn.skills.drawn_goals import DrawnGoalsConfig
+from hrc_learn.store import Metres, Pixels, read_json, write_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE
+
+LONGEST_OFFSET = 0.4
+"""Longest offset of the object's marker from the tool centre point [m]. Demonstrations at one
+place hardly show the height of the object: without this bound it could be metres."""
+
+# Steps of the fit of the offset, each from a closed form: perspective changes it slightly.
+_STEPS = 8
+# Offset from which the fit starts: below the end effector [m].
+_BELOW = (0.0, 0.0, 0.1)
+# Distance in the image along a marker's direction whose ends are followed to the table [px].
+_ALONG = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class DrawnGoalsConfig:
-    """Effect of a person's drawing on the goals."""
-
-    rate: float = 4.0
-    """Rate at which the end effector returns over the walls of a region [1/s], equal to that of
-    the planned box. Arms with a delay of 30 ms follow it without overshoot."""
-    target_half_size: float = 0.003
-    """Half edges of the box about a drawn target [m]; equal to the height of the planned
-    box."""
-    wall: float = 0.02
-    """Depth behind the walls of a region over which vision feedback fades in [m]: the distance
-    covered at full speed, 0.25 m/s, during the delay of images and servos, 80 ms."""
-    largest_turn: float = 0.5
-    """Largest turn relative to the planned orientation [rad]. The marker on the end effector is
-    detected up to about twice that tilt."""
-    settling: float = 0.15
-    """Time without changes until a drawing that keeps changing is applied [s]: a dragged
-    pointer changes it 25 times a second, and each change would have to be checked."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ValueError(f"{name} must be positive, but is {value}.")
+class _TargetFile:
+    version: Literal[3] = 3
+    offset_m: tuple[Metres, Metres, Metres]
+    error_px: Pixels | None
 
 
-class Drawing(NamedTuple):
-    """Region and target of the end effector drawn by a person."""
+@dataclass(frozen=True, kw_only=True)
+class VisualTarget:
+    """Place of the object's marker in the frame of a tool right above it."""
 
-    region: DrawnRegion | None
-    target: tuple[float, float, float] | None
+    offset: Float[np.ndarray, "3"]
+    """Place in the tool frame [m]."""
+    error: float
+    """Leave-one-out error, root mean square [px]; NaN with fewer than five demonstrations."""
 
-    def __bool__(self) -> bool:
-        return self.region is not None or self.target is not None
+    @classmethod
+    def fit(
+        cls,
+        camera: Float[Tensor, "13"],
+        objects: Float[np.ndarray, "demos 2"],
+        poses: Pose,
+    ) -> "VisualTarget":
+        """Fit to the ends of demonstrations.
 
-    @property
-    def words(self) -> str:
-        """Name of the drawing, for messages."""
-        if self.target is None:
-            return "the drawn region"
-        return "the target" if self.region is None else "the target in the drawn region"
+        Args:
+            camera: Camera of the demonstrations (see `jacobian.perspective`).
+            objects: Pixels of the object's marker [px].
+            poses: Poses of the end effector right above it, (demos,).
+
+        Raises:
+            ValueError: There are fewer than three demonstrations.
+        """
+        if len(objects) < 3:
+            raise ValueError(
+                f"the visual target needs three or more demonstrations, got {len(objects)}."
+            )
+        offset, error = np.array(_BELOW), math.nan
+        for _ in range(_STEPS):
+            # The camera sees the object as a marker on the tool.
+            carrying = torch.cat([camera[: MARKER.start], torch.from_numpy(offset)])
+            seen, slope = marker_pixels(carrying, poses)
+            design = slope[..., MARKER].numpy()
+            towards = objects - seen.numpy() + design @ offset
+            offset, error = _solved(design.reshape(-1, 3), towards)
+        return cls(offset=offset, error=error)
+
+    def tool_position(
+        self,
+        camera: Float[Tensor, "*batch 13"],
+        pixel: Float[Tensor, "2"],
+        above: Pose,
+    ) -> Float[Tensor, "*batch 3"]:
+        """Place of a tool right above an object [m].
+
+        Args:
+            camera: Cameras.
+            pixel: Pixel of the object's marker [px].
+            above: Orientation of the tool, and its height where demonstrations end.
+        """
+        offset = quaternion.rotate(above.orientation, torch.from_numpy(self.offset))
+        height = above.position[2] + offset[2]
+        return on_plane(camera, pixel.expand(*camera.shape[:-1], 2), height) - offset
+
+    def __call__(
+        self,
+        camera: Float[Tensor, "*batch 13"],
+        pixel: Float[Tensor, "2"],
+        above: Pose,
+        height: float | Float[Tensor, ""] | None = None,
+    ) -> Float[Tensor, "*batch 2"]:
+        """Target pixel of the end effector's marker for an object's marker at `pixel` [px].
+
+        Args:
+            camera: Cameras.
+            pixel: Pixel of the object's marker [px].
+            above: Orientation of the tool, and its height where demonstrations end.
+            height: Height of the tool now [m]; None: that of `above`.
+        """
+        place = self.tool_position(camera, pixel, above)
+        if height is not None:
+            level = torch.as_tensor(height).to(place).expand(place.shape[:-1])
+            place = torch.cat([place[..., :2], level[..., None]], dim=-1)
+        orientation = above.orientation.expand(*place.shape[:-1], 4)
+        one = Pose(place.unsqueeze(-2), orientation.unsqueeze(-2))
+        return marker_pixels(camera, one)[0].squeeze(-2)
+
+    def uncertainty(
+        self,
+        cameras: CameraSpread,
+        image_jacobian: Float[np.ndarray, "2 6"],
+        pixel: Float[Tensor, "2"],
+        above: Pose,
+    ) -> float:
+        """Standard deviation of the tool's place above the object, root of both axes [m].
+
+        The image closes the loop, so what counts is the error of the target pixel.
+
+        Args:
+            cameras: Estimate of the camera.
+            image_jacobian: Image Jacobian of the end effector's marker [px/m, px/rad].
+            pixel: Pixel of the object's marker [px].
+            above: Orientation of the tool, and its height where demonstrations end.
+        """
+        best, *others = self(cameras.samples, pixel, above)
+        apart = (torch.stack(others) - best).numpy()
+        metres = np.linalg.lstsq(image_jacobian[:, :2], apart.T, rcond=None)[0]
+        return float(np.sqrt(cameras.weights.numpy() @ (metres**2).sum(0)))
+
+    def save(self, path: Path) -> None:
+        """Write a JSON file, atomically."""
+        x, y, z = self.offset.tolist()
+        write_json(path, _TargetFile(offset_m=(x, y, z), error_px=self.error))
+
+    @classmethod
+    def load(cls, path: Path) -> "VisualTarget":
+        """Read a saved target.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file is damaged or has an unknown version.
+        """
+        content = read_json(path, _TargetFile, "fit the visual target again")
+        error = math.nan if content.error_px is None else content.error_px
+        return cls(offset=np.array(content.offset_m), error=error)
 
 
-_NOTHING = Drawing(None, None)
-# Avoids a division by zero [rad].
-_TINY_TURN = 1e-9
+def _solved(
+    design: Float[np.ndarray, "equations unknowns"], pixels: Float[np.ndarray, "demos 2"]
+) -> tuple[Float[np.ndarray, " unknowns"], float]:
+    """Least-squares solution for pixels, two equations a demonstration, and leave-one-out
+    error.
 
-
-def drawn_position(
-    drawing: Drawing, planned: PositionRegion, config: DrawnGoalsConfig
-) -> PositionRegion:
-    """Position region of the controller for a drawing.
-
-    It has the vertical walls of the drawn box, less a margin over which vision feedback fades.
-    The image shows little about height, so the box stays as flat as planned, at the planned
-    height or the nearest to it within the drawn one. A target has a small box of its own,
-    within the region.
-
-    Args:
-        drawing: Drawn region, target or both.
-        planned: Region without the person.
-        config: Rate and sizes.
+    A solution longer than `LONGEST_OFFSET` is shortened by the smallest sufficient ridge
+    penalty.
     """
-    centre, half_size = planned.centre, planned.half_size
-    box = drawing.region
-    if box is None:
-        low, high = torch.full_like(centre, -math.inf), torch.full_like(centre, math.inf)
-    else:
-        middle, half = centre.new_tensor(box.centre), centre.new_tensor(box.half_size)
-        low, high = middle - half, middle + half
-        flat = torch.minimum(half_size[2], half[2])
-        height = centre[2].clamp(low[2] + flat, high[2] - flat)
-        centre = torch.cat([middle[:2], height[None]])
-        half_size = torch.cat([half[:2] - _margin(half, config), flat[None]])
-    if drawing.target is not None:
-        half_size = ((high - low) / 2).clamp(max=config.target_half_size)
-        target = centre.new_tensor(drawing.target)
-        centre = target.clamp(low + half_size, high - half_size)
-    x, y, z = (config.rate / 4 * half_size.square()).tolist()
-    return PositionRegion(
-        centre=centre, half_size=half_size, stiffness=(x, y, z), formulation="saturated"
-    )
+    u, s, vt = np.linalg.svd(design, full_matrices=False)
+    # The factor keeps the divisions below finite for rank-deficient designs.
+    s = np.maximum(s, 1e-12 * s[0])
+    along = u.T @ pixels.ravel()
+
+    def too_long(penalty: float) -> bool:
+        return float(np.linalg.norm(s * along / (s**2 + penalty))) > LONGEST_OFFSET
+
+    low, high = 0.0, 0.0
+    if too_long(0.0):
+        high = float(s[0] * np.linalg.norm(along)) / LONGEST_OFFSET
+        # Bisection: the length falls with the penalty.
+        while high - low > 1e-6 * high:
+            middle = (low + high) / 2
+            low, high = (middle, high) if too_long(middle) else (low, middle)
+    inverse = (vt.T * (s / (s**2 + high))) @ u.T
+    solution = inverse @ pixels.ravel()
+    if len(pixels) < 5:
+        return solution, float("nan")
+    residuals = pixels - (design @ solution).reshape(-1, 2)
+    # From blocks of the hat matrix, one for each demonstration (Allen 1974, PRESS).
+    hat = (design @ inverse).reshape(len(pixels), 2, len(pixels), 2)
+    own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
+    press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
+    return solution, float(np.sqrt((press**2).sum(axis=(1, 2)).mean()))
 
 
-def vision_scale(
-    box: DrawnRegion, position: Float[Tensor, "3"], config: DrawnGoalsConfig
+def object_heading(
+    camera: Float[Tensor, "13"], pixel: Float[Tensor, "2"], angle: float, height: float
 ) -> float:
-    """Scale of vision feedback, 0 to 1: zero at the vertical walls of a box and outside.
-
-    So a feature outside the box cannot draw the end effector out of it.
+    """Heading in the base frame of a marker that lies flat [rad].
 
     Args:
-        box: Drawn box.
-        position: Position of the end effector [m].
-        config: Depth behind the walls at which the scale reaches 1.
+        camera: Camera.
+        pixel: Pixel of the marker [px].
+        angle: Its direction in the image [rad].
+        height: Its height [m].
     """
-    middle, half = position.new_tensor(box.centre), position.new_tensor(box.half_size)
-    behind = half[:2] - (position - middle)[:2].abs()
-    return float((behind / _margin(half, config)).clamp(0, 1).min())
-
-
-def _margin(half_size: Float[Tensor, "3"], config: DrawnGoalsConfig) -> Float[Tensor, "2"]:
-    """Margin between the vertical walls of a drawn box and of the controller's region [m]."""
-    # At most half of a narrow box.
-    return (half_size[:2] / 2).clamp(max=config.wall)
-
-
-def _contains(region: PositionRegion, planned: PositionRegion) -> bool:
-    """True if a region contains the middle of the planned one."""
-    offset = (planned.centre - region.centre).abs()
-    return bool((offset <= region.half_size).all())
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DrawnGoalsState:
-    """State of a person's drawing and turn."""
-
-    turn: Float[Tensor, "4"]
-    """Rotation that the person has added to the planned orientation (w, x, y, z)."""
-    drawing: Drawing = _NOTHING
-    """Newest drawing."""
-    active: Drawing = _NOTHING
-    """Drawing that replaces the planned region; empty: the plan holds."""
-    away: bool = False
-    """True if the active drawing is away from the planned region, so that the task waits."""
-    changed: float = -math.inf
-    """Time of the last change of the drawing [s]."""
-    checked: bool = True
-    """True once the newest drawing has been checked."""
-
-
-class DrawnGoals:
-    """Applies a person's drawing where the arm can go there, and their turn."""
-
-    def __init__(
-        self, config: DrawnGoalsConfig, refusal: Callable[[Pose], str] = lambda pose: ""
-    ):
-        """Prepare.
-
-        Args:
-            config: Effect of drawings.
-            refusal: Reason why the arm cannot go to a pose; empty if it can.
-        """
-        self._config, self._refusal = config, refusal
-
-    def initial_state(self) -> DrawnGoalsState:
-        """State without a drawing or a turn."""
-        return DrawnGoalsState(turn=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64))
-
-    def restarted(self, state: DrawnGoalsState) -> DrawnGoalsState:
-        """State for another target: the drawing is checked again, the turn is kept."""
-        return DrawnGoalsState(turn=state.turn)
-
-    def read(
-        self, state: DrawnGoalsState, human: HumanInput, planned: Goals, time: float
-    ) -> tuple[DrawnGoalsState, str]:
-        """Take in the drawing of a person.
-
-        Args:
-            state: State after the last step.
-            human: Input of the person.
-            planned: Goals without the drawing.
-            time: Present time [s].
-
-        Returns:
-            The next state, and a message to the person; empty: none.
-        """
-        drawing = Drawing(human.region, human.target)
-        waited = time - state.changed >= self._config.settling
-        if drawing != state.drawing:
-            # The first of several changes is applied at once, and so is the end of a drawing.
-            state = replace(state, drawing=drawing, changed=time, checked=False)
-            if waited or not drawing:
-                return self._checked(state, planned)
-        elif not state.checked and waited:
-            return self._checked(state, planned)
-        return state, ""
-
-    def applied(
-        self, state: DrawnGoalsState, planned: Goals, position: Float[Tensor, "3"]
-    ) -> tuple[Goals, DrawnGoalsState]:
-        """The goals with the active drawing in place of the planned region.
-
-        Within a region, vision feedback acts (`vision_scale`); a target is approached without
-        it. A joint-space approach that ends elsewhere is left out.
-
-        Args:
-            state: State after `read`.
-            planned: Goals without the person.
-            position: Position of the end effector [m].
-        """
-        if not state.active:
-            return planned, replace(state, away=False)
-        box, target = state.active
-        region = drawn_position(state.active, planned.position, self._config)
-        goals = replace(planned, position=region)
-        away = target is not None or not _contains(region, planned.position)
-        if away:
-            goals = goals.approached_by(None)
-        if target is not None or box is None:
-            goals = goals.with_vision(False)
-        else:
-            scale = vision_scale(box, position, self._config)
-            vision = replace(planned.vision, stiffness=scale * planned.vision.stiffness)
-            goals = replace(goals, vision=vision)
-        return goals, replace(state, away=away)
-
-    def turned(
-        self, state: DrawnGoalsState, requested: tuple[float, float, float] | None, most: float
-    ) -> DrawnGoalsState:
-        """State turned further towards a requested rotation, within the largest turn.
-
-        Args:
-            state: State after the last step.
-            requested: Rotation vector [rad]; None: none.
-            most: Largest angle of this step [rad].
-        """
-        vector = state.turn.new_tensor(requested or (0.0, 0.0, 0.0))
-        length = float(vector.norm())
-        fraction = min(1.0, self._config.largest_turn / max(length, _TINY_TURN))
-        wanted = quaternion.exp(fraction * vector)
-        missing = float(quaternion.angle(state.turn, wanted))
-        if missing == 0:
-            return state
-        turn = quaternion.slerp(state.turn, wanted, min(1.0, most / missing))
-        return replace(state, turn=turn)
-
-    def _checked(self, state: DrawnGoalsState, planned: Goals) -> tuple[DrawnGoalsState, str]:
-        """State with the newest drawing active if the arm can go there, and a message."""
-        drawing, before = state.drawing, state.active
-        state = replace(state, checked=True, active=drawing)
-        if not drawing:
-            return state, "The plan guides the end effector again." if before else ""
-        middle = drawn_position(drawing, planned.position, self._config).centre
-        assert planned.orientation is not None  # servoing to an object controls the whole pose
-        reason = self._refusal(Pose(middle, planned.orientation.goal))
-        words = drawing.words
-        if reason:
-            return replace(state, active=_NOTHING), f"Refused {words}: {reason}."
-        _, state = self.applied(state, planned, middle)
-        waits = "; the task waits" if state.away else ""
-        return state, f"{words[0].upper()}{words[1:]} guides the end effector{waits}."
+    along = _ALONG * pixel.new_tensor([math.cos(angle), math.sin(angle)])
+    ends = torch.stack([pixel - along, pixel + along])
+    start, end = on_plane(camera.expand(2, SIZE), ends, height)
+    x, y, _ = (end - start).tolist()
+    return math.atan2(y, x)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,13 +27,9 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraEstimator, CameraSpread
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
 from hrc_learn.protocols import HumanInput
+from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsState
 from hrc_learn.skills.marker_sensor import MarkerConsistency, MarkerObservation
-from hrc_learn.skills.servo_target import (
-    DrawnGoals,
-    DrawnGoalsState,
-    ServoTarget,
-    VisualServoConfig,
-)
+from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import MarkerAngle
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 from hrc_learn.vision.camera_model import IMAGE_SIZE

@@ -1,14 +1,5 @@
-"""Learned model of visual servoing: image Jacobian, approach direction, and visual target.
+"""Learned skill of visual servoing, and its files."""
 
-Demonstrations end with the end effector right above an object. The target is the place of the
-object's marker in the tool frame there, learned from the pixels of both markers. In a new scene
-the camera, as estimated then, turns the object's pixel into a ray; the ray meets the height
-at which the demonstrations found objects; and the end effector belongs where the object has the
-learned place. The target in the image is the pixel of the end effector's marker there, so
-errors of calibration that move both markers alike cancel.
-"""
-
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,25 +12,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import (
-    CameraConfig,
-    CameraEstimator,
-    CameraSpread,
-    CellErrors,
-    EvidenceResult,
-    RBFImageJacobian,
-)
-from hrc_learn.jacobian.perspective import (
-    FOCAL,
-    MARKER,
-    SHIFT,
-    SIZE,
-    marker_pixels,
-    on_plane,
-)
+from hrc_learn.jacobian import CellErrors, EvidenceResult, RBFImageJacobian
+from hrc_learn.jacobian.perspective import FOCAL, SHIFT
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.model_files import SavedModel, write_model
-from hrc_learn.store import Metres, Pixels, Radians, read_json, write_json
+from hrc_learn.skills.servo_target import VisualTarget, object_heading
+from hrc_learn.store import Radians, read_json, write_json
 from hrc_learn.vision.landmarks import Features, Landmarks, Object, Tool
 
 OBJECT_FEATURE = "observation.object_feature"
@@ -48,184 +26,12 @@ OBJECT_FEATURE_NAMES = ("u", "v", "visible")
 ANGLE_FEATURE = "observation.marker_angle"
 """Dataset column with the directions of both markers in the image [rad]."""
 ANGLE_FEATURE_NAMES = ("tool", "object")
-LONGEST_OFFSET = 0.4
-"""Longest offset of the object's marker from the tool centre point [m]. Demonstrations at one
-place hardly show the height of the object: without this bound it could be metres."""
 HALF_TURN = math.pi
 """Period of the turn of a parallel grasp [rad]."""
 
-# Steps of the fit of the offset, each from a closed form: perspective changes it slightly.
-_STEPS = 8
-# Offset from which the fit starts: below the end effector [m].
-_BELOW = (0.0, 0.0, 0.1)
-# Distance in the image along a marker's direction whose ends are followed to the table [px].
-_ALONG = 20.0
 # Distance from the range within which a chosen turn is kept [rad]: the error of its estimate
 # while the camera is uncertain.
 _KEPT = 0.15
-
-
-@dataclass(frozen=True, kw_only=True)
-class _TargetFile:
-    version: Literal[3] = 3
-    offset_m: tuple[Metres, Metres, Metres]
-    error_px: Pixels | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class VisualTarget:
-    """Place of the object's marker in the frame of a tool right above it."""
-
-    offset: Float[np.ndarray, "3"]
-    """Place in the tool frame [m]."""
-    error: float
-    """Leave-one-out error, root mean square [px]; NaN with fewer than five demonstrations."""
-
-    @classmethod
-    def fit(
-        cls,
-        camera: Float[Tensor, "13"],
-        objects: Float[np.ndarray, "demos 2"],
-        poses: Pose,
-    ) -> "VisualTarget":
-        """Fit to the ends of demonstrations.
-
-        Args:
-            camera: Camera of the demonstrations (see `jacobian.perspective`).
-            objects: Pixels of the object's marker [px].
-            poses: Poses of the end effector right above it, (demos,).
-
-        Raises:
-            ValueError: There are fewer than three demonstrations.
-        """
-        if len(objects) < 3:
-            raise ValueError(
-                f"the visual target needs three or more demonstrations, got {len(objects)}."
-            )
-        offset, error = np.array(_BELOW), math.nan
-        for _ in range(_STEPS):
-            # The camera sees the object as a marker on the tool.
-            carrying = torch.cat([camera[: MARKER.start], torch.from_numpy(offset)])
-            seen, slope = marker_pixels(carrying, poses)
-            design = slope[..., MARKER].numpy()
-            towards = objects - seen.numpy() + design @ offset
-            offset, error = _solved(design.reshape(-1, 3), towards)
-        return cls(offset=offset, error=error)
-
-    def tool_position(
-        self,
-        camera: Float[Tensor, "*batch 13"],
-        pixel: Float[Tensor, "2"],
-        above: Pose,
-    ) -> Float[Tensor, "*batch 3"]:
-        """Place of a tool right above an object [m].
-
-        Args:
-            camera: Cameras.
-            pixel: Pixel of the object's marker [px].
-            above: Orientation of the tool, and its height where demonstrations end.
-        """
-        offset = quaternion.rotate(above.orientation, torch.from_numpy(self.offset))
-        height = above.position[2] + offset[2]
-        return on_plane(camera, pixel.expand(*camera.shape[:-1], 2), height) - offset
-
-    def __call__(
-        self,
-        camera: Float[Tensor, "*batch 13"],
-        pixel: Float[Tensor, "2"],
-        above: Pose,
-        height: float | Float[Tensor, ""] | None = None,
-    ) -> Float[Tensor, "*batch 2"]:
-        """Target pixel of the end effector's marker for an object's marker at `pixel` [px].
-
-        Args:
-            camera: Cameras.
-            pixel: Pixel of the object's marker [px].
-            above: Orientation of the tool, and its height where demonstrations end.
-            height: Height of the tool now [m]; None: that of `above`.
-        """
-        place = self.tool_position(camera, pixel, above)
-        if height is not None:
-            level = torch.as_tensor(height).to(place).expand(place.shape[:-1])
-            place = torch.cat([place[..., :2], level[..., None]], dim=-1)
-        orientation = above.orientation.expand(*place.shape[:-1], 4)
-        one = Pose(place.unsqueeze(-2), orientation.unsqueeze(-2))
-        return marker_pixels(camera, one)[0].squeeze(-2)
-
-    def uncertainty(
-        self,
-        cameras: CameraSpread,
-        image_jacobian: Float[np.ndarray, "2 6"],
-        pixel: Float[Tensor, "2"],
-        above: Pose,
-    ) -> float:
-        """Standard deviation of the tool's place above the object, root of both axes [m].
-
-        The image closes the loop, so what counts is the error of the target pixel.
-
-        Args:
-            cameras: Estimate of the camera.
-            image_jacobian: Image Jacobian of the end effector's marker [px/m, px/rad].
-            pixel: Pixel of the object's marker [px].
-            above: Orientation of the tool, and its height where demonstrations end.
-        """
-        best, *others = self(cameras.samples, pixel, above)
-        apart = (torch.stack(others) - best).numpy()
-        metres = np.linalg.lstsq(image_jacobian[:, :2], apart.T, rcond=None)[0]
-        return float(np.sqrt(cameras.weights.numpy() @ (metres**2).sum(0)))
-
-    def save(self, path: Path) -> None:
-        """Write a JSON file, atomically."""
-        x, y, z = self.offset.tolist()
-        write_json(path, _TargetFile(offset_m=(x, y, z), error_px=self.error))
-
-    @classmethod
-    def load(cls, path: Path) -> "VisualTarget":
-        """Read a saved target.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: The file is damaged or has an unknown version.
-        """
-        content = read_json(path, _TargetFile, "fit the visual target again")
-        error = math.nan if content.error_px is None else content.error_px
-        return cls(offset=np.array(content.offset_m), error=error)
-
-
-def _solved(
-    design: Float[np.ndarray, "equations unknowns"], pixels: Float[np.ndarray, "demos 2"]
-) -> tuple[Float[np.ndarray, " unknowns"], float]:
-    """Least-squares solution for pixels, two equations a demonstration, and leave-one-out
-    error.
-
-    A solution longer than `LONGEST_OFFSET` is shortened by the smallest sufficient ridge
-    penalty.
-    """
-    u, s, vt = np.linalg.svd(design, full_matrices=False)
-    # The factor keeps the divisions below finite for rank-deficient designs.
-    s = np.maximum(s, 1e-12 * s[0])
-    along = u.T @ pixels.ravel()
-
-    def too_long(penalty: float) -> bool:
-        return float(np.linalg.norm(s * along / (s**2 + penalty))) > LONGEST_OFFSET
-
-    low, high = 0.0, 0.0
-    if too_long(0.0):
-        high = float(s[0] * np.linalg.norm(along)) / LONGEST_OFFSET
-        # Bisection: the length falls with the penalty.
-        while high - low > 1e-6 * high:
-            middle = (low + high) / 2
-            low, high = (middle, high) if too_long(middle) else (low, middle)
-    inverse = (vt.T * (s / (s**2 + high))) @ u.T
-    solution = inverse @ pixels.ravel()
-    if len(pixels) < 5:
-        return solution, float("nan")
-    residuals = pixels - (design @ solution).reshape(-1, 2)
-    # From blocks of the hat matrix, one for each demonstration (Allen 1974, PRESS).
-    hat = (design @ inverse).reshape(len(pixels), 2, len(pixels), 2)
-    own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
-    press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
-    return solution, float(np.sqrt((press**2).sum(axis=(1, 2)).mean()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -313,24 +119,6 @@ class MarkerAngle:
         """
         content = read_json(path, _AngleFile, "fit it again")
         return cls(offset=content.offset_rad, spread=content.spread_rad)
-
-
-def object_heading(
-    camera: Float[Tensor, "13"], pixel: Float[Tensor, "2"], angle: float, height: float
-) -> float:
-    """Heading in the base frame of a marker that lies flat [rad].
-
-    Args:
-        camera: Camera.
-        pixel: Pixel of the marker [px].
-        angle: Its direction in the image [rad].
-        height: Its height [m].
-    """
-    along = _ALONG * pixel.new_tensor([math.cos(angle), math.sin(angle)])
-    ends = torch.stack([pixel - along, pixel + along])
-    start, end = on_plane(camera.expand(2, SIZE), ends, height)
-    x, y, _ = (end - start).tolist()
-    return math.atan2(y, x)
 
 
 def _heading(orientation: Float[Tensor, "4"]) -> float:
@@ -461,8 +249,7 @@ def _write_landmarks(landmarks: Landmarks, folder: Path) -> None:
     arrays["optics"] = np.array(tool.optics)
     for name, item in landmarks.objects.items():
         for k, view in enumerate(item.views):
-            arrays[f"{name}.{k}.pixels"] = view.pixels
-            arrays[f"{name}.{k}.descriptors"] = view.descriptors
+            arrays |= {f"{name}.{k}.{field}": array for field, array in vars(view).items()}
     views = {name: len(item.views) for name, item in landmarks.objects.items()}
     config = {"image_size": list(landmarks.image_size), "views": views}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(a)) for name, a in arrays.items()}
@@ -472,38 +259,19 @@ def _write_landmarks(landmarks: Landmarks, folder: Path) -> None:
 def _read_landmarks(folder: Path) -> Landmarks:
     saved = SavedModel(folder, "Landmarks")
 
-    def array(name: str) -> np.ndarray:
-        return saved.tensor(name).numpy()
+    def arrays(*names: str, of: str = "") -> dict[str, np.ndarray]:
+        return {name: saved.tensor(f"{of}{name}").numpy() for name in names}
 
-    def view(key: str) -> Features:
-        return Features(pixels=array(f"{key}.pixels"), descriptors=array(f"{key}.descriptors"))
-
-    f, u, v, k = array("optics").tolist()
+    f, u, v, k = saved.tensor("optics").tolist()
     width, height = saved.get("image_size", list)
-    tool = Tool(
-        points=array("points"),
-        descriptors=array("descriptors"),
-        place=array("place"),
-        optics=(f, u, v, k),
-    )
-    views = saved.get("views", dict).items()
     objects = {
-        name: Object(views=tuple(view(f"{name}.{n}") for n in range(count)))
-        for name, count in views
+        name: Object(
+            views=tuple(
+                Features(**arrays("pixels", "descriptors", of=f"{name}.{n}."))
+                for n in range(count)
+            )
+        )
+        for name, count in saved.get("views", dict).items()
     }
+    tool = Tool(**arrays("points", "descriptors", "place"), optics=(f, u, v, k))
     return Landmarks(tool=tool, objects=objects, image_size=(width, height))
-
-
-def camera_estimator(
-    learned: RBFImageJacobian, config: CameraConfig | None = None
-) -> CameraEstimator:
-    """Online estimate of a camera that may have been moved since the demonstrations.
-
-    Args:
-        learned: Image Jacobian of the demonstrations with its camera.
-        config: Window, noise and prior.
-
-    Raises:
-        ValueError: The model has no camera.
-    """
-    return CameraEstimator(copy.deepcopy(learned).double(), config)

@@ -13,14 +13,14 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import DrawnRegion, HumanInput
 from hrc_learn.regions import PositionRegion
-from hrc_learn.skills.servo_target import (
+from hrc_learn.skills.drawn_goals import (
     Drawing,
     DrawnGoals,
     DrawnGoalsConfig,
-    VisualServoConfig,
     drawn_position,
     vision_scale,
 )
+from hrc_learn.skills.servo_target import VisualServoConfig
 
 pytestmark = pytest.mark.simulation
 

@@ -42,7 +42,8 @@ from hrc_learn.skills import MissedGraspError, grasping
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig
 from hrc_learn.skills.placing import check_plan
-from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
+from hrc_learn.skills.servo_target import VisualTarget
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 
 pytestmark = pytest.mark.simulation

@@ -135,7 +135,7 @@ class Photo:
         return self.image
 
 
-def test_landmarks_give_pixel_angle_and_covariance_or_nothing(tmp_path):
+def test_landmarks_give_pixel_and_angle_or_nothing(tmp_path):
     print_ = carton("thing", (0.3, 0.5, 0.6, 1.0))
     view = Features.of(print_)
     middle = np.array([print_.shape[1], print_.shape[0]]) / 2
@@ -158,5 +158,4 @@ def test_landmarks_give_pixel_angle_and_covariance_or_nothing(tmp_path):
     assert set(found) == {11}  # a tool without points is not found
     np.testing.assert_allclose(found[11].pixel, (300, 250), atol=1.0)
     assert found[11].angle == pytest.approx(np.deg2rad(40), abs=0.02)
-    assert np.linalg.eigvalsh(found[11].covariance)[1] < 1.0
     assert sensor.features([7]) == {}

@@ -23,8 +23,8 @@ from hrc_learn.skills import (
     VisualServo,
     VisualServoConfig,
 )
+from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_servoing import ServoReading, ServoStep
-from hrc_learn.skills.visual_skill import VisualTarget
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CONFIG = VisualServoConfig()

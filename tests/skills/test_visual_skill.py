@@ -12,11 +12,8 @@ from hrc_learn.jacobian.fitting import ImageJacobianFitReport
 from hrc_learn.jacobian.perspective import marker_pixels
 from hrc_learn.kinematics import gripper_down
 from hrc_learn.sim.scene import overhead_camera
-from hrc_learn.skills.visual_skill import (
-    LONGEST_OFFSET,
-    VisualServoSkill,
-    VisualTarget,
-)
+from hrc_learn.skills.servo_target import LONGEST_OFFSET, VisualTarget
+from hrc_learn.skills.visual_skill import VisualServoSkill
 
 OFFSET = np.array([0.012, -0.01, 0.11])
 MIDDLE = torch.tensor([0.26, 0.54, 0.16], dtype=torch.float64)
