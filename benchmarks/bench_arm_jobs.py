@@ -21,7 +21,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,7 +36,7 @@ from hrc_learn.experiments.collaboration_trial import (
     CollaborationScenario,
     simulate_collaboration,
 )
-from hrc_learn.experiments.simulated_cell import through_franka, through_franky
+from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.hardware import DriverError
 from hrc_learn.hardware.protocol_server import ArmServer, DrivenCycle, serve_world
 from hrc_learn.kinematics import panda
@@ -122,7 +121,6 @@ def job(
             yield server
 
     begun = time.monotonic()
-    through = through_franky if args.driver == "franky" else partial(through_franka, panda)
     try:
         run = simulate_collaboration(
             aiming,
@@ -135,7 +133,7 @@ def job(
                 imperfections=Imperfections.nominal(),
                 worker=args.worker,
             ),
-            access=through(serve=serve),
+            access=access_by(args.driver, panda, serve=serve),
             seed=seed,
         )
     except DriverError as error:

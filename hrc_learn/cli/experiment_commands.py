@@ -93,23 +93,25 @@ class _Settings:
 
 def run(args: Run) -> int:
     """Run an experiment, in simulation or on a real arm."""
-    args = replace(args, out=args.out or Path("outputs") / args.experiment)
+    folder = args.out or Path("outputs") / args.experiment
+    args = replace(args, out=folder)
     for name, experiments in _APPLIES.items():
         if args.experiment not in experiments:
             refuse_given(args, [name], f"is an option of hrc run {' and '.join(experiments)}")
-    refuse_existing(_folder(args), args.overwrite)
+    refuse_existing(folder, args.overwrite)
     is_real = args.drives_real_arm(_SIMULATED_ONLY)
     if args.arm == "lerobot":
         raise ValueError(
             "hrc run leads Franka arms only, not --arm lerobot: hrc page guides the arm and "
             "hrc play carries out a model."
         )
-    experiment = _experiment(_with_models(args))
+    experiment = _experiment(args, _models(args))
     settings = with_settings(args.config, _Settings(experiment=experiment))
     if is_real:
-        return _run_on_arm(args, settings.site, *_task(settings.experiment, args.shelf[0]))
+        task = _task(settings.experiment, args.shelf[0])
+        return _run_on_arm(args, folder, settings.site, *task)
     options = RunOptions(
-        out=_folder(args),
+        out=folder,
         seed=args.seed,
         trials=args.trials,
         processes=settings.processes,
@@ -122,36 +124,29 @@ def run(args: Run) -> int:
     return run_experiment(settings.experiment, options, command=command_line())
 
 
-def _folder(args: Run) -> Path:
-    assert args.out is not None
-    return args.out
-
-
-def _experiment(args: Run) -> Experiment[Any]:
+def _experiment(args: Run, models: dict[str, Path]) -> Experiment[Any]:
     common: dict[str, Any] = {
         "imperfections": _imperfections(args),
         "arm": args.arm,
-        "robot": _choice(args),
+        "robot": ArmChoice(args.robot),
     }
     if args.experiment == "placing":
-        folder = _model(args.placing)
-        demonstrations = dataset_of(folder).resolve()
-        return PlacingExperiment(placing=folder, demonstrations=demonstrations, **common)
+        demonstrations = dataset_of(models["placing"]).resolve()
+        return PlacingExperiment(**models, demonstrations=demonstrations, **common)
     common |= {
-        "aiming": _model(args.aiming),
         "camera": _simulated_camera(args),
         "page": PageConfig() if args.page else None,
         "look": UnmarkedLook() if args.markerless else None,
     }
     if args.experiment == "grasping":
-        return GraspingExperiment(**common)
+        return GraspingExperiment(**models, **common)
     return CollaborationExperiment(
-        placing=_model(args.placing),
         shelves=args.shelf,
         pulls=_possible_pulls(args),
         worker=args.worker,
         handover=args.handover,
         disturbances=Disturbances(camera_change=CameraChange() if args.camera_moved else None),
+        **models,
         **common,
     )
 
@@ -173,20 +168,11 @@ def _task(experiment: Experiment[Any], shelf: str) -> tuple[Workplace, Task]:
     return workplace, job
 
 
-def _model(folder: Path | None) -> Path:
-    assert folder is not None
-    return folder.resolve()
-
-
-def _choice(args: WithRobot) -> ArmChoice:
-    return ArmChoice(args.robot)
-
-
 def _possible_pulls(args: Run) -> Pulls:
     """Pulls at the elbow, or none if the arm has no null space."""
     if args.pulls == "none" or args.drives_real_arm():
         return args.pulls
-    robot = _choice(args).work_arm()
+    robot = ArmChoice(args.robot).work_arm()
     if robot.null_space == "none":
         print(
             f"note: the {robot.name} needs all its {robot.joints} joints for the tool's pose: "
@@ -214,7 +200,9 @@ def _imperfections(args: WithImperfections) -> Imperfections:
     return Imperfections.nominal().scaled(0.0 if args.ideal else args.imperfections)
 
 
-def _run_on_arm(args: Run, site: ArmSite, workplace: Workplace, task: Task) -> int:
+def _run_on_arm(
+    args: Run, folder: Path, site: ArmSite, workplace: Workplace, task: Task
+) -> int:
     """Carry out a task on a real arm and store its run; exit status 1 if it failed."""
     console = Console()
     site = replace(site, driver=args.arm, ip=args.ip)
@@ -231,19 +219,17 @@ def _run_on_arm(args: Run, site: ArmSite, workplace: Workplace, task: Task) -> i
             camera=camera,
             on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
         )
-    folder = _folder(args)
     done.save(folder, f"{args.arm} at {args.ip or 'its topics'}", asdict(args))
     console.print(done.failure or "done", style="red" if done.failure else "green")
     print(f"Dashboard: {show_command(folder)}")
     return int(bool(done.failure))
 
 
-def _with_models(args: Run) -> Run:
-    """Fill in the demo's models where none are given; make them if they are missing."""
-    needed = [name for name in ("placing", "aiming") if args.experiment in _APPLIES[name]]
-    missing = [name for name in needed if getattr(args, name) is None]
-    folders = {"placing": MODELS / "placing", "aiming": MODELS / _aiming(args.markerless)}
-    if any(not folders[name].is_dir() for name in missing):
+def _models(args: Run) -> dict[str, Path]:
+    """Models that the experiment needs; those of the demo, made if missing, by default."""
+    defaults = {"placing": MODELS / "placing", "aiming": MODELS / _aiming(args.markerless)}
+    needed = {k: v for k, v in defaults.items() if args.experiment in _APPLIES[k]}
+    if any(getattr(args, k) is None and not v.is_dir() for k, v in needed.items()):
         console = Console()
         console.print(f"note: no model given and none in {MODELS}: it is learned first")
         if args.robot != "panda":
@@ -252,7 +238,7 @@ def _with_models(args: Run) -> Run:
                 f"`hrc demo --robot {args.robot} --out FOLDER`, and name them."
             )
         learn(MODELS, console, markerless=args.markerless)
-    return replace(args, **{name: folders[name] for name in missing})
+    return {k: (getattr(args, k) or v).resolve() for k, v in needed.items()}
 
 
 def _aiming(markerless: bool) -> str:
@@ -262,8 +248,7 @@ def _aiming(markerless: bool) -> str:
 
 def demo(args: Demo) -> int:
     """Carry out the whole job, command after command in one process."""
-    console = Console()
-    markerless = args.markerless
+    console, markerless = Console(), args.markerless
     learn(args.out, console, 5, robot=args, again=args.overwrite, markerless=markerless)
     write_json(args.out / "configuration.json", asdict(args))
     _announce(console, 5, 5, "Grasping near a person, carrying, placing")
@@ -351,10 +336,9 @@ def _learning_steps(
         if record(Record(demonstration=scenario, out=folder, **chosen)):
             raise RuntimeError(f"the scripted expert failed to demonstrate {scenario}")
 
-    shown, watched = out / "placing_demos", out / "aiming_demos"
-    placing, aiming = out / "placing", out / _aiming(markerless)
+    shown, placing, aiming = out / "placing_demos", out / "placing", out / _aiming(markerless)
+    watched = out / ("aiming_films" if markerless else "aiming_demos")
     film = ("demonstration.markerless=true",) if markerless else ()
-    watched = out / "aiming_films" if markerless else watched
     primitives = FitPrimitives(dataset=shown, out=placing, overwrite=True)
     jacobian = FitImageJacobian(
         dataset=watched, out=aiming, overwrite=True, markerless=markerless

@@ -114,7 +114,7 @@ def _demonstrations(args: FitImageJacobian, console: Console, rank: int) -> _Sea
     if args.markerless:
         refuse_given(args, ["marker"], "is a marker, and --markerless uses none")
         with console.status(f"Searching the video of {len(demos)} demonstrations"):
-            unmarked = find_landmarks(demos, args.camera or "")
+            unmarked = find_landmarks(demos, args.camera)
         console.print(str(unmarked), highlight=False)
         return unmarked.demos, unmarked.figures(), unmarked
     if args.marker is None:

@@ -170,7 +170,7 @@ def extract_features(
         DatasetError: There is no such camera, or the metadata are damaged.
     """
     folder = open_folder(path)
-    key = _camera_key(video_keys(folder), camera)
+    key = camera_key(video_keys(folder), camera)
     cache = FeatureCache(folder.root, f"{key.rpartition('.')[2]}.{name}")
     segments = {i: shown[key] for i, shown in read_segments(folder).items() if key in shown}
     current = {i for i, segment in segments.items() if cache.is_current(i, segment)}
@@ -209,7 +209,12 @@ def _track(
     return (pixels, visible), images
 
 
-def _camera_key(keys: Sequence[str], camera: str | None) -> str:
+def camera_key(keys: Sequence[str], camera: str | None) -> str:
+    """Feature of the named camera among keys, or of the only one.
+
+    Raises:
+        DatasetError: There is no such camera, or several and none is named.
+    """
     wanted = [key for key in keys if camera is None or key in (camera, image_key(camera))]
     if len(wanted) == 1:
         return wanted[0]

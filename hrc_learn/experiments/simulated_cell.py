@@ -1,13 +1,13 @@
 """The simulated work cell of all three experiments, and the access to its arm.
 
-with simulated_cell(world, human=person, sensor=sensor, access=through_franky()) as (cell, _):
+access = access_by("franky", panda)
+with simulated_cell(world, human=person, sensor=sensor, access=access) as (cell, _):
     PickAndPlace(cell, ...).run(jobs)
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
 from hrc_learn.hardware.protocol_server import ArmServer, ServedArm, serve_world
-from hrc_learn.kinematics import Arm, SerialChain
+from hrc_learn.kinematics import Arm
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import Imperfections, MotionLog, World
 from hrc_learn.skills.marker_sensor import FeatureSensor, LatencyConfig
@@ -65,12 +65,20 @@ SIMULATED = ArmAccess(open=lambda world: nullcontext(world.opened_arm))
 """Direct access to the simulated arm."""
 
 
-def access_by(driver: ArmDriver, robot: Arm) -> ArmAccess:
+def access_by(
+    driver: ArmDriver,
+    robot: Arm,
+    *,
+    dynamics: float = FrankyConfig.dynamics,
+    serve: Serve = serve_world,
+) -> ArmAccess:
     """Access to the arm of a world through a named driver.
 
     Args:
         driver: Name of the driver.
         robot: Arm of the world.
+        dynamics: Fraction of the acceleration of the arm that a real driver uses.
+        serve: Serves the arm over its network protocol.
 
     Raises:
         ValueError: If the driver does not support the arm.
@@ -82,45 +90,23 @@ def access_by(driver: ArmDriver, robot: Arm) -> ArmAccess:
             f"--arm {driver} drives Franka arms only, not the {robot.name}: leave it out to "
             "simulate without a driver."
         )
-    return through_franky() if driver == "franky" else through_franka(robot)
 
-
-def through_franky(config: FrankyConfig | None = None, serve: Serve = serve_world) -> ArmAccess:
-    """Access over the network protocol through the driver package franky.
-
-    Args:
-        config: Configuration of the driver. By default that of a real arm without the real-time
-            check, which a server that waits for each answer does not need, and with the grip
-            force of the simulated gripper.
-        serve: Serves the arm over its protocol.
-    """
-    config = config or FrankyConfig(realtime=False, grip_force=40.0)
-    return _through_protocol(partial(FrankyArm, config=config), config.dynamics, serve)
-
-
-def through_franka(chain: SerialChain, serve: Serve = serve_world) -> ArmAccess:
-    """Access over the network protocol through our own loop at 1 kHz, in lockstep with it.
-
-    Args:
-        chain: Kinematics of the arm.
-        serve: Serves the arm over its protocol.
-    """
-    config = FrankaConfig(realtime=False, lockstep=True)
-    driver = partial(FrankaArm, chain=chain, config=config)
-    return _through_protocol(driver, config.dynamics, serve)
-
-
-def _through_protocol(
-    open_driver: Callable[[str], Any], dynamics: float, serve: Serve
-) -> ArmAccess:
-    """Access through a driver that connects to an address, with a method `close`."""
+    def connected(address: str) -> Any:
+        # No real-time check: a server that waits for each answer does not need it.
+        if driver == "franky":
+            # The grip force of the simulated gripper.
+            config = FrankyConfig(realtime=False, grip_force=40.0, dynamics=dynamics)
+            return FrankyArm(address, config)
+        return FrankaArm(
+            address, robot, FrankaConfig(realtime=False, lockstep=True, dynamics=dynamics)
+        )
 
     @contextmanager
     def open_arm(world: World) -> Iterator[OpenedArm]:
         with serve(world) as server:
             with server.running():
-                driver = open_driver(server.address)
-            with closing(ServedArm(driver, server)) as arm:
+                opened = connected(server.address)
+            with closing(ServedArm(opened, server)) as arm:
                 yield OpenedArm(arm=arm, gripper=arm, advance=server.advance)
 
     return ArmAccess(open=open_arm, delay=PROTOCOL_DELAY, dynamics=dynamics)
@@ -205,17 +191,12 @@ def simulated_cell(
             motion.advance(duration)
             on_step()
 
+        def tell(address: str) -> None:
+            observer.tell(f"Page at {address}")
+
         people, advance_all, task = human, advance, None
         if page is not None:
-            task = stack.enter_context(
-                task_page(
-                    world,
-                    config.dt,
-                    page,
-                    lambda address: observer.tell(f"Page at {address}"),
-                    title,
-                )
-            )
+            task = stack.enter_context(task_page(world, config.dt, page, tell, title))
             people, advance_all = task.joined(human, advance)
         cell = WorkCell(
             chain=world.arm.robot.chain,

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,10 +23,11 @@ from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.demos.dataset_arm import arm_of_dataset
+from hrc_learn.demos.image_features import camera_key
 from hrc_learn.demos.images import ImageReader
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraFit, ImageDemonstration, fit_camera
-from hrc_learn.jacobian.perspective import FOCAL, ROTATION, SHIFT, marker_pixels
+from hrc_learn.jacobian.perspective import FOCAL, SIZE, eye_of, marker_pixels, rays
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.store import new_file
 from hrc_learn.vision.landmarks import (
@@ -40,7 +42,6 @@ from hrc_learn.vision.landmarks import (
     Tool,
     changed_features,
     draw_finding,
-    features_near,
     match_view,
     nearest,
 )
@@ -115,33 +116,32 @@ class MarkerlessFit:
             imsave(part, self.picture, format="png")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Link:
+class _Link(NamedTuple):
     """Poses of a link in the searched frames, and the line on which the place lies."""
 
     name: str
     pose: Pose
-    axis: Float[np.ndarray, "3"] | None
-    """Point of the last joint's axis in the link's frame, along its z axis of the joint [m]."""
-    direction: Float[np.ndarray, "3"] | None
+    axis: tuple[np.ndarray, np.ndarray] | None = None
+    """Point on the axis of the last joint, and its direction, in the link's frame [m]."""
 
 
-def find_landmarks(source: DemonstrationSource, camera: str = "") -> MarkerlessFit:
+def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> MarkerlessFit:
     """Find tool and object in the video of demonstrations.
 
     Args:
         source: Demonstrations that end above an object, with video.
-        camera: Name of the camera; empty: the only one.
+        camera: Name of the camera; None: the only one.
 
     Raises:
         ValueError: There is no video, no pose, or nothing moves as the arm does.
     """
     reader = ImageReader(source.folder)
-    key = _camera_key(reader, camera, source.source)
+    key = camera_key(reader.cameras, camera)
     demos = _with_poses(source, source.load())
     height, width = reader.size(key)
     search = _Search(reader, key, demos, (width, height))
-    links = list(_links(source, demos, search.picked))
+    poses = _poses(demos, search.picked)
+    links = [_Link("tool", poses), *_wrist(source, demos, search.picked)]
     features = search.features()
     tracks = _tracks(features, width)
     best: tuple[int, _Link, CameraFit] | None = None
@@ -162,16 +162,17 @@ def find_landmarks(source: DemonstrationSource, camera: str = "") -> MarkerlessF
     _, link, fit = best
     tool = _tool(tracks, link, fit.camera, width)
     # The place on the tool, from all points at once, is seen better than one point.
-    fit = fit_camera(
-        [_seen_place(tool, features, _poses(demos, search.picked), width)], (width, height)
-    )
+    seen = [tool.find(one, width) for one in features]
+    pixels = np.array([(np.nan, np.nan) if one is None else one.pixel for one in seen])
+    fit = fit_camera([_as_demonstration(pixels, poses)], (width, height))
     tool = _tool(tracks, link, fit.camera, width)
     landmarks = Landmarks(tool=tool, image_size=(width, height))
     found = search.follow(landmarks, fit)
     item = search.object(fit.camera)
-    landmarks = replace(landmarks, objects={} if item is None else {"object": item[0]})
-    sure = [f.deviation for row in found for f in row if f is not None]
+    if item is not None:
+        landmarks = replace(landmarks, objects={"object": item[0]})
     objects = [None] * len(demos) if item is None else item[1]
+    sure = [f.deviation for row in found for f in row if f is not None]
     return MarkerlessFit(
         demos=_described(demos, found, objects),
         landmarks=landmarks,
@@ -237,20 +238,18 @@ class _Search:
     def picture(
         self, found: Sequence[Sequence[Finding | None]], objects: Sequence[Finding | None]
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Images of some demonstrations with what was found drawn over them."""
-        tiles, middle = [], len(self._demos[0]) // 2
-        smaller = -(-self._size[0] // _TILE)
-        for k in range(min(3, len(self._demos))):
-            seen = [j for j, finding in enumerate(found[k]) if finding is not None]
-            for near in (0, middle, len(found[k])):
-                row = min(seen, key=lambda j: abs(j - near), default=0)
-                shown = self._reader.stream(self._demos[k].episode, self._key, [row])
-                image = np.ascontiguousarray(next(shown)[1])
-                for finding in (found[k][row], objects[k]):
-                    if finding is not None:
-                        draw_finding(image, finding)
+        """First and last image with the tool of some demonstrations, the findings drawn in."""
+        rows, smaller = [], -(-self._size[0] // _TILE)
+        for demo, tools, item in list(zip(self._demos, found, objects, strict=True))[:3]:
+            seen = [k for k, finding in enumerate(tools) if finding is not None] or [0]
+            tiles = []
+            for _, shown in self._reader.stream(demo.episode, self._key, [seen[0], seen[-1]]):
+                image = np.ascontiguousarray(shown)
+                for finding in filter(None, (tools[seen[len(tiles) - 1]], item)):
+                    draw_finding(image, finding)
                 tiles.append(image[::smaller, ::smaller])
-        return np.vstack([np.hstack(tiles[k : k + 3]) for k in range(0, len(tiles), 3)])
+            rows.append(np.hstack(tiles))
+        return np.vstack(rows)
 
     def object(self, camera: Float[Tensor, "13"]) -> tuple[Object, list[Finding | None]] | None:
         """Views of the object, and its place in each demonstration; None: there is none."""
@@ -263,12 +262,11 @@ class _Search:
             rows.append(sorted(np.argsort(away)[-_CLEAR:].tolist()))
         views = [np.median(np.stack(p), axis=0).astype(np.uint8) for p in self._pictures(rows)]
         usual = np.median(np.stack(views), axis=0).astype(np.uint8)
-        seen = [features_near(v, usual, line) for v, line in zip(views, below, strict=True)]
+        seen = [changed_features(v, usual, line) for v, line in zip(views, below, strict=True)]
         return _common_object(seen, below, self._size[0])
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Tracks:
+class _Tracks(NamedTuple):
     """Features followed through the searched frames."""
 
     pixels: Float[np.ndarray, "tracks frames 2"]
@@ -295,7 +293,7 @@ def _tracks(features: Sequence[Features], width: int) -> _Tracks:
         moved = np.nanmedian(apart, axis=1) > _STILL * width / 1440
         tracks.append(pixels[moved])
         descriptors.append(own.descriptors[kept][moved])
-    return _Tracks(pixels=np.concatenate(tracks), descriptors=np.concatenate(descriptors))
+    return _Tracks(np.concatenate(tracks), np.concatenate(descriptors))
 
 
 def _cameras(
@@ -325,19 +323,20 @@ def _points(
 ) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " tracks"]]:
     """Place of each track in the frame of a link [m], and True if it moves with the link.
 
-    Robust least squares: a point m is seen along xi, so (x - xi z) = 0 for x = R (p + T m) + t.
+    Robust least squares: a point m is seen from the eye e along d, so d x (p + T m - e) = 0.
     """
-    world = quaternion.to_matrix(quaternion.exp(camera[ROTATION]))
-    turn = (world @ quaternion.to_matrix(pose.orientation)).numpy()
-    shift = (pose.position @ world.T + camera[SHIFT]).numpy()
-    xi = _undistorted(camera, tracks.pixels)
-    seen = np.isfinite(xi[..., 0])
-    xi = np.where(seen[..., None], xi, 0.0)
-    design = turn[:, :2] - xi[..., None] * turn[:, 2:]
-    right = xi * shift[:, 2:] - shift[:, :2]
-    scale = float(camera[FOCAL].exp()) / np.maximum(shift[:, 2], 0.05)
+    position, turn = pose.position.numpy(), quaternion.to_matrix(pose.orientation).numpy()
+    pixels = torch.from_numpy(tracks.pixels)
+    sight = rays(camera.expand(*pixels.shape[:2], SIZE), pixels).numpy()
+    seen = np.isfinite(sight[..., 0])
+    sight = np.nan_to_num(sight / np.linalg.norm(sight, axis=-1, keepdims=True))
+    lever = eye_of(camera).numpy() - position
+    # Rows of the matrix that takes the cross product with a line of sight.
+    across = np.cross(sight[..., None, :], np.eye(3)).swapaxes(-1, -2)
+    design, right = across @ turn, (across @ lever[..., None])[..., 0]
+    scale = float(camera[FOCAL].exp()) / np.maximum(np.linalg.norm(lever, axis=-1), 0.05)
     most = _AGREES * width / 1440
-    weight, point = seen.astype(float), np.zeros((len(xi), 3))
+    weight, point = seen.astype(float), np.zeros((len(seen), 3))
     agrees = seen
     for reach in (16, 8, 4, 2, 1, 1, 1, 1):
         weighted = (weight * scale**2)[..., None, None] * design
@@ -353,33 +352,18 @@ def _points(
     return point, good & (np.linalg.norm(point, axis=1) < _NEAR)
 
 
-def _undistorted(
-    camera: Float[Tensor, "13"], pixels: Float[np.ndarray, "*batch 2"]
-) -> Float[np.ndarray, "*batch 2"]:
-    """Normalised points (x / z, y / z) seen at pixels."""
-    f, u, v, k = float(camera[FOCAL].exp()), *camera[1:4].tolist()
-    distorted = (pixels - (u, v)) / f
-    xi = distorted
-    for _ in range(10):
-        xi = distorted / (1 + k * (xi**2).sum(-1, keepdims=True))
-    return xi
-
-
 def _tool(tracks: _Tracks, link: _Link, camera: Float[Tensor, "13"], width: int) -> Tool:
     """The points that move with a link, and the place on it that stands for the tool."""
     points, agrees = _points(tracks, link.pose, camera, width)
     points = points[agrees]
     place = np.median(points, axis=0)
-    if link.axis is not None and link.direction is not None:
+    if link.axis is not None:
         # On the axis of the last joint, which turns about it, near the points.
-        place = link.axis + ((place - link.axis) @ link.direction) * link.direction
+        origin, direction = link.axis
+        place = origin + ((place - origin) @ direction) * direction
     f, (u, v, k) = float(camera[FOCAL].exp()), camera[1:4].tolist()
-    return Tool(
-        points=points,
-        descriptors=tracks.descriptors[agrees],
-        place=place,
-        optics=(f, u, v, k),
-    )
+    descriptors = tracks.descriptors[agrees]
+    return Tool(points=points, descriptors=descriptors, place=place, optics=(f, u, v, k))
 
 
 def _with_poses(source: DemonstrationSource, demos: DemonstrationSet) -> DemonstrationSet:
@@ -406,38 +390,24 @@ def _poses(demos: DemonstrationSet, picked: Sequence[Sequence[int]]) -> Pose:
     )
 
 
-def _links(
+def _wrist(
     source: DemonstrationSource, demos: DemonstrationSet, picked: Sequence[Sequence[int]]
 ) -> Iterator[_Link]:
-    """The tool, and the link before the last joint where the joints are known."""
-    yield _Link(name="tool", pose=_poses(demos, picked), axis=None, direction=None)
+    """The link before the last joint, where arm and joints are known."""
     joints = [d.joint_position for d in demos]
-    if any(q is None for q in joints):
-        return
+    rows = [q[k] for q, k in zip(joints, picked, strict=True) if q is not None]
     try:
         arm = arm_of_dataset(source)
     except ValueError:
         return
-    rows = [q[k] for q, k in zip(joints, picked, strict=True) if q is not None]
+    if len(rows) < len(joints):
+        return
     links = arm.arm.link_poses(arm.positions(np.concatenate(rows)))
     wrist, last = links[:, arm.arm.joints - 2], links[0, arm.arm.joints - 1]
     turn = quaternion.to_matrix(wrist.orientation[0]).mT
-    yield _Link(
-        name="wrist",
-        pose=wrist,
-        axis=(turn @ (last.position - wrist.position[0])).numpy(),
-        direction=(turn @ quaternion.to_matrix(last.orientation)[:, 2]).numpy(),
-    )
-
-
-def _seen_place(
-    tool: Tool, features: Sequence[Features], pose: Pose, width: int
-) -> ImageDemonstration:
-    """The tool's place in the searched frames."""
-    found = [tool.find(seen, width) for seen in features]
-    nowhere = np.full(2, np.nan)
-    pixels = np.array([nowhere if f is None else f.pixel for f in found])
-    return _as_demonstration(pixels, pose)
+    origin = (turn @ (last.position - wrist.position[0])).numpy()
+    direction = (turn @ quaternion.to_matrix(last.orientation)[:, 2]).numpy()
+    yield _Link("wrist", wrist, (origin, direction))
 
 
 def _pose_of(demo: Demonstration) -> Pose:
@@ -449,14 +419,11 @@ def _pose_of(demo: Demonstration) -> Pose:
 def _below(demo: Demonstration, camera: Float[Tensor, "13"]) -> Float[np.ndarray, "points 2"]:
     """Pixels of the line along which the tool points at the end of a demonstration."""
     end = _pose_of(demo)[-1]
-    position, orientation = end.position, end.orientation
-    depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)
-    along = torch.zeros(len(depth), 3, dtype=torch.float64)
-    along[:, 2] = depth
-    points = position + quaternion.rotate(orientation, along)
+    depth = torch.linspace(0, _DEEPEST, 16, dtype=torch.float64)[:, None]
+    points = end.position + depth * quaternion.to_matrix(end.orientation)[:, 2]
     # A camera whose marker is at the origin of a frame that stands at each point.
     bare = torch.cat([camera[:10], camera.new_zeros(3)])
-    pixels, _ = marker_pixels(bare, Pose(points, orientation.expand(len(depth), 4)))
+    pixels, _ = marker_pixels(bare, Pose(points, end.orientation.expand(len(depth), 4)))
     return pixels.numpy()
 
 
@@ -464,15 +431,18 @@ def _common_object(
     seen: Sequence[Features], lines: Sequence[Float[np.ndarray, "points 2"]], width: int
 ) -> tuple[Object, list[Finding | None]] | None:
     """The object in the view that most others match where their motion ends."""
-    best: list[Finding | None] = []
+    rows: list[list[Finding | None]] = []
     for features, line in zip(seen, lines, strict=True):
         first = replace(features, pixels=features.pixels - line[len(line) // 2])
-        found = [
-            _at_end(first, other, end, width) for other, end in zip(seen, lines, strict=True)
+        found = [match_view(first, other, width) for other in seen]
+        # It lies near the line below the tool.
+        near = [
+            f if f and np.linalg.norm(end - f.pixel, axis=1).min() < ASIDE * width else None
+            for f, end in zip(found, lines, strict=True)
         ]
-        if sum(f is not None for f in found) > sum(f is not None for f in best):
-            best = found
-    if sum(f is not None for f in best) < 2:
+        rows.append(near)
+    best = min(rows, key=lambda row: row.count(None))
+    if len(best) - best.count(None) < 2:
         return None
     views = []
     for other, finding in zip(seen, best, strict=True):
@@ -483,17 +453,6 @@ def _common_object(
     return Object(views=tuple(views)), best
 
 
-def _at_end(
-    first: Features, other: Features, line: Float[np.ndarray, "points 2"], width: int
-) -> Finding | None:
-    """The object of a view in another image, near the line below the tool."""
-    found = match_view(first, other, width)
-    if found is None:
-        return None
-    apart = np.linalg.norm(line - found.pixel, axis=1).min()
-    return found if apart < ASIDE * width else None
-
-
 def _described(
     demos: DemonstrationSet,
     tools: Sequence[Sequence[Finding | None]],
@@ -501,11 +460,10 @@ def _described(
 ) -> DemonstrationSet:
     """Demonstrations with columns of what was found, as markers would have given them."""
     result = []
-    for k, (demo, found) in enumerate(zip(demos, tools, strict=True)):
+    for demo, found, item in zip(demos, tools, objects, strict=True):
         visible = np.array([f is not None for f in found])
         pixels = np.array([np.zeros(2) if f is None else f.pixel for f in found])
         extra = dict(demo.extra)
-        item = objects[k]
         if item is not None:
             ones = np.ones((len(demo), 1))
             extra[OBJECT_FEATURE] = ones * (*item.pixel, 1.0)
@@ -514,16 +472,3 @@ def _described(
     return DemonstrationSet(
         result, notes=demos.notes, source=demos.source, joint_unit=demos.joint_unit
     )
-
-
-def _camera_key(reader: ImageReader, camera: str, source: str) -> str:
-    """Feature of the named camera, or of the only one."""
-    keys = [
-        k for k in reader.cameras if camera in ("", k, k.removeprefix("observation.images."))
-    ]
-    if len(keys) != 1:
-        known = ", ".join(reader.cameras) or "none: record with video"
-        raise ValueError(
-            f"{source}: name one camera (--config markerless.camera=NAME), of {known}."
-        )
-    return keys[0]

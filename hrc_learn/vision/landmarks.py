@@ -226,20 +226,15 @@ def match_view(view: Features, seen: Features, width: int) -> Finding | None:
     if len({*image[kept].tolist()}) < _FEWEST_MATCHES or not _SCALES[0] < scale < _SCALES[1]:
         return None
     a, b = a[kept], b[kept]
-    n, zero, one = len(a), np.zeros(len(a)), np.ones(len(a))
-    design = np.stack(
-        [
-            np.column_stack([a[:, 0], -a[:, 1], one, zero]),
-            np.column_stack([a[:, 1], a[:, 0], zero, one]),
-        ],
-        axis=1,
-    ).reshape(2 * n, 4)
+    # Unknowns are scale and turn (c, s) and shift (u, v) of a similarity.
+    turned = np.stack([a, a[:, ::-1] * (-1, 1)], axis=-1)
+    design = np.concatenate([turned, np.broadcast_to(np.eye(2), turned.shape)], axis=-1)
+    design = design.reshape(-1, 4)
     c, s, u, v = np.linalg.lstsq(design, b.ravel(), rcond=None)[0]
-    error = (design @ (c, s, u, v)).reshape(n, 2) - b
-    by_map = np.array([[0.0, 0, 1, 0], [0, 0, 0, 1]])
+    error = (design @ (c, s, u, v)).reshape(-1, 2) - b
     return Finding(
         pixel=np.array([u, v]),
-        covariance=_propagated(design, by_map, error),
+        covariance=_propagated(design, np.eye(4)[2:], error),
         angle=float(np.arctan2(s, c)),
         scale=scale,
         points=b,
@@ -322,15 +317,12 @@ class LandmarkDetector:
         half: Features | None = None
         found: dict[str, Finding] = {}
         for name in names:
-            item, vain = self._item(name), self._in_vain.get(name, 0)
-            near, finding = self._last.pop(name, None), None
-            if near is not None:
-                finding = item.find(Features.of(image, _about(near.points, size)), size[0])
+            item = self.landmarks.tool if name == "tool" else self.landmarks.objects[name]
+            vain = self._in_vain.get(name, 0)
+            finding = _refined(item, image, self._last.pop(name, None))
             if finding is None and vain % _CLOSE_LOOK_EVERY and size[0] > _LARGE:
                 half = half or Features.coarse(image)
-                near = item.find(half, size[0])
-                if near is not None:
-                    finding = item.find(Features.of(image, _about(near.points, size)), size[0])
+                finding = _refined(item, image, item.find(half, size[0]))
             elif finding is None:
                 finding = item.find(Features.of(image), size[0])
             self._in_vain[name] = 0 if finding is not None else vain + 1
@@ -338,23 +330,17 @@ class LandmarkDetector:
                 found[name] = self._last[name] = finding
         return found
 
-    def _item(self, name: str) -> Tool | Object:
-        if name == "tool":
-            return self.landmarks.tool
-        if name not in self.landmarks.objects:
-            known = ", ".join(self.landmarks.objects) or "none"
-            raise ValueError(f"no object {name!r} was learned; there are {known}.")
-        return self.landmarks.objects[name]
 
-
-def _about(
-    points: Float[np.ndarray, "n 2"], size: tuple[int, int]
-) -> tuple[int, int, int, int]:
-    """Part of an image about points (left, top, right, bottom) [px]."""
-    margin = _MARGIN * size[0] / _WIDTH
-    left, top = np.maximum(points.min(axis=0) - margin, 0).astype(int).tolist()
-    right, bottom = np.minimum(points.max(axis=0) + margin, size).astype(int).tolist()
-    return left, top, right, bottom
+def _refined(item: Tool | Object, image: np.ndarray, near: Finding | None) -> Finding | None:
+    """The item at full resolution about an earlier or coarser finding; None: not found."""
+    if near is None:
+        return None
+    height, width = image.shape[:2]
+    margin = _MARGIN * width / _WIDTH
+    left, top = np.maximum(near.points.min(axis=0) - margin, 0).astype(int).tolist()
+    right, bottom = (near.points.max(axis=0) + margin).astype(int).tolist()
+    box = (left, top, min(right, width), min(bottom, height))
+    return item.find(Features.of(image, box), width)
 
 
 def draw_finding(image: UInt8[np.ndarray, "height width 3"], finding: Finding) -> None:
@@ -385,42 +371,28 @@ def draw_finding(image: UInt8[np.ndarray, "height width 3"], finding: Finding) -
         cv2.arrowedLine(image, (u, v), (a, b), (40, 120, 255), size)
 
 
-def changed(image: np.ndarray, usual: np.ndarray) -> Bool[np.ndarray, "height width"]:
-    """True about pixels that differ from the usual image."""
-    import cv2
-
-    different = (cv2.absdiff(image, usual) > _CHANGED).astype(np.uint8)
-    # Single pixels are noise of sensor and video.
-    kernel = np.ones((3, 3), np.uint8)
-    opened = cv2.morphologyEx(different, cv2.MORPH_OPEN, kernel)
-    return np.asarray(cv2.dilate(opened, np.ones((_GROWN, _GROWN), np.uint8))) > 0
-
-
-def changed_features(image: np.ndarray, usual: np.ndarray) -> Features:
-    mask = changed(image, usual)
-    if not mask.any():
-        return Features.of(image[:0])
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    box = (int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
-    seen = Features.of(image, box)
-    u, v = np.rint(seen.pixels).astype(int).T
-    return seen.chosen(mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)])
-
-
-def features_near(image: Grey, usual: Grey, line: Float[np.ndarray, "points 2"]) -> Features:
-    """Features that differ from the usual image, near a line.
+def changed_features(
+    image: Grey, usual: Grey, near: Float[np.ndarray, "points 2"] | None = None
+) -> Features:
+    """Features about pixels that differ from the usual image.
 
     Args:
         image: Grey image.
         usual: What is usually seen there.
-        line: Points of the line [px].
+        near: Points of a line near which features count [px]; None: everywhere.
     """
-    reach, size = ASIDE * image.shape[1], image.shape[::-1]
-    left, top = np.maximum(line.min(axis=0) - reach, 0).astype(int).tolist()
-    right, bottom = np.minimum(line.max(axis=0) + reach, size).astype(int).tolist()
-    if right - left < 2 or bottom - top < 2:
+    import cv2
+
+    different = (cv2.absdiff(image, usual) > _CHANGED).astype(np.uint8)
+    # Single pixels are noise of sensor and video.
+    opened = cv2.morphologyEx(different, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    mask: np.ndarray = np.asarray(cv2.dilate(opened, np.ones((_GROWN, _GROWN), np.uint8)))
+    if near is not None:
+        points, width = np.rint(near).astype(np.int32), round(2 * ASIDE * image.shape[1])
+        mask &= np.asarray(cv2.polylines(np.zeros_like(mask), [points], False, 1, width))
+    if not mask.any():
         return Features.of(image[:0])
-    seen = Features.of(image, (left, top, right, bottom))
-    u, v = seen.pixels.astype(int).T
-    near = np.linalg.norm(seen.pixels[:, None] - line, axis=-1).min(axis=1) < reach
-    return seen.chosen(near & changed(image, usual)[v, u])
+    left, top, width, height = cv2.boundingRect(mask)
+    seen = Features.of(image, (left, top, left + width, top + height))
+    u, v = np.rint(seen.pixels).astype(int).T
+    return seen.chosen(mask[v.clip(0, mask.shape[0] - 1), u.clip(0, mask.shape[1] - 1)] > 0)

@@ -18,8 +18,7 @@ from hrc_learn.experiments.grasping_trial import (
     simulate_grasp,
 )
 from hrc_learn.experiments.placing_trial import place
-from hrc_learn.experiments.simulated_cell import through_franka, through_franky
-from hrc_learn.hardware import FrankyConfig
+from hrc_learn.experiments.simulated_cell import access_by
 from hrc_learn.hardware.protocol_server import serve_world
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections
@@ -57,7 +56,7 @@ def test_a_whole_job_is_done_with_imperfections(skills):
         *skills,
         ("middle",),
         scenario,
-        access=through_franky(),
+        access=access_by("franky", panda),
         seed=3,
     )
     assert job.failure == ""
@@ -72,7 +71,7 @@ def test_an_object_is_grasped(skills):
     rng = np.random.default_rng(1)
     scene = GraspingScene.draw(WORKPLACE, GraspingSceneConfig(), rng)
     grasp = simulate_grasp(
-        skills[0], scene, camera="synthetic", rng=rng, access=through_franky()
+        skills[0], scene, camera="synthetic", rng=rng, access=access_by("franky", panda)
     )
     assert grasp.failure == ""
     assert grasp.world.holds(grasp.item.name)
@@ -97,8 +96,7 @@ def place_on_shelf(skill, access):
 @shapes_unchecked()
 @pytest.mark.parametrize("dynamics", [1.0, 0.3])
 def test_an_object_is_placed_also_by_a_gentle_driver(skills, dynamics):
-    config = FrankyConfig(realtime=False, grip_force=40.0, dynamics=dynamics)
-    place_on_shelf(skills[1], through_franky(config))
+    place_on_shelf(skills[1], access_by("franky", panda, dynamics=dynamics))
 
 
 @pytest.mark.skipif(not find_spec("pylibfranka"), reason="comes with the extra hardware")
@@ -112,7 +110,7 @@ def test_an_object_is_placed_by_our_loop_which_answers_each_cycle(skills):
             servers.append(server)
             yield server
 
-    place_on_shelf(skills[1], through_franka(panda, serve=serve))
+    place_on_shelf(skills[1], access_by("franka", panda, serve=serve))
     # A state after a pause is none that comes late; a machine that is held up may miss some.
     (server,) = servers
     assert server.missed < 0.01 * server.cycles
