@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from franky_servers import READY, served_world
 
-from hrc_learn.experiments.simulated_cell import PROTOCOL_DELAY, SIMULATED, through_franky
+from hrc_learn.experiments.simulated_cell import PROTOCOL_DELAY, SIMULATED, access_by
 from hrc_learn.hardware import FrankyConfig
 from hrc_learn.hardware.protocol_server import CYCLE, loopback_addresses, serve_world
+from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 
@@ -223,7 +224,7 @@ def test_servers_beside_each_other_take_addresses_of_their_own():
 
 
 def test_a_controller_is_told_of_the_drivers_delay_and_acceleration():
-    access = through_franky(FrankyConfig(dynamics=0.4, realtime=False))
+    access = access_by("franky", panda, dynamics=0.4)
     sizes = replace(Imperfections.ideal(), command_delay=0.02, slowness=0.3)
     told = access.declared(sizes)
     assert told.command_delay == pytest.approx(0.02 + PROTOCOL_DELAY)
