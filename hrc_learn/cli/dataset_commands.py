@@ -97,7 +97,7 @@ def _write_findings(args: Check, report: ValidationReport, counts: Mapping[str, 
             write_json(folder / "findings.json", report.records())
             write_json(folder / "metrics.json", counts)
             if report.contract is not None:
-                write_json(folder / "contract.json", report.contract.content())
+                write_json(folder / "contract.json", report.contract)
     write_values(args.json, counts)
 
 

@@ -277,7 +277,7 @@ class _Repair:
             for column in selections[role].columns
         }
         parts = tuple(
-            replace(part, unit=given.get((part.key, part.index), part.unit))
+            replace(part, unit=given.get(part.column, part.unit))
             for part in contract.components
         )
         return replace(contract, components=parts)

@@ -26,7 +26,7 @@ from hrc_learn.demos.read.dataset_folder import (
     read_tasks,
 )
 from hrc_learn.demos.read.frames import RawFrames, read_each, require_rows
-from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, read_features
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, read_feature
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.store import MANIFEST, changed_files
 
@@ -42,20 +42,19 @@ _PLACEHOLDERS = (
 def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
     """Read as much of the metadata as possible; None if episodes cannot be located."""
     info = report.attempt(lambda: read_info(root))
-    if info is None:
+    episodes = None if info is None else report.attempt(lambda: read_episodes(root, info))
+    if info is None or episodes is None:
         return None
-    features: dict[str, Feature] = {}
+    features = {}
     for key, declared in info["features"].items():
-        single = {"features": {key: declared}}
-        features |= report.attempt(lambda single=single: read_features(single)) or {}
+        feature = report.attempt(lambda key=key, declared=declared: read_feature(key, declared))
+        features |= {} if feature is None else {key: feature}
     tasks = report.attempt(lambda: read_tasks(root, info)) or {}
-    episodes = report.attempt(lambda: read_episodes(root, info))
-    if episodes is None:
-        return None
     folder = DatasetFolder(
         root=root, info=info, features=features, episodes=episodes, tasks=tasks
     )
-    report.attempt(lambda: [report.add_error(fault) for fault in count_faults(folder)])
+    for fault in count_faults(folder):
+        report.add_error(fault)
     return folder
 
 

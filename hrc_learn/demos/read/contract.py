@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -81,6 +81,11 @@ class ComponentContract:
             )
 
     @property
+    def column(self) -> tuple[str, int]:
+        """Feature and index of the component."""
+        return self.key, self.index
+
+    @property
     def quantity(self) -> str | None:
         """Quantity of a demonstration that holds the component; None for an extra column."""
         return _QUANTITIES.get(self.role, self.role)
@@ -101,7 +106,7 @@ class Contract:
     """Fingerprint of the data it was inferred from."""
 
     def __post_init__(self) -> None:
-        places = Counter((part.key, part.index) for part in self.components)
+        places = Counter(part.column for part in self.components)
         for (key, index), count in places.items():
             if count > 1:
                 raise ValueError(f"component {index} of {key} is listed {count} times")
@@ -110,19 +115,19 @@ class Contract:
         """The contract as a table with its header; similar neighbours are one row."""
         rows = [("column", "role", "unit", "range", "sign", "delay", "sure", "evidence")]
         alike = groupby(self.components, lambda p: (p.key, p.role, p.unit, p.sign, p.delay))
-        for group in ([*parts] for _, parts in alike):
-            first, last = group[0], group[-1]
-            name = first.name if len(group) == 1 else f"{first.name} .. {last.name}"
-            low, high = min(p.low for p in group), max(p.high for p in group)
-            weakest = min(group, key=lambda part: part.confidence)
+        for (key, role, unit, sign, delay), group in alike:
+            parts = [*group]
+            names = dict.fromkeys((parts[0].name, parts[-1].name))
+            low, high = min(p.low for p in parts), max(p.high for p in parts)
+            weakest = min(parts, key=lambda part: part.confidence)
             rows.append(
                 (
-                    plain_text(f"{first.key}/{name}"),
-                    first.role,
-                    first.unit or "-",
+                    plain_text(f"{key}/{' .. '.join(names)}"),
+                    role,
+                    unit or "-",
                     f"{low:.3g} .. {high:.3g}",
-                    {1: "+", -1: "-", 0: ""}[first.sign],
-                    "" if first.delay is None else f"{1e3 * first.delay:.0f} ms",
+                    {1: "+", -1: "-", 0: ""}[sign],
+                    "" if delay is None else f"{1e3 * delay:.0f} ms",
                     f"{100 * weakest.confidence:.0f} %",
                     weakest.evidence,
                 )
@@ -138,9 +143,9 @@ class Contract:
 
         Quantities with a column of unknown unit are left out.
         """
-        known, units = {(part.key, part.index): part for part in self.components}, {}
+        known, units = {part.column: part for part in self.components}, {}
         for role, selection in selections.items():
-            parts = [known.get(place) for place in selection.columns]
+            parts = [known.get(column) for column in selection.columns]
             each = tuple(part.unit_as(role) if part else "" for part in parts)
             if all(each):
                 units[role] = each
@@ -166,7 +171,7 @@ class Contract:
         return {
             role: ColumnSelection(
                 role=role,
-                columns=tuple((part.key, part.index) for part in parts),
+                columns=tuple(part.column for part in parts),
                 labels=tuple(joint_of(part.name) for part in parts),
                 numbered=features[parts[0].key].names is None,
             )
@@ -180,12 +185,12 @@ class Contract:
             kept: The older contract.
             overruled: Columns whose role or unit the caller gives now.
         """
-        known = {(part.key, part.index): part for part in kept.components}
+        known = {part.column: part for part in kept.components}
         parts = []
         for part in self.components:
-            old = known.get((part.key, part.index), part)
+            old = known.get(part.column, part)
             same = (part.role, part.unit) == (old.role, old.unit)
-            if same or (part.key, part.index) in overruled:
+            if same or part.column in overruled:
                 parts.append(replace(part, name=old.name))
             else:
                 parts.append(replace(old, low=part.low, high=part.high))
@@ -196,11 +201,6 @@ class Contract:
         doubtful = [p for p in self.components if p.unit and p.confidence < CONFIDENT]
         parts = [replace(p, unit="") if p in doubtful else p for p in self.components]
         return replace(self, components=tuple(parts)), [f"{p.key}/{p.name}" for p in doubtful]
-
-    def content(self) -> dict[str, Any]:
-        """The contract as JSON values."""
-        parts = [asdict(part) for part in self.components]
-        return {"fingerprint": self.fingerprint, "components": parts}
 
 
 def _faulty(message: str) -> DatasetError:
@@ -226,7 +226,7 @@ def read_contract(root: Path) -> Contract | None:
 
 def keep_contract(root: Path, contract: Contract) -> None:
     """Write the contract into the sidecar, keeping the rest of its content."""
-    sidecar = replace(read_sidecar(root), contract=contract.content())
+    sidecar = replace(read_sidecar(root), contract=asdict(contract))
     with new_file(root / SIDECAR_PATH) as part:
         dump_json(part, sidecar)
 
@@ -260,46 +260,35 @@ def infer_contract(
         decisions: Unit of each quantity.
         profiles: Profiles of its episodes.
     """
-    taken = {
-        column: (role, number)
-        for role, selection in mapping.selections.items()
-        for number, column in enumerate(selection.columns)
+    known = {
+        key: [(p.columns[key], p.length) for p in profiles if key in p.columns]
+        for key, feature in folder.features.items()
+        if feature.numeric and key not in INDEX_KEYS
     }
-    parts: list[ComponentContract] = []
-    places: dict[str, dict[int, int]] = {}
-    """Role -> number of its component -> place among the parts."""
-    for feature in folder.features.values():
-        known = [
-            (p.columns[feature.key], p.length) for p in profiles if feature.key in p.columns
-        ]
-        if not feature.numeric or feature.key in INDEX_KEYS or not known:
+    unnamed: dict[tuple[str, int], ComponentContract] = {}
+    discrete: dict[str, np.ndarray] = {}
+    for key, own in known.items():
+        if not own:
             continue
         # Quantiles over episodes, so that a single episode does not set the range.
-        low = np.quantile([p.levels[0] for p, _ in known], 0.05, axis=0)
-        high = np.quantile([p.levels[-1] for p, _ in known], 0.95, axis=0)
-        discrete = np.mean([is_discrete(p, length) for p, length in known], axis=0)
-        for index in range(min(feature.width, len(low))):
-            role, number = taken.get((feature.key, index), (None, 0))
-            part = ComponentContract(
-                key=feature.key,
-                index=index,
-                name=feature.names[index] if feature.names else f"joint_{index + 1}",
-                role="other",
-                unit="",
-                low=float(low[index]),
-                high=float(high[index]),
+        low = np.quantile([p.levels[0] for p, _ in own], 0.05, axis=0).tolist()
+        high = np.quantile([p.levels[-1] for p, _ in own], 0.95, axis=0).tolist()
+        discrete[key] = np.mean([is_discrete(p, length) for p, length in own], axis=0)
+        names = folder.features[key].names or [f"joint_{i + 1}" for i in range(len(low))]
+        for index, (name, least, most) in enumerate(zip(names, low, high, strict=False)):
+            place = {"key": key, "index": index, "name": name}
+            unnamed[key, index] = ComponentContract(
+                **place, role="other", unit="", low=least, high=most
             )
-            if role is None:
-                parts.append(_describe_extra(part, float(discrete[index])))
-            else:
-                places.setdefault(role, {})[number] = len(parts)
-                parts.append(_describe(part, number, decisions[role], profiles, folder.fps))
     # A quantity is read in the order of the contract: x, y, z, w on disk become w, x, y, z.
-    ordered = list(parts)
-    for numbers in places.values():
-        for there, number in zip(sorted(numbers.values()), sorted(numbers), strict=True):
-            ordered[there] = parts[numbers[number]]
-    return Contract(components=tuple(ordered), fingerprint=fingerprint(folder))
+    parts = [
+        _describe(unnamed.pop(column), number, decisions[role], profiles, folder.fps)
+        for role, selection in mapping.selections.items()
+        for number, column in enumerate(selection.columns)
+        if column in unnamed
+    ]
+    parts += [_describe_extra(p, float(discrete[p.key][p.index])) for p in unnamed.values()]
+    return Contract(components=tuple(parts), fingerprint=fingerprint(folder))
 
 
 def _describe_extra(part: ComponentContract, discrete: float) -> ComponentContract:

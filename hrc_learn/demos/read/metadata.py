@@ -64,36 +64,35 @@ class Feature:
 
 
 def read_features(info: dict) -> dict[str, Feature]:
-    """Declared features by key.
+    """Declared features by key; errors as in `read_feature`."""
+    return {key: read_feature(key, declared) for key, declared in info["features"].items()}
+
+
+def read_feature(key: str, declared: dict) -> Feature:
+    """One feature.
 
     Raises:
-        DatasetError: A declaration is malformed, or its names do not fit its shape.
+        DatasetError: The declaration is malformed, or its names do not fit its shape.
     """
-    features = {}
-    for key, declared in info["features"].items():
-        names = None
-        try:
-            dtype, shape = str(declared["dtype"]), tuple(int(n) for n in declared["shape"])
-            if any(n < 0 for n in shape) or len(shape) > _MOST_AXES:
-                raise ValueError(f"shape {shape}")
-            if dtype.startswith(NUMERIC) and prod(shape) > _WIDEST:
-                raise ValueError(f"{prod(shape)} numbers a frame")
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise DatasetError(
-                f"the feature's declaration is malformed: {error!r}", file=INFO_PATH, key=key
-            ) from error
-        if dtype.startswith(NUMERIC):
-            names = flatten_names(declared.get("names"))
-            if names is not None and len(names) == 1 < prod(shape):
-                names = None  # openpi's converters name the vector, not its components
-            if names is not None and len(names) != prod(shape):
-                text = (
-                    f"{len(names)} names for {prod(shape)} components; correct names or "
-                    f"shape of the feature"
-                )
-                raise DatasetError(text, file=INFO_PATH, key=key)
-        features[key] = Feature(key=key, dtype=dtype, shape=shape, names=names)
-    return features
+    try:
+        dtype, shape = str(declared["dtype"]), tuple(int(n) for n in declared["shape"])
+        if any(n < 0 for n in shape) or len(shape) > _MOST_AXES:
+            raise ValueError(f"shape {shape}")
+        numeric, width = dtype.startswith(NUMERIC), prod(shape)
+        if numeric and width > _WIDEST:
+            raise ValueError(f"{width} numbers a frame")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        text = f"the feature's declaration is malformed: {error!r}"
+        raise DatasetError(text, file=INFO_PATH, key=key) from error
+    names = flatten_names(declared.get("names")) if numeric else None
+    if names is not None and len(names) == 1 < width:
+        names = None  # openpi's converters name the vector, not its components
+    if names is not None and len(names) != width:
+        text = (
+            f"{len(names)} names for {width} components; correct names or shape of the feature"
+        )
+        raise DatasetError(text, file=INFO_PATH, key=key)
+    return Feature(key=key, dtype=dtype, shape=shape, names=names)
 
 
 def flatten_names(names: object) -> tuple[str, ...] | None:
@@ -104,10 +103,7 @@ def flatten_names(names: object) -> tuple[str, ...] | None:
         names = list(names.values())
     if not isinstance(names, list | tuple):
         return (str(names),)
-    flat: list[str] = []
-    for item in names:
-        flat.extend(flatten_names(item) or () if isinstance(item, list | dict) else [str(item)])
-    return tuple(flat)
+    return tuple(name for item in names for name in flatten_names(item) or ())
 
 
 @dataclass(frozen=True, kw_only=True)
