@@ -94,8 +94,6 @@ class Check(Columns, OnDataset, Written):
 
     out: Path | None = None
     """Folder for findings.json, contract.json and metrics.json."""
-    speed_limits: dict[str, float] = field(default_factory=dict)
-    """Maximum joint speeds [rad/s], such as: joint1 2.1 joint2 2.1."""
     strict: bool = False
     """Count warnings as errors in the exit status."""
     full: bool = False

@@ -3,7 +3,6 @@
 import sys
 import webbrowser
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -20,7 +19,6 @@ from hrc_learn.demos import (
     recover_all,
     repair_dataset,
 )
-from hrc_learn.demos.issues import ValidationReport
 from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
 from hrc_learn.demos.quality.repair import (
     Decisions,
@@ -51,9 +49,7 @@ def check(args: Check) -> int:
             of, or no marker to find camera motion by. The findings are written before.
     """
     _require_dataset(args.dataset)
-    report = check_dataset(
-        args.dataset, args.columns(), units=args.units, speed_limits=args.speed_limits
-    )
+    report = check_dataset(args.dataset, args.columns(), units=args.units)
     if report.contract is not None:
         print(*report.contract.lines(), "", sep="\n")
     print(*report.lines(full=args.full), sep="\n")
@@ -71,7 +67,13 @@ def check(args: Check) -> int:
             moved = _camera_moved(args)
             counts["camera_moved"] = int(moved)
     finally:
-        _write_findings(args, report, counts)
+        if args.out is not None:
+            with new_folder(args.out, configuration(args), args.overwrite) as folder:
+                write_json(folder / "findings.json", report.records())
+                write_json(folder / "metrics.json", counts)
+                if report.contract is not None:
+                    write_json(folder / "contract.json", report.contract)
+        write_values(args.json, counts)
     return int(bool(report.errors or (args.strict and (report.warnings or moved))))
 
 
@@ -89,16 +91,6 @@ def _store_contract(dataset: Path, contract: Contract | None) -> None:
     print(f"contract stored in {dataset / SIDECAR_PATH}: edit it there")
     if doubtful:
         print(f"note: unit left open, as the evidence is weak: {', '.join(doubtful)}")
-
-
-def _write_findings(args: Check, report: ValidationReport, counts: Mapping[str, int]) -> None:
-    if args.out is not None:
-        with new_folder(args.out, configuration(args), args.overwrite) as folder:
-            write_json(folder / "findings.json", report.records())
-            write_json(folder / "metrics.json", counts)
-            if report.contract is not None:
-                write_json(folder / "contract.json", report.contract)
-    write_values(args.json, counts)
 
 
 def _camera_moved(args: Check) -> bool:

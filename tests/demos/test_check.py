@@ -564,25 +564,6 @@ def test_a_command_in_a_message_keeps_its_long_path():
     assert command in str(warning(message=f"not found. {command} makes a dataset of it"))
 
 
-def test_speed_limits_are_the_callers(root):
-    assert not any("jumps" in f.message for f in check_dataset(root).warnings)
-    slow = check_dataset(root, speed_limits=dict.fromkeys("abc", 1e-3))
-    assert sum("jumps" in f.message for f in slow.warnings) == 3
-
-
-@pytest.mark.parametrize(
-    ("limits", "message"),
-    [
-        ({"a": 1.0, "nosuch": 0.1}, r"no joint 'nosuch'; there are a, b, c"),
-        ({"b": float("nan")}, r"that of b must be positive, but is nan"),
-        ({"b": 0}, r"that of b must be positive, but is 0"),
-    ],
-)
-def test_speed_limits_of_no_joint_and_that_are_none_are_refused(root, limits, message):
-    with pytest.raises(ValueError, match=message):
-        check_dataset(root, speed_limits=limits)
-
-
 def test_a_damaged_sidecar(root):
     (root / "meta/hrc_learn.json").write_text('{"format": 1')
     assert find(check_dataset(root).errors, "not valid JSON").file == "meta/hrc_learn.json"

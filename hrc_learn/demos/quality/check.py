@@ -60,7 +60,6 @@ def check_dataset(
     path: str | Path,
     mapping: MappingSpec | None = None,
     units: Mapping[str, str] | None = None,
-    speed_limits: Mapping[str, float | int] | None = None,
 ) -> ValidationReport:
     """Validate a LeRobot dataset of version 2.0, 2.1 or 3.0.
 
@@ -70,11 +69,9 @@ def check_dataset(
         path: Folder of the dataset.
         mapping: Columns of quantities that are not found by name, as in `load_demos`.
         units: Units on disk by role, as in `load_demos`.
-        speed_limits: Joint -> largest speed [rad/s]; 12 rad/s by default.
 
     Raises:
         DatasetError: `mapping` or `units` name what does not exist.
-        ValueError: `speed_limits` name no joint, or a limit is not positive.
     """
     for role, unit in (units or {}).items():
         unit_factor(role, unit)
@@ -86,20 +83,12 @@ def check_dataset(
         report.run(check, folder)
     parse_mapping(mapping or {}, folder.features)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
-    names = () if dataset is None else dataset.columns.joint_names
-    for name, limit in (speed_limits or {}).items() if dataset is not None else ():
-        if name not in names:
-            there = ", ".join(names) or "none"
-            raise ValueError(f"speed_limits: there is no joint {name!r}; there are {there}")
-        if not limit > 0:
-            raise ValueError(f"speed_limits: that of {name} must be positive, but is {limit}")
     report.attempt(lambda: check_videos(folder, report))
     if dataset is None:
         for _ in _first_pass(folder, report, None, {}):
             pass
     else:
-        given = (mapping or {}, units or {}, speed_limits or {})
-        report.attempt(lambda: _check_content(dataset, report, *given))
+        report.attempt(lambda: _check_content(dataset, report, mapping or {}, units or {}))
     return report
 
 
@@ -128,7 +117,6 @@ def _check_content(
     report: ValidationReport,
     mapping: MappingSpec,
     units: Mapping[str, str],
-    speed_limits: Mapping[str, float | int],
 ) -> None:
     """Decide on the units; check every motion, and episodes against others.
 
@@ -148,7 +136,7 @@ def _check_content(
     features = [*consistency.feature_profiles(folder, entries, profiles)]
     usual = _usual_motion(columns, decisions, {f.key: f for f in features})
     doubtful = {fault.episode for fault in faults}
-    _check_motions(folder, report, columns, decisions, speed_limits, usual, doubtful)
+    _check_motions(folder, report, columns, decisions, usual, doubtful)
     report.run(consistency.column_ranges, features)
     report.run(structure_checks.statistics_fit, folder, features)
     report.run(consistency.lengths, [entries[i] for i in profiles])
@@ -176,7 +164,6 @@ def _check_motions(
     report: ValidationReport,
     columns: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
-    speed_limits: Mapping[str, float | int],
     usual: UsualMotion,
     doubtful: set[int | None],
 ) -> None:
@@ -194,7 +181,6 @@ def _check_motions(
             raw=raw,
             quantities=scaled,
             joint_names=columns.joint_names,
-            speed_limits=speed_limits,
             usual=usual,
         )
         report.run(episode_checks.orientation_values, episode)

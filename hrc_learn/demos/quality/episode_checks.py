@@ -176,8 +176,6 @@ class MotionRecord:
     quantities: Quantities
     """Values in SI units."""
     joint_names: tuple[str, ...]
-    speed_limits: Mapping[str, float | int]
-    """Joint -> largest speed [rad/s]."""
     usual: UsualMotion
 
     @property
@@ -280,8 +278,7 @@ def joint_speeds(episode: MotionRecord) -> Iterator[Issue]:
     change = np.diff(joints, axis=0)
     speed = np.abs(change) / np.diff(episode.time)[:, None]
     # Fingers are faster, and often counted in units of their own.
-    usual = {name: np.inf if is_hand(name) else _FASTEST_ARM for name in names}
-    limits = np.array([episode.speed_limits.get(name, usual[name]) for name in names])
+    limits = np.array([np.inf if is_hand(name) else _FASTEST_ARM for name in names])
     too_fast = (speed > limits).any(1)
     if not too_fast.any():
         return
@@ -293,7 +290,7 @@ def joint_speeds(episode: MotionRecord) -> Iterator[Issue]:
         cause = "the encoder wrapped: hrc repair unwraps it"
     text = (
         f"{name} jumps by {step:.3g} rad in one frame ({speed[frame, joint]:.3g} rad/s, limit "
-        f"{limits[joint]:.3g}); {cause}. {int(too_fast.sum())} such frames in the episode"
+        f"{_FASTEST_ARM:g}); {cause}. {int(too_fast.sum())} such frames in the episode"
     )
     key = f"joint_position ({name})"
     yield episode.entry.warning(text, frame=frame + 1, key=key, components=(name,))

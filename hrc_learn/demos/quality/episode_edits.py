@@ -296,9 +296,9 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
     """Resample every column to a regular grid that begins at the first frame.
 
     Joints, joint velocities and poses follow cubic splines, other columns straight lines;
-    integers, switches and hands take the nearest frame. Angles that jump by whole turns are
-    unwrapped, interpolated and wrapped again. Rotation vectors are interpolated as they are:
-    unwrap them first.
+    integers, switches and hands take the nearest frame. Joints, commands and Euler angles that
+    jump by whole turns are unwrapped. Rotation vectors are interpolated as they are: unwrap
+    them first.
 
     Raises:
         DatasetError: The stamps do not increase, the episode is shorter than a period, or it
@@ -320,7 +320,7 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
             key="pose_matrix",
         )
     time = np.minimum(grid, known[-1])
-    smooth, wrapped = _unwrapped_all(edit)
+    smooth = _unwrapped_all(edit)
     frames = {
         key: make_interp_spline(known, values.astype(float), k=1)(time)
         for key, values in smooth.frames.items()
@@ -334,9 +334,6 @@ def resample_to_grid(edit: EpisodeEdit, fps: float | int) -> EpisodeEdit:
             q = CubicSpline(known, signed)(time)
             q /= np.linalg.norm(q, axis=1, keepdims=True)
             moved = moved.with_quantity(role, q)
-    for (key, index), (turn, middle) in wrapped:
-        column = moved.frames[key][:, index]
-        column -= turn * np.rint((column - middle) / turn)
     nearest = nearest_frames(known, time)
     for key, held in _levels(edit):
         moved.frames[key][:, held] = edit.frames[key][nearest][:, held]
@@ -362,25 +359,13 @@ def _levels(edit: EpisodeEdit) -> Iterator[tuple[str, Bool[np.ndarray, " compone
         yield key, held | (values.dtype.kind != "f")
 
 
-def _unwrapped_all(
-    edit: EpisodeEdit,
-) -> tuple[EpisodeEdit, list[tuple[tuple[str, int], tuple[float, float]]]]:
-    """Angles and commands without jumps by whole turns.
-
-    Returns:
-        The episode, and for each column that jumps a turn and the middle of its range, in its
-        unit.
-    """
-    quantities, wrapped = edit.quantities, []
+def _unwrapped_all(edit: EpisodeEdit) -> EpisodeEdit:
+    """Angles and commands without jumps by whole turns, which no interpolation follows."""
+    quantities = edit.quantities
     for role in (*_MEASURED_ANGLES, "command_position"):
-        if role not in quantities:
-            continue
-        values, turn = quantities[role], edit.turn(role)
-        turns = _turns(values / turn)
-        columns = edit.selections[role].columns
-        for k in np.flatnonzero(turns.any(0)):
-            middle = float(values[:, k].min() + values[:, k].max()) / 2
-            wrapped.append((columns[k], (float(turn[k]), middle)))
-        if turns.any():
-            edit = edit.with_quantity(role, values - turn * turns)
-    return edit, wrapped
+        if role in quantities:
+            turn = edit.turn(role)
+            turns = _turns(quantities[role] / turn)
+            if turns.any():
+                edit = edit.with_quantity(role, quantities[role] - turn * turns)
+    return edit
