@@ -15,13 +15,14 @@ from hrc_learn.demos.quality.video_checks import check_videos
 from hrc_learn.demos.read.columns import (
     ColumnMapping,
     MappingSpec,
+    map_columns,
     parse_mapping,
     replaced_roles,
 )
 from hrc_learn.demos.read.contract import infer_contract
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quantities
-from hrc_learn.demos.read.metadata import SIDECAR_PATH
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar
 from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
 from hrc_learn.demos.read.source import OpenedDataset
 from hrc_learn.demos.read.units import Quantities, UnitDecision, unit_factor
@@ -83,32 +84,28 @@ def check_dataset(
         report.run(check, folder)
     parse_mapping(mapping or {}, folder.features)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
+    if dataset is None:  # a damaged sidecar
+        columns = map_columns(folder.features, Sidecar(), mapping)
+        dataset = OpenedDataset(folder=folder, columns=columns)
     report.attempt(lambda: check_videos(folder, report))
-    if dataset is None:
-        for _ in _first_pass(folder, report, None, {}):
-            pass
-    else:
-        report.attempt(lambda: _check_content(dataset, report, mapping or {}, units or {}))
+    report.attempt(lambda: _check_content(dataset, report, mapping or {}, units or {}))
     return report
 
 
 def _first_pass(
-    folder: DatasetFolder,
-    report: ValidationReport,
-    columns: ColumnMapping | None,
-    profiles: dict[int, EpisodeProfile],
+    dataset: OpenedDataset, report: ValidationReport, profiles: dict[int, EpisodeProfile]
 ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
     """Run the checks that need no units, fill in the profiles, and give the quantities."""
+    folder, columns = dataset.folder, dataset.columns
     for entry, frames in read_sound_episodes(folder, report):
         for check in RAW_EPISODE_CHECKS:
             report.run(check, folder, entry, frames)
         report.episodes += 1
         report.frames += entry.length
-        found = None
-        if columns is not None and _is_sound(frames, columns):
-            found = select_quantities(frames, columns.selections)
+        sound = _is_sound(frames, columns)
+        found = select_quantities(frames, columns.selections) if sound else {}
         profiles[entry.index] = profile_episode(entry.index, frames, found, folder.fps)
-        if found is not None:
+        if sound:
             yield entry, found
 
 
@@ -127,7 +124,7 @@ def _check_content(
     profiles: dict[int, EpisodeProfile] = {}
     if dataset.contract_note is not None:
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
-    episodes = _first_pass(folder, report, columns, profiles)
+    episodes = _first_pass(dataset, report, profiles)
     decisions, faults = dataset.units_from(episodes, units)
     for fault in faults:
         report.add_error(fault)
@@ -218,16 +215,11 @@ def _usual_motion(
 
 def _is_sound(frames: RawFrames, mapping: ColumnMapping) -> bool:
     """True if all columns of the quantities exist and are finite."""
-    columns: dict[str, list[int]] = {}
-    for key, index in (column for s in mapping.selections.values() for column in s.columns):
-        columns.setdefault(key, []).append(index)
+    columns = [column for s in mapping.selections.values() for column in s.columns]
     return all(
-        key in frames
-        and len(frames[key]) > 1
-        and max(indices) < frames[key].shape[1]
-        and np.isfinite(frames[key][:, indices].astype(float)).all()
-        for key, indices in columns.items()
-    )
+        key in frames and len(frames[key]) > 1 and index < frames[key].shape[1]
+        for key, index in columns
+    ) and all(np.isfinite(frames[key][:, index].sum(dtype=float)) for key, index in columns)
 
 
 def _meaning(mapping: ColumnMapping, decisions: Mapping[str, UnitDecision]) -> Iterator[Issue]:

@@ -154,18 +154,17 @@ def meaning_of_component(name: str) -> ComponentMeaning | None:
     pose = _meaning_in_pose(plain)
     if pose is not None:
         return pose
-    stem, suffix = split_name(name.strip())
-    roles = [role for role, names in JOINT_SUFFIXES.items() if suffix in names]
+    joint, role = joint_and_role(name.strip())
     of_tool = re.match(r"(?:ee|eef|tcp|end_effector)[._/](.+)", plain)
     if (of_tool and "gripper" in of_tool[1]) or (
-        _GRIPPER.search(plain) and (not stem or roles)
+        _GRIPPER.search(plain) and (not joint or role)
     ):
         # The velocity or force of a gripper must not be mistaken for its opening.
         if re.search(r"_(?:vel|velocity|torque|effort|force|current)$", plain):
             return None
-        return ComponentMeaning("gripper", name) if roles in ([], ["joint_position"]) else None
-    if stem and roles:
-        return ComponentMeaning(roles[0], stem)
+        return ComponentMeaning("gripper", name) if role in ("", "joint_position") else None
+    if joint and role:
+        return ComponentMeaning(role, joint)
     prefix, _, number = plain.rpartition("_")
     if number.isdigit() and prefix in _JOINT_PREFIXES:
         return ComponentMeaning(_JOINT_PREFIXES[prefix], f"joint_{number}")
@@ -191,25 +190,25 @@ def _meaning_in_pose(plain: str) -> ComponentMeaning | None:
     return None
 
 
-def split_name(name: str) -> tuple[str, str]:
-    """Joint and quantity in a name such as `joint_1.pos` or `joint_1_vel`; "" for no joint."""
-    name = without_unit(name)[0]
-    stem, dot, suffix = name.rpartition(".")
-    if not dot and (match := _UNDERSCORED.fullmatch(name)):
-        known = any(match[2].lower() in names for names in JOINT_SUFFIXES.values())
-        stem, suffix = (match[1], match[2]) if known else ("", name)
-    return stem, suffix.lower()
+def joint_and_role(name: str) -> tuple[str, str]:
+    """Joint and role in a name such as `joint_1.pos` or `joint_1_vel`; "" if there is none."""
+    stem, dot, suffix = without_unit(name)[0].rpartition(".")
+    if not dot and (match := _UNDERSCORED.fullmatch(suffix)):
+        stem, suffix = match.groups()
+    suffix = suffix.lower()
+    role = next((role for role, names in JOINT_SUFFIXES.items() if suffix in names), "")
+    return (stem, role) if dot or role else ("", "")
 
 
 def names_joint_quantity(name: str) -> bool:
     """True if the name is a joint with a suffix of `JOINT_SUFFIXES`."""
-    stem, suffix = split_name(name)
-    return bool(stem) and any(suffix in names for names in JOINT_SUFFIXES.values())
+    return all(joint_and_role(name))
 
 
 def joint_of(name: str) -> str:
     """Joint of a component: its name without its unit and the suffix of the quantity."""
-    return split_name(name)[0] if names_joint_quantity(name) else without_unit(name)[0]
+    joint, role = joint_and_role(name)
+    return joint if joint and role else without_unit(name)[0]
 
 
 def is_hand(name: str) -> bool:

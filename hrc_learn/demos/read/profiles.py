@@ -122,14 +122,14 @@ def profile_columns(
 
 
 def profile_episode(
-    index: int, frames: RawFrames, quantities: Quantities | None, fps: float
+    index: int, frames: RawFrames, quantities: Quantities, fps: float
 ) -> EpisodeProfile:
-    """Profile of an episode; without quantities, its tracking stays empty."""
+    """Profile of an episode; without quantities, its tracking is empty."""
     return EpisodeProfile(
         index=index,
         length=len(next(iter(frames.values()))),
         columns=profile_columns(frames),
-        tracking={} if quantities is None else track_quantities(quantities, fps),
+        tracking=track_quantities(quantities, fps),
     )
 
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol, overload, runtime_checkable
@@ -51,10 +51,10 @@ class OpenedDataset:
     """Metadata of a dataset and the meaning of its columns; no file stays open."""
 
     folder: DatasetFolder
-    sidecar: Sidecar
-    contract: Contract | None
-    """Contract kept with the dataset."""
     columns: ColumnMapping
+    sidecar: Sidecar = field(default_factory=Sidecar)
+    contract: Contract | None = None
+    """Contract kept with the dataset."""
     own_feature: bool = False
     """True if the image feature is a column of the dataset, or left out by the caller."""
 
