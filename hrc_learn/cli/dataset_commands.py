@@ -182,7 +182,6 @@ def curate(args: Curate) -> None:
         "episodes": len(ranking.episodes),
         "episodes_in_doubt": sum(q.score > 0 for q in ranking.episodes),
         "episodes_broken": sum(q.broken for q in ranking.episodes),
-        "groups": sum(number >= 0 for number in ranking.clusters),
         "episodes_rejected": sum(d.verdict == "reject" for d in decisions.values()),
         "episodes_cut": sum(d.verdict == "cut" for d in decisions.values()),
     }

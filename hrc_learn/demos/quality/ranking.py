@@ -1,4 +1,4 @@
-"""Ranking of a dataset's episodes by how doubtful they are, and clusters of similar ones.
+"""Ranking of a dataset's episodes by how doubtful they are.
 
 A ranking decides nothing: it tells a person which episodes to look at first, and why.
 """
@@ -39,8 +39,6 @@ _PHASES = 20
 _DIMENSIONS = 16
 """Principal components for distances: a neighbour search in more is far slower."""
 _NEIGHBOURS = 3
-_REACH = 2.0
-"""Distance of neighbours in a cluster, in usual distances to the third neighbour."""
 
 
 @dataclass(kw_only=True)
@@ -57,8 +55,6 @@ class EpisodeQuality:
     """Doubt, 0 without any reason."""
     reasons: list[str] = field(default_factory=list)
     """Reasons, the weightiest first."""
-    cluster: int = -1
-    """Number of the cluster of similar episodes; -1 for none."""
     place: tuple[float, float] | None = None
     """First two principal components: similar episodes are close on this map."""
     start: int = 0
@@ -83,29 +79,16 @@ class Ranking:
     notes: tuple[str, ...] = ()
     """Faults of the dataset as a whole."""
 
-    @property
-    def clusters(self) -> dict[int, list[int]]:
-        """Cluster number -> episode indices; -1 for episodes without a cluster."""
-        groups: dict[int, list[int]] = {}
-        for quality in sorted(self.episodes, key=lambda q: (q.cluster, q.episode)):
-            groups.setdefault(quality.cluster, []).append(quality.episode)
-        return groups
-
     def lines(self, most: int | None = None) -> Iterator[str]:
         """The ranking as text: the first `most` episodes as a table, then a summary."""
-        rows = [("episode", "doubt", "group", "frames", *MEASURES, "why")]
+        rows = [("episode", "doubt", "frames", *MEASURES, "why")]
         for q in self.episodes[:most]:
             measured = (f"{q.measures[m]:.3g}" if m in q.measures else "-" for m in MEASURES)
-            group = "-" if q.cluster < 0 else f"{q.cluster}"
-            place = (f"{q.episode}", f"{q.score:.1f}", group, f"{q.length}")
+            place = (f"{q.episode}", f"{q.score:.1f}", f"{q.length}")
             rows.append((*place, *measured, "; ".join(q.reasons)))
         yield from aligned(rows, ">")
         if rest := len(self.episodes) - len(rows) + 1:
             yield f"and {rest} less doubtful episodes"
-        groups = self.clusters
-        alone = len(groups.pop(-1, ()))
-        sizes = ", ".join(str(len(members)) for members in groups.values()) or "none"
-        yield f"{len(groups)} groups of similar episodes ({sizes}); {alone} without a group"
         yield from self.notes
 
 
@@ -267,31 +250,18 @@ def _compare(
     qualities: Mapping[int, EpisodeQuality],
     shapes: Mapping[int, Float64[np.ndarray, " numbers"]],
 ) -> None:
-    """Find clusters, and the distance of each episode from its neighbours."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    """Find the place of each episode on the map, and its distance from its neighbours."""
     from scipy.spatial import KDTree
 
     if len(shapes) <= _NEIGHBOURS or len({len(shape) for shape in shapes.values()}) != 1:
         return
-    indices = [*shapes]
     points = _principal_components(np.stack([*shapes.values()]))
-    distances, found = KDTree(points).query(points, k=_NEIGHBOURS + 1)
-    neighbours = np.asarray(found)
-    reach = float(np.median(distances[:, -1]))
-    if reach <= 0:
-        return
-    one, other = np.nonzero(distances <= _REACH * reach)
-    edges = (np.ones(len(one)), (one, neighbours[one, other]))
-    labels = connected_components(coo_array(edges, shape=(len(points), len(points))))[1]
-    # The largest cluster is number 0; a few odd episodes are none.
-    clusters = [c for c, size in Counter(labels.tolist()).most_common() if size > _NEIGHBOURS]
-    for number, index in enumerate(indices):
-        quality = qualities[index]
-        if labels[number] in clusters:
-            quality.cluster = clusters.index(labels[number])
-        quality.place = float(points[number, 0]), float(points[number, 1])
-        quality.measures["distance"] = float(distances[number, 1:].mean() / reach)
+    distances = np.asarray(KDTree(points).query(points, k=_NEIGHBOURS + 1)[0])
+    usual = float(np.median(distances[:, -1]))
+    for index, point, own in zip(shapes, points, distances, strict=True):
+        qualities[index].place = float(point[0]), float(point[1])
+        if usual > 0:
+            qualities[index].measures["distance"] = float(own[1:].mean() / usual)
 
 
 def _principal_components(

@@ -55,7 +55,6 @@ function sorted() {
   const key = {
     score: (e) => [-e.score, e.episode],
     episode: (e) => [e.episode, 0],
-    cluster: (e) => [e.cluster < 0 ? 1e9 : e.cluster, -e.score],
   }[by] ?? ((e) => [-(e.measures[by] ?? -1e9), e.episode]); // the largest first
   const open = byId("open").checked;
   return overview.episodes
@@ -138,10 +137,9 @@ function drawMap() {
   const [pen, w, h] = canvasOf(canvas);
   byId("map").hidden = !overview.episodes.some((e) => e.place);
   for (const [e, x, y] of mapPlaces(w, h)) {
-    const grey = e.cluster < 0;
     pen.beginPath();
     pen.arc(x, y, e === current ? 6 : 3.5, 0, 7);
-    pen.fillStyle = grey ? colour("--faint") : SERIES[e.cluster % SERIES.length];
+    pen.fillStyle = e.score > 0 ? SERIES[1] : colour("--faint");
     pen.fill();
     if (e === current) {
       pen.lineWidth = 2;
@@ -173,8 +171,7 @@ async function choose(episode) {
   const motion = { start: episode.start, stop: episode.stop };
   marks = decided?.verdict === "cut" ? { start: decided.start, stop: decided.stop } : motion;
   byId("title").textContent = `Episode ${episode.episode}`;
-  const group = episode.cluster < 0 ? "" : `, group ${episode.cluster}`;
-  byId("task").textContent = `${episode.task} (${episode.length} frames${group})`;
+  byId("task").textContent = `${episode.task} (${episode.length} frames)`;
   const reasons = episode.reasons.length ? episode.reasons : ["Nothing speaks against it."];
   byId("reasons").className = episode.reasons.length ? "" : "none";
   byId("reasons").replaceChildren(
