@@ -209,26 +209,26 @@ def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:
     """Stored decisions, updated and stored again with those of the command line."""
     decisions = read_decisions(args.dataset)
     lengths = {quality.episode: quality.length for quality in ranking.episodes}
-    unknown = sorted({*args.reject, *args.accept, *args.cut} - {*lengths})
-    if unknown:
+    typed = {
+        **dict.fromkeys(args.accept, ("accept", "")),
+        **{episode: ("cut", text) for episode, text in args.cut.items()},
+        **dict.fromkeys(args.reject, ("reject", "")),
+    }
+    if unknown := sorted(typed.keys() - lengths.keys()):
         raise ValueError(
             f"there is no episode {unknown[0]}; the dataset has {min(lengths)} to "
             f"{max(lengths)}"
         )
-    for episode in args.accept:
-        decisions[episode] = decide("accept", lengths[episode])
-    for episode, text in args.cut.items():
+    for episode, (verdict, text) in typed.items():
         try:
-            start, stop = (int(part) for part in text.split(":"))
-            decisions[episode] = decide("cut", lengths[episode], start, stop)
+            start, stop = (int(part) for part in text.split(":")) if text else (0, 0)
+            decisions[episode] = decide(verdict, lengths[episode], start, stop)
         except ValueError as error:
             raise ValueError(
                 f"--cut {episode} {text}: give the first frame to keep and the one after the "
                 f"last, such as 30:410, of {lengths[episode]} ({error})"
             ) from error
-    for episode in args.reject:
-        decisions[episode] = decide("reject", lengths[episode])
-    if args.accept or args.cut or args.reject:
+    if typed:
         keep_decisions(args.dataset, decisions)
     return decisions
 

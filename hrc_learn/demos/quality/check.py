@@ -137,8 +137,11 @@ def _check_content(
     report.run(consistency.column_ranges, features)
     report.run(structure_checks.statistics_fit, folder, features)
     report.run(consistency.lengths, [entries[i] for i in profiles])
-    report.run(consistency.command_tracking, folder, columns, entries, profiles)
-    report.run(consistency.command_offsets, columns, entries, profiles, features)
+    commands = consistency.command_profiles(folder, columns, entries, profiles)
+    if commands is not None:
+        report.run(consistency.velocity_commands, commands)
+        report.run(consistency.command_tracking, commands)
+        report.run(consistency.command_offsets, commands, features)
     for feature in features:
         report.run(consistency.sizes, feature)
         for check in CONSISTENCY_CHECKS:

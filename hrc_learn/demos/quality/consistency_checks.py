@@ -353,22 +353,56 @@ def _without_sign(feature: FeatureProfiles) -> Bool[np.ndarray, " components"]:
     return np.char.startswith(roles, "quaternion") | (vectors & near_half_turn)
 
 
-def command_tracking(
+@dataclass(frozen=True, kw_only=True)
+class CommandProfiles:
+    """Relation of commands and states in all episodes that have commands."""
+
+    key: str
+    """Feature of the commands."""
+    names: tuple[str, ...]
+    """Joint of each component."""
+    states: tuple[tuple[str, int], ...]
+    """Column of the state of each component."""
+    fps: float
+    """Frame rate [1/s]."""
+    entries: list[EpisodeEntry]
+    trackings: list[Tracking]
+    """Commands against joint positions, one an episode."""
+    rates: list[Tracking]
+    """Commands against joint rates, of the episodes where positions do not follow at once."""
+
+    @cached_property
+    def fit(self) -> Float64[np.ndarray, " components"]:
+        """Usual R squared of each component."""
+        return _median([tracking.fit for tracking in self.trackings])
+
+
+def command_profiles(
     folder: DatasetFolder,
     mapping: ColumnMapping,
     entries: Mapping[int, EpisodeEntry],
     profiles: Mapping[int, EpisodeProfile],
-) -> Iterator[Issue]:
-    """Delays, signs and pairs of commands and states that agree between episodes."""
+) -> CommandProfiles | None:
+    """Tracking of the commands in all episodes; None without commands."""
     known = [p for p in profiles.values() if "command_position" in p.tracking]
-    if "command_position" not in mapping.selections or not known:
-        return
+    if not known:
+        return None
     command = mapping.selections["command_position"]
-    key, names = command.columns[0][0], command.labels
-    trackings = [p.tracking["command_position"] for p in known]
-    usual_fit = _median([t.fit for t in trackings])
-    yield from _velocity_commands(folder.fps, key, names, profiles, usual_fit)
-    follow = usual_fit > FOLLOWS
+    return CommandProfiles(
+        key=command.columns[0][0],
+        names=command.labels,
+        states=mapping.selections["joint_position"].columns,
+        fps=folder.fps,
+        entries=[entries[p.index] for p in known],
+        trackings=[p.tracking["command_position"] for p in known],
+        rates=[p.tracking["rates"] for p in known if "rates" in p.tracking],
+    )
+
+
+def command_tracking(commands: CommandProfiles) -> Iterator[Issue]:
+    """Delays, signs and pairs of commands and states that agree between episodes."""
+    trackings, place = commands.trackings, {"key": commands.key, "components": commands.names}
+    follow = commands.fit > FOLLOWS
     if not follow.any():
         return
     usual_slope = _median([t.slope for t in trackings])
@@ -379,10 +413,9 @@ def command_tracking(
             f"the state moves {-delay:.0f} frames before its command in most episodes: actions "
             f"and states are shifted against each other"
         )
-        yield warning(message=text, key=key)
+        yield warning(message=text, key=commands.key)
     agreement = (np.abs(delays - delay) <= 2).mean()
-    for profile, tracking in zip(known, trackings, strict=True):
-        entry = entries[profile.index]
+    for entry, tracking in zip(commands.entries, trackings, strict=True):
         shift = tracking.delay - delay
         # The own delay must explain far more of the motion than the usual one.
         better = gain_over(tracking, round(delay)) > 0.8
@@ -392,50 +425,66 @@ def command_tracking(
                 f"the state comes {tracking.delay} frames after its command, in the other "
                 f"episodes {delay:.0f}: actions were shifted against states"
             )
-            yield entry.fault(text, key=key, components=names, severity=abs(shift))
-        elif len(known) >= FEWEST:
-            for text, level in _component_tracking(tracking, usual_slope, follow, names):
-                yield entry.fault(text, key=key, components=names, level=level)
+            yield entry.fault(text, severity=abs(shift), **place)
+        elif len(trackings) >= FEWEST:
+            found = _component_tracking(tracking, usual_slope, follow, commands.names)
+            for text, level in found:
+                yield entry.fault(text, level=level, **place)
 
 
 def command_offsets(
-    mapping: ColumnMapping,
-    entries: Mapping[int, EpisodeEntry],
-    profiles: Mapping[int, EpisodeProfile],
-    features: Sequence[FeatureProfiles],
+    commands: CommandProfiles, features: Sequence[FeatureProfiles]
 ) -> Iterator[Issue]:
     """Constant distances between command and state at rest, and episodes where they changed.
 
     A leader and a follower that were calibrated differently are such a distance apart.
     """
-    known = [p for p in profiles.values() if "command_position" in p.tracking]
-    if not known or "command_position" not in mapping.selections:
-        return
-    command, states = (mapping.selections[r] for r in ("command_position", "joint_position"))
     spans = {feature.key: feature.median("span") for feature in features}
-    offsets = np.stack([p.tracking["command_position"].offset for p in known])
-    for number, (name, (key, index)) in enumerate(
-        zip(command.labels, states.columns, strict=True)
-    ):
-        found = np.flatnonzero(np.isfinite(offsets[:, number]))
+    offsets = np.stack([tracking.offset for tracking in commands.trackings])
+    for own, name, (key, index) in zip(offsets.T, commands.names, commands.states, strict=True):
+        found = np.flatnonzero(np.isfinite(own))
         # Hands that hold an object, and flags, do not reach their command.
         if not len(found) or key not in spans or is_hand(name):
             continue
-        own = offsets[found, number]
-        usual, least = float(np.median(own)), _OFFSET * float(spans[key][index])
-        if least > 0 and abs(usual) > least and np.median(np.abs(own - usual)) < least / 2:
+        usual, least = float(np.median(own[found])), _OFFSET * float(spans[key][index])
+        off = np.abs(own[found] - usual)
+        if least > 0 and abs(usual) > least and np.median(off) < least / 2:
             text = (
-                f"{name} rests {usual:.4g} from its command (action minus state) in {len(own)} "
-                f"episodes: leader and follower were calibrated differently?"
+                f"{name} rests {usual:.4g} from its command (action minus state) in "
+                f"{len(found)} episodes: leader and follower were calibrated differently?"
             )
-            yield warning(message=text, key=command.columns[0][0])
-        for place in found[np.abs(own - usual) > least] if len(own) >= FEWEST else ():
+            yield warning(message=text, key=commands.key)
+        for place in found[off > least] if len(found) >= FEWEST else ():
             text = (
-                f"{name} rests {offsets[place, number]:.4g} from its command, in the other "
-                f"episodes {usual:.4g}: its calibration changed?"
+                f"{name} rests {own[place]:.4g} from its command, in the other episodes "
+                f"{usual:.4g}: its calibration changed?"
             )
-            entry = entries[known[place].index]
-            yield entry.warning(text, key=command.columns[0][0])
+            yield commands.entries[place].warning(text, key=commands.key)
+
+
+def velocity_commands(commands: CommandProfiles) -> Iterator[Issue]:
+    """Commands that are named like positions but are velocities."""
+    rates, key = commands.rates, commands.key
+    if not rates:
+        return
+    rate_delay, position_delay = (
+        abs(float(np.median([t.delay for t in group]))) / commands.fps
+        for group in (rates, commands.trackings)
+    )
+    # If both readings fit a smooth motion, the one without a long delay is meant.
+    prompt = rate_delay <= PROMPT < position_delay
+    fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
+    # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
+    speeds = (fit > FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
+    speeds &= (commands.fit < _LOST) | (prompt & (commands.fit < fit))
+    if speeds.sum() > len(speeds) / 2:
+        names = _listed(commands.names, range(len(commands.names)))
+        text = (
+            f"is taken for positions, but follows the velocity of the state with slope "
+            f"{float(np.median(slope[speeds])):.2f}: {names}; declare it "
+            f"(mapping={{'command_velocity': {key!r}, 'command_position': None}})"
+        )
+        yield Issue(message=text, key=key)
 
 
 def _median(rows: Sequence[np.ndarray]) -> Float64[np.ndarray, " components"]:
@@ -477,34 +526,3 @@ def _component_tracking(
             f"episodes {usual_slope[size[0]]:.2g}: {_listed(names, size)}"
         )
         yield text, "warning"
-
-
-def _velocity_commands(
-    fps: float,
-    key: str,
-    names: tuple[str, ...],
-    profiles: Mapping[int, EpisodeProfile],
-    position_fit: Float64[np.ndarray, " components"],
-) -> Iterator[Issue]:
-    """Commands that are named like positions but are velocities."""
-    known = [p.tracking for p in profiles.values()]
-    rates = [t["rates"] for t in known if "rates" in t]
-    positions = [t["command_position"] for t in known if "command_position" in t]
-    if not rates:
-        return
-    rate_delay, position_delay = (
-        abs(float(np.median([t.delay for t in group]))) / fps for group in (rates, positions)
-    )
-    # If both readings fit a smooth motion, the one without a long delay is meant.
-    prompt = rate_delay <= PROMPT < position_delay
-    fit, slope = _median([t.fit for t in rates]), _median([t.slope for t in rates])
-    # Slopes between 0.3 and 3: the same unit per second, with lag or gain.
-    speeds = (fit > FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
-    speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
-    if speeds.sum() > len(speeds) / 2:
-        yield Issue(
-            message=f"is taken for positions, but follows the velocity of the state with slope "
-            f"{float(np.median(slope[speeds])):.2f}: {', '.join(names[:6])}; declare it "
-            f"(mapping={{'command_velocity': {key!r}, 'command_position': None}})",
-            key=key,
-        )
