@@ -18,7 +18,8 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.store import write_json
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,
-    demonstrate_placing,
+    guided_frames,
+    placing_expert,
 )
 
 
@@ -74,7 +75,9 @@ def demonstrate(
 ) -> Outcome:
     config = PlacingDemonstrationConfig(pull_elbow=moves_elbow)
     rng = np.random.default_rng(seed)
-    frames, touches = demonstrate_placing(world, workplace, shelf, config, rng)
+    expert = placing_expert(world, workplace, shelf, config, rng)
+    frames = list(guided_frames(world, expert, config))
+    touches = world.cabinet_contacts.touches + world.object_contacts.touches
     goal = workplace.shelf(shelf).position.numpy()
     return Outcome(
         arm_hit=any(touch.first.startswith("link") for touch in touches),

@@ -7,7 +7,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -248,9 +248,7 @@ def serve(args: Serve) -> None:
     figures = {"open_s": opened} | measured
     counts = runner.state("safety.counts")
     figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
-    for name, value in figures.items():
-        Console().print(f"{name:22} {value:.4g}", highlight=False)
-    write_values(args.json, figures)
+    _report(args, figures)
 
 
 def _serve_node(args: Serve, settings: _ServeSettings) -> None:
@@ -270,22 +268,25 @@ def _serve_node(args: Serve, settings: _ServeSettings) -> None:
             while time.monotonic() < end:
                 time.sleep(0.1)
         figures = node.figures()
+    _report(args, figures)
+
+
+def _report(args: Serve, figures: Mapping[str, float | int]) -> None:
     for name, value in figures.items():
         Console().print(f"{name:22} {value:.4g}", highlight=False)
     write_values(args.json, figures)
 
 
 def _camera() -> CameraModel:
-    """Camera 1.1 m above the box, leaning by 0.2 rad and turned about its axis."""
-    lean, turn = ([0.2 * -np.sin(1.0), 0.2 * np.cos(1.0), 0.0], [0.0, 0.0, 0.5])
-    # The paper's camera looks down, image right is -x and image down is +y.
-    overhead = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
-    turned = quaternion.multiply(overhead, quaternion.exp(torch.tensor(turn).double()))
-    orientation = quaternion.multiply(quaternion.exp(torch.tensor(lean).double()), turned)
-    pose = np.eye(4)
-    pose[:3, :3] = quaternion.to_matrix(orientation).numpy()
-    pose[:3, 3] = CENTRE - 1.1 * pose[:3, 2]
-    return CameraModel(focal=(1600.0, 1600.0), pose=pose)
+    """Camera 1.1 m from the middle of the box, looking down with a lean of 0.2 rad.
+
+    The image is turned by half a radian from that of the paper's camera, whose image Jacobian
+    the controller starts with.
+    """
+    lean, turn = 0.2, 1.0
+    towards = np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)
+    eye = np.array(CENTRE) + 1.1 * np.array(towards)
+    return CameraModel(focal=(1600.0, 1600.0)).look_at(eye, np.array(CENTRE))
 
 
 def _controller(

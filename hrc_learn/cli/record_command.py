@@ -31,15 +31,15 @@ from hrc_learn.skills.visual_skill import (
     OBJECT_FEATURE_NAMES,
 )
 from hrc_learn.skills.work_cell import TaskFailedError
+from hrc_learn.store import DATASET, replacing
 from hrc_learn.teleoperation.hand_guiding import Frame
 from hrc_learn.teleoperation.scripted_demonstrations import (
     FILM,
     PlacingDemonstrationConfig,
     ServoDemonstrationConfig,
-    demonstrate_placing_without_contact,
+    demonstrate_placing,
     demonstrate_servoing,
     film_servoing,
-    write_demonstrations,
 )
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
@@ -88,9 +88,7 @@ def _record_placing(args: Record, episodes: int, seed: int) -> None:
 
     def demonstrate() -> list[Frame]:
         nonlocal discarded
-        frames, contacts = demonstrate_placing_without_contact(
-            world, workplace, args.shelf, config, rng
-        )
+        frames, contacts = demonstrate_placing(world, workplace, args.shelf, config, rng)
         discarded += contacts
         errors.append(1e3 * float(np.linalg.norm(frames[-1]["position"] - goal)))
         return frames
@@ -164,18 +162,27 @@ def _write(
 ) -> None:
     """Record the demonstrations into the dataset, one after another."""
     assert args.episodes is not None
-    title = f"Demonstrations of {args.demonstration}"
-    write_demonstrations(
-        args.out,
-        (demonstrate() for _ in track(range(args.episodes), description=title)),
-        task,
-        fps,
-        robot=workplace.robot,
-        features=features,
-        cameras=cameras,
-        details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
-        overwrite=args.overwrite,
-    )
+    robot = workplace.robot
+    with (
+        replacing(args.out, DATASET, args.overwrite) as folder,
+        DatasetWriter(
+            folder,
+            fps=fps,
+            robot_type=robot.name,
+            joint_names=robot.chain.joint_names,
+            features=features,
+            cameras=cameras,
+            frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
+            details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
+        ) as writer,
+    ):
+        for _ in track(
+            range(args.episodes), description=f"Demonstrations of {args.demonstration}"
+        ):
+            writer.start_episode(task)
+            for frame in demonstrate():
+                writer.add_frame(**frame)
+            writer.save_episode()
 
 
 def _record_expert(args: Record, episodes: int, seed: int) -> None:

@@ -1,28 +1,25 @@
 """Demonstrations by the scripted expert: of visual servoing, and of placing with the null-space
-posture; and how they are recorded and written as a LeRobot dataset.
+posture; and how they are recorded.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import Arm, UnreachableError, coarse_orientation, gripper_down
+from hrc_learn.kinematics import UnreachableError, coarse_orientation, gripper_down
 from hrc_learn.protocols import Camera, Human, HumanInput
-from hrc_learn.sim import HAND_MARKER, Touch, World
+from hrc_learn.sim import HAND_MARKER, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
-from hrc_learn.store import DATASET, replacing
 from hrc_learn.teleoperation.hand_guiding import (
     Frame,
     GuidedStep,
@@ -85,54 +82,6 @@ def guided_frames(
         if k % config.record_every == 0:
             yield {**step.frame(), **observe()}
         world.advance(dt)
-
-
-def write_demonstrations(
-    path: Path,
-    demonstrations: Iterable[Iterable[Mapping[str, Any]]],
-    task: str,
-    fps: float,
-    *,
-    robot: Arm,
-    features: Mapping[str, Sequence[str]] | None = None,
-    cameras: Mapping[str, tuple[int, int]] | None = None,
-    details: Mapping[str, object] | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Write demonstrations of an arm as a LeRobot dataset, one episode each, as they come.
-
-    Args:
-        path: Folder of the dataset.
-        demonstrations: Frames of each.
-        task: Description of the task.
-        fps: Frames per second.
-        robot: The arm.
-        features: Columns beyond the usual ones: key, and names of the components.
-        cameras: Height and width of the images [px] that frames have, by camera.
-        details: Anything else worth keeping with the dataset.
-        overwrite: Replace an older dataset in that folder.
-
-    Raises:
-        FileExistsError: If there is something at `path` that may not be replaced.
-    """
-    with (
-        replacing(path, DATASET, overwrite) as folder,
-        DatasetWriter(
-            folder,
-            fps=fps,
-            robot_type=robot.name,
-            joint_names=robot.chain.joint_names,
-            features=features,
-            cameras=cameras,
-            frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
-            details=details,
-        ) as writer,
-    ):
-        for frames in demonstrations:
-            writer.start_episode(task)
-            for frame in frames:
-                writer.add_frame(**frame)
-            writer.save_episode()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -400,37 +349,13 @@ def demonstrate_placing(
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
-) -> tuple[list[Frame], list[Touch]]:
-    """Demonstrate one placing motion, from home to a shelf with the object in the gripper.
-
-    Args:
-        world: Reset for the demonstration.
-        workplace: Workplace of the demonstration.
-        shelf: Index of the shelf.
-        config: Timing and heights.
-        rng: Source of the tremor and of the initial position.
-
-    Returns:
-        The recorded frames, and all contacts of arm or object with the cabinet on the way.
-    """
-    expert = placing_expert(world, workplace, shelf, config, rng)
-    frames = list(guided_frames(world, expert, config))
-    return frames, world.cabinet_contacts.touches + world.object_contacts.touches
-
-
-def demonstrate_placing_without_contact(
-    world: World,
-    workplace: Workplace,
-    shelf: str,
-    config: PlacingDemonstrationConfig,
-    rng: np.random.Generator,
 ) -> tuple[list[Frame], int]:
-    """Demonstrate until the shelf is reached and nothing touched on the way, as people would.
+    """Carry the object in the gripper from home to a shelf, until it succeeds without contact.
 
     Args:
         world: Reset for each demonstration.
         workplace: Workplace of the demonstration.
-        shelf: Index of the shelf.
+        shelf: Name of the shelf.
         config: Timing and heights.
         rng: Source of the tremor and of the initial position.
 
@@ -442,8 +367,10 @@ def demonstrate_placing_without_contact(
     """
     goal, why = workplace.shelf(shelf).position.numpy(), ""
     for attempt in range(_ATTEMPTS):
-        frames, touches = demonstrate_placing(world, workplace, shelf, config, rng)
-        off = float(np.linalg.norm(np.asarray(frames[-1]["position"]) - goal))
+        expert = placing_expert(world, workplace, shelf, config, rng)
+        frames = list(guided_frames(world, expert, config))
+        touches = world.cabinet_contacts.touches + world.object_contacts.touches
+        off = float(np.linalg.norm(frames[-1]["position"] - goal))
         if not touches and off < _ARRIVED:
             return frames, attempt
         why = str(touches[0]) if touches else f"the arm ended {100 * off:.0f} cm from its place"

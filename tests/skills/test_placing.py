@@ -25,7 +25,8 @@ from hrc_learn.skills.work_cell import BlockedPathError, TaskFailedError
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,
     demonstrate_placing,
-    demonstrate_placing_without_contact,
+    guided_frames,
+    placing_expert,
 )
 
 pytestmark = pytest.mark.simulation
@@ -46,8 +47,8 @@ def demos(tmp_path_factory):
     world = World(WORKPLACE.scene)
     with DatasetWriter(folder, config.fps, "panda", panda.joint_names) as writer:
         for _ in range(2):
-            frames, touches = demonstrate_placing(world, WORKPLACE, "middle", config, rng)
-            assert touches == []
+            frames, discarded = demonstrate_placing(world, WORKPLACE, "middle", config, rng)
+            assert discarded == 0
             writer.start_episode("place")
             for frame in frames:
                 writer.add_frame(images=None, **frame)
@@ -97,10 +98,10 @@ def test_the_expert_ends_at_the_shelf_and_pulls_the_elbow_on_the_way(demos):
 def test_without_pulling_the_elbow_the_arm_hits_the_open_door():
     world = World(WORKPLACE.scene)
     config = PlacingDemonstrationConfig(pull_elbow=False, duration=6.0, settle=0.0)
-    _, touches = demonstrate_placing(
-        world, WORKPLACE, "middle", config, np.random.default_rng(0)
-    )
-    assert "cabinet_door" in {touch.second for touch in touches}
+    expert = placing_expert(world, WORKPLACE, "middle", config, np.random.default_rng(0))
+    for _ in guided_frames(world, expert, config):
+        pass
+    assert "cabinet_door" in {touch.second for touch in world.cabinet_contacts.touches}
 
 
 @shapes_unchecked()
@@ -108,7 +109,7 @@ def test_a_demonstration_that_does_not_arrive_is_none():
     # The first second of a motion of a minute: nothing is touched, and nothing reached.
     config = PlacingDemonstrationConfig(pull_elbow=False, duration=60.0, settle=-59.0)
     with pytest.raises(TaskFailedError, match=r"3 demonstrations .* \d+ cm from its place"):
-        demonstrate_placing_without_contact(
+        demonstrate_placing(
             World(WORKPLACE.scene), WORKPLACE, "middle", config, np.random.default_rng(0)
         )
 
