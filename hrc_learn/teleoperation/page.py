@@ -67,8 +67,6 @@ class PageConfig(AddressConfig):
     """Time without a sign of life after which everything held is released, and longest time
     that the page may be busy during a drag [s].
     """
-    refresh: float = 25.0
-    """Times a second that the page follows the arm, and efforts are computed anew [1/s]."""
     meshes: bool = True
     """Draw the arm with its meshes; otherwise as capsules, with which a browser without a
     graphics processor draws twice as many frames in AR.
@@ -79,8 +77,6 @@ class PageConfig(AddressConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.refresh > 0:
-            raise ValueError(f"refresh must be positive, but is {self.refresh}.")
         level = np.array(self.touch_points).reshape(-1, 3)[:, :2]
         if len(level) < 3 or np.ptp(level, axis=0).max() < _APART:
             raise ValueError(
@@ -91,6 +87,8 @@ class PageConfig(AddressConfig):
 
 # Between touched points: 1 cm off at 10 cm turns the arm by 6 degrees [m].
 _APART = 0.1
+_PERIOD = 0.04
+"""Time between two looks at the arm, at which efforts are computed anew [s]."""
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 _MOST_FAILURES = 25
 """Refreshes in a row that may fail before the page ends: one second of them. Each failure asks
@@ -271,20 +269,20 @@ class Page:
 
     def _guarded(self) -> None:
         """Follow the arm, and renew what is asked of it: at once when hands have moved."""
-        period, due, ticks, failures = 1 / self._config.refresh, 0.0, 0, 0
+        due, ticks, failures = 0.0, 0, 0
         while not self._closing.is_set():
             self._wake.wait(max(due - time.monotonic(), 0.0))
             self._wake.clear()
             try:
                 command = self._refresh()
                 if time.monotonic() >= due:
-                    due = time.monotonic() + period
+                    due = time.monotonic() + _PERIOD
                     if command is not None:
                         self._draw(command, panel=ticks % _PANEL_EVERY == 0)
                         ticks += 1
                 failures = 0
             except Exception as error:
-                failures, due = failures + 1, time.monotonic() + period
+                failures, due = failures + 1, time.monotonic() + _PERIOD
                 _logger.exception("the page could not follow the arm")
                 if failures >= _MOST_FAILURES:  # handed over to the thread that closes
                     self._error = error
@@ -400,7 +398,7 @@ class Page:
         feedback, status = self.human.feedback, self._status
         return {
             "words": words,
-            "recording": status.recording,
+            "recording": status.state,
             "seconds": round(status.seconds, 2),
             "saved": status.saved,
             "note": status.note,

@@ -262,10 +262,7 @@ class PageSession:
         counts = self.arm.safety.counts.tolist()
         return PageStatus(
             title="Simulated Panda",
-            recording=status.state,
-            seconds=status.seconds,
-            saved=status.saved,
-            note="; ".join(filter(None, notes)),
+            **{**vars(status), "note": "; ".join(filter(None, notes))},
             interventions=dict(zip(INTERVENTIONS, counts, strict=True)),
             contacts=sum(len(monitor.touches) for monitor in monitors),
         )

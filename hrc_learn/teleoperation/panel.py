@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Feedback, Request
+from hrc_learn.teleoperation.demonstration_recorder import RecorderStatus
 from hrc_learn.teleoperation.devices import DIRECTIONS, OPEN, KeyboardState
 from hrc_learn.teleoperation.gate.messages import Gripper, Message, Region, Target, Task
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
@@ -24,21 +25,13 @@ from hrc_learn.viz.report import page_templates
 
 
 @dataclass(frozen=True, kw_only=True)
-class PageStatus:
-    """Session status shown on the page."""
+class PageStatus(RecorderStatus):
+    """Session status shown on the page; `seconds` is the time at work of an autonomous arm."""
 
     title: str = ""
     """Name of the guided arm."""
     doing: str = ""
     """Present activity of an autonomous arm; empty if a person guides and records."""
-    recording: Literal["ready", "recording", "stopped"] = "ready"
-    """Stopped: a demonstration waits to be saved or discarded."""
-    seconds: float = 0.0
-    """Length of the demonstration in hand, or how long the arm has been at work [s]."""
-    saved: int = 0
-    """Demonstrations saved."""
-    note: str = ""
-    """Outcome of the last request."""
     interventions: Mapping[str, int] = field(default_factory=dict)
     """Steps in which each kind of intervention of the safety filter was needed."""
     contacts: int = 0
@@ -46,7 +39,7 @@ class PageStatus:
     region: DrawnRegion | None = None
     """Region to which a controller takes the end effector; None: there is none."""
     plan: Float[np.ndarray, "points 3"] | None = None
-    """Way that the end effector is about to take [m]; None: it has none."""
+    """Path that the end effector is about to take [m]; None: it has none."""
 
 
 @cache
@@ -262,13 +255,13 @@ class Panel:
         texts = panel_texts()
         self._told.content = str(texts.feedback(feedback, felt_words(feedback)))
         if self._switch is not None:
-            self._next = "stop" if status.recording == "recording" else "start"
+            self._next = "stop" if status.state == "recording" else "start"
             self._switch.label = self._next.capitalize()
             self._switch.icon = _ICONS[self._next]
             # Starting over would throw away what waits to be saved.
-            self._switch.disabled = status.recording == "stopped"
+            self._switch.disabled = status.state == "stopped"
             if self._keep is not None:
-                self._keep.visible = status.recording == "stopped"
+                self._keep.visible = status.state == "stopped"
         largest = self._initial_forces.max_nullspace_input
         self._state.content = str(texts.state(status, people, self.task))
         self._bars.content = str(texts.nullspace_input(nullspace_input.tolist(), largest))

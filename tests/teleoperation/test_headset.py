@@ -34,7 +34,7 @@ def still_page():
     world.hold(workplace.scene.objects[0].name, q)
     bodies = MovingBodies(world)
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-    config = PageConfig(silence=PATIENCE, timeout=PATIENCE, meshes=False, refresh=20.0)
+    config = PageConfig(silence=PATIENCE, timeout=PATIENCE, meshes=False)
     with Page(panda, drawn, workplace.scene.boxes(), config, task="lead it") as page:
         state = ArmState(
             time=0.0, joint_position=q, joint_velocity=np.zeros(7), gripper_width=0.05

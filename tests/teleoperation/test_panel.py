@@ -46,14 +46,14 @@ def test_what_others_have_written_is_not_taken_for_the_pages_own():
     assert "<script>" not in html
     assert "<b>" not in html
     assert "2 connected" in html
-    recording = PageStatus(recording="recording", seconds=1.5)
+    recording = PageStatus(state="recording", seconds=1.5)
     assert "recording 1.5 s" in panel_texts().state(recording, 0, "")
 
 
 def test_what_can_be_done_now_is_said():
     instruction = panel_texts().instruction
     said = {
-        (state, task): instruction(PageStatus(recording=state), task)
+        (state, task): instruction(PageStatus(state=state), task)
         for state in ("ready", "recording", "stopped")
         for task in ("", "show it")
     }
