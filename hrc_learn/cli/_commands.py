@@ -65,8 +65,6 @@ COMMANDS: dict[str, Command] = {
 }
 """Commands by the words typed after `hrc`."""
 
-_DEVICES = {"--robot": "site.device", "--teleop": "site.leader"}
-"""Settings that LeRobot's options of a device are."""
 _NAME_COLUMNS, _LONGEST_LINE = 20, 100
 
 
@@ -97,7 +95,7 @@ def _run(words: Sequence[str]) -> int:
     name, rest = find(words)
     if name:
         command = COMMANDS[name]
-        rest = device_settings(name_leading(command.leading, rest))
+        rest = name_leading(command.leading, rest)
         return command.run(parse(command.arguments, rest, f"hrc {name}"))
     if rest and rest[0] == "--version":
         print(metadata.version("hrc-learn"))
@@ -131,27 +129,6 @@ def name_leading(options: Sequence[str], words: Sequence[str]) -> list[str]:
         named += [f"--{option}", *taken]
         values = values[len(taken) :]
     return [*named, *values, *words[count:]]
-
-
-def device_settings(words: Sequence[str]) -> list[str]:
-    """Command line with LeRobot's options of a device as settings of `--config`.
-
-    `--robot.port=/dev/ttyACM0` and `--robot.port /dev/ttyACM0` become `site.device.port=...`.
-    """
-    rest, settings = list(words), []
-    for i, word in reversed(list(enumerate(words))):
-        name, assigned, value = word.partition("=")
-        prefix, _, field = name.partition(".")
-        if prefix not in _DEVICES or not field:
-            continue
-        if not assigned:
-            value = rest[i + 1] if i + 1 < len(rest) else ""
-        rest[i : i + (1 if assigned else 2)] = []
-        settings.insert(0, f"{_DEVICES[prefix]}.{field}={value}")
-    if settings and "--config" in rest:
-        at = rest.index("--config") + 1
-        return [*rest[:at], *settings, *rest[at:]]
-    return [*rest, "--config", *settings] if settings else rest
 
 
 def _overview() -> list[str]:

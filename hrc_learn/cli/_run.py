@@ -45,6 +45,8 @@ _LIBRARIES = {
     "meshes": ("example_robot_data",),
     "hub": ("huggingface_hub", "httpx"),
 }
+_DEVICES = {"--robot": "site.device", "--teleop": "site.leader"}
+"""Settings that hold LeRobot's options of a device."""
 EXTRAS = {library: extra for extra, names in _LIBRARIES.items() for library in names}
 """Extra of the package that installs a library."""
 
@@ -157,7 +159,7 @@ def parse[Args](
         with redirect_stderr(said):
             return tyro.cli(
                 arguments,
-                args=_joined(words),
+                args=gathered_settings(words),
                 prog=program,
                 description=description or inspect.getdoc(arguments),
             )
@@ -167,18 +169,28 @@ def parse[Args](
         raise
 
 
-def _joined(words: Sequence[str]) -> list[str]:
-    """Command line with the values of all `--config` at the first one: the parser would keep
-    those of the last alone.
+def gathered_settings(words: Sequence[str]) -> list[str]:
+    """Command line with all settings after one `--config`, in their order.
+
+    These are the values of every `--config`, of which the parser would keep the last alone, and
+    LeRobot's options of a device: `--robot.port=/dev/ttyACM0` and `--robot.port /dev/ttyACM0`
+    become `site.device.port=/dev/ttyACM0`.
     """
-    parts: list[list[str]] = [[]]
-    for word in words:
+    rest, settings, in_settings, remaining = [], [], False, iter(words)
+    for word in remaining:
+        option, assigned, value = word.partition("=")
+        device, _, name = option.partition(".")
+        if device in _DEVICES and name:
+            value = value if assigned else next(remaining, "")
+            settings.append(f"{_DEVICES[device]}.{name}={value}")
+            continue
         if word.startswith("--"):
-            parts.append([])
-        parts[-1].append(word)
-    first, *later = [part for part in parts if part[:1] == ["--config"]] or [[]]
-    first += [value for part in later for value in part[1:]]
-    return [word for part in parts if not any(part is x for x in later) for word in part]
+            in_settings = word == "--config"
+        if not in_settings:
+            rest.append(word)
+        elif word != "--config":
+            settings.append(word)
+    return [*rest, "--config", *settings] if settings else rest
 
 
 def _complaint(box: str) -> str:

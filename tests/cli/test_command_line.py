@@ -19,8 +19,8 @@ from commands import done, hrc
 
 from hrc_learn import cli
 from hrc_learn.cli import arguments
-from hrc_learn.cli._commands import COMMANDS, device_settings
-from hrc_learn.cli._run import parse, with_settings
+from hrc_learn.cli._commands import COMMANDS
+from hrc_learn.cli._run import gathered_settings, parse, with_settings
 from hrc_learn.cli.arguments import Serve
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.kinematics import MissingModelError
@@ -344,14 +344,10 @@ def test_options_of_a_lerobot_device_become_settings():
     ]
     settings = ["site.device.type=so101_follower", "site.device.port=/p"]
     expected = ["--out", "o", "--robot", "so101", "--config", *settings]
-    assert device_settings(typed) == expected
+    assert gathered_settings(typed) == expected
     given = [*typed, "--config", "site.speed=0.1", "--arm", "lerobot"]
-    assert device_settings(given) == [
-        *expected,
-        "site.speed=0.1",
-        "--arm",
-        "lerobot",
-    ]
+    robot = ["--out", "o", "--robot", "so101", "--arm", "lerobot"]
+    assert gathered_settings(given) == [*robot, "--config", *settings, "site.speed=0.1"]
 
 
 def test_a_lerobot_arm_needs_its_type_and_no_address(tmp_path):
