@@ -153,7 +153,7 @@ class Page:
             bodies = [replace(body, meshes=()) for body in bodies]
         self._chain = chain
         self.control = control = Control(config.silence, config.timeout, self._let_go)
-        self.human = PageHuman(len(chain.joint_names), present=lambda: control.present)
+        self.human = PageHuman(present=lambda: control.present)
         draws = guides if draws is None else draws
         headset = headset_contents()
         features = {"guides": guides, "draws": draws, "task": task, "opening": OPEN}

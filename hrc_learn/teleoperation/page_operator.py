@@ -254,7 +254,6 @@ class PageHuman(Human):
 
     def __init__(
         self,
-        joints: int,
         *,
         holds_for: float = 0.25,
         clock: Callable[[], float] = time.monotonic,
@@ -263,35 +262,31 @@ class PageHuman(Human):
         """Start without input.
 
         Args:
-            joints: Number of joints.
             holds_for: Time for which a posted input stays valid [s].
             clock: Monotonic clock [s].
             present: True while the person gives signs of life; called at each reading.
         """
         self._holds_for, self._clock, self._present = holds_for, clock, present
-        self._idle = _locked(HumanInput(nullspace_input=np.zeros(joints)))
-        # While it holds, afterwards, and until when: changed together, as one reference.
-        self._posted = (self._idle, self._idle, float("-inf"))
+        # The input and the end of its validity: changed together, as one reference.
+        self._posted = (HumanInput(), float("-inf"))
         self._requests: deque[Request] = deque()
         self.state: ArmState | None = None
         self.feedback = Feedback()
 
     def post(self, asked: HumanInput) -> None:
         """Renew what the person asks for; its requests are left to `request`."""
-        still = replace(self._idle, region=asked.region, target=asked.target, turn=asked.turn)
-        deadline = self._clock() + self._holds_for
-        self._posted = (_locked(asked), still, deadline)
+        self._posted = (asked, self._clock() + self._holds_for)
 
     def request(self, request: Request) -> None:
         """Ask once for something other than motion."""
         self._requests.append(request)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Current input of the person. Its arrays must not be written to."""
+        """Current input of the person; what was drawn stays in force after the rest."""
         self.state = state
-        asked, still, deadline = self._posted
+        asked, deadline = self._posted
         if self._clock() > deadline or not self._present():
-            asked = still
+            asked = HumanInput(region=asked.region, target=asked.target, turn=asked.turn)
         if not self._requests:
             return asked
         requests = tuple(self._requests.popleft() for _ in range(len(self._requests)))
@@ -300,13 +295,6 @@ class PageHuman(Human):
     def tell(self, feedback: Feedback) -> None:
         """Hand over what the arm tells, for the page's thread to show."""
         self.feedback = feedback
-
-
-def _locked(asked: HumanInput) -> HumanInput:
-    for array in (asked.nullspace_input, asked.twist):
-        if array is not None:
-            array.setflags(write=False)
-    return asked
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

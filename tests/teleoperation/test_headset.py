@@ -142,7 +142,7 @@ def test_both_hands_and_a_region_arrive_as_a_scripted_person_says_them(still, wo
     worn.pinch("left", closed=False)
     worn.pinch("right", closed=False)
     settled(lambda: not page.human.read(state).twist.any(), "empty hands ask for nothing")
-    assert not page.human.read(state).nullspace_input.any()
+    assert not page.human.read(state).effort(7).any()
 
     # The right hand draws a region, and it is switched on.
     worn.press("Draw region")

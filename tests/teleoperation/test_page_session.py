@@ -108,7 +108,7 @@ def test_the_script_and_the_page_pull_together_while_somebody_holds_on(world, be
     human, _ = beside.joined(Pulling(), world.advance)
 
     def effort():
-        return human.read(world.arm.read()).nullspace_input
+        return human.read(world.arm.read()).effort(7)
 
     np.testing.assert_array_equal(effort(), np.ones(7))
     beside._page.control.join("somebody")
@@ -195,7 +195,7 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
         arrows = page._scene._arrows
         return tuple(np.ravel(arrows.colors)[:3]) if arrows.visible else None
 
-    until(lambda: human.read(cell.state).nullspace_input.any())
+    until(lambda: human.read(cell.state).effort(7).any())
     told = Feedback(
         pushed=True,
         followed=0.0,
