@@ -1,7 +1,7 @@
 """Rerun recording of a dataset: the arm, its cameras and curves, episode by episode.
 
 Each episode has a timeline of its own, named after it, so that one layout shows them all. The
-timeline "time" holds the first episode, and the joints of all episodes laid over one another.
+timeline "time" holds the first episode.
 """
 
 import os
@@ -22,7 +22,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.log import JointRanges
 from hrc_learn.viz import palette
-from hrc_learn.viz.panels import Curves, Plot, Tab, limit_curves, several, single, slug
+from hrc_learn.viz.panels import Curves, Plot, Tab, limit_curves, several, slug
 from hrc_learn.viz.rerun_stream import (
     POSE_RATE,
     TIMELINE,
@@ -111,10 +111,8 @@ def demonstration_layout(shown: ShownDataset) -> rrb.Blueprint:
         left.append(rrb.Grid(contents=views, grid_columns=min(3, len(views))))
     task = rrb.TextDocumentView(origin="/task", name="Task")
     episodes = rrb.TextDocumentView(origin="/summary", name="Episodes")
-    tabs = [tab_view(tab) for tab in (_episode_tab(shown, first), _together_tab(shown, first))]
-    right = rrb.Vertical(
-        rrb.Tabs(contents=[*tabs, episodes], active_tab=0), task, row_shares=(9, 1)
-    )
+    tabs = [tab_view(_episode_tab(shown, first)), episodes]
+    right = rrb.Vertical(rrb.Tabs(contents=tabs, active_tab=0), task, row_shares=(9, 1))
     # Without arm, path and cameras the curves have the whole screen.
     return dashboard(left, [right], row_shares=(3, 2), column_shares=(1, 1))
 
@@ -138,7 +136,7 @@ def send_demonstrations(
             send_curves(stream, demo.time, curves, timelines)
         task = rr.TextDocument.columns(text=[f"Episode {demo.episode}: {demo.task}"])
         stream.send_columns("task", seconds(demo.time[:1], timelines), task)
-        path = _send_together(stream, shown, demo, k)
+        path = _send_path(stream, shown, demo, k)
         rows.append((demo.episode, demo.task, f"{demo.duration:.2f}", len(demo), path))
         yield demo
     send_summary(stream, _summary(shown, rows))
@@ -273,40 +271,17 @@ def _seen(demo: Demonstration) -> Float[np.ndarray, "frames 2"] | None:
     return np.where(demo.feature_visible[:, None], demo.feature, np.nan)
 
 
-def _together_tab(shown: ShownDataset, demo: Demonstration) -> Tab:
-    """Every joint and the feature of all episodes, on the timeline "time"."""
-    every = [*demo.joint_names] if demo.joint_position is not None else []
-    titles = {
-        f"joint_{k}": _title(shown, demo, f"episode/joint_{k}") for k in range(len(every))
-    }
-    if demo.feature is not None:
-        titles |= {f"feature_{k}": f"Feature {axis} [px]" for k, axis in enumerate("uv")}
-    glob = {name: several(f"together/{name}/**", (), np.empty((0, 0))) for name in titles}
-    plots = [Plot(title=titles[name], curves=(curves,)) for name, curves in glob.items()]
-    return Tab(title=f"All episodes (timeline {TIMELINE})", plots=tuple(plots), columns=2)
-
-
-def _send_together(
+def _send_path(
     stream: rr.RecordingStream, shown: ShownDataset, demo: Demonstration, k: int
 ) -> str:
-    """Send an episode's part of what shows all of them; returns the length of its path."""
-    colour = palette.SERIES_ON_DARK[k % len(palette.SERIES_ON_DARK)]
-    columns = {}
-    if demo.joint_position is not None:
-        for joint, values in enumerate(demo.joint_position.T):
-            columns[f"joint_{joint}"] = values / _own_unit(shown, "joint_position", joint)[1]
-    if (feature := _seen(demo)) is not None:
-        columns |= {f"feature_{i}": values for i, values in enumerate(feature.T)}
-    name = f"episode {demo.episode}"
-    for quantity, values in columns.items():
-        path = f"together/{quantity}/{demo.episode}"
-        send_curves(stream, demo.time, single(path, name, values, colour))
-    way = tool_path(shown, demo)
-    if way is None:
+    """Draw the path of an episode's tool; returns its length [m] in words."""
+    path = tool_path(shown, demo)
+    if path is None:
         return ""
-    send_strips(stream, f"world/paths/{demo.episode}", [way], colour, 0.003)
-    send_dot(stream, str(demo.episode), demo.time, way, colour)
-    return f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.2f}"
+    colour = palette.SERIES_ON_DARK[k % len(palette.SERIES_ON_DARK)]
+    send_strips(stream, f"world/paths/{demo.episode}", [path], colour, 0.003)
+    send_dot(stream, str(demo.episode), demo.time, path, colour)
+    return f"{np.linalg.norm(np.diff(path, axis=0), axis=1).sum():.2f}"
 
 
 def _summary(shown: ShownDataset, rows: Iterable[Sequence[object]]) -> str:

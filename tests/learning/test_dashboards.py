@@ -77,18 +77,6 @@ def tool_path(demo: Demonstration) -> np.ndarray:
     return panda.forward(torch.from_numpy(demo.joint_position)).position.numpy()
 
 
-def test_joints_and_features_of_all_lie_over_one_another(demos, rrd):
-    for demo in demos:
-        path = f"together/joint_4/{demo.episode}"
-        np.testing.assert_array_equal(rrd.scalars(path)[:, 0], demo.joint_position[:, 4])
-        np.testing.assert_allclose(rrd.time(path), demo.time, atol=1e-9)
-    v = rrd.scalars("together/feature_1/7")[:, 0]
-    seen = demos[2].feature_visible
-    assert 0 < (~seen).sum() < len(seen)
-    np.testing.assert_array_equal(v, np.where(seen, demos[2].feature[:, 1], np.nan))
-    assert "together/feature_1/5" not in rrd.entities
-
-
 def test_each_episode_has_a_timeline_with_all_that_was_recorded(demos, rrd):
     for demo in demos:
         timeline = f"episode {demo.episode}"
@@ -107,6 +95,9 @@ def test_each_episode_has_a_timeline_with_all_that_was_recorded(demos, rrd):
     np.testing.assert_array_equal(
         rrd.scalars("episode/effort", "episode 2"), demos[0].human_effort
     )
+    v, seen = rrd.scalars("episode/feature", "episode 7")[:, 1], demos[2].feature_visible
+    assert 0 < (~seen).sum() < len(seen)
+    np.testing.assert_array_equal(v, np.where(seen, demos[2].feature[:, 1], np.nan))
 
 
 def test_recorded_or_computed_paths_are_drawn_and_the_arm_moves(demos, rrd):
