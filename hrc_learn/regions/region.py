@@ -117,9 +117,47 @@ class PositionRegion(Region):
 _SHORTEST_AXIS = 1e-12
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Cone(Region):
+    """All orientations whose angle phi to the goal is below a tolerance.
+
+    f = alpha_o phi / 2 - 1
+    P = k_o/2 max(0, f)^2
+    """
+
+    goal: Float[Tensor, "*#batch 4"]
+    """Goal orientation, a unit quaternion (w, x, y, z) of either sign."""
+    sharpness: float = static(15.0)
+    """alpha_o, two over the tolerated angle [1/rad]."""
+    stiffness: float = static(0.02)
+    """k_o."""
+
+    @property
+    def tolerance(self) -> float:
+        """Half opening angle of the cone [rad]."""
+        return 2 / self.sharpness
+
+    def value(self, x: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*both"]:
+        """Region function f at the orientation x (a unit quaternion)."""
+        _, sine, cosine = self._half_angle(x)
+        return self.sharpness * torch.atan2(sine, cosine).squeeze(-1) - 1
+
+    @abstractmethod
+    def _half_angle(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """sin(phi/2) n with the axis n of the error, sin(phi/2) and cos(phi/2)."""
+
+    def _potential_and_slope(self, sine: Tensor, cosine: Tensor) -> tuple[Tensor, Tensor]:
+        """Potential, and its derivative by phi over sin(phi/2)."""
+        f = (self.sharpness * torch.atan2(sine, cosine) - 1).clamp(min=0)
+        P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
+        # Divided by the sine, because the vector part of the error is sin(phi/2) n.
+        slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
+        return P, slope
+
+
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class OrientationRegion(Region):
+class OrientationRegion(_Cone):
     """All orientations within an angle of the goal; its potential is zero inside.
 
     f = alpha_o |log(p * p_g^-1)| - 1                                    (OrtRegion)
@@ -140,57 +178,36 @@ class OrientationRegion(Region):
     chain's divisions by the components of both quaternions are defined.
     """
 
-    goal: Float[Tensor, "*#batch 4"]
-    """Goal orientation, a unit quaternion (w, x, y, z) of either sign."""
-    sharpness: float = static(15.0)
-    """alpha_o, two over the tolerated angle [1/rad]."""
-    stiffness: float = static(0.02)
-    """k_o."""
     formulation: Literal["exact", "paper"] = static("exact")
     coordinates: Literal["rotation", "rotation_vector"] = static("rotation")
-
-    @property
-    def tolerance(self) -> float:
-        """Half opening angle of the cone [rad]."""
-        return 2 / self.sharpness
-
-    def value(self, x: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*both"]:
-        """Region function f at the orientation x (a unit quaternion)."""
-        error = self._error(x)
-        half_angle = torch.atan2(
-            torch.linalg.vector_norm(error[..., 1:], dim=-1), error[..., 0]
-        )
-        return self.sharpness * half_angle - 1
 
     def feedback(
         self, x: Float[Tensor, "*batch 4"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
         """Potential of shape (*both,) and its gradient (*both, 3) [1/rad]."""
-        error = self._error(x)
-        sine = torch.linalg.vector_norm(error[..., 1:], dim=-1, keepdim=True)
-        half_angle = torch.atan2(sine, error[..., :1])
-        f = (self.sharpness * half_angle - 1).clamp(min=0)
-        P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
-        # Divided by the sine, because the vector part of the error is sin(phi/2) n.
-        slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
+        axis, sine, cosine = self._half_angle(x)
+        P, slope = self._potential_and_slope(sine, cosine)
         over_vector = self.coordinates == "rotation_vector"
         if self.formulation == "paper":
             # The printed chain over the rotation vector is twice the derivative.
-            slope = slope * (2 if over_vector else 4 * half_angle)
-        gradient = slope * error[..., 1:]
+            slope = slope * (2 if over_vector else 4 * torch.atan2(sine, cosine))
+        gradient = slope * axis
         if not over_vector:
             return P, gradient
         r = quaternion.log(x).expand_as(gradient)
         return P, quaternion.left_jacobian_transposed(r, gradient)
 
-    def _error(self, x: Tensor) -> Tensor:
-        """Error p * p_g^-1 with the sign of the shortest rotation."""
-        return quaternion.canonical(quaternion.multiply(x, quaternion.conjugate(self.goal)))
+    def _half_angle(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        # The error p * p_g^-1 with the sign of the shortest rotation.
+        error = quaternion.canonical(quaternion.multiply(x, quaternion.conjugate(self.goal)))
+        vector = error[..., 1:]
+        sine = torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+        return vector, sine, error[..., :1]
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class AxisRegion(Region):
+class AxisRegion(_Cone):
     """All orientations whose z axis is within an angle of the goal's; rotation about it is
     free.
 
@@ -200,34 +217,15 @@ class AxisRegion(Region):
     opposite, the goal determines the axis of rotation.
     """
 
-    goal: Float[Tensor, "*#batch 4"]
-    """An orientation with the goal's z axis, a unit quaternion (w, x, y, z)."""
-    sharpness: float = static(15.0)
-    """alpha_o, two over the tolerated angle [1/rad]."""
-    stiffness: float = static(0.02)
-    """k_o."""
-
-    @property
-    def tolerance(self) -> float:
-        """Half opening angle of the cone [rad]."""
-        return 2 / self.sharpness
-
-    def value(self, x: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*both"]:
-        """Region function f at the orientation x (a unit quaternion)."""
-        _, sine, cosine = self._swing(x)
-        return self.sharpness * torch.atan2(sine, cosine).squeeze(-1) - 1
-
     def feedback(
         self, x: Float[Tensor, "*batch 4"]
     ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
         """Potential of shape (*both,) and its gradient (*both, 3) [1/rad]."""
-        swing, sine, cosine = self._swing(x)
-        f = (self.sharpness * torch.atan2(sine, cosine) - 1).clamp(min=0)
-        P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
-        slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
+        swing, sine, cosine = self._half_angle(x)
+        P, slope = self._potential_and_slope(sine, cosine)
         return P, slope * quaternion.rotate(self.goal, swing)
 
-    def _swing(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _half_angle(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """sin(phi/2) n in the goal's frame, sin(phi/2) and cos(phi/2).
 
         The rotation from goal to x is a rotation about z, then one by phi about n,
