@@ -7,7 +7,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -19,7 +18,7 @@ from hrc_learn.demos import DemonstrationSet, open_demos
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.large_datasets import sampled
 from hrc_learn.learning.model_choice import best_models, predict
-from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, load_primitive
+from hrc_learn.learning.primitive_fitting import CHANNELS, Motions
 from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
@@ -96,13 +95,9 @@ def _evaluate_primitives(args: Evaluate, model: Path) -> int:
         console.print(f"note: the {better} model predicts {channel}, not the mean")
     for channel in channels:
         motions.require(channel)
-        primitive = load_primitive(model / channel, channel)
         made = predict(model, channel, motions, demos)
         errors[channel] = motions.error(channel, made)
         figures |= errors[channel].summary(channel)
-        figures[f"{channel}_duration_ratio_median"] = _duration_ratio(
-            motions, primitive.duration
-        )
         console.print(_table(channel, demos, errors[channel]))
     if args.out is not None:
         with new_folder(args.out, asdict(args), args.overwrite) as folder:
@@ -159,12 +154,6 @@ def fitted_from(model: Path) -> dict[str, Any]:
             f"{model / MADE_BY} does not name the model's dataset: give a folder of hrc fit"
         )
     return made_by
-
-
-def _duration_ratio(motions: Motions, duration: torch.Tensor) -> float:
-    """Median ratio of the primitive's duration to that of each demonstration."""
-    last = (motions.demos.length - 1)[:, None]
-    return float((duration / motions.demos.time.take_along_dim(last, dim=1)[:, 0]).median())
 
 
 _ROWS = 8

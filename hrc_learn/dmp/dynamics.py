@@ -396,10 +396,7 @@ def restored_basis(config: dict[str, Any]) -> Basis:
     if kind not in BASES:
         raise ValueError(f"unknown type {kind!r}; choose from {', '.join(BASES)}")
     if "phase" in fields:
-        phase = dict(fields["phase"])
-        if (name := phase.pop("type", "ExponentialPhase")) != "ExponentialPhase":
-            raise ValueError(f"unknown phase {name!r}; there is ExponentialPhase only")
-        fields["phase"] = ExponentialPhase(**phase)
+        fields["phase"] = ExponentialPhase(**fields["phase"])
     return BASES[kind](**fields)
 
 

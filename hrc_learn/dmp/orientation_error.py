@@ -132,20 +132,13 @@ def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4
     return quaternion.normalize(q)
 
 
-def intrinsic_mean(
-    q: Float[Tensor, "*batch n 4"], mask: Bool[Tensor, "*batch n"] | None = None
-) -> Float[Tensor, "*batch 4"]:
+def intrinsic_mean(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
     """Orientation from which the rotation vectors to all others sum to zero.
 
     (Moakher 2002, "Means and averaging in the group of rotations".) Fixed-point iteration from
-    the extrinsic mean, the first eigenvector of sum q q^T, which does not depend on signs.
-
-    Args:
-        q: Unit quaternions, of either sign.
-        mask: False at orientations to ignore.
+    the extrinsic mean, which does not depend on signs.
     """
-    weight = _mean_weights(q, mask)
-    return _refined(torch.linalg.eigh((weight * q).mT @ q).eigenvectors[..., -1], q, weight)
+    return _refined(quaternion.mean(q), q, torch.full_like(q[:, :1], 1 / len(q)))
 
 
 def mean_along(
@@ -161,16 +154,11 @@ def mean_along(
         q: Unit quaternions over time, neighbours less than half a turn apart.
         mask: False at samples to ignore.
     """
-    weight = _mean_weights(q, mask)
+    weight = (mask.to(q) / mask.sum(-1, keepdim=True))[..., None]
     first = q[..., :1, :]
     vector = quaternion.log(quaternion.multiply(q, quaternion.conjugate(first)))
     vector = (weight * quaternion.unwrap_log(vector)).sum(-2)
     return _refined(quaternion.multiply(quaternion.exp(vector), first[..., 0, :]), q, weight)
-
-
-def _mean_weights(q: Tensor, mask: Tensor | None) -> Float[Tensor, "*batch n 1"]:
-    weight = torch.ones_like(q[..., 0]) if mask is None else mask.to(q)
-    return (weight / weight.sum(-1, keepdim=True))[..., None]
 
 
 def _refined(

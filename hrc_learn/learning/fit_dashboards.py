@@ -46,6 +46,7 @@ from hrc_learn.viz.rerun_stream import (
     tab_view,
 )
 
+_MOST_TABS = 6
 _JOINT_UNITS = {"rad": "rad", "1": "of the range"}
 _THOUSANDTHS = {"rad": "mrad", "m": "mm", "of the range": "1/1000 of the range"}
 
@@ -89,7 +90,7 @@ def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
     channel = next((k for k in ("joint", "position", "pose") if k in fitted.each), None)
     if channel is None:
         raise ValueError("orientations alone cannot be shown: learn the pose or positions.")
-    motions, lengths = fitted.motions, fitted.demonstrations.length.tolist()
+    motions, lengths = fitted.motions, fitted.motions.demos.length.tolist()
     demos, made = motions.position(channel), motions.own(fitted.each[channel]).position
     assert made is not None
 
@@ -122,15 +123,14 @@ def shown_fit(fitted: FittedPrimitives, title: str) -> ShownFit:
     )
 
 
-def record_fit(path: str | os.PathLike[str], fit: ShownFit, *, most: int = 6) -> None:
+def record_fit(path: str | os.PathLike[str], fit: ShownFit) -> None:
     """Write demonstrations and reproductions as an .rrd file with its layout.
 
     Args:
         path: File to write; it appears only when complete.
-        fit: Demonstrations and reproductions.
-        most: Demonstrations that get a tab of their own; all are drawn in 3D.
+        fit: Demonstrations and reproductions; the first `_MOST_TABS` get a tab of their own.
     """
-    tabs = [_tab(fit, i) for i in range(min(most, len(fit.demos)))]
+    tabs = [_tab(fit, i) for i in range(min(_MOST_TABS, len(fit.demos)))]
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
     if every := [*fit.paths, *fit.reproduced_paths]:
         name = "Paths: demonstrations (grey), reproductions (blue, dots: now)"

@@ -238,11 +238,6 @@ class FittedPrimitives:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Options of the fit."""
 
-    @property
-    def demonstrations(self) -> PaddedDemonstrations:
-        """Padded demonstrations."""
-        return self.motions.demos
-
     def save(self, folder: Path, each: bool = False) -> None:
         """Write the mean primitives to `folder/CHANNEL`.
 
@@ -261,7 +256,7 @@ class FittedPrimitives:
 
         `mean_` marks the mean primitive, given start, goal and duration of each demonstration.
         """
-        count = float(len(self.demonstrations.length))
+        count = float(len(self.motions.demos.length))
         values = {"demonstrations": count, "basis_functions": float(self.n_basis)}
         for channel, primitives in self.each.items():
             own = self.motions.own(primitives)

@@ -155,7 +155,7 @@ def test_files_with_another_phase_or_basis_are_refused(tmp_path):
     file = tmp_path / "config.json"
     content = json.loads(file.read_text())
     for basis, complaint in (
-        ({"type": "GaussianBasis", "phase": {"type": "SigmoidPhase"}}, "unknown phase 'Sig"),
+        ({"type": "GaussianBasis", "phase": {"slope": 4.0}}, ".*unexpected .*'slope'"),
         ({"type": "WaveletBasis"}, "unknown type 'WaveletBasis'; choose from GaussianBasis"),
     ):
         file.write_text(json.dumps(content | {"basis": basis}))
