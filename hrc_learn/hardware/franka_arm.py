@@ -356,7 +356,7 @@ class FrankaHand:
 
 
 def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner]:
-    """Open the runner of the loop's step, in any process."""
+    """Function that opens the runner of the loop's step, in any process."""
     limits = replace(
         chain.limits,
         acceleration=config.dynamics * chain.limits.acceleration,
@@ -369,6 +369,27 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
         stop=torch.tensor(False),
         dt=CYCLE,
     )
+    if config.load is None or config.load.far_end is None:
+        return _opening(step, example, config)
+    # From the frame of the flange to that of the tool centre point.
+    offset = chain.tcp.new_tensor(config.load.far_end) - chain.tcp[:3, 3]
+    far_end = chain.tcp[:3, :3].T @ offset
+    open_runner = _opening(step, replace(example, load=far_end), config)
+    return partial(_with_load, open_runner, far_end.numpy())
+
+
+def _opening(
+    step: VelocityStep, example: WantedVelocity, config: FrankaConfig
+) -> Callable[[], StepRunner]:
     if config.compiled:
         return partial(PackageRunner, export_step(step, example))
     return partial(EagerRunner, step, example)
+
+
+def _with_load(
+    open_runner: Callable[[], StepRunner], far_end: Float[np.ndarray, "3"]
+) -> StepRunner:
+    """The runner with the far end of a load, which stays the same in all cycles."""
+    runner = open_runner()
+    runner.observation["load"][:] = far_end
+    return runner

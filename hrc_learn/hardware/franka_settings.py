@@ -24,12 +24,17 @@ class Load:
     """Centre of mass, in the flange's frame [m]."""
     inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
     """About that centre, along the flange's axes [kg m^2]."""
+    far_end: tuple[float, float, float] | None = None
+    """Point of the load farthest from the flange, in its frame [m]: `FrankaArm` caps its speed
+    as that of the tool. None: no such point."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.mass < math.inf:
             raise ValueError(f"mass of a load must not be negative, but is {self.mass} kg.")
-        if not np.isfinite(self.centre).all():
-            raise ValueError(f"centre of a load must be finite, but is {self.centre} m.")
+        for name in ("centre", "far_end"):
+            point = getattr(self, name)
+            if point is not None and not np.isfinite(point).all():
+                raise ValueError(f"{name} of a load must be finite, but is {point} m.")
         tensor = np.array(self.inertia)
         if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=0):
             raise ValueError(

@@ -10,16 +10,18 @@ import time
 from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
-from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from franka_servers import franky_sim, loopback
 from loop_on_franka import loop_of
 
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, Load
 from hrc_learn.hardware.franka_arm import step_of
+from hrc_learn.hardware.franka_settings import CYCLE
 from hrc_learn.hardware.protocol_server import ServedArm, serve_world
 from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.kinematics import fr3 as FR3
@@ -66,11 +68,26 @@ def test_it_is_an_arm_and_a_gripper(arm):
     assert isinstance(arm, Gripper)
 
 
-def test_views_of_the_chain_are_not_left_behind():
-    """PyTorch moves a tensor into shared memory as it is sent to another process."""
-    here = FR3.ready.data_ptr()
-    ForkingPickler.dumps(step_of(FR3, CONFIG))
-    assert FR3.ready.data_ptr() == here
+def test_the_far_end_of_a_load_keeps_the_cap_on_the_tool():
+    """By finite differences of the point, 0.5 m beyond the flange, as the wrist turns."""
+    far_end = torch.tensor([0.1, 0.0, 0.5, 1.0], dtype=torch.float64)
+
+    def fastest(load):
+        safety = SafetyConfig(tcp_speed=0.25)
+        runner = step_of(FR3, replace(CONFIG, safety=safety, load=load))()
+        q, points = FR3.ready.clone(), []
+        runner.start(q.numpy())
+        runner.observation["stop"][...] = False
+        runner.observation["joint_velocity"][:] = 2.0 * np.eye(7)[5]
+        for _ in range(400):
+            runner.observation["joint_position"][:] = q.numpy()
+            q = q + CYCLE * torch.from_numpy(np.array(runner.step()))
+            flange = FR3.forward(q).matrix() @ FR3.tcp.inverse()
+            points.append((flange @ far_end)[:3])
+        return float(torch.stack(points).diff(dim=0).norm(dim=-1).max()) / CYCLE
+
+    assert fastest(Load(far_end=tuple(far_end[:3].tolist()))) == pytest.approx(0.25, rel=0.02)
+    assert fastest(Load()) > 0.4
 
 
 def test_joints_move_as_they_are_told_and_rest_once_nobody_tells(arm):
