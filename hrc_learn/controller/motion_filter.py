@@ -1,7 +1,4 @@
-"""Jerk-limited filter of positions, fast enough for a loop at the rate of the motors.
-
-Imports NumPy only: the distribution `lerobot-smooth` has a copy of this file.
-"""
+"""Jerk-limited filter of positions, fast enough for a loop at the rate of the motors."""
 
 from __future__ import annotations
 

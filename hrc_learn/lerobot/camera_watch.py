@@ -34,8 +34,7 @@ from hrc_learn.jacobian import (
 from hrc_learn.lerobot.arm_values import HAND, MARKER, PIXELS
 from hrc_learn.lerobot.policy.policy_base import read_episodes
 from hrc_learn.lerobot.smoothing import PREPROCESSOR, read_pipeline
-from hrc_learn.lerobot.smoothing.action_limits import write_json
-from hrc_learn.store import json_text, parse_json
+from hrc_learn.store import json_text, parse_json, write_json
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CAMERA_WATCH = "hrc_learn_camera_watch"

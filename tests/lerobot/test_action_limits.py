@@ -2,10 +2,7 @@
 
 import itertools
 import json
-import os
-import subprocess
-import sys
-from importlib.util import module_from_spec, spec_from_file_location
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +98,8 @@ def test_names_may_be_missing_or_grouped(tmp_path):
     describe_anew(dataset, lambda f: f["action"].update(names=[["x", "y", "z"]]))
     assert demonstrated_limits(dataset).names == ["x", "y", "z"]
     describe_anew(dataset, lambda f: f["action"].update(names=["x", "y"]))
-    assert demonstrated_limits(dataset).names == ["action.0", "action.1", "action.2"]
+    with pytest.raises(ValueError, match="2 names for 3 components"):
+        demonstrated_limits(dataset)
     for feature in ("action", "observation.state"):
         describe_anew(dataset, lambda f, feature=feature: f[feature].update(names=None))
     limits = demonstrated_limits(dataset)
@@ -132,10 +130,14 @@ def test_a_dataset_without_actions_is_refused(tmp_path):
 
 URDF = """<?xml version="1.0"?>
 <robot name="arm">
-  <joint name="a" type="revolute"><limit lower="-1.5" upper="2" velocity="0.25"/></joint>
-  <joint name="b" type="continuous"><limit velocity="3" effort="1"/></joint>
-  <joint name="c" type="prismatic"><limit lower="0" upper="0.1" velocity="0"/></joint>
-  <joint name="d" type="fixed"/>
+  <link name="l0"/><link name="l1"/><link name="l2"/><link name="l3"/><link name="l4"/>
+  <joint name="a" type="revolute"><parent link="l0"/><child link="l1"/>
+    <limit lower="-1.5" upper="2" velocity="0.25"/></joint>
+  <joint name="b" type="continuous"><parent link="l1"/><child link="l2"/>
+    <limit velocity="3" effort="1"/></joint>
+  <joint name="c" type="prismatic"><parent link="l2"/><child link="l3"/>
+    <limit lower="0" upper="0.1" velocity="0"/></joint>
+  <joint name="d" type="fixed"><parent link="l3"/><child link="l4"/></joint>
 </robot>
 """
 
@@ -206,13 +208,13 @@ def test_the_calibration_of_another_robot_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("read", "content", "message"),
     [
-        (urdf_limits, "<robot", "is not a URDF"),
-        (urdf_limits, "<mujoco/>", "describes a mujoco"),
-        (urdf_limits, "<robot/>", "has no joints with limits"),
-        (calibrated_ranges, "[]", "it has no motors"),
+        (urdf_limits, "<robot", "is no XML"),
+        (urdf_limits, "<mujoco/>", "neither URDF nor MJCF"),
+        (urdf_limits, '<robot><link name="a"/></robot>', "has no joints with limits"),
+        (calibrated_ranges, "{}", "it has no motors"),
         (calibrated_ranges, '{"a": {"range_min": 5, "range_max": 5}}', "a has no range_min"),
         (calibrated_ranges, '{"a": 3}', "a has no range_min"),
-        (calibrated_ranges, "nonsense", "is damaged"),
+        (calibrated_ranges, "nonsense", "not valid JSON"),
     ],
 )
 def test_files_that_tell_no_limits_are_refused(tmp_path, read, content, message):
@@ -223,17 +225,11 @@ def test_files_that_tell_no_limits_are_refused(tmp_path, read, content, message)
         read(tmp_path / "none")
 
 
-PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_smooth"
+PLUGIN = Path(__file__).parents[2] / "plugins/lerobot_smooth/src/lerobot_smooth"
 
 
 def test_the_command_says_what_is_wrong_and_writes_what_it_found(tmp_path, capsys):
-    name = "hrc_learn.lerobot.smoothing.command"  # in the distribution: lerobot_smooth.command
-    spec = spec_from_file_location(name, PLUGIN / "command.py")
-    assert spec is not None
-    assert spec.loader is not None
-    command = module_from_spec(spec)
-    spec.loader.exec_module(command)
-    main = command.main
+    main = runpy.run_path(str(PLUGIN / "command.py"))["main"]
     dataset, out = write(tmp_path / "set", paths()), tmp_path / "limits.json"
     arguments = ["limits", "--dataset", str(dataset), "--out", str(out)]
     assert main([*arguments, "--scale", "0"]) == 1
@@ -247,28 +243,6 @@ def test_the_command_says_what_is_wrong_and_writes_what_it_found(tmp_path, capsy
     assert out.stat().st_mode & 0o044
     assert main(["add", "--checkpoint", str(tmp_path), "--limits", str(out)]) == 1
     assert "pretrained_model" in capsys.readouterr().err
-
-
-def test_the_distribution_of_its_own_imports_nothing_else_of_ours(tmp_path):
-    """Built as a wheel, loaded where hrc_learn cannot be found, and then together with it."""
-    pytest.importorskip("hatchling", reason="the build backend is not installed")
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
-    subprocess.run(build, cwd=PLUGIN, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    program = (
-        "import sys; sys.modules['hrc_learn'] = None; import lerobot_smooth.command;"
-        "from lerobot.robots import RobotConfig;"
-        "print('smooth' in RobotConfig.get_known_choices());"
-        "del sys.modules['hrc_learn']; import hrc_learn.lerobot.smoothing"
-    )
-    path = os.pathsep.join([str(wheel), str(PLUGIN.parents[1])])
-    ran = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-    assert (ran.stdout.strip(), ran.returncode) == ("True", 0), ran.stderr
 
 
 def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
+from lerobot.utils.constants import ACTION, OBS_STATE
+from msgspec import Meta
 
-try:
-    from hrc_learn.controller.motion_filter import MotionFilter, MotionState
-except ImportError:  # the distribution of this folder has a copy of that file
-    from .motion_filter import (  # pyright: ignore[reportMissingImports]
-        MotionFilter,
-        MotionState,
-    )
+from hrc_learn.controller.motion_filter import MotionFilter
+from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
+from hrc_learn.demos.read.frames import read_frames
+from hrc_learn.kinematics.description import MOVING
+from hrc_learn.kinematics.urdf import read_urdf
+from hrc_learn.lerobot.policy.action_encoding import matched_columns
+from hrc_learn.store import read_json, write_json
 
-__all__ = ["ActionLimits", "MotionFilter", "MotionState"]
-
-ACTION, STATE = "action", "observation.state"
 _UNUSUAL = 0.999
 """Quantile of the differences used as a limit; single glitches do not count."""
 _STILL = 1e-3
@@ -36,6 +32,8 @@ Dynamixel X).
 
 type Range = tuple[float | None, float | None]
 """Lowest and highest position; None: no limit."""
+Positive = Annotated[float, Meta(gt=0, le=1e300)]
+"""Positive, finite number of a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,41 +41,32 @@ class ActionLimits:
     """Limits of every value of an action, in its unit, and where it is measured.
 
     Raises:
-        ValueError: An entry is missing, of the wrong type, not finite or out of its range.
+        ValueError: The lists differ in length, or a range is empty. `load` checks all else.
     """
 
-    names: list[str]
-    fps: float
+    names: Annotated[list[str], Meta(min_length=1)]
+    fps: Positive
     """Actions a second."""
-    velocity: list[float]
+    velocity: list[Positive]
     """[1/s]"""
-    acceleration: list[float]
+    acceleration: list[Positive]
     """[1/s^2]"""
-    jerk: list[float]
+    jerk: list[Positive]
     """[1/s^3]"""
     lower: list[float | None]
     """Lowest position; None: no limit."""
     upper: list[float | None]
     """Highest position; None: no limit."""
-    state_columns: list[int]
+    state_columns: list[Annotated[int, Meta(ge=-1)]]
     """Columns of `observation.state` that measure each value; -1: not measured."""
 
     def __post_init__(self) -> None:
-        named = isinstance(self.names, list) and self.names
-        if not (named and all(isinstance(name, str) for name in self.names)):
-            raise ValueError(f"names must be a list of texts, but is {self.names!r}")
-        if not _is_positive(self.fps):
-            raise ValueError(f"fps must be positive and finite, but is {self.fps!r}")
-        for key, (fits, needed) in _ENTRIES.items():
-            values = getattr(self, key)
-            if not isinstance(values, list) or len(values) != len(self.names):
+        for key, values in vars(self).items():
+            if key != "fps" and len(values) != len(self.names):
                 raise ValueError(
                     f"{key} must have one entry for each of {', '.join(self.names)}, but is "
                     f"{values!r}"
                 )
-            for name, value in zip(self.names, values, strict=True):
-                if not fits(value):
-                    raise ValueError(f"{key} of {name} must be {needed}, but is {value!r}")
         for name, low, high in zip(self.names, *self.positions(), strict=True):
             if not low < high:
                 raise ValueError(
@@ -125,7 +114,7 @@ class ActionLimits:
 
     def save(self, path: Path) -> None:
         """Write them as JSON; the file is whole or as it was."""
-        write_json(path, asdict(self))
+        write_json(path, self)
 
     @classmethod
     def load(cls, path: Path) -> ActionLimits:
@@ -133,43 +122,9 @@ class ActionLimits:
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: It holds no limits.
+            ValueError: An entry is missing, of the wrong type, not finite or out of its range.
         """
-        content, keys = read_json(path), [f.name for f in fields(cls)]
-        if not isinstance(content, dict) or content.keys() != {*keys}:
-            raise ValueError(
-                f"{path} holds no limits of actions: its keys must be {', '.join(keys)}"
-            )
-        try:
-            return cls(**content)
-        except ValueError as error:
-            raise ValueError(f"{path} holds no limits of actions: {error}") from None
-
-
-def _is_number(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    # Whole numbers of JSON have no bound; no robot has a limit beyond this one.
-    return abs(value) < 1e300
-
-
-def _is_positive(value: Any) -> bool:
-    return _is_number(value) and value > 0
-
-
-def _is_number_or_none(value: object) -> bool:
-    return value is None or _is_number(value)
-
-
-_ENTRIES: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "velocity": (_is_positive, "positive and finite"),
-    "acceleration": (_is_positive, "positive and finite"),
-    "jerk": (_is_positive, "positive and finite"),
-    "lower": (_is_number_or_none, "finite or null"),
-    "upper": (_is_number_or_none, "finite or null"),
-    "state_columns": (lambda x: type(x) is int and x >= -1, "a column, or -1"),
-}
-"""Entries for each value of an action: what they must be, as a check and in words."""
+        return read_json(path, cls, "write the limits of actions again by hrc smooth --limits")
 
 
 def gathered_limits(
@@ -237,28 +192,29 @@ def demonstrated_limits(dataset: Path, scale: float = 1.0) -> ActionLimits:
         FileNotFoundError: There is no dataset.
         ValueError: It cannot be read, or its actions are constant.
     """
-    info = read_json(dataset / "meta" / "info.json")
-    features, fps = info["features"], float(info["fps"])
+    folder = open_folder(dataset)
+    features, fps = folder.features, folder.fps
     if ACTION not in features:
         raise ValueError(f"{dataset} has no actions.")
-    episodes = _read_actions(dataset)
-    names, width = _names(features, ACTION), episodes[0].shape[-1]
-    names = names or [f"{ACTION}.{i}" for i in range(width)]
+    entries = select_episodes(folder)
+    episodes = [np.asarray(x[ACTION], float) for _, x in read_frames(folder, entries, [ACTION])]
     limits = [scale * _largest(episodes, order, fps) for order in (1, 2, 3)]
     if not all((limit > 0).any() for limit in limits):
         raise ValueError(f"the actions of {dataset} hold still: there is no motion to go by.")
     velocity, acceleration, jerk = (
         np.maximum(limit, _STILL * limit.max()).tolist() for limit in limits
     )
+    names, width, state = features[ACTION].names, len(velocity), features.get(OBS_STATE)
+    states, state_width = (None, 0) if state is None else (state.names, math.prod(state.shape))
     return ActionLimits(
-        names=names,
+        names=[*names] if names else [f"{ACTION}.{i}" for i in range(width)],
         fps=fps,
         velocity=velocity,
         acceleration=acceleration,
         jerk=jerk,
         lower=[None] * width,
         upper=[None] * width,
-        state_columns=_state_columns(features, names, width),
+        state_columns=matched_columns(names, states, (width, state_width)),
     )
 
 
@@ -281,25 +237,17 @@ def urdf_limits(
         FileNotFoundError: There is no such file.
         ValueError: It is no URDF.
     """
-    try:
-        root = ElementTree.fromstring(urdf.read_text(encoding="utf-8"))
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{urdf} is not a URDF: {error}") from None
-    if root.tag != "robot":
-        raise ValueError(f"{urdf} is not a URDF: it describes a {root.tag}, not a robot")
     ranges: dict[str, Range] = {}
     velocities: dict[str, float] = {}
-    for joint in root.iter("joint"):
-        kind, limit = joint.get("type"), joint.find("limit")
-        if limit is None or kind not in ("revolute", "continuous", "prismatic"):
+    for joint in read_urdf(urdf).joints:
+        if joint.kind not in MOVING:
             continue
-        unit = math.degrees(1) if degrees and kind != "prismatic" else 1.0
-        name = f"{joint.get('name')}.pos"
-        low, high = (unit * float(limit.get(side, 0)) for side in ("lower", "upper"))
-        if kind != "continuous" and low < high:
-            ranges[name] = (low, high)
-        if (velocity := unit * float(limit.get("velocity", 0))) > 0:
-            velocities[name] = velocity
+        unit = math.degrees(1) if degrees and joint.kind != "prismatic" else 1.0
+        low, high = (unit * (end or 0.0) for end in (joint.lower, joint.upper))
+        if low < high:
+            ranges[f"{joint.name}.pos"] = (low, high)
+        if joint.velocity is not None and joint.velocity > 0:
+            velocities[f"{joint.name}.pos"] = unit * joint.velocity
     if not ranges and not velocities:
         raise ValueError(f"{urdf} has no joints with limits")
     return ranges, velocities
@@ -324,7 +272,7 @@ def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, 
     """
     content = read_json(calibration)
     ranges: dict[str, Range] = {}
-    for name, motor in content.items() if isinstance(content, dict) else ():
+    for name, motor in content.items():
         try:
             half = (float(motor["range_max"]) - float(motor["range_min"])) / 2
         except (TypeError, KeyError, ValueError):
@@ -344,80 +292,8 @@ def calibrated_ranges(calibration: Path, *, degrees: bool = False) -> dict[str, 
     return ranges
 
 
-def read_json(path: Path) -> Any:
-    """Content of a file.
-
-    Raises:
-        FileNotFoundError: There is none.
-        ValueError: It is damaged.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no {path}")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from None
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write a file that is complete or as it was."""
-    new = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with new.open("w", encoding="utf-8") as file:
-            json.dump(content, file, indent=2)
-            file.flush()
-            os.fsync(file.fileno())
-        new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
-
-
-def _read_actions(folder: Path) -> list[Float[np.ndarray, "frames D"]]:
-    """Actions of each episode, of all versions of the format that keep them in Parquet."""
-    from pyarrow import ArrowInvalid
-    from pyarrow.dataset import dataset
-
-    files = [str(file) for file in sorted((folder / "data").glob("chunk-*/*.parquet"))]
-    if not files:
-        raise ValueError(f"{folder} has no episodes.")
-    try:
-        table = dataset(files, format="parquet").to_table(columns=["episode_index", ACTION])
-    except (ArrowInvalid, OSError) as error:
-        raise ValueError(f"{folder}: the actions cannot be read: {error}") from None
-    index = table["episode_index"].to_numpy()
-    actions = np.array(table[ACTION].to_pylist(), dtype=np.float64).reshape(len(index), -1)
-    return [actions[index == k] for k in np.unique(index)]
-
-
 def _largest(episodes: Sequence[np.ndarray], order: int, fps: float) -> np.ndarray:
     differences = [np.abs(np.diff(e, n=order, axis=0)) for e in episodes if len(e) > order]
     if not differences:
         raise ValueError("episodes are too short to tell how the actions move.")
     return np.quantile(np.concatenate(differences), _UNUSUAL, axis=0) * fps**order
-
-
-def _names(features: Mapping[str, Any], key: str) -> list[str]:
-    """Names in a feature's metadata: flat, nested or in a dict; none if their number does not
-    match.
-    """
-    names = _flat(features[key].get("names") or [])
-    return names if len(names) == math.prod(features[key]["shape"]) else []
-
-
-def _flat(names: Any) -> list[str]:
-    if isinstance(names, dict):
-        names = list(names.values())
-    if not isinstance(names, list | tuple):
-        return [str(names)]
-    return [name for part in names for name in _flat(part)]
-
-
-def _state_columns(features: Mapping[str, Any], names: list[str], width: int) -> list[int]:
-    """State column of each action value, matched by name; by index if neither has names."""
-    if STATE not in features:
-        return [-1] * width
-    states = _names(features, STATE)
-    if not states and not _names(features, ACTION):
-        return list(range(width)) if features[STATE]["shape"][0] == width else [-1] * width
-    index = {name: i for i, name in enumerate(states)}
-    return [index.get(name, -1) for name in names]

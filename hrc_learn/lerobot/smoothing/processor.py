@@ -19,10 +19,12 @@ from jaxtyping import Bool, Float
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.processor import ProcessorStep, ProcessorStepRegistry
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from .action_limits import ACTION, ActionLimits, MotionState, read_json, write_json
+from hrc_learn.controller.motion_filter import MotionState
+from hrc_learn.lerobot.smoothing.action_limits import ActionLimits
+from hrc_learn.store import json_text, parse_json, read_json, write_json
 
 WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
 PREPROCESSOR = "policy_preprocessor.json"
@@ -73,6 +75,7 @@ class Changes:
         )
 
 
+@ProcessorStepRegistry.register(WATCH)
 @dataclass
 class WatchStateStep(ProcessorStep):
     """Keeps the state that the robot reports, for the `SmoothActionsStep` of the same policy.
@@ -118,6 +121,7 @@ class WatchStateStep(ProcessorStep):
         return features
 
 
+@ProcessorStepRegistry.register(SMOOTH)
 class SmoothActionsStep(ProcessorStep):
     """Keeps actions within limits of position, velocity, acceleration and jerk.
 
@@ -138,7 +142,8 @@ class SmoothActionsStep(ProcessorStep):
         Args:
             limits: Fields of `ActionLimits`, as checkpoints keep them.
         """
-        self.limits = ActionLimits(**limits)
+        text = json_text(limits)
+        self.limits = parse_json(text, ActionLimits, "limits of smooth actions")
         self._filter = self.limits.motion_filter(1.0 / self.limits.fps)
         self._columns = np.array(self.limits.state_columns)
         self._watch: weakref.ref[WatchStateStep] | None = None
@@ -269,12 +274,6 @@ def _log(changes: Changes) -> None:
         logging.info("smooth actions: %s", changes)
 
 
-for _name, _step in ((WATCH, WatchStateStep), (SMOOTH, SmoothActionsStep)):
-    # The same steps may be installed as a distribution of their own, and known already.
-    if _name not in ProcessorStepRegistry.list():
-        ProcessorStepRegistry.register(_name)(_step)
-
-
 def add_smoothing(checkpoint: Path, limits: ActionLimits, dataset: Path | None = None) -> None:
     """Add smoothing of the actions to a trained policy's checkpoint.
 
@@ -381,9 +380,7 @@ def read_pipeline(path: Path, without: Sequence[str] = (WATCH, SMOOTH)) -> dict[
             f"there is no {path}: give the folder `pretrained_model` of a LeRobot checkpoint."
         )
     content = read_json(path)
-    try:
-        steps = content["steps"]
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not a processor of LeRobot: {error}") from None
-    content["steps"] = [s for s in steps if s.get("registry_name") not in without]
+    if not isinstance(content.get("steps"), list):
+        raise ValueError(f"{path} is not a processor of LeRobot: it lists no steps")
+    content["steps"] = [s for s in content["steps"] if s.get("registry_name") not in without]
     return content

@@ -16,7 +16,8 @@ from jaxtyping import Float
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from .action_limits import ActionLimits, MotionState
+from hrc_learn.controller.motion_filter import MotionState
+from hrc_learn.lerobot.smoothing.action_limits import ActionLimits
 
 logger = logging.getLogger(__name__)
 
@@ -185,6 +186,7 @@ def _weights(degree: int, u: float) -> Float[np.ndarray, " points"]:
     return weights
 
 
+@RobotConfig.register_subclass(SMOOTH_ROBOT)
 @dataclass(kw_only=True)
 class SmoothRobotConfig(RobotConfig):
     """`--robot.type=smooth --robot.of=so101_follower --robot.options='{port: /dev/ttyACM0}'`"""
@@ -194,7 +196,7 @@ class SmoothRobotConfig(RobotConfig):
     options: dict[str, Any] = field(default_factory=dict)
     """Its settings, as YAML: what else would be given as --robot.NAME=VALUE."""
     limits: Path | None = None
-    """File of limits, as `lerobot-smooth limits` and `hrc smooth --limits` write it."""
+    """File of limits, as `hrc smooth --limits` writes it."""
     rate: float = 250.0
     """Setpoints a second that the robot is sent."""
     degree: int = 3
@@ -239,8 +241,8 @@ class SmoothRobot(Robot):
             raise ValueError(f"--robot.of must be one of {known}; got {config.of!r}")
         if config.limits is None:
             raise ValueError(
-                "--robot.limits is needed: `lerobot-smooth limits --dataset FOLDER --out FILE` "
-                "writes such a file."
+                "--robot.limits is needed: `hrc smooth --dataset FOLDER --limits FILE` writes "
+                "such a file."
             )
         limits = ActionLimits.load(config.limits)
         settings = {"id": config.id, "calibration_dir": config.calibration_dir}
@@ -431,8 +433,3 @@ class SmoothRobot(Robot):
                 break
             self._started += (1 + _FOLLOW * late) / fps
         return (now - self._started) * fps
-
-
-if SMOOTH_ROBOT not in RobotConfig.get_known_choices():
-    # It may be installed as a distribution of its own, and known already.
-    RobotConfig.register_subclass(SMOOTH_ROBOT)(SmoothRobotConfig)

@@ -7,8 +7,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from .action_limits import ActionLimits, gathered_limits
-from .processor import add_smoothing, remove_smoothing
+from hrc_learn.lerobot.smoothing import (
+    ActionLimits,
+    add_smoothing,
+    gathered_limits,
+    remove_smoothing,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
