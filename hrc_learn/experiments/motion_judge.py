@@ -275,9 +275,9 @@ _JUDGE: list[_Judge] = []
 
 
 def _begin(given: tuple[JudgeConfig, ArmChoice, float, float]) -> None:
-    config, *settings = given
+    config, robot, fps, widest = given
     torch.set_num_threads(1)
-    _JUDGE[:] = [config.open(*settings)]
+    _JUDGE[:] = [config.open(robot, fps, widest)]
 
 
 def _replay(trial: Trial) -> Replay:
@@ -297,11 +297,12 @@ class Judges:
         # Opened here first, so that a mistake is one error of this process.
         _begin(self._given)
         if config.processes > 1:
+            sent: Any = ByValue(self._given)
             self._pool = ProcessPoolExecutor(
                 config.processes,
                 multiprocessing.get_context("spawn"),
                 initializer=_begin,
-                initargs=(ByValue(self._given),),
+                initargs=(sent,),
             )
         return self
 
@@ -311,8 +312,7 @@ class Judges:
 
     def replays(self, trials: Sequence[Trial]) -> Iterator[Replay]:
         """Replays in the order of the motions."""
-        return (
-            map(_replay, trials)
-            if self._pool is None
-            else self._pool.map(_replay, map(ByValue, trials))
-        )
+        if self._pool is None:
+            return map(_replay, trials)
+        sent: Any = map(ByValue, trials)
+        return self._pool.map(_replay, sent)

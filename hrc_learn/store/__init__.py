@@ -44,6 +44,7 @@ from hrc_learn.store._folder import sync_file as sync_file
 from hrc_learn.store._reading import Count as Count
 from hrc_learn.store._reading import Metres as Metres
 from hrc_learn.store._reading import Pixels as Pixels
+from hrc_learn.store._reading import Positive as Positive
 from hrc_learn.store._reading import Radians as Radians
 from hrc_learn.store._reading import json_text as json_text
 from hrc_learn.store._reading import parse_json as parse_json

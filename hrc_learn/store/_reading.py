@@ -24,6 +24,8 @@ Pixels = Annotated[float, Meta(ge=-1e6, le=1e6)]
 """Image coordinate or focal length in a file [px]."""
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 """Number of things in a file, or an index."""
+Positive = Annotated[float, Meta(gt=0, le=1e300)]
+"""Positive, finite number in a file."""
 
 MAX_SIZE = 64 * 2**20
 """Largest file that is read [bytes]. Ours have a few kilobytes."""

@@ -6,12 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 from lerobot.utils.constants import ACTION, OBS_STATE
-from msgspec import Meta
 
 from hrc_learn.controller.motion_filter import MotionFilter
 from hrc_learn.demos.read.dataset_folder import open_folder, select_episodes
@@ -19,7 +17,7 @@ from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.kinematics.description import MOVING
 from hrc_learn.kinematics.urdf import read_urdf
 from hrc_learn.lerobot.policy.action_encoding import matched_columns
-from hrc_learn.store import read_json, write_json
+from hrc_learn.store import Positive, read_json, write_json
 
 _UNUSUAL = 0.999
 """Quantile of the differences used as a limit; single glitches do not count."""
@@ -32,8 +30,6 @@ Dynamixel X).
 
 type Range = tuple[float | None, float | None]
 """Lowest and highest position; None: no limit."""
-Positive = Annotated[float, Meta(gt=0, le=1e300)]
-"""Positive, finite number of a file."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +40,7 @@ class ActionLimits:
         ValueError: The lists differ in length, or a range is empty. `load` checks all else.
     """
 
-    names: Annotated[list[str], Meta(min_length=1)]
+    names: list[str]
     fps: Positive
     """Actions a second."""
     velocity: list[Positive]
@@ -57,16 +53,20 @@ class ActionLimits:
     """Lowest position; None: no limit."""
     upper: list[float | None]
     """Highest position; None: no limit."""
-    state_columns: list[Annotated[int, Meta(ge=-1)]]
+    state_columns: list[int]
     """Columns of `observation.state` that measure each value; -1: not measured."""
 
     def __post_init__(self) -> None:
         for key, values in vars(self).items():
-            if key != "fps" and len(values) != len(self.names):
+            if key != "fps" and (not values or len(values) != len(self.names)):
                 raise ValueError(
                     f"{key} must have one entry for each of {', '.join(self.names)}, but is "
                     f"{values!r}"
                 )
+        if min(self.state_columns) < -1:
+            raise ValueError(
+                f"state_columns must be columns or -1, but are {self.state_columns}"
+            )
         for name, low, high in zip(self.names, *self.positions(), strict=True):
             if not low < high:
                 raise ValueError(

@@ -75,7 +75,6 @@ class Changes:
         )
 
 
-@ProcessorStepRegistry.register(WATCH)
 @dataclass
 class WatchStateStep(ProcessorStep):
     """Keeps the state that the robot reports, for the `SmoothActionsStep` of the same policy.
@@ -121,7 +120,6 @@ class WatchStateStep(ProcessorStep):
         return features
 
 
-@ProcessorStepRegistry.register(SMOOTH)
 class SmoothActionsStep(ProcessorStep):
     """Keeps actions within limits of position, velocity, acceleration and jerk.
 
@@ -272,6 +270,10 @@ def _restarted(
 def _log(changes: Changes) -> None:
     if changes.steps:
         logging.info("smooth actions: %s", changes)
+
+
+ProcessorStepRegistry.register(WATCH)(WatchStateStep)
+ProcessorStepRegistry.register(SMOOTH)(SmoothActionsStep)
 
 
 def add_smoothing(checkpoint: Path, limits: ActionLimits, dataset: Path | None = None) -> None:
