@@ -5,6 +5,7 @@ import http.client
 import json
 import shutil
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,12 +32,23 @@ def cleaned(tmp_path_factory):
     return write_set(tmp_path_factory.mktemp("clean") / "set", "v3.0", camera=True)
 
 
+@pytest.fixture(scope="module")
+def ranking(cleaned):
+    return rank_episodes(cleaned)
+
+
 @pytest.fixture
-def page(cleaned, tmp_path):
+def page(cleaned, ranking, tmp_path):
     root = shutil.copytree(cleaned, tmp_path / "set")
     config = AddressConfig(port=0)
-    with CurationPage(rank_episodes(root), tmp_path / "out", config) as page:
+    with CurationPage(replace(ranking, path=root), tmp_path / "out", config) as page:
         yield page
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    with chromium(tmp_path_factory.mktemp("chromium"), (1280, 800)) as tab:
+        yield tab
 
 
 class Client:
@@ -75,7 +87,16 @@ def client(page):
     return Client(page)
 
 
-def test_only_who_has_the_secret_gets_in(client):
+@pytest.fixture(scope="module")
+def unchanged(ranking, tmp_path_factory):
+    """A page on which nothing is decided, and its client."""
+    out = tmp_path_factory.mktemp("out") / "set"
+    with CurationPage(ranking, out, AddressConfig(port=0)) as page:
+        yield page, Client(page)
+
+
+def test_only_who_has_the_secret_gets_in(unchanged):
+    _, client = unchanged
     for path in ("/data/overview", "/data/state", "/data/images/0/0/0"):
         assert client.ask(path, Authorization="")[0].status == 401
         assert client.ask(path, Authorization="Bearer wrong")[0].status == 403
@@ -86,7 +107,8 @@ def test_only_who_has_the_secret_gets_in(client):
     assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
 
 
-def test_another_site_decides_nothing(page, client):
+def test_another_site_decides_nothing(unchanged):
+    page, client = unchanged
     said = json.dumps({"type": "decide", "episode": 0, "verdict": "reject"})
     for origin in ("https://evil.example", "http://127.0.0.1", "http://localhost", "null", ""):
         with pytest.raises(InvalidStatus):
@@ -108,13 +130,15 @@ def test_another_site_decides_nothing(page, client):
         "x" * 50_000,
     ],
 )
-def test_what_is_no_decision_closes_the_socket(page, client, said):
+def test_what_is_no_decision_closes_the_socket(unchanged, said):
+    page, client = unchanged
     assert client.say(said) is None
     assert not page.decisions
     assert not read_decisions(page.ranking.path)
 
 
-def test_a_decision_that_makes_no_sense_is_refused_with_its_reason(page, client):
+def test_a_decision_that_makes_no_sense_is_refused_with_its_reason(unchanged):
+    page, client = unchanged
     assert "no episode 9" in client.decide(episode=9, verdict="reject")["refused"]
     assert client.decide(episode=0, verdict="cut", start=5, stop=6)["refused"]
     assert not page.decisions
@@ -144,11 +168,13 @@ def test_a_decision_on_a_full_disk_is_refused_with_its_reason(page, client, monk
         ("/static/../curation_page.py", 404),
     ],
 )
-def test_there_is_nothing_elsewhere(client, path, status):
+def test_there_is_nothing_elsewhere(unchanged, path, status):
+    _, client = unchanged
     assert client.ask(path)[0].status == status
 
 
-def test_images_and_curves_are_those_of_the_dataset(page, client):
+def test_images_and_curves_are_those_of_the_dataset(unchanged):
+    page, client = unchanged
     root = page.ranking.path
     demo = load_demos(root)[2]
     curves = json.loads(client.ask("/data/curves/2")[1])
@@ -237,38 +263,37 @@ def test_a_set_that_cannot_be_written_says_why(page, client):
 
 
 @pytest.mark.browser
-def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tmp_path):
-    with chromium(tmp_path / "chromium", (1280, 800)) as tab:
-        errors: list = []
-        tab.on("pageerror", lambda error: errors.append(error))
-        tab.goto(page.url)
-        tab.locator("#charts canvas").first.wait_for()
-        # The same order as in the terminal.
-        listed = tab.locator("#episodes b").all_inner_texts()
-        rows = [line.split()[0] for line in page.ranking.lines()][1 : 1 + len(listed)]
-        assert listed == [f"Episode {row}" for row in rows]
-        wait_until(lambda: tab.locator("#videos canvas[data-frame='0']").count(), "an image")
-        tab.locator("#sort").select_option("duration")
-        longest = max(page.ranking.episodes, key=lambda q: q.measures.get("duration", -1))
-        assert tab.locator("#episodes b").first.inner_text() == f"Episode {longest.episode}"
-        tab.locator("#sort").select_option("score")
-        tab.get_by_role("button", name="Play").click()
-        moved = tab.locator("#videos canvas").first
-        wait_until(lambda: int(moved.get_attribute("data-frame")) > 20, "playing")
-        tab.get_by_role("button", name="Pause").click()
-        tab.keyboard.press("x")  # rejects the first, and goes on to the next
-        wait_until(lambda: len(page.decisions) == 1, "a rejection")
-        first, second = (q.episode for q in page.ranking.episodes[:2])
-        tab.get_by_role("heading", name=f"Episode {second}").wait_for()
-        tab.locator("#slider").fill("30")
-        tab.get_by_role("button", name="Start here").click()
-        tab.locator("#slider").fill("99")
-        tab.get_by_role("button", name="End here").click()
-        tab.get_by_role("button", name="Cut to 30 - 100").click()
-        wait_until(lambda: len(page.decisions) == 2, "a cut")
-        tab.get_by_role("button", name="Write the cleaned set").click()
-        tab.get_by_text("4 episodes with").wait_for()
-        assert not errors
+def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tab):
+    errors: list = []
+    tab.on("pageerror", lambda error: errors.append(error))
+    tab.goto(page.url)
+    tab.locator("#charts canvas").first.wait_for()
+    # The same order as in the terminal.
+    listed = tab.locator("#episodes b").all_inner_texts()
+    rows = [line.split()[0] for line in page.ranking.lines()][1 : 1 + len(listed)]
+    assert listed == [f"Episode {row}" for row in rows]
+    wait_until(lambda: tab.locator("#videos canvas[data-frame='0']").count(), "an image")
+    tab.locator("#sort").select_option("duration")
+    longest = max(page.ranking.episodes, key=lambda q: q.measures.get("duration", -1))
+    assert tab.locator("#episodes b").first.inner_text() == f"Episode {longest.episode}"
+    tab.locator("#sort").select_option("score")
+    tab.get_by_role("button", name="Play").click()
+    moved = tab.locator("#videos canvas").first
+    wait_until(lambda: int(moved.get_attribute("data-frame")) > 20, "playing")
+    tab.get_by_role("button", name="Pause").click()
+    tab.keyboard.press("x")  # rejects the first, and goes on to the next
+    wait_until(lambda: len(page.decisions) == 1, "a rejection")
+    first, second = (q.episode for q in page.ranking.episodes[:2])
+    tab.get_by_role("heading", name=f"Episode {second}").wait_for()
+    tab.locator("#slider").fill("30")
+    tab.get_by_role("button", name="Start here").click()
+    tab.locator("#slider").fill("99")
+    tab.get_by_role("button", name="End here").click()
+    tab.get_by_role("button", name="Cut to 30 - 100").click()
+    wait_until(lambda: len(page.decisions) == 2, "a cut")
+    tab.get_by_role("button", name="Write the cleaned set").click()
+    tab.get_by_text("4 episodes with").wait_for()
+    assert not errors
     assert page.decisions[first].verdict == "reject"
     kept = load_demos(page.out)
     assert len(kept) == 4
@@ -279,17 +304,17 @@ def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tmp_path):
 
 
 @pytest.mark.browser
-def test_a_phone_shows_image_and_buttons_at_once(page, tmp_path):
-    with chromium(tmp_path / "chromium", (390, 844)) as tab:
-        tab.goto(page.url)
-        wait_until(lambda: tab.locator("#videos canvas[data-frame='0']").count(), "an image")
-        tab.locator("#sort").select_option("duration")
-        longest = max(page.ranking.episodes, key=lambda q: q.measures.get("duration", -1))
-        assert tab.locator("#episodes b").first.inner_text() == f"Episode {longest.episode}"
-        tab.locator("#sort").select_option("score")
-        for name in ("Accept", "Reject", "Start here"):
-            box = tab.get_by_role("button", name=name).bounding_box()
-            assert box["y"] + box["height"] <= 844
-            assert box["x"] + box["width"] <= 390
-            assert box["height"] >= 40
-        assert tab.evaluate("document.documentElement.scrollWidth") <= 390
+def test_a_phone_shows_image_and_buttons_at_once(page, tab):
+    tab.set_viewport_size({"width": 390, "height": 844})
+    tab.goto(page.url)
+    wait_until(lambda: tab.locator("#videos canvas[data-frame='0']").count(), "an image")
+    tab.locator("#sort").select_option("duration")
+    longest = max(page.ranking.episodes, key=lambda q: q.measures.get("duration", -1))
+    assert tab.locator("#episodes b").first.inner_text() == f"Episode {longest.episode}"
+    tab.locator("#sort").select_option("score")
+    for name in ("Accept", "Reject", "Start here"):
+        box = tab.get_by_role("button", name=name).bounding_box()
+        assert box["y"] + box["height"] <= 844
+        assert box["x"] + box["width"] <= 390
+        assert box["height"] >= 40
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 390

@@ -32,6 +32,7 @@ RATE = 60.0
 """Points of a hand's path [1/s]."""
 
 
+@pytest.mark.slow
 def test_a_demonstration_by_two_hands_is_recorded_kept_and_replayed(tmp_path):
     with Session(tmp_path / "demos") as session:
         page = session.page

@@ -91,6 +91,26 @@ def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
     assert session.asked.region is None  # it is not in force
 
 
+def test_view_and_panel_share_a_phone_and_start_throws_nothing_away(browser):
+    tab, usual = browser.tab, browser.tab.viewport_size
+    tab.set_viewport_size({"width": 390, "height": 844})
+    view = tab.locator("canvas").first
+    wait_until(lambda: view.bounding_box()["width"] == 390, "the narrow view")
+    view, button = view.bounding_box(), browser.button("Start").bounding_box()
+    assert view["height"] > 400
+    assert button["y"] > view["y"] + view["height"]
+    assert button["width"] > 300
+    assert button["y"] + button["height"] < 844
+    browser.button("Start").click()
+    browser.button("Stop").click()
+    browser.button("save").wait_for()
+    wait_until(browser.button("Start").is_disabled, "nothing to start over")
+    browser.button("save").click()
+    tab.get_by_text("the arm has not moved").wait_for()
+    wait_until(browser.button("Start").is_enabled, "the next demonstration")
+    tab.set_viewport_size(usual)
+
+
 @pytest.mark.slow
 def test_the_twin_is_held_as_the_arm_is(session, browser):
     with browser.dragging(session.frame(4) + np.array(_TWIN_AT), by=(-50, 0)):

@@ -185,14 +185,14 @@ def aside(q, size):
 
 def test_pushed_elbow_moves_and_hand_goes_on():
     push = aside(WORKPLACE.home_joints(), 20.0)
-    _, cell, human = at_work(1, [("elbow", push, 0.5, 2.0)])
-    along_a_path(cell, 5.0)
+    _, cell, human = at_work(1, [("elbow", push, 0.5, 1.5)])
+    along_a_path(cell, 3.5)
     elbow, hand, _ = off_path(cell)
     assert elbow.max() > 0.1
     assert np.percentile(hand, 95) < 2e-3
     felt = human.moments("elbow")
     assert 0.5 < felt.min() < 1.0
-    assert felt.max() < 3.1
+    assert felt.max() < 2.6
     assert not len(human.moments("hand"))
     assert not len(human.pauses())
     assert elbow[-1] < 0.01  # and it comes back
@@ -245,12 +245,12 @@ def test_what_the_gripper_meets_is_no_person():
     cell.hold_pose(0.3)
     low = replace(cell.pose, position=cell.pose.position.clone())
     low.position[2] = world.table_top + 0.06
-    cell.move_straight(low, speed=0.3)
+    cell.move_straight(low, speed=0.5)
     low.position[2] -= 0.08
     met = cell.move_until_contact(low, speed=0.04)
     assert met is not None
     world.arm.move(0.08)
-    cell.hold_pose(0.8)
+    cell.hold_pose(0.5)
     low.position[2] += 0.1
     cell.move_straight(low, speed=0.15)
     assert not len(human.pauses())
