@@ -60,6 +60,26 @@ class OpenedArm:
     """Lets a duration pass: waits, or steps a simulation [s]."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Touch:
+    """Two objects in contact, from `start` until `end`."""
+
+    first: str
+    """Geom of the moving side (arm, hand or carried object)."""
+    second: str
+    """Geom that it met."""
+    start: float
+    """[s]"""
+    end: float
+    """Time of the last step in contact [s]."""
+    depth: float
+    """Deepest penetration [m]."""
+
+    def __str__(self) -> str:
+        depth_mm = 1e3 * self.depth
+        return f"{self.first} met {self.second} at {self.start:.2f} s, {depth_mm:.1f} mm deep"
+
+
 @runtime_checkable
 class Camera(Protocol):
     """An uncalibrated camera."""

@@ -1,5 +1,6 @@
 """The workplace in MuJoCo: arm, furniture, objects, cameras, contacts."""
 
+from hrc_learn.protocols import Touch as Touch
 from hrc_learn.sim.arm_model import FINGER_STROKE as FINGER_STROKE
 from hrc_learn.sim.arm_model import ArmModelConfig as ArmModelConfig
 from hrc_learn.sim.arm_model import Plate as Plate
@@ -28,7 +29,6 @@ from hrc_learn.sim.scene import ObjectConfig as ObjectConfig
 from hrc_learn.sim.scene import SceneConfig as SceneConfig
 from hrc_learn.sim.scene import build_scene as build_scene
 from hrc_learn.sim.step_checks import PhysicsError as PhysicsError
-from hrc_learn.sim.step_checks import Touch as Touch
 from hrc_learn.sim.worker import Worker as Worker
 from hrc_learn.sim.worker import WorkerConfig as WorkerConfig
 from hrc_learn.sim.worker import WorkerSensor as WorkerSensor

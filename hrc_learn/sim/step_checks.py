@@ -7,11 +7,13 @@ first pose at time zero, and counts a warning. Measurements of such a run are me
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool
+
+from hrc_learn.protocols import Touch
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -20,37 +22,12 @@ FASTEST = 1e3
 """Largest plausible speed of a coordinate [m/s or rad/s]: the arm's joints reach 2.6 rad/s, and
 a fall takes 100 s to reach it. MuJoCo itself objects at 1e10 only."""
 
-_WARNINGS = {
-    # In the order in which a step can give them.
-    mujoco.mjtWarning.mjWARN_BADQPOS: ("a position is not finite, or huge", "qpos"),
-    mujoco.mjtWarning.mjWARN_BADQVEL: ("a velocity is not finite, or huge", "qvel"),
-    mujoco.mjtWarning.mjWARN_CONTACTFULL: ("there was no room for all contacts", ""),
-    mujoco.mjtWarning.mjWARN_CNSTRFULL: ("there was no room for all constraints", ""),
-    mujoco.mjtWarning.mjWARN_INERTIA: ("the inertia matrix is singular", ""),
-    mujoco.mjtWarning.mjWARN_BADCTRL: ("a command is not finite, or huge", ""),
-    mujoco.mjtWarning.mjWARN_BADQACC: ("an acceleration is not finite, or huge", "qacc"),
+_INDEXED = {
+    int(mujoco.mjtWarning.mjWARN_BADQPOS): "qpos",
+    int(mujoco.mjtWarning.mjWARN_BADQVEL): "qvel",
+    int(mujoco.mjtWarning.mjWARN_BADQACC): "qacc",
 }
-"""Meaning of each MuJoCo warning, and the array that its coordinate indexes, if any."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Touch:
-    """Two objects in contact, from `start` until `end`."""
-
-    first: str
-    """Geom of the moving side (arm, hand or carried object)."""
-    second: str
-    """Geom that it met."""
-    start: float
-    """[s]"""
-    end: float
-    """Time of the last step in contact [s]."""
-    depth: float
-    """Deepest penetration [m]."""
-
-    def __str__(self) -> str:
-        depth_mm = 1e3 * self.depth
-        return f"{self.first} met {self.second} at {self.start:.2f} s, {depth_mm:.1f} mm deep"
+"""Array that the place of a warning indexes, by the kind of the warning."""
 
 
 def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
@@ -193,13 +170,12 @@ class PhysicsWatch:
         if len(bad := np.flatnonzero(~np.isfinite(data.xfrc_applied).all(-1))):
             body = self._model.body(int(bad[0])).name
             raise self._error("a force on it is not finite", body)
-        numbers = np.array(data.warning.number)
-        for kind, (reason, has_place) in _WARNINGS.items():
-            if numbers[kind] != self._warnings[kind]:
-                # The body where it began: by the end of the step it may be everywhere.
-                place = int(data.warning.lastinfo[kind])
-                body = self._body(place, has_place) if has_place else ""
-                raise self._error(f"MuJoCo warns that {reason}", body)
+        if len(new := np.flatnonzero(data.warning.number != self._warnings)):
+            kind = int(new[0])
+            # The body where it began: by the end of the step it may be everywhere.
+            place = int(data.warning.lastinfo[kind])
+            body = self._body(place, _INDEXED[kind]) if kind in _INDEXED else ""
+            raise self._error(f"MuJoCo warns: {mujoco.mju_warningText(kind, place)}", body)
         for name in ("qpos", "qvel", "qacc"):
             if len(bad := np.flatnonzero(~np.isfinite(values := getattr(data, name)))):
                 place = int(bad[0])

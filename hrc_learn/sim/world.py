@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.protocols import ArmState, OpenedArm
+from hrc_learn.protocols import ArmState, OpenedArm, Touch
 from hrc_learn.sim.arm_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
 from hrc_learn.sim.scene import (
@@ -18,7 +18,7 @@ from hrc_learn.sim.scene import (
     SceneConfig,
     build_scene,
 )
-from hrc_learn.sim.step_checks import ContactMonitor, PhysicsWatch, Touch
+from hrc_learn.sim.step_checks import ContactMonitor, PhysicsWatch
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import Arm
+from hrc_learn.protocols import Touch
 from hrc_learn.vision import Marker
 
 
@@ -114,36 +115,14 @@ class Workplace(Protocol):
 
 
 @runtime_checkable
-class Collision(Protocol):
-    """A contact that a planned path would make."""
-
-    @property
-    def first(self) -> str:
-        """Name of the moving body."""
-        ...
-
-    @property
-    def second(self) -> str:
-        """Name of the body that it touches."""
-        ...
-
-    @property
-    def start(self) -> float:
-        """Index of the first sample of the path in contact."""
-        ...
-
-    @property
-    def depth(self) -> float:
-        """Deepest penetration [m]."""
-        ...
-
-
-@runtime_checkable
 class CollisionChecker(Protocol):
     """A geometric model of the workplace."""
 
     def collisions_along(
         self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
-    ) -> Sequence[Collision]:
-        """Contacts along a path of joint positions [rad], with an object carried along."""
+    ) -> Sequence[Touch]:
+        """Contacts along a path of joint positions [rad], with an object carried along.
+
+        Their times are indices of the samples.
+        """
         ...
