@@ -198,11 +198,11 @@ def _free_plan(
         speed=config.speed,
     ):
         try:
-            check_plan(candidate.plan, world, workplace.scene.objects[0].name)
+            check_plan(candidate, world, workplace.scene.objects[0].name)
         except BlockedPathError as error:
             failure = error
         else:
-            return candidate.plan
+            return candidate
     raise failure
 
 

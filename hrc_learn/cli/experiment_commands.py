@@ -33,22 +33,12 @@ from hrc_learn.experiments.experiment import (
 )
 from hrc_learn.experiments.grasping_experiment import GraspingExperiment
 from hrc_learn.experiments.placing_experiment import PlacingExperiment, dataset_of
-from hrc_learn.experiments.real_arm import (
-    ArmSite,
-    Task,
-    collaboration_task,
-    grasping_task,
-    placing_task,
-    run_on_arm,
-)
-from hrc_learn.experiments.surroundings import workplace_for
+from hrc_learn.experiments.real_arm import ArmSite, Task, run_on_arm, task_of
 from hrc_learn.hardware import CaptureCamera
-from hrc_learn.kinematics import ArmChoice, panda
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections
 from hrc_learn.sim.unmarked_scene import UnmarkedLook
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import read_json, write_json
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz.report import show_command, software_versions
@@ -108,7 +98,7 @@ def run(args: Run) -> int:
     experiment = _experiment(args, _models(args))
     settings = with_settings(args.config, _Settings(experiment=experiment))
     if is_real:
-        task = _task(settings.experiment, args.shelf[0])
+        task = task_of(settings.experiment, args.shelf[0])
         return _run_on_arm(args, folder, settings.site, *task)
     options = RunOptions(
         out=folder,
@@ -149,23 +139,6 @@ def _experiment(args: Run, models: dict[str, Path]) -> Experiment[Any]:
         **models,
         **common,
     )
-
-
-def _task(experiment: Experiment[Any], shelf: str) -> tuple[Workplace, Task]:
-    """Workplace and task of an experiment on a real arm."""
-    if isinstance(experiment, PlacingExperiment):
-        workplace = Workplace()
-        skill = PlacingSkill.load(experiment.placing, workplace.robot)
-        return workplace, placing_task(skill, workplace, shelf, experiment.speed)
-    assert isinstance(experiment, GraspingExperiment | CollaborationExperiment)
-    servoing = VisualServoSkill.load(experiment.aiming)
-    if isinstance(experiment, GraspingExperiment):
-        workplace = Workplace().approached(servoing.approach)
-        return workplace, grasping_task(servoing, workplace, experiment.config)
-    shelves, skill = experiment.shelves, PlacingSkill.load(experiment.placing, panda)
-    workplace = workplace_for(shelves, panda).approached(servoing.approach)
-    job = collaboration_task(servoing, skill, workplace, shelves, experiment.config)
-    return workplace, job
 
 
 def _possible_pulls(args: Run) -> Pulls:

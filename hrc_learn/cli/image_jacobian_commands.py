@@ -237,10 +237,7 @@ def _named(name: str, value: float) -> Measurement:
 def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[str, float]:
     """Errors on two grids of poses."""
     # MuJoCo, which the evaluation of primitives does not need.
-    from hrc_learn.experiments.grasping_experiment import (
-        compare_with_truth,
-        held_out_grid,
-    )
+    from hrc_learn.experiments.grasping_experiment import compare_with_truth, held_out_grid
     from hrc_learn.sim import World
     from hrc_learn.sim.workplace import Workplace
 

@@ -19,12 +19,14 @@ from hrc_learn.experiments.run_measures import (
     unwanted_contacts,
     worker_distance,
 )
-from hrc_learn.experiments.surroundings import worker_contacts
+from hrc_learn.experiments.surroundings import NearWorker, worker_contacts
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.sim import Touch
 from hrc_learn.sim.hand_over import HandOver, Reach
 from hrc_learn.skills.pick_and_place import RELEASE, Mishap
 from hrc_learn.skills.receiving import Receipt
+
+type Measure = Callable[[CollaborationRun], float | int | None]
 
 _SAME_TASK = "main task not affected (Experiment 3)"
 
@@ -72,14 +74,15 @@ def _delivered(
         names = [item.name for item in run.workplace.scene.objects]
         return f"not {', '.join(name for name in names if name not in of(run))}"
 
-    return Metric(
-        name,
-        lambda run: len(of(run)),
-        at_least=count,
-        claim=claim,
-        essential=True,
-        detail=others,
-    )
+    def number(run: CollaborationRun) -> int:
+        return len(of(run))
+
+    return Metric(name, number, at_least=count, claim=claim, essential=True, detail=others)
+
+
+def _near_worker(of: Callable[[NearWorker], float | int]) -> Measure:
+    """Measure of the arm near the worker; none without a worker."""
+    return lambda run: None if run.near_worker is None else of(run.near_worker)
 
 
 def _touches(hit: str, name: str) -> Metric[CollaborationRun]:
@@ -102,8 +105,12 @@ _SAFETY: Sequence[Metric[CollaborationRun]] = (
     Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
     Metric("contacts with the worker", lambda run: _worker_contacts(run)),
     Metric("min distance", lambda run: _min_distance(run), "mm"),
-    never("separation violations", lambda run: _violations(run)),
-    Metric("force of contacts, of the limit", lambda run: _contact_force(run)),
+    # Steps in which the arm could not have stopped before the worker.
+    never("separation violations", _near_worker(lambda near: int((near.margin < 0).sum()))),
+    Metric(
+        "force of contacts, of the limit",
+        _near_worker(lambda near: float(near.force.max(initial=0.0))),
+    ),
     never("contacts over the limit", lambda run: _too_hard(run)),
     Metric(
         "waited for the worker",
@@ -224,20 +231,6 @@ def _worker_contacts(run: CollaborationRun) -> int | None:
     if run.world.config.worker is None:
         return None
     return len(worker_contacts(run.world, run.cell.log, run.motion))
-
-
-def _violations(run: CollaborationRun) -> int | None:
-    """Steps in which the arm could not have stopped before the worker; None without one."""
-    near = run.near_worker
-    return None if near is None else int((near.margin < 0).sum())
-
-
-def _contact_force(run: CollaborationRun) -> float | None:
-    """Largest force or pressure of a contact with the worker, as a fraction of its limit; None
-    without a worker.
-    """
-    near = run.near_worker
-    return None if near is None else float(near.force.max(initial=0.0))
 
 
 def _too_hard(run: CollaborationRun) -> int | None:

@@ -19,7 +19,6 @@ from hrc_learn.experiments.simulated_cell import (
 from hrc_learn.experiments.surroundings import (
     GivingPerson,
     NearWorker,
-    check_shelves,
     draw_object_poses,
     draw_visit,
     near_worker,
@@ -61,11 +60,7 @@ from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.receiving import Receiving
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
-from hrc_learn.teleoperation import (
-    ScriptedForce,
-    ScriptedPerturbation,
-    random_pulls,
-)
+from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation, random_pulls
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.vision import CameraModel
 
@@ -208,7 +203,11 @@ def simulate_collaboration(
     """
     scenario = scenario or CollaborationScenario()
     workplace = (workplace or Workplace()).approached(aiming.approach)
-    check_shelves(workplace, shelves)
+    if not len(shelves) == len(workplace.scene.objects) == len(set(shelves)):
+        raise ValueError(
+            f"each of the {len(workplace.scene.objects)} objects needs a shelf of its own, but "
+            f"the shelves are {', '.join(shelves)}."
+        )
     if scenario.worker and scenario.handover:
         raise ValueError("only one person comes: give --worker or --handover, not both.")
     rng, sizes = np.random.default_rng(seed), scenario.imperfections
@@ -263,13 +262,7 @@ def simulate_collaboration(
         watch=stage.watch,
     ) as (cell, motion):
         task = PickAndPlace(
-            cell,
-            workplace,
-            aiming,
-            placing,
-            plan_checker(world),
-            config,
-            stage.receiving(cell),
+            cell, workplace, aiming, placing, plan_checker(world), config, stage.receiving(cell)
         )
         picks = task.run(list(zip(items, shelves, strict=True)), change_camera)
     return CollaborationRun(

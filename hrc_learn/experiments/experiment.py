@@ -57,13 +57,9 @@ class Study:
     def section(self, trials: Sequence[Trial]) -> Section:
         """Section of the report: success rate and failures."""
         summary = Summary.of(trials)
-        lines = [
-            self.text,
-            f"{summary.rate}.",
-            *(f"Seed {seed}: {reason}." for seed, reason in summary.failed.items()),
-        ]
-        text = "\n\n".join(filter(None, lines))
-        return Section(heading=self.title, text=text)
+        reasons = [f"Seed {seed}: {reason}." for seed, reason in summary.failed.items()]
+        lines = filter(None, [self.text, f"{summary.rate}.", *reasons])
+        return Section(heading=self.title, text="\n\n".join(lines))
 
 
 @runtime_checkable
@@ -227,7 +223,7 @@ def run_experiment[Run](
     show_measurements(results.table)
     if trials:
         trial_file.unlink()
-        console.print(Summary.of(trials).table(study.title))
+        print(f"{study.title}: {Summary.of(trials)}")
     _print_outputs(options.out, results, report.film is not None)
     return 0 if results.ok else 1
 

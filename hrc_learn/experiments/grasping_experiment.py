@@ -214,10 +214,7 @@ def held_out_grid(
 
 
 def compare_with_truth(
-    network: RBFImageJacobian,
-    poses: Pose,
-    camera: CameraModel,
-    offset: Float[np.ndarray, "3"],
+    network: RBFImageJacobian, poses: Pose, camera: CameraModel, offset: Float[np.ndarray, "3"]
 ) -> dict[str, float]:
     """Relative errors of the estimate, and calibration of its uncertainty.
 

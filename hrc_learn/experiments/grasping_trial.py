@@ -18,14 +18,7 @@ from hrc_learn.experiments.simulated_cell import (
 )
 from hrc_learn.geometry import quaternion
 from hrc_learn.protocols import Human
-from hrc_learn.sim import (
-    CameraKind,
-    Imperfections,
-    MotionLog,
-    ObjectConfig,
-    World,
-    open_camera,
-)
+from hrc_learn.sim import CameraKind, Imperfections, MotionLog, ObjectConfig, World, open_camera
 from hrc_learn.sim.imperfections import DrawnImperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line

@@ -6,17 +6,14 @@ rate, quantiles and totals of trials, from which `median`, `p95` and others make
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
-from typing import TYPE_CHECKING
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.experiments.trials import Trial
 from hrc_learn.viz.report import Measurement
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 RESOLUTIONS = {
     # Encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm; contacts in MuJoCo are as soft.
@@ -87,15 +84,11 @@ class Metric[Run]:
             prefix: Prefix of the name.
             bounded: Keep the bound; else the value is only reported for comparison.
         """
-        return Metric(
-            f"{prefix}{self.name}",
-            lambda whole: self.of(part(whole)),
-            self.unit,
-            at_most=self.at_most if bounded else None,
-            at_least=self.at_least if bounded else None,
-            claim=self.claim,
-            essential=self.essential and bounded,
-            listed=self.listed,
+        free = {} if bounded else {"at_most": None, "at_least": None, "essential": False}
+        parted: Any = replace(self, name=f"{prefix}{self.name}", **free)
+        return replace(
+            parted,
+            of=lambda whole: self.of(part(whole)),
             detail=lambda whole: self.detail(part(whole)),
         )
 
@@ -181,12 +174,10 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 def spread(values: Float[np.ndarray, " trials"]) -> dict[str, float]:
     """Quantiles of finite values, at least one: median, p95, min and max."""
-    # "higher": a measured value, with at least the requested fraction below it.
     levels = {"median": 0.5, "p95": 0.95, "min": 0.0, "max": 1.0}
-    return {
-        name: float(np.quantile(values, level, method="higher"))
-        for name, level in levels.items()
-    }
+    # "higher": a measured value, with at least the requested fraction below it.
+    found = np.quantile(values, [*levels.values()], method="higher")
+    return dict(zip(levels, found.tolist(), strict=True))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,22 +201,15 @@ class Summary:
         """
         if not trials:
             raise ValueError("there are no trials to sum up.")
-        keys = list(dict.fromkeys(key for trial in trials for key in trial.values))
-        counts = [
-            key
-            for key in keys
-            if all(isinstance(trial.values.get(key, 0), int) for trial in trials)
-        ]
-        measured = {key: column(trials, key) for key in keys if key not in counts}
-        known = {key: values[np.isfinite(values)] for key, values in measured.items()}
-        return cls(
-            trials=len(trials),
-            failed={trial.seed: trial.failure for trial in trials if trial.failure},
-            spread={key: spread(values) for key, values in known.items() if len(values)},
-            totals={
-                key: sum(int(trial.values.get(key, 0)) for trial in trials) for key in counts
-            },
-        )
+        spreads, totals = {}, {}
+        for key in dict.fromkeys(key for trial in trials for key in trial.values):
+            counts = [trial.values.get(key, 0) for trial in trials]
+            if all(isinstance(count, int) for count in counts):
+                totals[key] = sum(map(int, counts))
+            elif len(known := (values := column(trials, key))[np.isfinite(values)]):
+                spreads[key] = spread(known)
+        failed = {trial.seed: trial.failure for trial in trials if trial.failure}
+        return cls(trials=len(trials), failed=failed, spread=spreads, totals=totals)
 
     @property
     def successes(self) -> int:
@@ -264,26 +248,10 @@ class Summary:
                 values[name] = value
         return values
 
-    def table(self, title: str) -> "Table":
-        """Table to print, with the success rate above and the reasons of failures below."""
-        from rich.table import Table
-        from rich.text import Text
-
-        # As text: brackets in a reason are no markup.
-        reasons = Text(
-            "\n".join(f"seed {seed}: {reason}" for seed, reason in self.failed.items())
-        )
-        table = Table(
-            "measured", title=f"{title}: {self.rate}", caption=reasons, caption_justify="left"
-        )
-        for column in ("median", "p95", "min", "max"):
-            table.add_column(column, justify="right")
-        for key, quantiles in self.spread.items():
-            numbers = (f"{number:.4g}" for number in quantiles.values())
-            table.add_row(key.replace("_", " "), *numbers)
-        for key, count in self.totals.items():
-            table.add_row(f"{key.replace('_', ' ')}, in all", f"{count}")
-        return table
+    def __str__(self) -> str:
+        """The success rate, and the reasons of failures by seed."""
+        reasons = [f"seed {seed}: {reason}" for seed, reason in self.failed.items()]
+        return "\n".join([self.rate, *reasons])
 
 
 def column(trials: Sequence[Trial], key: str) -> Float[np.ndarray, " trials"]:

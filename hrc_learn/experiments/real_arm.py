@@ -6,7 +6,7 @@ and follows the arm for the recording.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,7 +17,12 @@ import numpy as np
 import torch
 
 from hrc_learn.deploy import Rate
+from hrc_learn.experiments.collaboration_experiment import CollaborationExperiment
+from hrc_learn.experiments.experiment import Experiment
+from hrc_learn.experiments.grasping_experiment import GraspingExperiment
+from hrc_learn.experiments.placing_experiment import PlacingExperiment
 from hrc_learn.experiments.run_recorder import record
+from hrc_learn.experiments.surroundings import workplace_for
 from hrc_learn.hardware import (
     ArmProcess,
     CameraError,
@@ -36,9 +41,9 @@ from hrc_learn.kinematics import SerialChain, fr3, panda
 from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.grasping import Grasping, GraspingConfig, as_load, joint_plan
+from hrc_learn.skills.grasping import Grasping, as_load, joint_plan
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
-from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, PickAndPlaceConfig, place_along
+from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, place_along
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
@@ -218,49 +223,38 @@ def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: f
     return task
 
 
-def grasping_task(
-    servoing: VisualServoSkill, workplace: Workplace, config: GraspingConfig
-) -> Task:
-    """Task: grasp the first object with the camera, and carry it home.
+def task_of(experiment: Experiment[Any], shelf: str) -> tuple[Workplace, Task]:
+    """Workplace and task of an experiment on a real Panda.
 
     Args:
-        servoing: Learned image Jacobian and visual target.
-        workplace: Workplace with the object.
-        config: Configuration of the grasp.
+        experiment: Placing, grasping or collaboration.
+        shelf: Shelf for the object of placing.
     """
+    if isinstance(experiment, PlacingExperiment):
+        workplace = Workplace()
+        skill = PlacingSkill.load(experiment.placing, workplace.robot)
+        return workplace, placing_task(skill, workplace, shelf, experiment.speed)
+    assert isinstance(experiment, GraspingExperiment | CollaborationExperiment)
+    servoing = VisualServoSkill.load(experiment.aiming)
+    if isinstance(experiment, GraspingExperiment):
+        workplace = Workplace().approached(servoing.approach)
 
-    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
-        grasping = Grasping(cell, workplace, servoing, config, check=check)
-        grasping.grasp(workplace.scene.objects[0])
-        grasping.go_home()
-        return ""
+        def grasp(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+            grasping = Grasping(cell, workplace, servoing, experiment.config, check=check)
+            grasping.grasp(workplace.scene.objects[0])
+            grasping.go_home()
+            return ""
 
-    return task
+        return workplace, grasp
+    skill = PlacingSkill.load(experiment.placing, panda)
+    workplace = workplace_for(experiment.shelves, panda).approached(servoing.approach)
 
+    def collaborate(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+        job = PickAndPlace(cell, workplace, servoing, skill, check, experiment.config)
+        orders = zip(workplace.scene.objects, experiment.shelves, strict=True)
+        return "; ".join(done.failure for done in job.run(list(orders)) if done.failure)
 
-def collaboration_task(
-    servoing: VisualServoSkill,
-    placing: PlacingSkill,
-    workplace: Workplace,
-    shelves: Sequence[str],
-    config: PickAndPlaceConfig,
-) -> Task:
-    """Task: grasp objects near a person, and put each on its shelf.
-
-    Args:
-        servoing: Learned image Jacobian and visual target.
-        placing: Learned placing motion.
-        workplace: Workplace with the objects.
-        shelves: Shelf of each object.
-        config: Configuration of the job.
-    """
-
-    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
-        job = PickAndPlace(cell, workplace, servoing, placing, check, config)
-        jobs = job.run(list(zip(workplace.scene.objects, shelves, strict=True)))
-        return "; ".join(done.failure for done in jobs if done.failure)
-
-    return task
+    return workplace, collaborate
 
 
 def run_on_arm(

@@ -172,9 +172,7 @@ def joint_ranges(chain: SerialChain) -> JointRanges:
     """Limits of an arm, to be drawn with its joint positions."""
     limits = chain.limits
     return JointRanges(
-        lower=limits.lower.numpy(),
-        upper=limits.upper.numpy(),
-        velocity=limits.velocity.numpy(),
+        lower=limits.lower.numpy(), upper=limits.upper.numpy(), velocity=limits.velocity.numpy()
     )
 
 

@@ -86,11 +86,7 @@ def run_sections(run: RunRecording, objects: Spans, notes: Sequence[str] = ()) -
                 "The person",
                 "The force of the person acts in the null space of the task: the elbow yields, "
                 "the end effector stays.",
-                (
-                    "person",
-                    person_figure(run),
-                    "Effort of the person, elbow and end effector.",
-                ),
+                ("person", person_figure(run), "Effort of the person, elbow and end effector."),
             )
         )
     if run.worker_distance:

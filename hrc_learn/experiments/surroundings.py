@@ -150,22 +150,6 @@ def workplace_for(shelves: Sequence[str], robot: Arm) -> Workplace:
     return with_objects(Workplace.of(robot), items)
 
 
-def check_shelves(workplace: Workplace, shelves: Sequence[str]) -> None:
-    """Check that every object has a shelf of its own.
-
-    Raises:
-        ValueError: If a shelf is unknown or named twice, or their number is wrong.
-    """
-    items = workplace.scene.objects
-    for name in shelves:
-        workplace.shelf(name)
-    if len(shelves) != len(items) or len(set(shelves)) != len(shelves):
-        raise ValueError(
-            f"each of the {len(items)} objects needs a shelf of its own, but the shelves are "
-            f"{', '.join(shelves)}."
-        )
-
-
 def draw_object_poses(
     workplace: Workplace, world: World, yaw: float, rng: np.random.Generator
 ) -> dict[str, Float[np.ndarray, "4 4"]]:

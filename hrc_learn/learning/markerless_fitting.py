@@ -189,11 +189,7 @@ class _Search:
     """Frames of all demonstrations in which tool and object are looked for."""
 
     def __init__(
-        self,
-        reader: ImageReader,
-        key: str,
-        demos: DemonstrationSet,
-        size: tuple[int, int],
+        self, reader: ImageReader, key: str, demos: DemonstrationSet, size: tuple[int, int]
     ):
         self._reader, self._key, self._demos, self._size = reader, key, demos, size
         each = max(2, -(-_FRAMES // len(demos)))

@@ -163,10 +163,7 @@ class ArmModelConfig:
 
 _SERVOS = dict.fromkeys(
     ("panda", "fr3"),
-    (
-        (2e4, 2e4, 1.5e4, 1.5e4, 6e3, 6e3, 4e3),
-        (600.0, 600.0, 450.0, 450.0, 150.0, 150.0, 80.0),
-    ),
+    ((2e4, 2e4, 1.5e4, 1.5e4, 6e3, 6e3, 4e3), (600.0, 600.0, 450.0, 450.0, 150.0, 150.0, 80.0)),
 )
 """Gains of Franka's arms."""
 _STIFFNESS, _DAMPING = 230.0, 0.03

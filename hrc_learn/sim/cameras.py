@@ -19,19 +19,9 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.shapes import Line
 from hrc_learn.protocols import Camera
 from hrc_learn.sim.recorded_world import DrawnWorld, RecordedWorld
-from hrc_learn.sim.scene import (
-    HAND_MARKER,
-    NOWHERE,
-    OCCLUDER,
-)
+from hrc_learn.sim.scene import HAND_MARKER, NOWHERE, OCCLUDER
 from hrc_learn.sim.world import World
-from hrc_learn.vision import (
-    CameraModel,
-    ImageNoise,
-    Lens,
-    Marker,
-    SyntheticCamera,
-)
+from hrc_learn.vision import CameraModel, ImageNoise, Lens, Marker, SyntheticCamera
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -370,18 +360,15 @@ class ScriptedOcclusion:
     """Holds a board between the camera and a marker, wherever that moves."""
 
     def __init__(self, world: World, intervals: Sequence[OcclusionInterval]):
-        self._world, self._intervals, self._held = world, tuple(intervals), False
+        self._world, self._intervals = world, tuple(intervals)
 
     def update(self) -> None:
         """Move the board to where it belongs now."""
-        world, held = self._world, self._held
-        now = [i for i in self._intervals if 0 <= world.time - i.start < i.duration]
-        self._held = bool(now)
-        if now:
-            marker = world.marker_poses()[now[0].marker][:3, 3]
-            towards = world.config.camera.pose[:3, 3] - marker
-            world.move_obstacle(
-                OCCLUDER, marker + _BOARD_HEIGHT * towards / np.linalg.norm(towards)
-            )
-        elif held:
-            world.move_obstacle(OCCLUDER, NOWHERE)
+        world, place = self._world, np.array(NOWHERE)
+        for interval in self._intervals:
+            if 0 <= world.time - interval.start < interval.duration:
+                marker = world.marker_poses()[interval.marker][:3, 3]
+                towards = world.config.camera.pose[:3, 3] - marker
+                place = marker + _BOARD_HEIGHT * towards / np.linalg.norm(towards)
+        if self._intervals:
+            world.move_obstacle(OCCLUDER, place)

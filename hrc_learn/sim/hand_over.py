@@ -133,11 +133,7 @@ class HandOver:
 
 
 def random_hand_over(
-    worker: Worker,
-    rng: np.random.Generator,
-    *,
-    bench: Box,
-    thickness: float,
+    worker: Worker, rng: np.random.Generator, *, bench: Box, thickness: float
 ) -> HandOver:
     """Draw a worker's walk to the far side of the bench, with an object for the robot.
 

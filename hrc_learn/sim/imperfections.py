@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
@@ -95,15 +95,10 @@ class Imperfections:
     """Fraction of images in which a person present is missed."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{field.name} must not be negative, but is {value}.")
-        for name in _FRACTIONS:
-            if getattr(self, name) > _LARGEST_FRACTION:
-                raise ValueError(
-                    f"{name} must be at most {_LARGEST_FRACTION}, but is {getattr(self, name)}."
-                )
+        for name, value in vars(self).items():
+            most = _LARGEST_FRACTION if name in _FRACTIONS else math.inf
+            if not (math.isfinite(value) and 0 <= value <= most):
+                raise ValueError(f"{name} must be from 0 to {most:g}, but is {value}.")
 
     @classmethod
     def ideal(cls) -> Imperfections:
@@ -121,7 +116,7 @@ class Imperfections:
         Raises:
             ValueError: If the factor is negative.
         """
-        values = {f.name: factor * getattr(self, f.name) for f in fields(self)}
+        values = {name: factor * value for name, value in vars(self).items()}
         for name in _FRACTIONS:
             values[name] = min(values[name], _LARGEST_FRACTION)
         values["object_yaw"] = min(values["object_yaw"], math.pi)
@@ -255,11 +250,7 @@ class CommandChannel:
     The arm then follows with its servos' lag and its driver's limits of acceleration.
     """
 
-    def __init__(
-        self,
-        drawn: DrawnImperfections,
-        acceleration: Float[np.ndarray, " joints"],
-    ):
+    def __init__(self, drawn: DrawnImperfections, acceleration: Float[np.ndarray, " joints"]):
         """Start at rest.
 
         Args:

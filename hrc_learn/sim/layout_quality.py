@@ -153,16 +153,14 @@ def _turned_above_table(
     robot: Arm, middle: Pose, reach: tuple[float, float], hover: Float[Tensor, " joints"]
 ) -> tuple[Float[Tensor, "turns places joints"], Float[Tensor, "turns places"]]:
     """Joint positions above five places, for turns of the gripper by -180 to 180 degrees."""
-    chain, (a, b) = robot, reach
-    aside = torch.tensor(
-        [[0.0, 0.0, 0.0], [a, b, 0.0], [a, -b, 0.0], [-a, b, 0.0], [-a, -b, 0.0]]
-    ).double()
+    corners = [[0, 0, 0], [1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]
+    aside = torch.tensor(corners).double() * torch.tensor([*reach, 0.0]).double()
     fraction = torch.linspace(0.0, 1.0, _ACROSS, dtype=torch.float64)
     across = Pose(
         middle.position + fraction[:, None, None] * aside,
         middle.orientation.expand(_ACROSS, len(aside), 4),
     )
-    q, _ = follow_poses(chain, across, hover.expand(len(aside), -1))
+    q, _ = follow_poses(robot, across, hover.expand(len(aside), -1))
     halves = []
     for sense in (-1.0, 1.0):
         turns = sense * torch.linspace(0.0, math.pi, _HALF_TURN + 1, dtype=torch.float64)
@@ -172,7 +170,7 @@ def _turned_above_table(
             (middle.position + aside).expand(len(turns), -1, -1),
             orientation.expand(-1, len(aside), 4),
         )
-        halves.append(follow_poses(chain, path, q[-1]))
+        halves.append(follow_poses(robot, path, q[-1]))
     (left, left_error), (right, right_error) = halves
     return (
         torch.cat([left.flip(0), right[1:]]),
@@ -209,9 +207,7 @@ def marker_seen(
     back = torch.tensor([0.0, 0.0, float(robot.tcp[:3, 3].norm())], dtype=torch.float64)
     centre = torch.tensor(plate.position, dtype=torch.float64) - back
     points = centre + quaternion.rotate(turn, corners)
-    world = tool.position[..., None, :] + quaternion.rotate(
-        tool.orientation[..., None, :], points
-    )
+    world = Pose(tool.position[..., None, :], tool.orientation[..., None, :]).apply(points)
     eye = torch.from_numpy(camera.pose[:3, 3].copy())
     rays = torch.stack([eye.expand_as(world), world], dim=-2)
     radii = torch.tensor([c.radius for c in robot.body.capsules], dtype=torch.float64)

@@ -33,8 +33,7 @@ class MovingBodies:
         objects = (item.name for item in world.config.objects)
         worker = () if world.config.worker is None else (*WORKER_BODIES, WORKER_ITEM)
         movers = ["link0", *objects, *obstacles, *worker, OCCLUDER]
-        geoms = body_geoms(model, movers)
-        self._indices = sorted({int(b) for b in model.geom_bodyid[geoms]})
+        self._indices = np.unique(model.geom_bodyid[body_geoms(model, movers)]).tolist()
         self.names = tuple(model.body(b).name for b in self._indices)
 
     def poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 4"]]:
@@ -48,21 +47,19 @@ class MovingBodies:
         orientations: Float[np.ndarray, "time bodies 4"],
     ) -> tuple[Body, ...]:
         """The bodies as they are to be drawn, along poses collected over time."""
-        robot, shapes = (
-            self._world.arm.robot,
-            [_shapes(self._world.model, index) for index in self._indices],
-        )
-        return tuple(
-            Body(
+        bodies = []
+        for i, name in enumerate(self.names):
+            capsules, boxes = _shapes(self._world.model, self._indices[i])
+            body = Body(
                 name=name,
                 position=positions[:, i],
                 orientation=orientations[:, i],
-                capsules=shapes[i][0],
-                boxes=shapes[i][1],
-                meshes=arm_meshes(robot, name),
+                capsules=capsules,
+                boxes=boxes,
+                meshes=arm_meshes(self._world.arm.robot, name),
             )
-            for i, name in enumerate(self.names)
-        )
+            bodies.append(body)
+        return tuple(bodies)
 
 
 def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tuple[Box, ...]]:
@@ -263,7 +260,14 @@ class RecordedWorld:
         for box in recording.boxes:
             add_box(spec.worldbody, "", box.half_size, box.colour, pos=box.centre)
         for number, body in enumerate(recording.bodies):
-            _add_drawn_body(spec, body, f"body{number}")
+            drawn = spec.worldbody.add_body(name=f"body{number}", mocap=True)
+            for mesh in body.meshes:
+                add_mesh(spec, drawn, mesh)
+            for box in body.boxes:
+                if box.name or not body.meshes:  # as in every other picture of a body
+                    add_box(drawn, "", box.half_size, box.colour, pos=box.centre)
+            for capsule in () if body.meshes else body.capsules:
+                add_capsule(drawn, "", capsule, capsule.colour)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self.show(0)
@@ -279,17 +283,6 @@ class RecordedWorld:
         """Make ready to be rendered."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-
-
-def _add_drawn_body(spec: mujoco.MjSpec, body: Body, name: str) -> None:
-    drawn = spec.worldbody.add_body(name=name, mocap=True)
-    for mesh in body.meshes:
-        add_mesh(spec, drawn, mesh)
-    for box in body.boxes:
-        if box.name or not body.meshes:  # as in every other picture of a body
-            add_box(drawn, "", box.half_size, box.colour, pos=box.centre)
-    for capsule in () if body.meshes else body.capsules:
-        add_capsule(drawn, "", capsule, capsule.colour)
 
 
 def add_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, mesh: MeshFile) -> None:

@@ -13,14 +13,7 @@ import numpy as np
 
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.arm_model import (
-    FIRM,
-    ArmModelConfig,
-    Plate,
-    add_arm,
-    add_box,
-    add_plate,
-)
+from hrc_learn.sim.arm_model import FIRM, ArmModelConfig, Plate, add_arm, add_box, add_plate
 from hrc_learn.sim.worker import COLOURS, PARTS, WORKER_ITEM_HALF_SIZE, Worker, WorkerConfig
 from hrc_learn.vision import CameraModel, Marker
 

@@ -419,10 +419,7 @@ def _marker(
 
 
 def in_worker_frame(
-    worker: Worker,
-    stand: Float[np.ndarray, "2"],
-    facing: float,
-    point: Float[np.ndarray, "3"],
+    worker: Worker, stand: Float[np.ndarray, "2"], facing: float, point: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "3"]:
     """A point of the base frame in the frame of a standing worker [m]."""
     c, s = np.cos(facing), np.sin(facing)

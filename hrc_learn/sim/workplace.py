@@ -6,7 +6,7 @@ the usual ones first, until one suits the arm (`layout_quality`).
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from itertools import product
 from typing import Any
 
@@ -17,12 +17,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import Constant
-from hrc_learn.kinematics import (
-    Arm,
-    UnreachableError,
-    coarse_orientation,
-    gripper_down,
-)
+from hrc_learn.kinematics import Arm, UnreachableError, coarse_orientation, gripper_down
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim.layout_quality import (
     MarkedTurns,
@@ -489,29 +484,20 @@ def _above_table(workplace: Workplace) -> _Above:
         postures = robot.postures(workplace.hover())[:_POSTURES]
     except UnreachableError:
         return []
-    found = [
-        (
-            hover,
-            marked_turns(
-                robot,
-                workplace.arm_clearances,
-                scene.camera,
-                marked_plate(robot.hand_size, _wrist_radius(robot)),
-                workplace.hover(),
-                workplace.table_reach,
-                hover,
-            ),
-        )
-        for hover in postures
-    ]
+    # The plate sticks out beyond the last two links.
+    wrist = [c.radius for c in robot.body.capsules if c.link >= robot.joints - 1]
+    turns = partial(
+        marked_turns,
+        robot,
+        workplace.arm_clearances,
+        scene.camera,
+        marked_plate(robot.hand_size, max(wrist, default=0.0)),
+        workplace.hover(),
+        workplace.table_reach,
+    )
+    found = [(hover, turns(hover)) for hover in postures]
     found.sort(key=lambda pair: _worth(pair[1].quality, pair[1].seen), reverse=True)
     return found[: 2 * _TRIED]
-
-
-def _wrist_radius(robot: Arm) -> float:
-    """Largest radius of the capsules of the last two links [m]."""
-    wrist = [c.radius for c in robot.body.capsules if c.link >= robot.joints - 1]
-    return max(wrist, default=0.0)
 
 
 def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:

@@ -243,9 +243,7 @@ class World:
         mujoco.mj_kinematics(self.model, self.data)
 
     def move_worker(
-        self,
-        ends: Float[np.ndarray, "parts 2 3"],
-        item: Float[np.ndarray, "3"] | None = None,
+        self, ends: Float[np.ndarray, "parts 2 3"], item: Float[np.ndarray, "3"] | None = None
     ) -> None:
         """Put the worker somewhere at once.
 

@@ -108,16 +108,6 @@ class GraspResult:
         return len(self.setbacks) + 1
 
 
-@dataclass(frozen=True)
-class _TableHeight:
-    """Height of the table, estimated by touching it."""
-
-    height: float = 0.0
-    """Estimate in the base frame [m]."""
-    margin: float = _TABLE_RANGE
-    """Uncertainty [m]."""
-
-
 class Grasping:
     """Grasps objects: `grasp` runs the whole sequence, the other methods are its steps.
 
@@ -157,10 +147,11 @@ class Grasping:
         self._visual = skill.target
         config = config or GraspingConfig()
         servo = config.servo.scaled(self._size)
-        probe = servo.probe * _reachable_probe(workplace, servo.probe)
-        self._config = config = replace(config, servo=replace(servo, probe=probe))
+        servo = replace(servo, probe=_reachable_probe(workplace, servo.probe))
+        self._config = config = replace(config, servo=servo)
         self._check = check
-        self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
+        # Estimated height of the table in the base frame, and its uncertainty [m].
+        self._table = 0.0, self._size * _TABLE_RANGE
         controller = AdaptiveController(
             cell.chain,
             CameraEstimator(
@@ -253,11 +244,9 @@ class Grasping:
         are unknown so far, so the path avoids the whole region of the objects.
         """
         postures, home = self._workplace.hover_postures(), self._workplace.home_joints()
+        here, clearance = self._cell.joints, self._size * _PLATE_CLEARANCE
         for posture in postures:
-            here = self._cell.joints
-            if self._free(here, posture, self._size * _PLATE_CLEARANCE) and self._free(
-                posture, home
-            ):
+            if self._free(here, posture, clearance) and self._free(posture, home):
                 return posture
         self.go_home()
         return postures[0]
@@ -283,10 +272,7 @@ class Grasping:
             posture = self._workplace.robot.inverse(pose, near=here, samples=_POSTURES)
         except UnreachableError:
             return "the arm does not reach there with this orientation"
-        table = self._workplace.robot.whole.box_distance(
-            posture, *self._workplace.object_region()
-        )
-        if float(table) < self._size * _PLATE_CLEARANCE:
+        if float(self._to_objects(posture)) < self._size * _PLATE_CLEARANCE:
             return "too close to objects on the table"
         try:
             self._check(joint_plan(self._cell, here, posture))
@@ -303,12 +289,12 @@ class Grasping:
         self._cell.begin_phase("grasp")
         self._cell.tracked_markers = ()
         self._touch_table(item)
-        height = self._table.height + item.half_size[2]
-        self._cell.move_straight(self._at_height(height), speed=DESCENT_SPEED)
+        height = self._at_height(self._table[0] + item.half_size[2])
+        self._cell.move_straight(height, speed=DESCENT_SPEED)
         move_fingers(self._cell, CLOSED, CLOSING_TIME)
         if not holds(self._cell, item):
             # The contact may not have been with the table.
-            self._table = _TableHeight(margin=self._size * _TABLE_RANGE)
+            self._table = 0.0, self._size * _TABLE_RANGE
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Check that {item.name!r} is under its "
                 "marker."
@@ -323,13 +309,12 @@ class Grasping:
         """
         # First contact: the fingers with the table, or the palm with the top of a tall object.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
-        expected, margin = self._table.height + reach, self._table.margin
+        height, margin = self._table
+        expected = height + reach
         self._cell.move_straight(self._at_height(expected + margin), speed=DESCENT_SPEED)
         met = self._cell.move_until_contact(self._at_height(expected - margin))
         if met is not None:
-            self._table = _TableHeight(
-                float(met.position[2]) - reach, self._size * _OBJECT_RANGE
-            )
+            self._table = float(met.position[2]) - reach, self._size * _OBJECT_RANGE
 
     def _at_height(self, height: float) -> Pose:
         """Pose of the end effector after moving along its own axis to a height [m]."""
@@ -382,9 +367,11 @@ class Grasping:
         if clearance is None:
             return True
         path = torch.from_numpy(plan.path[::_CHECK_EVERY])
-        whole = self._workplace.robot.whole
-        distance = whole.box_distance(path, *self._workplace.object_region())
-        return bool((distance > clearance).all())
+        return bool((self._to_objects(path) > clearance).all())
+
+    def _to_objects(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance of the arm from the region of the objects on the table [m]."""
+        return self._workplace.robot.whole.box_distance(q, *self._workplace.object_region())
 
     def start_over(self) -> None:
         """Open the fingers and go home, away from the table and out of the camera's view."""
@@ -397,11 +384,11 @@ class Grasping:
 
 
 def _reachable_probe(workplace: Workplace, probe: float) -> float:
-    """Fraction of the height of a probe at which the arm reaches all over the objects.
+    """Height of a probe at which the arm reaches all over the objects [m].
 
     Args:
         workplace: Workplace with the region of the objects.
-        probe: Height above that of servoing [m].
+        probe: Wanted height above that of servoing [m].
     """
     robot, hover = workplace.robot, workplace.hover()
     _, half = workplace.object_region()
@@ -413,8 +400,8 @@ def _reachable_probe(workplace: Workplace, probe: float) -> float:
             q = robot.inverse(pose, near=workplace.hover_joints())
             within = [robot.limits.contain(q + side * _PROBE_MARGIN) for side in (-1, 1)]
             if bool((within[0] & within[1]).all()):
-                return fraction
-    return _PROBE_FRACTIONS[-1]
+                return fraction * probe
+    return _PROBE_FRACTIONS[-1] * probe
 
 
 def joint_plan(

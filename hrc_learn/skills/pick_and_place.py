@@ -405,14 +405,14 @@ class PickAndPlace:
                 dt=self._cell.config.dt,
                 speed=self._config.speed,
             )
-            for candidate in candidates:
+            for number, plan in enumerate(candidates):
                 try:
-                    self._check(candidate.plan)
+                    self._check(plan)
                 except BlockedPathError as error:
-                    if candidate.name == "as learned":
+                    if number == 0:  # as learned
                         self._note(job, "blocked path", str(error))
                 else:
-                    return candidate.plan
+                    return plan
         return None
 
     def _release(self, job: PickPlaceJob) -> Phase:
@@ -448,10 +448,8 @@ class PickAndPlace:
         """Start over from home, unless the number of attempts is reached."""
         self._note(job, mishap, what)
         self._grasping.start_over()
-        if job.receipt is not None:
-            job.failure = what  # the place of a lost received object is unknown
-            return Phase.OVER
-        if job.attempts == self._config.grasping.attempts:
+        # The place of a lost received object is unknown.
+        if job.receipt is not None or job.attempts == self._config.grasping.attempts:
             job.failure = what
             return Phase.OVER
         job.attempts += 1

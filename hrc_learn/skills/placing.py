@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -259,23 +259,13 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
         )
 
 
-# Offsets of via points from home [m], to go around objects in the direct path.
-_VIA_POINTS = {
-    "higher": (0.0, 0.0, 0.12),
-    "nearer to the robot": (-0.14, 0.0, 0.06),
-    "further from the robot": (0.08, 0.0, 0.10),
-}
-# Changes of joint 7 at home, which move the elbow about the line to the wrist [rad].
-_ARM_ANGLES = {"with the elbow further out": -0.35, "with the elbow further in": 0.35}
+# Offsets of via points from home, to go around objects in the direct path [m]: higher, nearer
+# to the robot, further from it.
+_VIA_POINTS = ((0.0, 0.0, 0.12), (-0.14, 0.0, 0.06), (0.08, 0.0, 0.10))
+# Changes of joint 7 at home, which move the elbow about the line to the wrist [rad]: out, in.
+_ARM_ANGLES = (-0.35, 0.35)
 # Height added to the release of an object that sits low in the gripper [m].
 _RAISED = 0.008
-
-
-class CandidatePlan(NamedTuple):
-    """A plan with the name of its variation."""
-
-    name: str
-    plan: Plan
 
 
 def plan_candidates(
@@ -287,7 +277,7 @@ def plan_candidates(
     space: PlanningSpace,
     dt: float,
     speed: float,
-) -> Iterator[CandidatePlan]:
+) -> Iterator[Plan]:
     """Candidate plans to a shelf, the learned one first; planned on demand.
 
     The others end a little higher, for an object that sits low in the gripper, or start at
@@ -307,31 +297,25 @@ def plan_candidates(
     def learned(start: Tensor, goal: Pose = goal) -> Plan:
         return skill.plan(start, goal, space=space, dt=dt, speed=speed)
 
-    yield CandidatePlan("as learned", learned(start))
+    yield learned(start)
     size = workplace.robot.hand_size
     up = goal.position.new_tensor([0.0, 0.0, size * _RAISED])
     with suppress(UnreachableError):
         raised = Pose(goal.position + up, goal.orientation)
-        yield CandidatePlan("a little higher", learned(start, raised))
-    for name, via in _via_postures(workplace):
+        yield learned(start, raised)
+    for via in _via_postures(workplace):
         first = joint_line(start, via, speed=0.6, dt=dt).numpy()
         rest = learned(via)
         path = np.concatenate([first, rest.path[1:]])
-        yield CandidatePlan(name, replace(rest, path=path))
+        yield replace(rest, path=path)
 
 
-def _via_postures(workplace: Workplace) -> Iterator[tuple[str, Float[Tensor, " joints"]]]:
-    """Reachable joint positions near home, with their names."""
-    for name, offset in _VIA_POINTS.items():
+def _via_postures(workplace: Workplace) -> Iterator[Float[Tensor, " joints"]]:
+    """Reachable joint positions near home."""
+    for offset in workplace.robot.hand_size * torch.tensor(_VIA_POINTS, dtype=torch.float64):
         with suppress(UnreachableError):
-            yield (
-                name,
-                workplace.home_joints(
-                    workplace.robot.hand_size * torch.tensor(offset, dtype=torch.float64)
-                ),
-            )
-    if workplace.robot.null_space != "arm angle":
-        return
-    for name, change in _ARM_ANGLES.items():
-        with suppress(UnreachableError):
-            yield name, workplace.home_joints(q7_offset=change)
+            yield workplace.home_joints(offset)
+    if workplace.robot.null_space == "arm angle":
+        for change in _ARM_ANGLES:
+            with suppress(UnreachableError):
+                yield workplace.home_joints(q7_offset=change)

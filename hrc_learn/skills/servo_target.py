@@ -57,10 +57,7 @@ class VisualTarget:
 
     @classmethod
     def fit(
-        cls,
-        camera: Float[Tensor, "13"],
-        objects: Float[np.ndarray, "demos 2"],
-        poses: Pose,
+        cls, camera: Float[Tensor, "13"], objects: Float[np.ndarray, "demos 2"], poses: Pose
     ) -> "VisualTarget":
         """Fit to the ends of demonstrations.
 
@@ -87,10 +84,7 @@ class VisualTarget:
         return cls(offset=offset, error=error)
 
     def tool_position(
-        self,
-        camera: Float[Tensor, "*batch 13"],
-        pixel: Float[Tensor, "2"],
-        above: Pose,
+        self, camera: Float[Tensor, "*batch 13"], pixel: Float[Tensor, "2"], above: Pose
     ) -> Float[Tensor, "*batch 3"]:
         """Place of a tool right above an object [m].
 

@@ -1,7 +1,6 @@
 """Statistics of many trials: success rate, quantiles, totals, and their keys."""
 
 import math
-import os
 
 import numpy as np
 import pytest
@@ -53,18 +52,13 @@ def test_a_summary_counts_and_sorts():
         Summary.of([])
 
 
-def test_the_table_tells_who_failed_and_why():
-    from rich.console import Console
-
+def test_a_summary_names_the_rate_and_the_reasons_of_failures():
     trials = [
         Trial(seed=0, values={"goal_error_mm": 0.5}),
         Trial(seed=8, values={}, failure="a [b]"),
     ]
-    console = Console(width=100, record=True, file=open(os.devnull, "w"))  # noqa: SIM115
-    console.print(Summary.of(trials).table("Placing"))
-    text = console.export_text()
+    text = str(Summary.of(trials))
     assert "1 of 2 succeeded" in text
-    assert "goal error mm" in text
     assert "seed 8: a [b]" in text
 
 
