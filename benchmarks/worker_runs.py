@@ -34,8 +34,7 @@ from hrc_learn.skills.person_watch import (
     NEAR_PEOPLE,
     ContactLimits,
     PersonWatchConfig,
-    person_speed_cap,
-    person_speed_scale,
+    person_speeds,
     urgent_distances,
 )
 from hrc_learn.teleoperation import ScriptedForce
@@ -349,8 +348,7 @@ class _Batch:
                 contact,
             )
             part = urgent_distances(*observed)
-            scale[rows] = person_speed_scale(*observed)
-            cap[rows] = person_speed_cap(*observed)
+            scale[rows], cap[rows] = person_speeds(*observed)
             distance[rows] = part.distance
             gradient[rows], approach[rows] = part.gradient, part.approach_speed
             if part.contact_speed is not None:

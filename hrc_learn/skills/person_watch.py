@@ -142,92 +142,14 @@ class PersonWatch:
         if self._limits is not None and seen.regions:
             regions = region_numbers(seen.regions)
             contact = self._limits.speeds(found, joints, regions, load is not None)
-        speed_scale, speed_cap = self._speeds(found, velocity, age, contact)
+        observed = (velocity, joints.new_tensor(age), self._separation, self._config, contact)
+        speed_scale, speed_cap = person_speeds(found, *observed)
         return WatchedPeople(
-            distances=self._urgent_distances(found, velocity, age, contact),
+            distances=urgent_distances(found, *observed),
             nearest=float(found.distance.min()),
             age=age,
             speed_scale=float(speed_scale),
             speed_cap=float(speed_cap),
-        )
-
-    def _urgent_distances(
-        self,
-        found: Separation,
-        velocity: Float[Tensor, "*batch H 2 3"],
-        age: float,
-        contact: ContactSpeeds | None,
-    ) -> Distances:
-        """Distances of the most urgent pairs, for people observed some time ago.
-
-        Args:
-            found: Distances of the arm as it is now from people as they were observed.
-            velocity: Velocities of the ends of their capsules [m/s].
-            age: Age of the observation [s].
-            contact: Highest relative speeds of contacts; None: no contact is allowed.
-
-        Returns:
-            The distances, reduced by the distance that people may have moved since. NaN where
-            they may touch the arm and must not.
-        """
-        config, separation = self._config, self._separation
-        # Speed that people may have gained since, and gain until the arm reacts.
-        gain = config.acceleration * (age + separation.reaction_time)
-        towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten(-2)
-        distance = found.distance.flatten(-2) - age * towards
-        # A contact that has begun may last, so that quasi-static limits hold.
-        near, speed = found.distance < config.contact, None
-        if contact is not None:
-            speed = torch.where(near, contact.lasting, contact.first).flatten(-2)
-            near = near & (contact.first <= 0)
-        allowed = separation.allowed_speed(distance, towards, speed)
-        # Among pairs that allow no approach the nearest are the most urgent.
-        number = min(config.pairs, distance.shape[-1])
-        _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
-        touching = near.flatten(-2).any(-1, keepdim=True)
-        return Distances(
-            distance=distance.gather(-1, urgent).masked_fill(touching, _NAN),
-            gradient=found.gradient_of(urgent),
-            approach_speed=towards.gather(-1, urgent),
-            person=torch.ones_like(urgent, dtype=torch.bool),
-            contact_speed=None if speed is None else speed.gather(-1, urgent),
-        )
-
-    def _speeds(
-        self,
-        found: Separation,
-        velocity: Float[Tensor, "*batch H 2 3"],
-        age: float,
-        contact: ContactSpeeds | None,
-    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
-        """Speed scale of the arm, 0 to 1, and cap on the speed of all its parts [m/s].
-
-        The protective distance limits the speed towards people only. An arm that moves past
-        them, or makes way, approaches them as soon as they have come near; so it comes to rest
-        by the time at which they may touch any part of it, if they accelerate all the while.
-        People who recede count as at rest: a hand turns round faster than a tracker, which
-        averages over some images, can show.
-
-        Where contact is allowed, the cap takes the place of the scale: by that time the arm is
-        at rest, or no faster than a contact in any direction allows. The cap is infinite where
-        no such contact may come about. The arguments are those of `_urgent_distances`.
-        """
-        config = self._config
-        coming = (-found.person_rate(velocity)).clamp(min=0)
-        # The root t of  coming t + a t^2/2 = distance.
-        a, distance = config.acceleration, (found.distance - config.contact).clamp(min=0)
-        root = (coming**2 + 2 * a * distance).sqrt()
-        arrival = 2 * distance / (coming + root).clamp(min=1e-9)
-        late = age + self._separation.reaction_time
-        scale = ((arrival - late) / _COMING_TO_REST).clamp(0, 1)
-        if contact is None:
-            slowest = scale.amin((-2, -1))
-            return slowest, torch.full_like(slowest, math.inf)
-        cap = torch.maximum(contact.first - coming - a * late, config.fastest * scale)
-        applies = (contact.first > 0) & (scale < 1)
-        return (
-            scale.masked_fill(contact.first > 0, 1.0).amin((-2, -1)),
-            torch.where(applies, cap, math.inf).amin((-2, -1)),
         )
 
 
@@ -278,3 +200,86 @@ class ContactLimits:
             self._separation.reaction_time,
             self._separation.deceleration,
         )
+
+
+def urgent_distances(
+    found: Separation,
+    velocity: Float[Tensor, "*batch H 2 3"],
+    age: Float[Tensor, "*batch"],
+    separation: SeparationConfig,
+    config: PersonWatchConfig,
+    contact: ContactSpeeds | None = None,
+) -> Distances:
+    """Distances of the most urgent pairs, for people observed some time ago.
+
+    Args:
+        found: Distances of the arm as it is now from people as they were observed.
+        velocity: Velocities of the ends of their capsules [m/s].
+        age: Age of the observation [s].
+        separation: Protective distance, by which the urgency of pairs is judged.
+        config: Assumptions about people.
+        contact: Highest relative speeds of contacts; None: no contact is allowed.
+
+    Returns:
+        The distances, reduced by the distance that people may have moved since. NaN where
+        they may touch the arm and must not.
+    """
+    # Speed that people may have gained since, and gain until the arm reacts.
+    gain = (config.acceleration * (age + separation.reaction_time))[..., None, None]
+    towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten(-2)
+    distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
+    # A contact that has begun may last, so that quasi-static limits hold.
+    near, speed = found.distance < config.contact, None
+    if contact is not None:
+        speed = torch.where(near, contact.lasting, contact.first).flatten(-2)
+        near = near & (contact.first <= 0)
+    allowed = separation.allowed_speed(distance, towards, speed)
+    # Among pairs that allow no approach the nearest are the most urgent.
+    number = min(config.pairs, distance.shape[-1])
+    _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
+    touching = near.flatten(-2).any(-1, keepdim=True)
+    return Distances(
+        distance=distance.gather(-1, urgent).masked_fill(touching, _NAN),
+        gradient=found.gradient_of(urgent),
+        approach_speed=towards.gather(-1, urgent),
+        person=torch.ones_like(urgent, dtype=torch.bool),
+        contact_speed=None if speed is None else speed.gather(-1, urgent),
+    )
+
+
+def person_speeds(
+    found: Separation,
+    velocity: Float[Tensor, "*batch H 2 3"],
+    age: Float[Tensor, "*batch"],
+    separation: SeparationConfig,
+    config: PersonWatchConfig,
+    contact: ContactSpeeds | None = None,
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Speed scale of the arm, 0 to 1, and cap on the speed of all its parts [m/s].
+
+    The protective distance limits the speed towards people only. An arm that moves past
+    them, or makes way, approaches them as soon as they have come near; so it comes to rest
+    by the time at which they may touch any part of it, if they accelerate all the while.
+    People who recede count as at rest: a hand turns round faster than a tracker, which
+    averages over some images, can show.
+
+    Where contact is allowed, the cap takes the place of the scale: by that time the arm is
+    at rest, or no faster than a contact in any direction allows. The cap is infinite where
+    no such contact may come about. The arguments are those of `urgent_distances`.
+    """
+    coming = (-found.person_rate(velocity)).clamp(min=0)
+    # The root t of  coming t + a t^2/2 = distance.
+    a, distance = config.acceleration, (found.distance - config.contact).clamp(min=0)
+    root = (coming**2 + 2 * a * distance).sqrt()
+    arrival = 2 * distance / (coming + root).clamp(min=1e-9)
+    late = (age + separation.reaction_time)[..., None, None]
+    scale = ((arrival - late) / _COMING_TO_REST).clamp(0, 1)
+    if contact is None:
+        slowest = scale.amin((-2, -1))
+        return slowest, torch.full_like(slowest, math.inf)
+    cap = torch.maximum(contact.first - coming - a * late, config.fastest * scale)
+    applies = (contact.first > 0) & (scale < 1)
+    return (
+        scale.masked_fill(contact.first > 0, 1.0).amin((-2, -1)),
+        torch.where(applies, cap, math.inf).amin((-2, -1)),
+    )
