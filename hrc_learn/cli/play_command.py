@@ -16,13 +16,11 @@ from hrc_learn.demos import DatasetWriter, open_demos
 from hrc_learn.experiments.run_recorder import film
 from hrc_learn.kinematics import Arm, UnreachableError
 from hrc_learn.kinematics.drawing import arm_bodies
+from hrc_learn.learning.fitted_model import FittedModel, Target, arm_for
 from hrc_learn.learning.motion_playing import (
     DT,
     BeyondLimitsError,
-    FittedModel,
     PlayedMotion,
-    Target,
-    arm_for,
     play_on_arm,
     play_path,
 )

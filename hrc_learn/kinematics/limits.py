@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.store import read_toml
@@ -107,6 +107,32 @@ class JointLimits(MotionLimits):
         """True where all joints are within their limits or at them."""
         lower, upper = self.lower.to(q), self.upper.to(q)
         return torch.all((q >= lower) & (q <= upper), dim=-1)
+
+    def excess(
+        self,
+        path: Float[Tensor, "*batch T joints"],
+        dt: float,
+        kinds: Sequence[str] = ("velocity", "acceleration", "jerk"),
+    ) -> tuple[Float[Tensor, "*batch"], Int[Tensor, "*batch"]]:
+        """Factor by which a path is too fast, and the limit that it breaks most.
+
+        A path that takes that many times as long keeps all limits; below 1 it keeps them.
+
+        Args:
+            path: Joint positions [rad].
+            dt: Time between samples [s].
+            kinds: Limits to keep: velocity, acceleration, jerk, or the first of these.
+
+        Returns:
+            The factor, and the number of the limit: all joints of the first kind, then those of
+            the second, and so on.
+        """
+        factors = []
+        for order, kind in enumerate(kinds, 1):
+            rate = torch.diff(path, n=order, dim=-2).abs() / dt**order
+            factors.append((rate / getattr(self, kind)).amax(-2) ** (1 / order))
+        worst, at = torch.cat(factors, -1).max(-1)
+        return worst, at
 
 
 # Defaults for limits that a description does not give. The velocity of revolute joints is lower

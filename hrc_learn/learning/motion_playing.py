@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -15,22 +14,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller.motion_filter import MotionFilter, MotionState
-from hrc_learn.dmp import JointDMP, PoseDMP
+from hrc_learn.dmp import JointDMP
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import Arm, ArmChoice, UnreachableError
+from hrc_learn.kinematics import Arm, UnreachableError
 from hrc_learn.kinematics.inverse import TASK_ROWS, follow_poses
-from hrc_learn.learning.arm_speed import speed_excess
+from hrc_learn.learning.fitted_model import FittedModel, Target
 from hrc_learn.learning.model_choice import predicted_primitive
-from hrc_learn.learning.primitive_fitting import Primitive, load_primitive
 
 DT = 0.02
 """Time between samples [s]."""
-CHANNELS = ("joint", "pose", "position")
-"""Channels that can be played; an orientation alone moves no arm."""
-_RAD = {"rad": 1.0, "deg": math.pi / 180}
-"""Units of joints with a fixed size, in radians."""
 _DEVIATION = 2e-3
 """Largest distance of the motion from the planned path [rad]: 1 mm at 0.5 m."""
+_KINDS = "velocity", "acceleration"
+"""Limits of a planned path; the motion filter keeps the jerk."""
 _SLOWER, _ATTEMPTS = 1.1, 30
 _SETTLING = 1.0
 """Longest time after the path in which the motion reaches its end [s]."""
@@ -38,112 +34,10 @@ _TURNS = 30
 """Steps towards an orientation that an arm may have no joints for."""
 _MISSED = 1e-3
 """Error that counts as out of reach [m, rad]."""
-_SAME_TOOL = 0.02
-"""Largest distance between the model's poses and those of its joints [m]."""
-
-KINDS = "joints", "position", "pose"
-"""Kinds of goals."""
 
 
 class BeyondLimitsError(RuntimeError):
     """The motion leaves a limit that no longer duration can keep."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Target:
-    """Start or goal of a motion."""
-
-    joints: Float[Tensor, " joints"] | None = None
-    """In the model's unit."""
-    position: Float[Tensor, "3"] | None = None
-    """[m]"""
-    orientation: Float[Tensor, "4"] | None = None
-    """Unit quaternion (w, x, y, z); None leaves the model's."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FittedModel:
-    """Primitives of a folder of `hrc fit`."""
-
-    folder: Path
-    primitives: Mapping[str, Primitive]
-    """Common primitives by channel."""
-
-    @classmethod
-    def load(cls, folder: Path) -> FittedModel:
-        """Read the primitives that can be played.
-
-        Raises:
-            FileNotFoundError: The folder holds none.
-        """
-        found = [channel for channel in CHANNELS if (folder / channel).is_dir()]
-        if not found:
-            raise FileNotFoundError(
-                f"{folder} holds no primitive of joints, poses or positions: give a folder of "
-                "hrc fit"
-            )
-        loaded = {c: cast(Any, load_primitive(folder / c, c)).double() for c in found}
-        return cls(folder=folder, primitives=loaded)
-
-    @property
-    def joint(self) -> JointDMP | None:
-        """Primitive of the joints."""
-        return cast("JointDMP | None", self.primitives.get("joint"))
-
-    @property
-    def pose(self) -> PoseDMP | None:
-        """Primitive of the end effector."""
-        return cast("PoseDMP | None", self.primitives.get("pose"))
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, empty without their primitive."""
-        joint = self.joint
-        if joint is None:
-            return ()
-        names = joint.joint_names or [f"joint{i + 1}" for i in range(len(joint.start))]
-        return tuple(name.removesuffix(".pos") for name in names)
-
-    def target(self, words: Sequence[str], option: str) -> Target:
-        """Start or goal from the words of an option.
-
-        Args:
-            words: Numbers, or "joints", "position" or "pose" before them.
-            option: Name of the option, for errors.
-
-        Raises:
-            ValueError: The words name no target of this model.
-        """
-        counts = {"position": 3, "pose": 7}
-        if self.joint is not None:
-            counts = {"joints": len(self.joint_names), **counts}
-        given, numbers = ("", words) if words[0] not in KINDS else (words[0], words[1:])
-        forms = ", ".join(f"{n} numbers ({kind})" for kind, n in counts.items())
-        try:
-            values = torch.tensor([float(word) for word in numbers], dtype=torch.float64)
-        except ValueError:
-            values = torch.empty(0)
-        fits = [kind for kind, n in counts.items() if n == len(values) and given in ("", kind)]
-        if not fits or not bool(values.isfinite().all()):
-            raise ValueError(
-                f"{option} {' '.join(words)}: {self.folder} takes {forms}, all finite, or "
-                "episode and its number."
-            )
-        if len(fits) > 1:
-            raise ValueError(
-                f"{option}: {len(values)} numbers may be {' or '.join(fits)}: write "
-                f"{option} {fits[0]} before them, or {fits[1]}."
-            )
-        if fits[0] == "joints":
-            return Target(joints=values)
-        if fits[0] == "position":
-            return Target(position=values)
-        norm = float(values[3:].norm())
-        if abs(norm - 1) > 0.02:
-            raise ValueError(
-                f"{option} pose: w x y z have the norm {norm:.3f}, but a quaternion has 1."
-            )
-        return Target(position=values[:3], orientation=values[3:] / norm)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,10 +136,11 @@ def play_on_arm(
     path, note, stretch = path_in(lasting), "", 1.0
     for _ in range(_ATTEMPTS):
         _require_range(robot, path)
-        excess, limits = speed_excess(robot, path[None], DT, ("velocity", "acceleration"))
+        excess, at = robot.limits.excess(path, DT, _KINDS)
         factor = float(excess)
         if factor > 1.0:
-            note = note or limits[0]
+            kind, joint = divmod(int(at), robot.joints)
+            note = note or f"{_KINDS[kind]} of {robot.chain.joint_names[joint]}"
         else:
             joints = _within_limits(robot, path)
             off = _distance(joints, path)
@@ -259,7 +154,7 @@ def play_on_arm(
     reached = robot.forward(torch.from_numpy(joints))
     errors = _pose_errors(reached, goal)
     if goal.joints is not None:
-        wanted = _in_rad(model, robot, goal.joints).numpy()
+        wanted = model.in_rad(robot, goal.joints).numpy()
         errors = {"goal_joint_error": float(np.abs(joints[-1] - wanted).max())}
     return PlayedMotion(
         time=DT * np.arange(len(joints)),
@@ -271,42 +166,6 @@ def play_on_arm(
         deviation=off,
         goal_errors=errors,
     )
-
-
-def arm_for(model: FittedModel, name: str) -> Arm:
-    """Arm whose tool the model's poses are of: that of its description, or with our hand.
-
-    Args:
-        model: The model.
-        name: Registered arm, or its file.
-
-    Raises:
-        ValueError: The model moves other joints, or poses of another tool or base.
-    """
-    robot = ArmChoice(name).arm()
-    names = robot.chain.joint_names
-    if model.joint is not None and {*model.joint_names} != {*names}:
-        raise ValueError(
-            f"{model.folder} moves the joints {', '.join(model.joint_names)}, but {name} has "
-            f"{', '.join(names)}: choose the arm it was taught with, or fit --joint-names."
-        )
-    if model.joint is None or model.pose is None:
-        return robot
-    arms = [robot]
-    if robot.joints >= 6 and not robot.is_franka:
-        arms.append(robot.with_hand())
-    q = _in_rad(model, robot, model.joint.start)
-    apart = [
-        float((arm.forward(q).position - model.pose.start.position).norm()) for arm in arms
-    ]
-    best = int(np.argmin(apart))
-    if apart[best] > _SAME_TOOL:
-        raise ValueError(
-            f"the poses of {model.folder} begin {1e3 * apart[best]:.0f} mm from where its "
-            f"joints put the tool of {name}: they are of another tool or base frame. Fit with "
-            "--channels joint, or choose the arm's description with that tool."
-        )
-    return arms[best]
 
 
 def _planner(
@@ -324,16 +183,16 @@ def _planner(
         raise ValueError(
             f"{model.folder} holds no primitive of joints: give --goal position or pose."
         )
-    usual = _in_rad(model, robot, model.joint.goal)  # refuses shares before any search
+    usual = model.in_rad(robot, model.joint.goal)  # refuses shares before any search
     if goal.joints is None:
         end = _joints_at(model, robot, goal, usual, robot.forward(usual))
     else:
-        end = _in_rad(model, robot, goal.joints)
+        end = model.in_rad(robot, goal.joints)
     first = _first_joints(model, robot, start)
 
     def path(duration: float) -> Tensor:
-        asked, wanted = (_in_model(model, robot, q) for q in (first, end))
-        return _in_rad(model, robot, _joint_path(model, asked, wanted, duration))
+        asked, wanted = (model.from_rad(robot, q) for q in (first, end))
+        return model.in_rad(robot, _joint_path(model, asked, wanted, duration))
 
     return "joint", path
 
@@ -400,9 +259,9 @@ def _joints_along(
     poses, end = _pose_path(model, start, goal, duration), None
     whole = robot.joints >= 6 and (model.pose is not None or goal.orientation is not None)
     if robot.joints < 6:
-        end = _joints_at(model, robot, None, first, poses[-1])
+        end = _joints_at(model, robot, goal, first, poses[-1])
     elif model.joint is not None:
-        end = _in_rad(model, robot, model.joint.goal)
+        end = model.in_rad(robot, model.joint.goal)
     wish = None
     if end is not None:
         progress, _ = minimum_jerk(torch.linspace(0, 1, len(poses.position)).to(first))
@@ -422,11 +281,11 @@ def _joints_along(
 
 def _first_joints(model: FittedModel, robot: Arm, start: Target | None) -> Tensor:
     """Joint positions at the start [rad]."""
-    near = robot.ready if model.joint is None else _in_rad(model, robot, model.joint.start)
+    near = robot.ready if model.joint is None else model.in_rad(robot, model.joint.start)
     if start is None and model.joint is not None:
         return near
     if start is not None and start.joints is not None:
-        return _in_rad(model, robot, start.joints)
+        return model.in_rad(robot, start.joints)
     usual = robot.forward(near)
     if model.pose is not None:
         usual = model.pose.start
@@ -455,33 +314,6 @@ def _joints_at(
     turned, _ = follow_poses(robot.chain, still, q)
     missed = torch.linalg.vector_norm(robot.forward(turned[-1]).position - pose.position)
     return turned[-1] if float(missed) < _MISSED / 10 else q
-
-
-def _columns(model: FittedModel, robot: Arm) -> tuple[float, list[int]]:
-    """Radians in the model's unit, and the model's column of each joint of the arm."""
-    assert model.joint is not None
-    unit = model.joint.units
-    if unit not in _RAD:
-        shown = "shares of their ranges" if unit in ("1", "%") else repr(unit)
-        raise ValueError(
-            f"{model.folder} holds joints in {shown}, of which no angle is known: fit "
-            "with the unit of the dataset (--units joint_position deg) or convert it with the "
-            "robot's calibration; without --robot the model is played as it is."
-        )
-    names = model.joint_names
-    return _RAD[unit], [names.index(name) for name in robot.chain.joint_names]
-
-
-def _in_rad(model: FittedModel, robot: Arm, values: Tensor) -> Tensor:
-    """Joint positions of the arm [rad] from the model's."""
-    factor, columns = _columns(model, robot)
-    return factor * values[..., columns]
-
-
-def _in_model(model: FittedModel, robot: Arm, joints: Tensor) -> Tensor:
-    """Inverse of `_in_rad`."""
-    factor, columns = _columns(model, robot)
-    return joints[..., np.argsort(columns).tolist()] / factor
 
 
 def _require_range(robot: Arm, path: Float[Tensor, "samples joints"]) -> None:

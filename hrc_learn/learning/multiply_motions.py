@@ -25,7 +25,6 @@ from hrc_learn.dmp.probabilistic_dmp import with_common_reference
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm
 from hrc_learn.kinematics.inverse import follow_poses
-from hrc_learn.learning.arm_speed import speed_excess
 
 BASE, POSITION_ONLY = "base", " position"
 """Frame of the base, and end of the name of an object's frame that does not turn."""
@@ -46,8 +45,8 @@ _COMPARED, _USUALLY_FREE = 50, 0.6
 _FIRST = 12
 # Largest error of inverse kinematics: 1 mm or 1 mrad.
 _REACHED = 1e-3
-# Fraction of the limits that a motion may use, and attempts to slow it down until it does.
-_USABLE, _SLOWER = 0.95, 3
+# Speed of a motion relative to the fastest one within the limits, and attempts to slow it down.
+_USABLE, _SLOWER = 0.975, 3
 # Largest factor by which a motion is slowed down at once.
 _JUMP = 3.0
 # Every so many frames are checked for collisions.
@@ -355,9 +354,9 @@ class MotionSource:
             part = draws[left]
             poses = self.poses(part)
             q, missed = self._joint_paths(part, poses)
-            factor, limit = speed_excess(self.robot, q, 1 / self.fps, usable=_USABLE)
+            factor, limit = self.robot.limits.excess(q, 1 / self.fps)
             # Joints of a motion that does not reach its poses may jump, at any speed.
-            factor = factor.clamp(max=_JUMP)
+            factor = (factor / _USABLE).clamp(max=_JUMP)
             # What cannot be reached is tried once at a lower speed, at which joints jump less.
             again = (factor > 1) & (turn < _SLOWER) & ((missed == 0) | (turn == 0))
             where = self._collisions(q[~again])
@@ -366,7 +365,9 @@ class MotionSource:
                 if missed[k] > 0:
                     reason = "not reached, or only beyond the range of a joint"
                 elif factor[k] > 1:
-                    reason = f"beyond the limit of {limit[k]}"
+                    kind, joint = divmod(int(limit[k]), self.robot.joints)
+                    kind = ("velocity", "acceleration", "jerk")[kind]
+                    reason = f"beyond the limit of {kind} of {self.robot.joint_names[joint]}"
                 n = int(poses.length[k])
                 made[int(left[k])] = NewMotion(
                     joints=q[k, :n],

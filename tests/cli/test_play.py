@@ -14,7 +14,8 @@ from hrc_learn.demos import DatasetWriter, open_demos
 from hrc_learn.geometry import minimum_jerk
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.registry import arm
-from hrc_learn.learning.motion_playing import FittedModel, Target, arm_for, play_on_arm
+from hrc_learn.learning.fitted_model import FittedModel, Target, arm_for
+from hrc_learn.learning.motion_playing import play_on_arm
 
 pin = pytest.importorskip("pinocchio")
 

@@ -1,0 +1,187 @@
+"""A fitted model as a whole: its primitives by channel, its units, and the arm it moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp import JointDMP, PoseDMP
+from hrc_learn.kinematics import Arm, ArmChoice
+from hrc_learn.learning.primitive_fitting import Primitive, load_primitive
+
+CHANNELS = ("joint", "pose", "position")
+"""Channels that can be played; an orientation alone moves no arm."""
+_RAD = {"rad": 1.0, "deg": math.pi / 180}
+"""Units of joints with a fixed size, in radians."""
+_SAME_TOOL = 0.02
+"""Largest distance between the model's poses and those of its joints [m]."""
+KINDS = "joints", "position", "pose"
+"""Kinds of goals."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Target:
+    """Start or goal of a motion."""
+
+    joints: Float[Tensor, " joints"] | None = None
+    """In the model's unit."""
+    position: Float[Tensor, "3"] | None = None
+    """[m]"""
+    orientation: Float[Tensor, "4"] | None = None
+    """Unit quaternion (w, x, y, z); None leaves the model's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedModel:
+    """Primitives of a folder of `hrc fit`."""
+
+    folder: Path
+    primitives: Mapping[str, Primitive]
+    """Common primitives by channel."""
+
+    @classmethod
+    def load(cls, folder: Path) -> FittedModel:
+        """Read the primitives that can be played.
+
+        Raises:
+            FileNotFoundError: The folder holds none.
+        """
+        found = [channel for channel in CHANNELS if (folder / channel).is_dir()]
+        if not found:
+            raise FileNotFoundError(
+                f"{folder} holds no primitive of joints, poses or positions: give a folder of "
+                "hrc fit"
+            )
+        loaded = {c: cast(Any, load_primitive(folder / c, c)).double() for c in found}
+        return cls(folder=folder, primitives=loaded)
+
+    @property
+    def joint(self) -> JointDMP | None:
+        """Primitive of the joints."""
+        return cast("JointDMP | None", self.primitives.get("joint"))
+
+    @property
+    def pose(self) -> PoseDMP | None:
+        """Primitive of the end effector."""
+        return cast("PoseDMP | None", self.primitives.get("pose"))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, empty without their primitive."""
+        joint = self.joint
+        if joint is None:
+            return ()
+        names = joint.joint_names or [f"joint{i + 1}" for i in range(len(joint.start))]
+        return tuple(name.removesuffix(".pos") for name in names)
+
+    def target(self, words: Sequence[str], option: str) -> Target:
+        """Start or goal from the words of an option.
+
+        Args:
+            words: Numbers, or "joints", "position" or "pose" before them.
+            option: Name of the option, for errors.
+
+        Raises:
+            ValueError: The words name no target of this model.
+        """
+        counts = {"position": 3, "pose": 7}
+        if self.joint is not None:
+            counts = {"joints": len(self.joint_names), **counts}
+        given, numbers = ("", words) if words[0] not in KINDS else (words[0], words[1:])
+        forms = ", ".join(f"{n} numbers ({kind})" for kind, n in counts.items())
+        try:
+            values = torch.tensor([float(word) for word in numbers], dtype=torch.float64)
+        except ValueError:
+            values = torch.empty(0)
+        fits = [kind for kind, n in counts.items() if n == len(values) and given in ("", kind)]
+        if not fits or not bool(values.isfinite().all()):
+            raise ValueError(
+                f"{option} {' '.join(words)}: {self.folder} takes {forms}, all finite, or "
+                "episode and its number."
+            )
+        if len(fits) > 1:
+            raise ValueError(
+                f"{option}: {len(values)} numbers may be {' or '.join(fits)}: write "
+                f"{option} {fits[0]} before them, or {fits[1]}."
+            )
+        if fits[0] == "joints":
+            return Target(joints=values)
+        if fits[0] == "position":
+            return Target(position=values)
+        norm = float(values[3:].norm())
+        if abs(norm - 1) > 0.02:
+            raise ValueError(
+                f"{option} pose: w x y z have the norm {norm:.3f}, but a quaternion has 1."
+            )
+        return Target(position=values[:3], orientation=values[3:] / norm)
+
+    def in_rad(self, robot: Arm, values: Float[Tensor, "*batch joints"]) -> Tensor:
+        """Joint positions of an arm [rad] from the model's, (*batch, joints).
+
+        Raises:
+            ValueError: The model's unit has no fixed size.
+        """
+        factor, columns = self._columns(robot)
+        return factor * values[..., columns]
+
+    def from_rad(self, robot: Arm, joints: Float[Tensor, "*batch joints"]) -> Tensor:
+        """Inverse of `in_rad`."""
+        factor, columns = self._columns(robot)
+        return joints[..., np.argsort(columns).tolist()] / factor
+
+    def _columns(self, robot: Arm) -> tuple[float, list[int]]:
+        """Radians in the model's unit, and the model's column of each joint of the arm."""
+        assert self.joint is not None
+        unit = self.joint.units
+        if unit not in _RAD:
+            shown = "shares of their ranges" if unit in ("1", "%") else repr(unit)
+            raise ValueError(
+                f"{self.folder} holds joints in {shown}, of which no angle is known: fit "
+                "with the unit of the dataset (--units joint_position deg) or convert it with "
+                "the robot's calibration; without --robot the model is played as it is."
+            )
+        return _RAD[unit], [self.joint_names.index(name) for name in robot.chain.joint_names]
+
+
+def arm_for(model: FittedModel, name: str) -> Arm:
+    """Arm whose tool the model's poses are of: that of its description, or with our hand.
+
+    Args:
+        model: The model.
+        name: Registered arm, or its file.
+
+    Raises:
+        ValueError: The model moves other joints, or poses of another tool or base.
+    """
+    robot = ArmChoice(name).arm()
+    names = robot.chain.joint_names
+    if model.joint is not None and {*model.joint_names} != {*names}:
+        raise ValueError(
+            f"{model.folder} moves the joints {', '.join(model.joint_names)}, but {name} has "
+            f"{', '.join(names)}: choose the arm it was taught with, or fit --joint-names."
+        )
+    if model.joint is None or model.pose is None:
+        return robot
+    arms = [robot]
+    if robot.joints >= 6 and not robot.is_franka:
+        arms.append(robot.with_hand())
+    q = model.in_rad(robot, model.joint.start)
+    apart = [
+        float((arm.forward(q).position - model.pose.start.position).norm()) for arm in arms
+    ]
+    best = int(np.argmin(apart))
+    if apart[best] > _SAME_TOOL:
+        raise ValueError(
+            f"the poses of {model.folder} begin {1e3 * apart[best]:.0f} mm from where its "
+            f"joints put the tool of {name}: they are of another tool or base frame. Fit with "
+            "--channels joint, or choose the arm's description with that tool."
+        )
+    return arms[best]
