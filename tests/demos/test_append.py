@@ -140,7 +140,7 @@ def test_a_broken_recording_leaves_the_dataset_whole_and_its_episodes_safe(tmp_p
 @pytest.mark.parametrize(
     ("append", "every"),
     [
-        (True, 5),
+        (True, 9),
         pytest.param(True, 1, marks=pytest.mark.slow),
         pytest.param(False, 1, marks=pytest.mark.slow),
     ],

@@ -27,14 +27,14 @@ def hub(monkeypatch, tmp_path):
         yield served
 
 
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory):
-    return write_set(tmp_path_factory.mktemp("sets") / "reach", "v3.0", camera=True)
+@pytest.fixture
+def filmed(tmp_path):
+    return write_set(tmp_path / "reach", "v3.0", camera=True)
 
 
 @pytest.fixture
-def dataset(sound, tmp_path):
-    return shutil.copytree(sound, tmp_path / "reach")
+def dataset(tmp_path):
+    return write_set(tmp_path / "reach", "v3.0")
 
 
 def client(hub, token=TOKEN):
@@ -46,7 +46,8 @@ def contents(root):
     return {str(path.relative_to(root)): path.read_bytes() for path in files}
 
 
-def test_what_is_fetched_is_what_was_pushed(hub, dataset, tmp_path):
+def test_what_is_fetched_is_what_was_pushed_with_a_card(hub, filmed, tmp_path):
+    dataset = filmed
     before = contents(dataset)
     (dataset / "notes.txt").write_text("not of the dataset")
     pushed = push_dataset(
@@ -67,17 +68,7 @@ def test_what_is_fetched_is_what_was_pushed(hub, dataset, tmp_path):
         "alice/reach", repo_type="dataset", revision="v3.0", local_dir=tmp_path / "fetched"
     )
     assert load_demos(fetched).frames == load_demos(dataset).frames
-
-
-def test_the_card_says_what_is_in_it(hub, dataset):
-    push_dataset(
-        dataset,
-        "alice/reach",
-        license="mit",
-        tags=["reach"],
-        api=client(hub),
-    )
-    card = hub.repositories["alice/reach"].files()["README.md"].decode()
+    card = repo.files()["README.md"].decode()
     _, head, body = card.split("---\n", 2)
     info = json.loads((dataset / "meta/info.json").read_text())
     assert yaml.safe_load(head) == {
