@@ -1,10 +1,12 @@
 """What is recorded comes back, and a recording that breaks off is neither lost nor whole."""
 
-import contextlib
 import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
+import textwrap
 import time
 
 import numpy as np
@@ -270,31 +272,34 @@ def test_an_exception_keeps_the_saved_episodes_for_recovery(tmp_path):
         recover_dataset(root)
 
 
-def record_until_killed(root, pipe):
-    writer = DatasetWriter(root, 50, "any", ["a", "b"])
+KILLED = textwrap.dedent(
+    """
+    import sys
+    import numpy as np
+    from hrc_learn.demos import DatasetWriter
+
+    writer = DatasetWriter(sys.argv[1], 50, "any", ["a", "b"])
     for episode in range(10_000):
         writer.start_episode("reach")
         for k in range(20):
             writer.add_frame(joint_position=[episode, k])
         writer.save_episode()
-        os.write(pipe, bytes([1]))
+        print(writer.episodes, flush=True)
+    """
+)
 
 
 def kill_and_recover(root, seconds):
     """Kill a recording so long after its first episode was saved; what was and is there."""
-    read, write = os.pipe()
-    process = os.fork()
-    if process == 0:  # a copy of this process needs no second import of the package
-        with contextlib.suppress(BaseException):
-            record_until_killed(root, write)
-        os._exit(1)
-    os.close(write)
-    announced = len(os.read(read, 1))
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(root)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    first = process.stdout.readline()
     time.sleep(seconds)
-    os.kill(process, signal.SIGKILL)
-    os.waitpid(process, 0)
-    with os.fdopen(read, "rb") as stream:
-        announced += len(stream.read())
+    os.kill(process.pid, signal.SIGKILL)
+    announced = int([first, *process.stdout.readlines()][-1])
+    process.wait()
     assert not root.exists()  # nothing that looks whole
     return announced, load_demos(recover_dataset(root))
 
