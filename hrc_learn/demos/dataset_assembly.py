@@ -29,8 +29,8 @@ from hrc_learn.demos.read.dataset_folder import (
     staging_folder,
 )
 from hrc_learn.demos.recorded_episode import (
+    EpisodeDescription,
     RecordingHeader,
-    StagedEpisode,
     episode_number,
     read_episode,
     staged_paths,
@@ -62,7 +62,7 @@ def assemble(
         tasks: Task texts that already have an index, in order of the index.
         link_videos: Hard-link videos instead of copying them, where possible.
     """
-    header = read_episode(paths[0]).header
+    header = read_episode(paths[0])[0].header
     for folder in ("meta/episodes/chunk-000", "data"):
         (target / folder).mkdir(parents=True)
     cameras = [key for key, f in header.features.items() if f["dtype"] == "video"]
@@ -79,10 +79,9 @@ def assemble(
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
     segments = iter(videos)
     for file, group in enumerate(_by_size(paths), start=listed.data_files):
-        for staged in _write_frames(
-            target / metadata.place(metadata.DATA_PATH, file), header, group
-        ):
-            listed.add(staged, file, next(segments))
+        path = target / metadata.place(metadata.DATA_PATH, file)
+        for staged, frames in _write_frames(path, header, group):
+            listed.add(staged, frames, file, next(segments))
     _write_metadata(target, header, listed, sidecar)
 
 
@@ -114,9 +113,8 @@ class _EpisodeList:
         self.episodes += len(table)
         self.frames = table.column("dataset_to_index")[-1].as_py()
 
-    def add(self, staged: StagedEpisode, file: int, videos: Segments) -> None:
+    def add(self, staged: EpisodeDescription, length: int, file: int, videos: Segments) -> None:
         """Append an episode of a data file, and place its videos."""
-        length = len(staged.table)
         self.tasks |= dict.fromkeys(staged.tasks)
         row = {
             "episode_index": self.episodes,
@@ -133,7 +131,6 @@ class _EpisodeList:
             row |= {f"stats/{key}/{name}": values for name, values in statistics.items()}
         if staged.provenance:
             row["provenance"] = staged.provenance
-        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
         self._rows.append(row)
         self.episodes += 1
         self.frames += length
@@ -163,7 +160,12 @@ class _EpisodeList:
         """All rows."""
         if self._rows:
             self._pack()
-        return _concatenated(self._tables)
+        table = _concatenated(self._tables)
+        places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
+        table = table.drop_columns([name for name in places if name in table.column_names])
+        for name in places:  # the list is one file
+            table = table.append_column(name, pa.array(np.zeros(len(table), np.int64)))
+        return table
 
 
 def _table_of(rows: Sequence[dict]) -> pa.Table:
@@ -182,22 +184,20 @@ def _concatenated(tables: Sequence[pa.Table]) -> pa.Table:
 
 def _count_files(table: pa.Table, kind: str) -> int:
     """Number of data files, or of a camera's video files, in a list of episodes."""
-    chunks, files = (
-        table.column(f"{kind}/{part}_index").to_pylist() for part in ("chunk", "file")
-    )
-    return 1 + max(c * metadata.CHUNK_SIZE + f for c, f in zip(chunks, files, strict=True))
+    chunks, files = (np.array(table[f"{kind}/{part}_index"]) for part in ("chunk", "file"))
+    return 1 + int((chunks * metadata.CHUNK_SIZE + files).max())
 
 
 def _write_frames(
     path: Path, header: RecordingHeader, group: Sequence[Path]
-) -> Iterator[StagedEpisode]:
-    """Write a data file, one row group per episode."""
+) -> Iterator[tuple[EpisodeDescription, int]]:
+    """Write a data file, one row group per episode; each episode and its number of frames."""
     path.parent.mkdir(exist_ok=True)
-    schema = metadata.data_schema(read_episode(group[0]).table.schema, header.features)
+    schema = metadata.data_schema(read_episode(group[0])[1].schema, header.features)
     with pq.ParquetWriter(path, schema, write_page_checksum=True) as writer:
-        for staged in map(read_episode, group):
-            writer.write_table(staged.table.cast(schema))
-            yield staged
+        for staged, table in map(read_episode, group):
+            writer.write_table(table.cast(schema))
+            yield staged, len(table)
 
 
 def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
@@ -246,10 +246,6 @@ def _carry_over(earlier: Path, listed: _EpisodeList, cameras: Sequence[str]) -> 
         _put(file, listed.target / file.relative_to(earlier), link=True)
     tables = [read_table(open_parquet(earlier, n), n) for n in episode_lists(earlier)]
     table = _concatenated(tables).sort_by("episode_index")
-    places = ["meta/episodes/chunk_index", "meta/episodes/file_index"]
-    table = table.drop_columns([name for name in places if name in table.column_names])
-    for name in places:  # the new list is one file
-        table = table.append_column(name, pa.array(np.zeros(len(table), np.int64)))
     listed.carry(table)
     listed.tasks |= dict.fromkeys(folder.tasks[i] for i in sorted(folder.tasks))
     listed.data_files = _count_files(table, "data")

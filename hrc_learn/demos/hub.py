@@ -126,7 +126,7 @@ def _upload(api: "HfApi", root: Path, push: Push) -> None:
         **where,
     )
     known = api.list_repo_refs(push.repo, repo_type="dataset").tags
-    if any(tag.name == push.tag for tag in known):
+    if push.tag in [tag.name for tag in known]:
         api.delete_tag(push.repo, tag=push.tag, repo_type="dataset")
     api.create_tag(push.repo, tag=push.tag, repo_type="dataset")
 
@@ -187,12 +187,9 @@ def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterato
     shown = Counter(task for entry in folder.episodes for task in entry.tasks)
     for task, count in shown.most_common(_MOST_TASKS):
         yield f"- {_cell(task)} ({count} episodes)"
-    if len(shown) > _MOST_TASKS:
-        yield f"- and {len(shown) - _MOST_TASKS} more tasks"
-    for feature in folder.features.values():
-        if feature.is_picture:
-            size = " x ".join(map(str, feature.shape))
-            yield f"- camera `{_cell(feature.key)}`: {size}, stored as {feature.dtype}"
+    for feature in filter(lambda feature: feature.is_picture, folder.features.values()):
+        size = " x ".join(map(str, feature.shape))
+        yield f"- camera `{_cell(feature.key)}`: {size}, stored as {feature.dtype}"
     if report.contract is not None:
         header, *rows = report.contract.rows()
         yield (

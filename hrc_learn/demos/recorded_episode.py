@@ -237,13 +237,6 @@ class EpisodeDescription:
     """Origin of an episode that was made from others, as JSON."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class StagedEpisode(EpisodeDescription):
-    """One saved episode of a recording."""
-
-    table: pa.Table
-
-
 def episode_path(folder: Path, index: int) -> Path:
     """File of a saved episode in the folder of a recording."""
     return folder / f"episode_{index:06d}.parquet"
@@ -294,7 +287,7 @@ def write_episode(
         write_parquet(table.replace_schema_metadata(metadata), part)
 
 
-def read_episode(path: Path) -> StagedEpisode:
+def read_episode(path: Path) -> tuple[EpisodeDescription, pa.Table]:
     """Read an episode written by `write_episode`.
 
     Raises:
@@ -303,10 +296,9 @@ def read_episode(path: Path) -> StagedEpisode:
     table = read_table(open_parquet(path.parent, path.name), path.name)
     described = (table.schema.metadata or {}).get(_METADATA_KEY, b"")
     try:
-        description = parse_json(described, EpisodeDescription)
+        return parse_json(described, EpisodeDescription), table
     except ValueError as error:
         raise DatasetError(f"no episode of a recording ({error})", file=path) from error
-    return StagedEpisode(**vars(description), table=table)
 
 
 def staged_paths(folder: Path, first: int = 0) -> list[Path]:

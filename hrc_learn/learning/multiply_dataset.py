@@ -341,13 +341,13 @@ class MultipliedWriter:
 
     def _continue(self) -> None:
         for path in recorded.staged_paths(self._staging):
-            staged = recorded.read_episode(path)
+            staged, table = recorded.read_episode(path)
             if staged.header.sidecar.details != self.header.sidecar.details:
                 raise FileExistsError(
                     f"{self._staging} holds an interrupted recording with other settings: "
                     "continue it with those, remove it, or choose another --out"
                 )
-            self._add(staged.provenance, staged.tasks[0], len(staged.table))
+            self._add(staged.provenance, staged.tasks[0], len(table))
 
     def _add(self, provenance: str, task: str, frames: int) -> None:
         self.provenance.append(parse_json(provenance))
