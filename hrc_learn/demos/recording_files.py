@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.columns import column_places
 from hrc_learn.demos.read.naming import without_unit
 
 Kind = Literal["number", "image", "encoded", "text", "depth", "pose", "other"]
@@ -107,42 +108,9 @@ class Recording:
         place = "/".join(part for part in (self.label, key) if part) or None
         return DatasetError(message, file=self.file, key=place)
 
-    def known(self, name: str, role: str) -> str:
-        """Field of this name, or the only one whose path ends so.
-
-        Raises:
-            DatasetError: There is no such field for the role.
-        """
-        ends = [known for known in self.fields if known.endswith("/" + name)]
-        if name not in self.fields and len(ends) != 1:
-            text = f"there is no array {name!r} for {role}; it holds {', '.join(self.fields)}"
-            raise self.error(text, role)
-        return name if name in self.fields else ends[0]
-
-    def places(self, token: str, role: str) -> list[tuple[str, int]]:
-        """Columns that "FIELD", "FIELD[2:5]" or the name of a component stands for.
-
-        Raises:
-            DatasetError: There is no such field, or the range exceeds it.
-        """
-        named = [
-            (name, index)
-            for name, one in self.fields.items()
-            for index, known in enumerate(one.names or ())
-            if known == token
-        ]
-        if len(named) == 1 and token not in self.fields:
-            return named
-        match = re.fullmatch(r"(.+)\[(\d+)(?::(\d+))?\]", token)
-        if match is None or token in self.fields:
-            name = self.known(token, role)
-            return [(name, index) for index in range(self.fields[name].width)]
-        name, start = self.known(match[1], role), int(match[2])
-        stop = int(match[3] or start + 1)
-        if not start < stop <= self.fields[name].width:
-            text = f"{token} is no range of its {self.fields[name].width} components"
-            raise self.error(text, role)
-        return [(name, index) for index in range(start, stop)]
+    def places(self, text: str, role: str) -> list[tuple[str, int]]:
+        """Columns that a text stands for, as in `column_places`."""
+        return column_places(role, text, self.fields, self.file)
 
     def clock_of(self, name: str, preferred: str = "") -> str:
         """Field that holds the stamps of another field; "" if none has as many frames.

@@ -162,7 +162,7 @@ def _by_name(
         text = "name the arrays of joints or poses (joints, position); it holds"
         raise first.error(f"{text} {there}")
     if options.time:
-        meaning.time = first.known(options.time, "time")
+        meaning.time = first.places(options.time, "time")[0][0]
     elif options.duration is None:
         meaning.time = first.clock_of(meaning.main)
     _name_joints(meaning, options.joint_names, first)

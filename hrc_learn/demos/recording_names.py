@@ -117,7 +117,7 @@ def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str,
     """
     found: dict[str, str] = {}
     if named is not None:
-        found = {camera: first.known(name, camera) for camera, name in named.items()}
+        found = {camera: first.places(name, camera)[0][0] for camera, name in named.items()}
         for camera, name in found.items():
             if first.fields[name].kind not in ("image", "encoded"):
                 raise first.error(f"{name} holds no images", camera)

@@ -84,7 +84,7 @@ def test_poses_are_imported_in_centimetres(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--joints", "p", "--time", "t"], "pour.npz, joint_position: there is no array 'p'"),
+        (["--joints", "p", "--time", "t"], "pour.npz, joint_position: there is no column 'p'"),
         (["--joints", "q"], None),
         (["--joints", "q", "--time", "t", "--joint-names", "a"], "1 joint names for 7 columns"),
         (["--position", "q", "--time", "t"], "position takes 3 columns, not 7"),

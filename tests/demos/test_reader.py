@@ -326,14 +326,14 @@ def test_mapping_overrules_what_names_say(tmp_path):
     ("mapping", "message"),
     [
         ({"joints": STATE}, "unknown quantity 'joints'"),
-        ({"joint_position": "observation.qpos"}, "observation.qpos: .*does not exist"),
-        ({"joint_position": ["elbow"]}, "elbow: .*does not exist.*panda_joint1"),
+        ({"joint_position": "observation.qpos"}, "no column 'observation.qpos'"),
+        ({"joint_position": ["elbow"]}, "no column 'elbow'.*panda_joint1"),
         ({"position": f"{STATE}[0:2]"}, "position 2 columns, it takes 3"),
         ({"joint_position": []}, "joint_position no columns"),
         *(
             (
                 {"joint_position": f"{STATE}[{bounds}]"},
-                rf"{STATE}: mapping takes joint_position from .*\[{bounds}\]', which is no "
+                rf"{STATE}: joint_position takes .*\[{bounds}\]', which is no "
                 rf"range of its 3 components",
             )
             for bounds in ("0:6", "3:6", "3:", "4", "2:1", "2:2", "", "0:3:2", "x")

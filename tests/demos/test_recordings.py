@@ -104,7 +104,11 @@ def test_durations_and_rates_are_positive(tmp_path, name, value):
     ("arrays", "columns", "message"),
     [
         ({"x": Q}, {}, "name the arrays of joints or poses.*it holds x"),
-        ({"q": Q}, {"joint_position": "p"}, "no array 'p' for joint_position; it holds q"),
+        (
+            {"q": Q},
+            {"joint_position": "p"},
+            "no column 'p' for joint_position; there are features q",
+        ),
         ({"q": Q, "t": TIME[:-2]}, {"joint_position": "q"}, "38 stamps for 40 frames"),
         (
             {"a": Q[:, 0], "b": Q[:-1, 1], "t": TIME},

@@ -7,6 +7,8 @@ the contract or sidecar kept with the dataset, then the naming conventions of `q
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.issues import DatasetError
@@ -187,10 +189,8 @@ def parse_mapping(
 def _named_selection(
     role: str, columns: str | Sequence[str], features: Mapping[str, Feature]
 ) -> ColumnSelection:
-    if isinstance(columns, str):
-        places = _feature_range(role, columns, features)
-    else:
-        places = [_component(role, name, features) for name in columns]
+    texts = [columns] if isinstance(columns, str) else columns
+    places = [p for text in texts for p in column_places(role, text, features, INFO_PATH)]
     if not places:
         raise DatasetError(f"mapping gives {role} no columns; None leaves it out")
     width = ROLES[role].width
@@ -205,16 +205,60 @@ def _named_selection(
     )
 
 
-def _feature_range(
-    role: str, text: str, features: Mapping[str, Feature]
+@runtime_checkable
+class HasComponents(Protocol):
+    """Feature of a dataset, or field of a recording."""
+
+    @property
+    def width(self) -> int:
+        """Number of components."""
+        ...
+
+    @property
+    def names(self) -> tuple[str, ...] | None:
+        """Names of the components, if there are any."""
+        ...
+
+
+def column_places(
+    role: str, text: str, features: Mapping[str, HasComponents], file: str | Path
 ) -> list[tuple[str, int]]:
-    """Columns of a whole feature ("key") or of a part of it ("key[2:5]", "key[3]")."""
+    """Feature and component of each column that a text stands for.
+
+    It may be a feature ("key", or the end of its path), a part of one ("key[2:5]", "key[3]"),
+    or a component ("NAME" or "key/NAME").
+
+    Args:
+        role: Quantity that takes the columns.
+        text: The text.
+        features: Features by key.
+        file: File that declares them, for messages.
+
+    Raises:
+        DatasetError: There is no such column, or there are several.
+    """
     match = None if text in features else _RANGE.fullmatch(text)
     key = match[1] if match else text
     if key not in features:
-        known = ", ".join(features)
-        text = f"mapping takes {role} from a feature that does not exist; there are {known}"
-        raise DatasetError(text, file=INFO_PATH, key=key)
+        named = [
+            (name, index)
+            for name, feature in features.items()
+            for index, known in enumerate(feature.names or ())
+            if text in (known, f"{name}/{known}")
+        ]
+        found = named or [(name, 0) for name in features if name.endswith(f"/{key}")]
+        if len(found) > 1:
+            options = ", ".join(f"{name}/{text}" if named else name for name, _ in found)
+            text = f"{text!r} for {role} is ambiguous: write one of {options}"
+            raise DatasetError(text, file=file, key=role)
+        if named:
+            return named
+        if not found:
+            words = [n for feature in features.values() for n in feature.names or ()]
+            known = f"features {', '.join(features)}; components {', '.join(words) or 'none'}"
+            text = f"there is no column {text!r} for {role}; there are {known}"
+            raise DatasetError(text, file=file, key=role)
+        key = found[0][0]
     width = features[key].width
     first, stop = 0, width
     if match:
@@ -223,32 +267,11 @@ def _feature_range(
         stop = int(bounds[3] or width) if bounds and bounds[2] else first + 1
     if not first < stop <= width:
         text = (
-            f"mapping takes {role} from {text!r}, which is no range of its {width} components: "
-            f"write [first:stop] or [index], counted from 0"
+            f"{role} takes {text!r}, which is no range of its {width} components: write "
+            f"[first:stop] or [index], counted from 0"
         )
-        raise DatasetError(text, file=INFO_PATH, key=key)
+        raise DatasetError(text, file=file, key=key)
     return [(key, index) for index in range(first, stop)]
-
-
-def _component(role: str, name: str, features: Mapping[str, Feature]) -> tuple[str, int]:
-    """Column of a component named "NAME" or "FEATURE/NAME"."""
-    key, slash, component = name.partition("/")
-    places = [
-        (feature.key, index)
-        for feature in features.values()
-        for index, known in enumerate(feature.names or ())
-        if (feature.key, known) == (key, component) or (not slash and known == name)
-    ]
-    if not places:
-        known = ", ".join(n for feature in features.values() for n in feature.names or ())
-        text = "from a component that does not exist; named are"
-        raise DatasetError(
-            f"mapping takes {role} {text} {known or 'none'}", file=INFO_PATH, key=name
-        )
-    if len(places) > 1:
-        options = ", ".join(f"{key}/{name}" for key, _ in places)
-        raise DatasetError(f"mapping for {role} is ambiguous: write one of {options}", key=name)
-    return places[0]
 
 
 class _Conventions:
