@@ -257,7 +257,7 @@ class DemonstrationRecorder:
         self._quality = RecordingQuality(writer.fps, chain)
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
         self._writing: list[Future[int]] = []
-        self._draft: Future[float] | None = None
+        self._draft: Future[None] = self._thread.submit(lambda: None)
         self._draft_due = 0.0
         self._state: RecorderState = "ready"
         self._note, self._insists = "", False
@@ -334,15 +334,11 @@ class DemonstrationRecorder:
             float(frame.get("gripper", 0.0)),
             touching,
         )
-        if self._draft is not None and self._draft.done():
-            # A long demonstration takes longer to write: a tenth of the time at most.
-            took = self._draft.result()
-            self._draft, self._draft_due = None, now + max(_DRAFT_EVERY, 10 * took)
-        if self._draft is None and now >= self._draft_due:
-            frames, task = self._frames[:], self._task() or UNNAMED
-            if self._quality.worthless():
-                self._draft_due = now + _DRAFT_EVERY
-            else:
+        if now >= self._draft_due and self._draft.done():
+            # A long demonstration takes longer to write: drafts of it become rarer.
+            self._draft_due = now + max(_DRAFT_EVERY, self._quality.seconds / 10)
+            if not self._quality.worthless():
+                frames, task = self._frames[:], self._task() or UNNAMED
                 self._draft = self._thread.submit(self._write_draft, frames, task)
 
     def _forget(self) -> None:
@@ -386,13 +382,10 @@ class DemonstrationRecorder:
             )
         return ", ".join(self._quality.met())
 
-    def _write_draft(self, frames: list[Frame], task: str) -> float:
-        """Time that it took [s]."""
-        began = time.perf_counter()
+    def _write_draft(self, frames: list[Frame], task: str) -> None:
         # Write errors are reported when the demonstration is saved.
         with contextlib.suppress(ValueError, OSError):
             self._writer.write_draft(task, frames)
-        return time.perf_counter() - began
 
     def _write(self, frames: list[Frame], task: str) -> int:
         self._writer.start_episode(task)

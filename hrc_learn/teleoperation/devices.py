@@ -201,6 +201,10 @@ DIRECTIONS = MappingProxyType(
 """Direction of each key in the base frame: i away from the robot, j to its left, u up."""
 
 
+_KEY_HOLDS = 0.3
+"""Time that a press of a key counts [s]."""
+
+
 class KeyboardState:
     """Keys held down, and the direction that they request.
 
@@ -209,20 +213,19 @@ class KeyboardState:
     first, then every 30 ms). A keyboard that falls silent requests no motion.
     """
 
-    def __init__(self, holds_for: float = 0.3, clock: Callable[[], float] = time.monotonic):
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
         """Start with no key held.
 
         Args:
-            holds_for: Time that a press counts [s].
             clock: Monotonic clock [s].
         """
-        self._holds_for, self._clock = holds_for, clock
+        self._clock = clock
         self._until = dict.fromkeys(DIRECTIONS, float("-inf"))
 
     def press(self, key: str) -> None:
         """Note a press or repeat; other keys than those of `DIRECTIONS` have no effect."""
         if key in self._until:
-            self._until[key] = self._clock() + self._holds_for
+            self._until[key] = self._clock() + _KEY_HOLDS
 
     def direction(self) -> Float[np.ndarray, "3"]:
         """The direction asked for now: a unit vector, or zero."""

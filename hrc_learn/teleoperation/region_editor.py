@@ -193,7 +193,7 @@ class RegionEditor:
         self._box = scene.add_box(
             "/region/box",
             color=_COLOUR,
-            dimensions=_doubled(region.half_size),
+            dimensions=_triple(2 * np.array(region.half_size)),
             opacity=0.12,
             side="double",
             cast_shadow=False,
@@ -236,7 +236,7 @@ class RegionEditor:
     def _update(self) -> None:
         region = self.drawn
         self._gizmo.position = region.centre
-        self._box.dimensions = _doubled(region.half_size)
+        self._box.dimensions = _triple(2 * np.array(region.half_size))
         self._box.opacity = 0.3 if self._in_force.value else 0.12
         self._edges.points = box_edges(region.half_size)
         self._corner.position = region.half_size
@@ -288,8 +288,3 @@ def _once(
         act(event)
 
     listen()(heard)
-
-
-def _doubled(half_size: tuple[float, float, float]) -> tuple[float, float, float]:
-    x, y, z = half_size
-    return 2 * x, 2 * y, 2 * z

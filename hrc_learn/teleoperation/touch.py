@@ -348,24 +348,16 @@ class Touch(Human):
         config, before = self._config, self.place
         likelier = hand.evidence - above.evidence
         evidence = max(above, hand).evidence - none
-        sure = evidence > config.evidence
         # Once touched, half of the force is enough, as long as something tells of it and it is
         # not far likelier to be elsewhere.
-        felt = evidence > 0
-        if (
-            before == "elbow"
-            and felt
-            and likelier < _CHANGES
-            and above.size > 0.5 * config.elbow_force
-        ):
-            self.place = "elbow"
-        elif (
-            before == "hand"
-            and felt
-            and likelier > -_CHANGES
-            and hand.size > 0.5 * config.hand_force
-        ):
-            self.place = "hand"
+        stays = {
+            "nothing": False,
+            "elbow": likelier < _CHANGES and above.size > 0.5 * config.elbow_force,
+            "hand": likelier > -_CHANGES and hand.size > 0.5 * config.hand_force,
+        }
+        sure = evidence > config.evidence
+        if evidence > 0 and stays[before]:
+            self.place = before
         elif sure and likelier < 0 and above.size > config.elbow_force:
             self.place = "elbow"
         elif sure and likelier > _SURE and hand.size > config.hand_force:

@@ -77,10 +77,7 @@ def _filled(clause: Clause, reports: Sequence[Report]) -> Clause:
         for name in clause.parameters
     ]
     measured = [
-        (
-            number,
-            [m for m in report.table if m.name in clause.measured],
-        )
+        (number, [m for m in report.table if m.name in clause.measured])
         for number, report in enumerate(reports, start=1)
     ]
     return replace(clause, parameters=parameters, measured=measured)

@@ -127,7 +127,7 @@ class CameraInset:
         """
         self._camera = camera
         self._scale = _INSET * width / camera.model.width
-        size = round(_INSET * width), round(_INSET * width * _aspect(camera.model))
+        size = round(_INSET * width), round(self._scale * camera.model.height)
         self._images = [Image.fromarray(image).resize(size) for image in camera.images]
 
     def at(self, step: int, time: float) -> Picture:
@@ -156,10 +156,6 @@ class CameraInset:
             anchor="lm",
         )
         return np.asarray(image)
-
-
-def _aspect(model: CameraModel) -> float:
-    return model.height / model.width
 
 
 @cache

@@ -212,14 +212,11 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
     start, end = (np.array([getattr(s, at) for s in shapes]) for at in ("start", "end"))
     axis = end - start
     length = np.linalg.norm(axis, axis=1)
-    direction = np.where(
-        length[:, None] > 0, axis / np.maximum(length, 1e-12)[:, None], [0, 0, 1]
-    )
+    direction = axis / np.maximum(length, 1e-12)[:, None]
     # Half way between z and the axis lies the normal of the turn by pi that swaps them; its
-    # quaternion is (0, normal). Where both are opposite, any normal across z will do.
-    half = direction + np.array([0.0, 0.0, 1.0])
-    norm = np.linalg.norm(half, axis=1, keepdims=True)
-    normal = np.where(norm > 1e-9, half / np.maximum(norm, 1e-12), [1.0, 0.0, 0.0])
+    # quaternion is (0, normal). The tilt chooses x where both are opposite.
+    half = direction + np.array([1e-9, 0.0, 1.0])
+    normal = half / np.linalg.norm(half, axis=1, keepdims=True)
     return rr.Capsules3D(
         lengths=length,
         radii=[s.radius for s in shapes],

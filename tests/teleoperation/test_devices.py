@@ -162,21 +162,21 @@ def test_the_device_is_read_before_it_is_asked():
 
 def test_keys_count_for_a_moment_and_together():
     clock = Clock()
-    keys = KeyboardState(holds_for=0.2, clock=clock)
+    keys = KeyboardState(clock)
     keys.press("i")
     keys.press("x")
     assert keys.direction().tolist() == [1.0, 0.0, 0.0]
     clock.time = 0.15
     keys.press("u")
     np.testing.assert_allclose(keys.direction(), np.array([1, 0, 1]) / 2**0.5)
-    clock.time = 0.2
+    clock.time = 0.3
     assert keys.direction().tolist() == [0.0, 0.0, 1.0]
-    clock.time = 0.36
+    clock.time = 0.46
     assert not keys.direction().any()
 
 
 def test_opposite_keys_cancel():
-    keys = KeyboardState(clock=Clock())
+    keys = KeyboardState(Clock())
     keys.press("j")
     keys.press("l")
     assert not keys.direction().any()
@@ -186,7 +186,7 @@ def test_opposite_keys_cancel():
 def test_what_is_typed_leads_grips_and_asks():
     typed = iter(["i", "", "]13", "[q"])
     clock = Clock()
-    keyboard = TerminalKeyboard(panda, lambda: next(typed), KeyboardState(0.3, clock))
+    keyboard = TerminalKeyboard(panda, lambda: next(typed), KeyboardState(clock))
     assert isinstance(keyboard, Human)
     asked = keyboard.read(STATE)
     np.testing.assert_allclose(asked.twist[:3], [SPEED, 0, 0])
