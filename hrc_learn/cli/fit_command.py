@@ -198,19 +198,21 @@ def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> Non
         error = 100 * metrics[f"held_out_{channel}_{better}_nrmse_median"]
         mean = 100 * metrics[f"held_out_{channel}_mean_nrmse_median"]
         print(
-            f"{channel}: {_MODELS[better]} predicts held-out demonstrations with an NRMSE of "
-            f"{error:.1f} %, the mean with {mean:.1f} %; hrc evaluate uses it"
+            f"{channel}: held-out demonstrations are predicted by {_MODELS[better]}, NRMSE "
+            f"{error:.1f} %, by the mean {mean:.1f} %; hrc evaluate uses it"
         )
     print(f"Model in {shlex.quote(str(args.folder))}")
     write_values(args.json, metrics)
 
 
 _MODELS = {
-    "contextual": "a function of start and goal (or of --context)",
-    "nearest": "the demonstration of the nearest start and goal",
-    "kernel": "a mean weighted by nearness of start and goal (or of --context)",
+    "mean": "the mean",
+    "contextual": "start and goal or context",
+    "nearest": "the nearest demonstration",
+    "kernel": "nearby demonstrations",
     "line": "a straight line",
 }
+"""Kinds of model that predict held-out demonstrations."""
 
 
 # Key in JSON of a channel, title, unit and largest value that passes. A primitive represents
@@ -222,11 +224,6 @@ _ROWS = (
     ("{}_turn_rmse_max", "worst rotation error", "deg", None),
 )
 _WORDS = {"joint": "joints", "orientation": "orientation"}
-_HELD_OUT = {
-    "held_out_{}_mean_nrmse_median": "held out, by the mean",
-    "held_out_{}_contextual_nrmse_median": "held out, by start and goal",
-    "held_out_{}_nearest_nrmse_median": "held out, by the nearest",
-}
 _RESOLUTION = 0.01
 """Resolution of NRMSE [%] and of rotation errors [deg]: an encoder resolves 1e-4 rad."""
 
@@ -242,9 +239,10 @@ def _rows(metrics: Mapping[str, float]) -> list[Measurement]:
         if key in metrics
     ]
     for channel in CHANNELS:
-        held_out = [key for key in _HELD_OUT if key.format(channel) in metrics]
-        best = sorted(held_out, key=lambda key: metrics[key.format(channel)])[:1]
-        shown = [*_ROWS, *((key, _HELD_OUT[key], "%", None) for key in best)]
+        keys = {kind: f"held_out_{channel}_{kind}_nrmse_median" for kind in _MODELS}
+        held_out = [kind for kind, key in keys.items() if key in metrics]
+        best = sorted(held_out, key=lambda kind: metrics[keys[kind]])[:1]
+        shown = [*_ROWS, *((keys[k], f"held out, by {_MODELS[k]}", "%", None) for k in best)]
         rows += [
             Measurement(
                 name=f"{_WORDS.get(channel, 'end effector')}: {name}",

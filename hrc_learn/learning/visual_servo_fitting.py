@@ -85,7 +85,10 @@ def fit_visual_servo(
         held_out_error=float(held_out.error.square().sum(-1).mean().sqrt()),
     )
     ends = _ends(demos)
-    target = _visual_target(ends, camera.camera) if ends else None
+    target = None
+    if ends:
+        objects = np.array([end.object_pixel for end in ends], dtype=np.float64)
+        target = VisualTarget.fit(camera.camera, objects, _poses(ends))
     return VisualServoSkill(
         jacobian=network,
         target=target,
@@ -177,11 +180,6 @@ def _poses(ends: Sequence[_End]) -> Pose:
         torch.stack([end.pose.position for end in ends]),
         torch.stack([end.pose.orientation for end in ends]),
     )
-
-
-def _visual_target(ends: Sequence[_End], camera: Float[Tensor, "13"]) -> VisualTarget:
-    objects = np.array([end.object_pixel for end in ends], dtype=np.float64)
-    return VisualTarget.fit(camera, objects, _poses(ends))
 
 
 def _marker_angle(
