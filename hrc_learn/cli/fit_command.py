@@ -207,7 +207,7 @@ def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> Non
 
 _MODELS = {
     "mean": "the mean",
-    "contextual": "start and goal or context",
+    "contextual": "a regression",
     "nearest": "the nearest demonstration",
     "kernel": "nearby demonstrations",
     "line": "a straight line",
