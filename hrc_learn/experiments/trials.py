@@ -212,7 +212,7 @@ def _trials(
     with ProcessPoolExecutor(
         processes, context, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        sent = ByValue(run)
+        sent: Any = ByValue(run)
         waiting = {pool.submit(_trial, sent, seed, failures) for seed in seeds}
         try:
             while waiting:
