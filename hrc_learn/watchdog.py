@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from types import TracebackType
 from typing import final
 
 _FIRST_PAUSE = 0.02
@@ -20,56 +19,38 @@ class WatchdogError(RuntimeError):
     """The watchdog is no longer alive: do not move the arm."""
 
 
-def report_failed_stop(error: BaseException, attempts: int) -> None:
-    """Print on stderr that a stop failed, and the number of attempts."""
-    if attempts & (attempts - 1) == 0:  # the 1st, 2nd, 4th, ...
-        print(f"watchdog: stop failed {attempts} times, retrying: {error!r}", file=sys.stderr)
-
-
-Report = Callable[[BaseException, int], object]
-"""Callback for each failed stop, with the error and the number of failures in a row."""
-
-
-def bring_to_rest(
-    stop: Callable[[], object],
-    timeout: float,
-    report: Report = report_failed_stop,
-    sleep: Callable[[float], None] = time.sleep,
-) -> bool:
+def bring_to_rest(stop: Callable[[], object], timeout: float) -> bool:
     """Stop an arm, retrying with growing pauses.
 
     Args:
         stop: Brings the arm to rest.
         timeout: Time to go on retrying [s].
-        report: Called with each failure.
-        sleep: Waits at least a given time [s].
 
     Returns:
         True if an attempt succeeded.
     """
     end, pause, attempts = time.monotonic() + timeout, _FIRST_PAUSE, 0
-    while (error := _attempt(stop)) is not None:
+    while not _attempt(stop, attempts):
         attempts += 1
-        _tell(report, error, attempts)
         if time.monotonic() + pause > end:
             return False
-        sleep(pause)
+        time.sleep(pause)
         pause = min(2 * pause, _LONGEST_PAUSE)
     return True
 
 
-def _attempt(stop: Callable[[], object]) -> BaseException | None:
-    """Try to stop once; return the error, or None."""
+def _attempt(stop: Callable[[], object], failed: int) -> bool:
+    """Try to stop once, after a number of failures in a row; True if the arm is at rest."""
     try:
         stop()
+        return True
     except (Exception, SystemExit) as error:  # a driver's sys.exit() must not end the watch
-        return error
-    return None
-
-
-def _tell(report: Report, error: BaseException, attempts: int) -> None:
-    with suppress(Exception):  # a closed stderr must not end the watch either
-        report(error, attempts)
+        failed += 1
+        if failed & (failed - 1) == 0:  # the 1st, 2nd, 4th, ...
+            with suppress(Exception):  # a closed stderr must not end the watch either
+                text = f"watchdog: stop failed {failed} times, retrying: {error!r}"
+                print(text, file=sys.stderr)
+        return False
 
 
 @final
@@ -90,8 +71,6 @@ class Watchdog:
 
     Attributes:
         trips: Number of times the loop was silent for too long.
-        failures: Number of failed stops.
-        error: Error of the last failed stop; None if no stop has failed.
     """
 
     def __init__(
@@ -100,7 +79,6 @@ class Watchdog:
         stop: Callable[[], object],
         *,
         clock: Callable[[], float] = time.monotonic,
-        report: Report = report_failed_stop,
     ):
         """Set up; the time starts with the first `feed`, or on entering the context.
 
@@ -108,16 +86,14 @@ class Watchdog:
             timeout: Longest silence [s]; it is noticed up to a quarter of it late.
             stop: Brings the arm to rest. Called once for every silence, and again if it fails.
             clock: Current time [s].
-            report: Called with each failed stop; by default it prints a line to stderr.
 
         Raises:
             ValueError: The timeout is not positive.
         """
         if not timeout > 0:
             raise ValueError(f"timeout must be positive, but is {timeout}")
-        self.trips, self.failures = 0, 0
-        self.error: BaseException | None = None
-        self._timeout, self._stop, self._clock, self._report = timeout, stop, clock, report
+        self.trips = 0
+        self._timeout, self._stop, self._clock = timeout, stop, clock
         self._fed: float | None = None
         # When to stop next, and the pause after that; None: there is nothing to stop.
         self._due: float | None = None
@@ -126,11 +102,6 @@ class Watchdog:
         self._lock = threading.Lock()
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-
-    @property
-    def tripped(self) -> bool:
-        """True if the watchdog has acted since it was last fed."""
-        return self.trips > 0 and self._fed is None
 
     def feed(self) -> None:
         """Report that the loop is alive.
@@ -150,7 +121,7 @@ class Watchdog:
         """Stop the arm if a stop is due. The thread calls this by itself.
 
         Returns:
-            True if a stop was due and succeeded.
+            True if a stop was due.
         """
         with self._lock:
             now = self._clock()
@@ -162,18 +133,15 @@ class Watchdog:
                 return False
             self._due, self._stopping_since = None, now
         # Outside the lock: stopping an arm may take long, and may feed.
-        error = _attempt(self._stop)
+        stopped = _attempt(self._stop, self._in_a_row)
         with self._lock:
             self._stopping_since = None
-            if error is None:
-                return True
-            self.failures += 1
             self._in_a_row += 1
-            self.error = error
-            if self._fed is None:  # if it was fed meanwhile, the loop is in charge again
+            if (
+                not stopped and self._fed is None
+            ):  # if it was fed meanwhile, the loop is in charge again
                 self._due = self._clock() + self._pause
                 self._pause = min(2 * self._pause, _LONGEST_PAUSE)
-        _tell(self._report, error, self._in_a_row)
         return True
 
     def start(self) -> None:
@@ -190,15 +158,10 @@ class Watchdog:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close()
-        if error is not None or self._due is not None:
-            bring_to_rest(self._stop, _LONGEST_PAUSE, self._report)
+        if kind is not None or self._due is not None:
+            bring_to_rest(self._stop, _LONGEST_PAUSE)
 
     def _watch(self) -> None:
         # A silence is noticed at most a quarter of the timeout late.

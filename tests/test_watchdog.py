@@ -27,11 +27,9 @@ def test_it_stops_a_silent_loop_once_and_watches_again_when_fed():
         assert not dog.check()
     clock.now = 0.29
     assert dog.check()
-    assert dog.tripped
     clock.now = 5.0
     assert not dog.check()
     dog.feed()
-    assert not dog.tripped
     clock.now = 5.2
     assert dog.check()
     assert stops == [0.29, 5.2]
@@ -83,29 +81,23 @@ class Stop:
         self.worked.set()
 
 
-def silent(error: BaseException, attempts: int) -> None:
-    """Says nothing of a stop that failed."""
-
-
 @pytest.mark.parametrize("error", [OSError("offline"), SystemExit(1), RuntimeError()])
 def test_its_thread_survives_stops_that_raise(error):
     stop = Stop(4, error)
-    with Watchdog(0.01, stop, report=silent) as dog:
+    with Watchdog(0.01, stop) as dog:
         assert stop.worked.wait(timeout=60)
-        deadline = time.monotonic() + 60
-        while dog.tripped and time.monotonic() < deadline:
-            dog.feed()
         stop.failing, first = 6, dog.trips
+        dog.feed()
         stop.worked.clear()
         assert stop.worked.wait(timeout=60)  # it watches on
         assert dog.trips > first
-        assert (dog.failures, dog.error) == (5, error)
+        assert len(stop.tried) == 7
 
 
 def test_it_tries_on_with_growing_pauses_and_for_ever():
     clock = Clock()
     stop = Stop(float("inf"), clock=clock)
-    dog = Watchdog(0.1, stop, clock=clock, report=silent)
+    dog = Watchdog(0.1, stop, clock=clock)
     dog.feed()
     while clock.now < 600:
         clock.now += 0.005
@@ -115,7 +107,7 @@ def test_it_tries_on_with_growing_pauses_and_for_ever():
     assert 0.1 < tried[0] <= 0.105 + 1e-9
     assert pauses[:6] == pytest.approx([0.02, 0.04, 0.08, 0.16, 0.32, 0.64], abs=0.006)
     assert max(pauses) < 1.01
-    assert len(tried) == dog.failures > 590
+    assert len(tried) > 590
     assert dog.trips == 1
     dog.feed()  # the loop is back: there is nothing to stop any more
     for _ in range(15):
@@ -123,7 +115,7 @@ def test_it_tries_on_with_growing_pauses_and_for_ever():
         assert not dog.check()
 
 
-def test_failures_are_reported_and_a_report_that_fails_changes_nothing(capsys):
+def test_failures_are_reported_and_a_report_that_fails_changes_nothing(capsys, monkeypatch):
     clock = Clock()
     dog = Watchdog(0.1, Stop(3), clock=clock)
     dog.feed()
@@ -133,12 +125,10 @@ def test_failures_are_reported_and_a_report_that_fails_changes_nothing(capsys):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2  # the first and the second; then the fourth, the eighth, ...
     assert "stop failed 1 times, retrying: OSError('the control box is offline')" in lines[0]
-
-    def broken(error: BaseException, attempts: int) -> None:
-        raise BrokenPipeError
-
+    monkeypatch.setattr("sys.stderr", None)
+    monkeypatch.setattr("builtins.print", Stop(float("inf"), BrokenPipeError()))
     stop = Stop(3)
-    with Watchdog(0.01, stop, report=broken):
+    with Watchdog(0.01, stop):
         assert stop.worked.wait(timeout=60)
 
 
@@ -170,7 +160,7 @@ def test_a_loop_learns_that_a_stop_hangs_and_can_still_leave():
 
 def test_a_loop_that_raises_leaves_the_arm_at_rest():
     stop = Stop(2)
-    with pytest.raises(ZeroDivisionError), Watchdog(60.0, stop, report=silent):
+    with pytest.raises(ZeroDivisionError), Watchdog(60.0, stop):
         raise ZeroDivisionError
     assert stop.worked.is_set()
     stop = Stop(0)
@@ -180,9 +170,9 @@ def test_a_loop_that_raises_leaves_the_arm_at_rest():
 
 
 def test_bringing_to_rest_gives_up_when_its_patience_ends():
-    assert bring_to_rest(Stop(3), 10.0, silent)
+    assert bring_to_rest(Stop(3), 10.0)
     stop = Stop(float("inf"))
     began = time.monotonic()
-    assert not bring_to_rest(stop, 0.3, silent)
+    assert not bring_to_rest(stop, 0.3)
     assert 0.1 < time.monotonic() - began < 5
     assert len(stop.tried) == 4  # after 0, 0.02, 0.06, 0.14 s; the next would be after 0.30

@@ -26,11 +26,9 @@ from jaxtyping import Float
 from hrc_learn.distributed import ByValue
 from hrc_learn.protocols import Arm, ArmState, Gripper
 from hrc_learn.watchdog import (
-    Report,
     Watchdog,
     WatchdogError,
     bring_to_rest,
-    report_failed_stop,
 )
 
 _STARTUP = 60.0
@@ -47,7 +45,7 @@ class DriverProcess:
 
     Attributes:
         process: The process.
-        news: Numbers that the process sends with each answer, as of the last one.
+        news: Number that the process sends with each answer, as of the last one.
     """
 
     def __init__(self, serve: Callable[..., None], *arguments: object, name: str):
@@ -63,7 +61,7 @@ class DriverProcess:
             DriverError: The device cannot be reached.
             WatchdogError: The process died, or takes too long.
         """
-        self.news: tuple[int, ...] = ()
+        self.news = 0
         self._name, self._lost, self._number = name, "", 0
         self._calling = threading.Lock()
         # A forked process would have this one's locks, but not the threads that hold them.
@@ -152,21 +150,21 @@ def opened[Driver](connection: Connection, open_driver: Callable[[], Driver]) ->
     try:
         return open_driver()
     except Exception as error:
-        connection.send((0, None, _described(error), ()))
+        connection.send((0, None, _described(error), 0))
         return None
 
 
 def answer_calls(
     connection: Connection,
     carry_out: Callable[..., object],
-    news: Callable[[], tuple[int, ...]] = tuple,
+    news: Callable[[], int] = int,
 ) -> None:
     """Answer calls until the calling process closes the connection or dies.
 
     Args:
         connection: The process's end of the connection.
         carry_out: Carries out a call, given its name and arguments.
-        news: Numbers to send with each answer.
+        news: Number to send with each answer.
     """
     with suppress(EOFError, OSError):
         connection.send((0, None, "", news()))
@@ -195,9 +193,7 @@ SIGNALS = tuple(
 
 
 @contextmanager
-def ending_at_rest(
-    stop: Callable[[], object], *, patience: float = 5.0, report: Report = report_failed_stop
-) -> Iterator[None]:
+def ending_at_rest(stop: Callable[[], object], *, patience: float = 5.0) -> Iterator[None]:
     """Bring the arm to rest however this block ends.
 
         with ending_at_rest(arm.stop):
@@ -211,7 +207,6 @@ def ending_at_rest(
     Args:
         stop: Brings the arm to rest.
         patience: Longest time for which a failing stop is repeated [s].
-        report: Called with each failure.
 
     Raises:
         RuntimeError: The arm could not be stopped, and the block itself raised nothing.
@@ -235,7 +230,7 @@ def ending_at_rest(
         finally:
             ending = True
     finally:  # also where the signal came in the line above
-        stopped = bring_to_rest(stop, patience, report)
+        stopped = bring_to_rest(stop, patience)
         for number, handler in before.items():
             signal.signal(number, handler)
         if not stopped:
@@ -311,12 +306,7 @@ class ArmProcess:
     @property
     def trips(self) -> int:
         """Number of times that the process had stopped the arm, as of its last answer."""
-        return self._driver.news[0]
-
-    @property
-    def failures(self) -> int:
-        """Number of its stops that had failed, as of its last answer."""
-        return self._driver.news[1]
+        return self._driver.news
 
     def read(self) -> ArmState:
         """Return the newest state."""
@@ -396,6 +386,6 @@ def _serve(
     with ending_at_rest(arm.stop, patience=_PATIENCE):
         dog.start()
         try:
-            answer_calls(connection, carry_out, lambda: (dog.trips, dog.failures))
+            answer_calls(connection, carry_out, lambda: dog.trips)
         finally:
             dog.close()

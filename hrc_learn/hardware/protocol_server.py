@@ -100,11 +100,7 @@ class ArmServer:
         self.cycles = self.missed = self.lost = self.longest_gap = self._gap = 0
         self._loss, self._chance, self._on_cycle = loss, random.Random(0), on_cycle
         try:
-            from hrc_learn.hardware.served_robot import (
-                LossyServer,
-                ServedRobot,
-                ServedSimulator,
-            )
+            from hrc_learn.hardware.served_robot import LossyServer, ServedRobot
         except ImportError as error:
             raise ImportError(
                 "the protocol of the arm is spoken by the package franky-sim: pip install "
@@ -114,9 +110,6 @@ class ArmServer:
         self._server: Any = LossyServer(self._robot, list(addresses))
         self._server.init()
         self.address: str = self._server.hostname
-        self._simulator = ServedSimulator(world, self._robot)
-        self._simulator.init()
-        self._simulator.start()
         self._server.process_commands()  # none yet, but a step needs a command before it
         self._due = world.time
         # Until when the thread may go on; None: as long as calls of the driver take.
@@ -175,7 +168,6 @@ class ArmServer:
             self._turn.notify_all()
         self._thread.join()
         self._hang_up()
-        self._simulator.cleanup()
 
     def _hang_up(self) -> None:
         self._server.cleanup()
@@ -217,7 +209,7 @@ class ArmServer:
         cycle.
         """
         server, robot = self._server, self._robot
-        self._simulator.step()
+        robot.step()
         robot.begin_cycle()
         connected = server.udp_connected
         server.lose_state, server.lose_answer = (

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from franky_sim.base_simulator import BaseRobot, BaseSimulator, InnerRobotState
+from franky_sim.base_simulator import BaseRobot, InnerRobotState
 from franky_sim.franka_robot_server import FrankaRobotServer
 
 from hrc_learn.hardware.franka_settings import CYCLE
@@ -40,10 +40,7 @@ class ServedRobot(BaseRobot):
         self.velocity = self._last = self._before = np.zeros(7)
         self._width_goal: float | None = None
         self._finger_speed = 0.0
-        self._look()
-
-    def _look(self) -> None:
-        self.reading = self._world.arm.read()
+        self.reading = world.arm.read()
 
     def _get_state(self) -> InnerRobotState:
         read = self.reading
@@ -126,23 +123,12 @@ class ServedRobot(BaseRobot):
         self._width_now = float(np.clip(self._width_now + change, 0.0, 2 * FINGER_STROKE))
         self._world.arm.move(self._width_now)
 
-    def _post_step(self) -> None:
-        self._look()
-        super()._post_step()
-
-
-class ServedSimulator(BaseSimulator):
-    """One robot in a world."""
-
-    def __init__(self, world: World, robot: ServedRobot):
-        super().__init__()
-        self._world, self._robot = world, robot
-
-    def _get_robots(self) -> list[BaseRobot]:
-        return [self._robot]
-
-    def _step(self) -> None:
+    def step(self) -> None:
+        """Advance the world by one cycle, and take its reading."""
+        self._pre_step()
         self._world.advance(CYCLE)
+        self.reading = self._world.arm.read()
+        self._post_step()
 
 
 class LossyServer(FrankaRobotServer):

@@ -138,7 +138,11 @@ class RunRecording:
     """Messages to the person near the arm."""
 
     def __post_init__(self) -> None:
-        series: dict[str, np.ndarray | None] = {name: getattr(self, name) for name in _SERIES}
+        series = {
+            name: value
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray) and name not in _PATHS
+        }
         series |= {f"potentials[{name!r}]": value for name, value in self.potentials.items()}
         for field_name in ("safety", "worker_distance", "hindered"):
             named = getattr(self, field_name)
@@ -152,31 +156,12 @@ class RunRecording:
         check_samples(self.time, series)
 
 
-_SERIES = (
-    "joint_position",
-    "joint_velocity",
-    "demo_joint_position",
-    "position",
-    "image_jacobian",
-    "true_image_jacobian",
-    "weight_norm",
-    "potential_rate",
-    "nullspace_input",
-    "push",
-    "followed",
-    "elbow_motion",
-    "position_deviation",
-    "rotation_deviation",
-    "worker_nearest",
-    "active_region",
-    "drawn",
-)
+_PATHS = ("demo_path", "plan_path")
+"""Arrays without a sample for each control step."""
 
 
-def check_samples(
-    time: Float[np.ndarray, " time"], series: Mapping[str, np.ndarray | None]
-) -> None:
-    wrong = {n: len(v) for n, v in series.items() if v is not None and len(v) != len(time)}
+def check_samples(time: Float[np.ndarray, " time"], series: Mapping[str, np.ndarray]) -> None:
+    wrong = {n: len(v) for n, v in series.items() if len(v) != len(time)}
     if wrong:
         raise ValueError(
             f"time has {len(time)} samples, but "

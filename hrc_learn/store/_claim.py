@@ -96,8 +96,6 @@ class Claim:
             return
         try:
             self.clear()
-            if os.name == "nt":  # Windows deletes no open file
-                self._lock.close()
             # Deleted while held: a process that has opened it meanwhile notices and retries.
             (self.workspace / _LOCK).unlink(missing_ok=True)
         finally:

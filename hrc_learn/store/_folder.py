@@ -5,6 +5,7 @@ Only files that this package has written may be deleted with their folder.
 
 import contextlib
 import errno
+import fcntl
 import filecmp
 import hashlib
 import os
@@ -22,20 +23,15 @@ MADE_BY = "made_by.json"
 """File in each folder of results that records its inputs."""
 MANIFEST = ".manifest.json"
 """File that lists all other files of a folder, with their checksums."""
-# Errors of file systems without locks, such as some network ones; not every OS has each.
-_NO_LOCKS = {
-    getattr(errno, name)
-    for name in ("ENOTSUP", "EOPNOTSUPP", "ENOSYS", "ENOLCK", "EINVAL")
-    if hasattr(errno, name)
-}
+# Errors of file systems without locks, such as some network ones.
+_NO_LOCKS = {errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
 
 
 SUFFIX = ".writing"
 """Suffix of a workspace."""
 DISK_ERRORS = {
-    getattr(errno, name)
-    for name in ("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "EIO")
-    if hasattr(errno, name)
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
+    *(errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
 }
 """Errors of a full, read-only, protected or broken disk."""
 
@@ -43,16 +39,7 @@ DISK_ERRORS = {
 def try_lock(file: TextIO) -> bool:
     """Lock an open file; False if another process holds the lock."""
     try:
-        if os.name == "nt":
-            import msvcrt
-
-            # One byte far behind the text, which other processes must be able to read.
-            file.seek(2**30)
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         return error.errno in _NO_LOCKS  # then nothing keeps two writers apart
     return True
@@ -120,15 +107,12 @@ def sync_tree(folder: Path) -> None:
 
 def sync_file(path: Path) -> None:
     """Sync the content of a file to disk."""
-    # Windows syncs only files open for writing; other systems also read-only ones.
-    with path.open("r+b" if os.name == "nt" else "rb") as file:
+    with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
 def sync_folder(path: Path) -> None:
     """Sync the names in a folder to disk, if the system supports it."""
-    if os.name == "nt":
-        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         # Some network file systems refuse; they keep the order of names themselves.

@@ -362,7 +362,7 @@ def test_tuning_on_states_in_another_order_is_refused():
     config.set_dataset_feature_metadata(names | same)
     other = {"observation.state": {"names": ["a.pos", "gripper.pos", "b.pos"]}}
     with pytest.raises(
-        ValueError, match=r"b\.pos, gripper\.pos, a\.pos, in this order; .*a\.pos"
+        ValueError, match=r"in the order b\.pos, gripper\.pos, a\.pos; .*a\.pos"
     ):
         config.set_dataset_feature_metadata(names | other)
 

@@ -119,18 +119,15 @@ class MotionPolicyConfig(PreTrainedConfig):
         """
         self.action_feature_names = _names(features, "action")
         self.state_names = _names(features, "observation.state")
-        if self._trained_for not in (None, self.action_feature_names):
-            raise ValueError(
-                f"the policy in {self.pretrained_path} was trained for the actions "
-                f"{', '.join(self._trained_for)}; the dataset has "
-                f"{', '.join(self.action_feature_names or ['no names'])}"
-            )
-        if self._trained_on not in (None, self.state_names):
-            raise ValueError(
-                f"the policy in {self.pretrained_path} was trained on observation.state with "
-                f"{', '.join(self._trained_on)}, in this order; the dataset has "
-                f"{', '.join(self.state_names or ['no names'])}"
-            )
+        for before, now, of in (
+            (self._trained_for, self.action_feature_names, "for the actions"),
+            (self._trained_on, self.state_names, "on observation.state in the order"),
+        ):
+            if before not in (None, now):
+                raise ValueError(
+                    f"the policy in {self.pretrained_path} was trained {of} "
+                    f"{', '.join(before)}; the dataset has {', '.join(now or ['no names'])}"
+                )
 
 
 def _names(features: dict[str, dict[str, Any]], key: str) -> list[str] | None:
