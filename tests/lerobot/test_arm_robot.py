@@ -1,5 +1,7 @@
 """What LeRobot's names for the values of an arm stand for."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -47,10 +49,15 @@ def test_an_action_without_joints_is_refused():
         VALUES.target_of({JOINTS[0]: 0.0})
 
 
+@cache
+def _arm_of_six_joints():
+    return bare().with_hand()
+
+
 @pytest.fixture
 def six(monkeypatch):
     """Lets every simulated arm be one of six joints, a Panda's without the third."""
-    arm = bare().with_hand()
+    arm = _arm_of_six_joints()
     monkeypatch.setattr(MujocoArmRobotConfig, "work_arm", lambda config: arm)
     return arm
 

@@ -27,7 +27,7 @@ CAMERA = MarkerCamera(
 )
 
 
-def episode(rng, camera=CAMERA, frames=100):
+def episode(rng, camera=CAMERA, frames=60):
     """Poses of a tool as vectors, and the pixels of its marker."""
     time = np.linspace(0, 1, frames)[:, None]
     wave = sum(rng.normal(0, 0.05, 3) * np.sin(2 * np.pi * k * time) for k in (0.5, 1.0, 1.5))
@@ -45,7 +45,7 @@ def dataset(tmp_path_factory):
     root, rng = tmp_path_factory.mktemp("sets") / "set", np.random.default_rng(0)
     names = [name.removesuffix(".pos") for name in ("a.pos", *HAND, *MARKER)]
     with DatasetWriter(root, FPS, "any", names) as writer:
-        for _ in range(6):
+        for _ in range(4):
             writer.start_episode("look")
             pose, pixels = episode(rng)
             for k, pixel in enumerate(pixels):

@@ -23,7 +23,7 @@ def limits(width=2, **change):
     return ActionLimits(**values | change)
 
 
-def gentle(seconds=4.0):
+def gentle(seconds=2.5):
     """Actions that keep the limits, from rest."""
     t = np.arange(round(seconds * FPS)) / FPS
     return np.stack([0.2 * (1 - np.cos(1.5 * t)), 0.1 * (1 - np.cos(2.2 * t))], axis=-1)
@@ -54,19 +54,19 @@ def test_it_is_as_late_as_it_says(degree, latency):
     upsampler = ActionUpsampler(limits(), rate, degree=degree, latency=latency)
     assert upsampler.latency == ((degree + 1) / 2 if latency is None else latency) / FPS
     speed = 0.3
-    ramp = speed * np.arange(90)[:, None] / FPS * np.ones(2)
+    ramp = speed * np.arange(60)[:, None] / FPS * np.ones(2)
     made = setpoints(upsampler, ramp, ramp[0])
     t = np.arange(len(made)) / rate
     late = t - made[:, 0] / speed
     np.testing.assert_allclose(late[-100:], upsampler.latency, atol=1e-6)
 
 
-@pytest.mark.parametrize("rate", [125.0, 250.0, 1000.0])
+@pytest.mark.parametrize("rate", [125.0, 1000.0])
 @pytest.mark.parametrize("latency", [None, 0.0])
 def test_any_actions_are_followed_within_limits(rate, latency):
     rng = np.random.default_rng(1)
-    actions = rng.normal(size=(40, 2)).repeat(3, 0)
-    actions[50:53] = np.nan
+    actions = rng.normal(size=(14, 2)).repeat(3, 0)
+    actions[25:28] = np.nan
     given = limits(lower=[-1.0, None], upper=[1.0, None])
     made = setpoints(ActionUpsampler(given, rate, latency=latency), actions, np.zeros(2))
     assert np.isfinite(made).all()
