@@ -1,15 +1,16 @@
 """Validation of a dataset before anything is learned from it."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.issues import Issue, ValidationReport, warning
+from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, warning
 from hrc_learn.demos.quality import consistency_checks as consistency
 from hrc_learn.demos.quality import episode_checks, structure_checks
-from hrc_learn.demos.quality.episode_checks import MotionRecord, UsualMotion, motion_sketch
+from hrc_learn.demos.quality.episode_checks import UsualMotion, motion_sketch
 from hrc_learn.demos.quality.structure_checks import read_metadata, read_sound_episodes
 from hrc_learn.demos.quality.video_checks import check_videos
 from hrc_learn.demos.read.columns import (
@@ -20,11 +21,12 @@ from hrc_learn.demos.read.columns import (
     replaced_roles,
 )
 from hrc_learn.demos.read.contract import infer_contract
-from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.read.frames import RawFrames, recorded_stamps, select_quantities
+from hrc_learn.demos.read.dataset_folder import EpisodeEntry
+from hrc_learn.demos.read.frames import RawFrames, select_quantities
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar
 from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
-from hrc_learn.demos.read.source import OpenedDataset
+from hrc_learn.demos.read.quantities import ORIENTATION_ROLES
+from hrc_learn.demos.read.source import DemonstrationSource, OpenedDataset
 from hrc_learn.demos.read.units import Quantities, UnitDecision, unit_factor
 
 METADATA_CHECKS = (
@@ -45,7 +47,6 @@ RAW_EPISODE_CHECKS = (
 MOTION_CHECKS = (
     episode_checks.motion_present,
     episode_checks.rest_at_ends,
-    episode_checks.spikes_and_jumps,
     episode_checks.joint_speeds,
     episode_checks.copied_commands,
 )
@@ -106,6 +107,7 @@ def _first_pass(
         found = select_quantities(frames, columns.selections) if sound else {}
         profiles[entry.index] = profile_episode(entry.index, frames, found, folder.fps)
         if sound:
+            report.run(episode_checks.quaternion_signs, entry, found)
             yield entry, found
 
 
@@ -124,8 +126,14 @@ def _check_content(
     profiles: dict[int, EpisodeProfile] = {}
     if dataset.contract_note is not None:
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
-    episodes = _first_pass(dataset, report, profiles)
-    decisions, faults = dataset.units_from(episodes, units)
+    sound: list[EpisodeEntry] = []
+
+    def episodes() -> Iterator[tuple[EpisodeEntry, Quantities]]:
+        for entry, quantities in _first_pass(dataset, report, profiles):
+            sound.append(entry)
+            yield entry, quantities
+
+    decisions, faults = dataset.units_from(episodes(), units)
     for fault in faults:
         report.add_error(fault)
     report.run(_meaning, columns, decisions if profiles else {})
@@ -133,7 +141,7 @@ def _check_content(
     features = [*consistency.feature_profiles(folder, entries, profiles)]
     usual = _usual_motion(columns, decisions, {f.key: f for f in features})
     doubtful = {fault.episode for fault in faults}
-    _check_motions(folder, report, columns, decisions, usual, doubtful)
+    _check_motions(dataset, sound, decisions, report, usual, doubtful)
     report.run(consistency.column_ranges, features)
     report.run(structure_checks.statistics_fit, folder, features)
     report.run(consistency.lengths, [entries[i] for i in profiles])
@@ -160,40 +168,32 @@ def _check_content(
 
 
 def _check_motions(
-    folder: DatasetFolder,
-    report: ValidationReport,
-    columns: ColumnMapping,
+    dataset: OpenedDataset,
+    entries: Sequence[EpisodeEntry],
     decisions: Mapping[str, UnitDecision],
+    report: ValidationReport,
     usual: UsualMotion,
     doubtful: set[int | None],
 ) -> None:
     """Check the motion of every sound episode whose units are known, in a second pass."""
     sketches = []
-    # What cannot be read was reported in the first pass.
-    for entry, frames in read_sound_episodes(folder, ValidationReport(path=report.path)):
-        if not _is_sound(frames, columns):
+    # No feature extracted from videos is needed.
+    source = DemonstrationSource(replace(dataset, own_feature=True), entries, decisions)
+    for entry, demo in zip(entries, source.each(), strict=True):
+        if isinstance(demo, DatasetError):
+            # Other faults were reported in the first pass.
+            if demo.key in ("time", *ORIENTATION_ROLES):
+                report.add_error(demo)
             continue
-        raw = select_quantities(frames, columns.selections)
-        scaled = {role: v * decisions[role].factor for role, v in raw.items()}
-        episode = MotionRecord(
-            entry=entry,
-            time=scaled["time"][:, 0] if "time" in scaled else recorded_stamps(folder, frames),
-            raw=raw,
-            quantities=scaled,
-            joint_names=columns.joint_names,
-            usual=usual,
-        )
-        report.run(episode_checks.orientation_values, episode)
         if entry.index not in doubtful:
-            if "time" in scaled:
-                stamps = (entry, "time", episode.time, folder.fps)
-                report.run(episode_checks.stamps, *stamps)
-            # Stamps that do not increase are reported as such; speeds make no sense then.
-            for check in MOTION_CHECKS if episode.is_ordered else ():
-                report.run(check, episode)
-        if episode.motion is not None:
-            span = float(np.ptp(episode.motion, axis=0).max())
-            sketches.append((entry, motion_sketch(episode.motion), span))
+            if "time" in source.columns.selections:
+                report.run(episode_checks.stamps, entry, "time", demo.time, source.fps)
+            for check in MOTION_CHECKS:
+                report.run(check, entry, demo)
+            report.run(episode_checks.spikes_and_jumps, entry, demo, usual)
+        if (motion := episode_checks.arm_motion(demo)) is not None:
+            span = float(np.ptp(motion, axis=0).max())
+            sketches.append((entry, motion_sketch(motion), span))
     report.run(episode_checks.duplicates, sketches)
 
 

@@ -1,16 +1,15 @@
 """Checks of single episodes: values, stamps and motion."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import Issue
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.naming import is_hand
-from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion
 from hrc_learn.demos.read.units import Quantities
 
 _REPEATED = 0.05
@@ -164,66 +163,36 @@ UsualMotion = Mapping[str, tuple[np.ndarray, np.ndarray]]
 """Role -> usual fast step (99 % quantile) and usual range of each joint [rad]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MotionRecord:
-    """Motion of one sound episode in SI units, with the values usual in the dataset."""
-
-    entry: EpisodeEntry
-    time: Float64[np.ndarray, " frames"]
-    """True stamps if there are any, LeRobot's otherwise [s]."""
-    raw: Quantities
-    """Values in the units on disk."""
-    quantities: Quantities
-    """Values in SI units."""
-    joint_names: tuple[str, ...]
-    usual: UsualMotion
-
-    @property
-    def motion(self) -> Float64[np.ndarray, "frames _"] | None:
-        """Joint positions, or the end-effector position if no joints are known."""
-        return self.quantities.get("joint_position", self.quantities.get("position"))
-
-    @property
-    def is_ordered(self) -> bool:
-        """True if time increases; otherwise speeds make no sense."""
-        return bool((np.diff(self.time) > 0).all())
-
-
-def orientation_values(episode: MotionRecord) -> Iterator[Issue]:
-    """Valid orientations, and quaternions of continuous sign."""
-    role = next((role for role in ORIENTATION_ROLES if role in episode.raw), None)
-    if role is None:
-        return
-    values = (episode.raw if role == "pose_matrix" else episode.quantities)[role]
-    try:
-        to_quaternion(role, values)
-    except ValueError as error:
-        yield episode.entry.fault(str(error), key=role)
-        return
-    if role.startswith("quaternion"):
-        flips = np.flatnonzero((values[1:] * values[:-1]).sum(1) < 0)
-        if len(flips):
+def quaternion_signs(entry: EpisodeEntry, quantities: Quantities) -> Iterator[Issue]:
+    """Quaternions of continuous sign."""
+    for role, values in quantities.items():
+        flips = role.startswith("quaternion") and (values[1:] * values[:-1]).sum(1) < 0
+        if np.any(flips):
             text = (
-                f"the quaternion changes its sign {len(flips)} times without turning; "
+                f"the quaternion changes its sign {np.sum(flips)} times without turning; "
                 f"load_demos makes it continuous, hrc repair does so on disk"
             )
-            yield episode.entry.warning(text, frame=int(flips[0]) + 1, key=role)
+            yield entry.warning(text, frame=int(np.argmax(flips)) + 1, key=role)
 
 
-def motion_present(episode: MotionRecord) -> Iterator[Issue]:
+def arm_motion(demo: Demonstration) -> Float64[np.ndarray, "frames _"] | None:
+    """Joint positions, or the end-effector position if no joints are known."""
+    return demo.position if demo.joint_position is None else demo.joint_position
+
+
+def motion_present(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
     """Motion at all: no primitive can be fitted to an arm at rest."""
-    if episode.motion is None:
-        return
-    span = float(np.ptp(episode.motion, axis=0).max())
+    motion = arm_motion(demo)
+    span = np.inf if motion is None else float(np.ptp(motion, axis=0).max())
     if span < _SMALLEST_MOTION:
-        yield episode.entry.fault(
+        yield entry.fault(
             f"moves by {span:.2g} in all: nothing was demonstrated; leave the episode out"
         )
 
 
-def rest_at_ends(episode: MotionRecord) -> Iterator[Issue]:
+def rest_at_ends(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
     """Rest before or after the motion, which a fit would reproduce."""
-    motion, time = episode.motion, episode.time
+    motion, time = arm_motion(demo), demo.time
     span = 0.0 if motion is None else float(np.ptp(motion, axis=0).max())
     if motion is None or span == 0:
         return  # reported as a state that never changes
@@ -237,13 +206,15 @@ def rest_at_ends(episode: MotionRecord) -> Iterator[Issue]:
     ):
         if seconds > _STILL_SECONDS:
             text = f"{place} with {seconds:.1f} s of standing still: hrc repair trims it"
-            yield episode.entry.warning(text, frame=frame)
+            yield entry.warning(text, frame=frame)
 
 
-def spikes_and_jumps(episode: MotionRecord) -> Iterator[Issue]:
+def spikes_and_jumps(
+    entry: EpisodeEntry, demo: Demonstration, usual: UsualMotion
+) -> Iterator[Issue]:
     """Frames out of line with both neighbours, and steps far beyond those usual here."""
-    for role, (step, span) in episode.usual.items():
-        steps = np.diff(episode.quantities[role], axis=0)
+    for role, (step, span) in usual.items():
+        steps = np.diff(getattr(demo, role), axis=0)
         smooth = (step > 0) & (step < 0.2 * span)  # other joints switch between levels
         there, back = steps[:-1], steps[1:]
         bound = np.maximum(_SPIKE * step, _SPIKE_FRACTION * span) + _LEAST_SPIKE
@@ -258,25 +229,25 @@ def spikes_and_jumps(episode: MotionRecord) -> Iterator[Issue]:
                 continue
             size = np.where(odd, np.abs(steps[: len(odd)]) / np.maximum(step, 1e-9), 0.0)
             frame, joint = divmod(int(size.argmax()), size.shape[1])
-            name = episode.joint_names[joint]
+            name = demo.joint_names[joint]
             text = (
                 f"{name} {what} by {steps[frame, joint]:.3g}, "
                 f"{size[frame, joint]:.0f} times its usual fast step; "
                 f"{int(odd.any(1).sum())} such frames in the episode"
             )
             key, worst = f"{role} ({name})", float(size.max())
-            yield episode.entry.warning(
+            yield entry.warning(
                 text, frame=frame + 1, key=key, components=(name,), severity=worst
             )
 
 
-def joint_speeds(episode: MotionRecord) -> Iterator[Issue]:
+def joint_speeds(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
     """Speeds that a joint can reach: no lost frames, glitches or wrapped encoders."""
-    joints, names = episode.quantities.get("joint_position"), episode.joint_names
+    joints, names = demo.joint_position, demo.joint_names
     if joints is None:
         return
     change = np.diff(joints, axis=0)
-    speed = np.abs(change) / np.diff(episode.time)[:, None]
+    speed = np.abs(change) / np.diff(demo.time)[:, None]
     # Fingers are faster, and often counted in units of their own.
     limits = np.array([np.inf if is_hand(name) else _FASTEST_ARM for name in names])
     too_fast = (speed > limits).any(1)
@@ -293,16 +264,15 @@ def joint_speeds(episode: MotionRecord) -> Iterator[Issue]:
         f"{_FASTEST_ARM:g}); {cause}. {int(too_fast.sum())} such frames in the episode"
     )
     key = f"joint_position ({name})"
-    yield episode.entry.warning(text, frame=frame + 1, key=key, components=(name,))
+    yield entry.warning(text, frame=frame + 1, key=key, components=(name,))
 
 
-def copied_commands(episode: MotionRecord) -> Iterator[Issue]:
+def copied_commands(entry: EpisodeEntry, demo: Demonstration) -> Iterator[Issue]:
     """Actions that differ from the state: a copy teaches a policy to stand still."""
-    joints = episode.quantities.get("joint_position")
-    command = episode.quantities.get("command_position")
+    joints, command = demo.joint_position, demo.command_position
     if joints is not None and command is not None and np.array_equal(joints, command):
         text = "is a copy of the state at the same frame; a policy learns to stay where it is"
-        yield episode.entry.warning(text, key="action")
+        yield entry.warning(text, key="action")
 
 
 def duplicates(

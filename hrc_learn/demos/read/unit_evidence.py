@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from numpy.lib.stride_tricks import sliding_window_view
 
 CONFIDENT = 0.75
 """Confidence from which a guessed unit is used without a question."""
@@ -89,13 +90,12 @@ def measure(values: Float64[np.ndarray, "frames components"]) -> Sizes:
     known = np.where(np.isfinite(values), values, 0.0)
     sizes = np.abs(known)
     place = int(0.995 * (len(sizes) - 1))
-    squares = known * known
-    length = np.ones(values.shape[1], bool)
-    length[-3:] = False
+    length = np.zeros(values.shape[1], bool)
+    if values.shape[1] >= 4:
+        four = sliding_window_view(known * known, 4, axis=1).sum(-1)
+        length[:-3] = (np.abs(four - 1) < 2 * _UNIT_LENGTH).all(0)
     for first in np.flatnonzero(length):
-        four = squares[:, first : first + 4].sum(1)
-        moves = np.ptp(known[:, first : first + 4], axis=0).max() > 1e-3
-        length[first] = bool((np.abs(four - 1) < 2 * _UNIT_LENGTH).all() and moves)
+        length[first] = np.ptp(known[:, first : first + 4], axis=0).max() > 1e-3
     return Sizes(
         peak=np.partition(sizes, place, axis=0)[place],
         clipped=(sizes == 100.0).mean(0),
