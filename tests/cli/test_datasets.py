@@ -247,7 +247,7 @@ def test_a_broken_dataset_is_repaired_checked_and_read(tmp_path):
     assert demo.fps == 40
 
 
-def record_marker(root, episodes=3, frames=30):
+def record_marker(root, episodes=2, frames=20):
     """A dataset in whose videos marker 7 is seen by a camera that looks down at the gripper."""
     cv2 = pytest.importorskip("cv2")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
@@ -276,13 +276,13 @@ def test_an_image_jacobian_is_fitted_to_a_marker_found_in_the_videos(tmp_path):
     words = ("fit", "image-jacobian", root, "--marker", 7, "--no-learn", "--json", values)
     status, text, error = hrc(*words)
     assert status == 0, error
-    assert "front.marker_7: 3 episodes searched" in text
+    assert "front.marker_7: 2 episodes searched" in text
     measured = json.loads(values.read_text())
-    assert measured["frames_with_marker"] == measured["frames_searched"] == 90
-    assert measured["pairs"] > 50
+    assert measured["frames_with_marker"] == measured["frames_searched"] == 40
+    assert measured["pairs"] > 20
     found = np.concatenate([demo.feature for demo in load_demos(root)])
     np.testing.assert_allclose(found, truth, atol=0.5)
-    assert "3 known before" in hrc(*words, "--overwrite")[1]
+    assert "2 known before" in hrc(*words, "--overwrite")[1]
     assert hrc("fit", "image-jacobian", root, "--marker", 70)[0] == 2
     assert "--marker" in hrc("fit", "image-jacobian", root, "--camera", "front").error
 

@@ -24,11 +24,15 @@ def columns(seed):
     return {STATE: q, "action": q + 0.01 * np.sin(np.arange(60))[:, None]}
 
 
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    folder, names = tmp_path_factory.mktemp("sound") / "set", {STATE: NAMES, "action": NAMES}
+    return write_folder(folder, [columns(i) for i in range(3)], names)
+
+
 @pytest.fixture
-def root(tmp_path):
-    return write_folder(
-        tmp_path / "set", [columns(i) for i in range(3)], {STATE: NAMES, "action": NAMES}
-    )
+def root(sound, tmp_path):
+    return shutil.copytree(sound, tmp_path / "set")
 
 
 def change_values(root, key, change, file=DATA):
@@ -391,7 +395,7 @@ def test_dimensions_that_never_change_or_saturate(tmp_path):
     assert find(report.warnings, "end of its range").message.endswith("c.pos")
 
 
-@pytest.mark.parametrize(("count", "warnings"), [(6, 6), (7, 1), (300, 1)])
+@pytest.mark.parametrize(("count", "warnings"), [(6, 6), (7, 1)])
 def test_many_constant_features_are_one_warning(tmp_path, count, warnings):
     still = {f"observation.f{k}": np.full((60, 1), k) for k in range(count)}
     root = write_folder(tmp_path / "set", [columns(0) | still], {STATE: NAMES, "action": NAMES})

@@ -1,7 +1,7 @@
 """The check finds every defect of a sound dataset, locates it, and never breaks down."""
 
 import pytest
-from checker_score import KINDS, Checker, outcomes
+from checker_score import KINDS, Checker, check_here, outcomes
 from clean_sets import SETS, write_set
 
 from hrc_learn.demos import check_dataset
@@ -24,8 +24,8 @@ def clean(name, tmp_path_factory):
     return write_set(tmp_path_factory.mktemp("clean") / "set", **SETS[name])
 
 
-def assert_found(clean, kinds, folder):
-    done = list(outcomes(clean, "set", kinds, folder, Checker()))
+def assert_found(clean, kinds, folder, check):
+    done = list(outcomes(clean, "set", kinds, folder, check))
     assert done
     for outcome in done:
         assert outcome.found, outcome
@@ -40,10 +40,10 @@ def test_a_sound_set_has_no_errors(clean):
 
 
 def test_defects_are_found(clean, name, tmp_path):
-    assert_found(clean, SAMPLE[name], tmp_path)
+    assert_found(clean, SAMPLE[name], tmp_path, check_here)
 
 
 @pytest.mark.slow
 def test_every_kind_of_defect_is_found(clean, tmp_path):
     assert len(KINDS) > 130
-    assert_found(clean, KINDS, tmp_path)
+    assert_found(clean, KINDS, tmp_path, Checker())
