@@ -13,6 +13,9 @@ from lerobot_folders import FPS, joint_path, read_info, rewrite, write_folder, w
 from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
 from hrc_learn.demos.issues import ValidationReport, warning
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
 DATA = "data/chunk-000/file-000.parquet"

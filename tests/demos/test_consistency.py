@@ -11,6 +11,9 @@ from hrc_learn.demos.issues import ValidationReport
 from hrc_learn.demos.quality import structure_checks
 from hrc_learn.demos.read.dataset_folder import open_folder
 
+# Whole datasets are written and read; shapes are checked in the other tests of this folder.
+pytestmark = pytest.mark.simulation
+
 STATE = "observation.state"
 JOINTS = ["shoulder.pos", "elbow.pos", "wrist.pos"]
 ODD = 4
