@@ -1,5 +1,6 @@
 """`hrc show` and `hrc report`: Rerun dashboards, and one page that reports several runs."""
 
+import contextlib
 import subprocess
 import sys
 import tempfile
@@ -46,28 +47,21 @@ def recordings_in(path: Path) -> list[Path]:
 
 def _open(recordings: Sequence[Path], web: bool) -> int:
     """Open recordings in Rerun's viewer, or serve them to the browser until Ctrl-C."""
-    screen = has_screen()
-    if not screen and not web:
-        print("no screen: the dashboard is served to the browser (Ctrl-C ends it)")
-    try:
-        if web or not screen:
-            return _serve(recordings)
-        # Started by this interpreter, so that the viewer need not be on PATH.
-        command = [sys.executable, "-m", "rerun", *map(str, recordings)]
-        return subprocess.run(command, check=False).returncode
-    except KeyboardInterrupt:
-        return 0
+    with contextlib.suppress(KeyboardInterrupt):
+        if has_screen() and not web:
+            # Started by this interpreter, so that the viewer need not be on PATH.
+            command = [sys.executable, "-m", "rerun", *map(str, recordings)]
+            return subprocess.run(command, check=False).returncode
+        # Imported here: the desktop viewer does not need the web server.
+        from hrc_learn.teleoperation.dashboard_page import serve_recordings
 
-
-def _serve(recordings: Sequence[Path]) -> int:
-    # Imported here: the desktop viewer does not need the web server.
-    from hrc_learn.teleoperation.dashboard_page import serve_recordings
-
-    with serve_recordings(recordings) as url:
-        print(f"Dashboard at {url} (Ctrl-C ends it)", flush=True)
-        if has_screen():
-            webbrowser.open(url)
-        threading.Event().wait()
+        if not web:
+            print("no screen: the dashboard is served to the browser (Ctrl-C ends it)")
+        with serve_recordings(recordings) as url:
+            print(f"Dashboard at {url} (Ctrl-C ends it)", flush=True)
+            if has_screen():
+                webbrowser.open(url)
+            threading.Event().wait()
     return 0
 
 

@@ -312,17 +312,12 @@ def _describe(
     fps: float,
 ) -> ComponentContract:
     """Complete the contract of a component that a quantity uses."""
-    role, hand = decision.role, is_hand(part.name)
-    names = {
-        "joint_position": "finger" if hand else "arm",
-        "command_position": "finger command" if hand else "command",
-        "joint_velocity": "velocity",
-        "joint_effort": "effort",
-        "command_velocity": "velocity command",
-    }
+    role = decision.role
+    # Of two roles for one quantity, the second is that of fingers.
+    roles = [known for known, quantity in _QUANTITIES.items() if quantity == role] or [role]
     part = replace(
         part,
-        role=names.get(role, role),
+        role=roles[-1 if is_hand(part.name) else 0],
         unit=decision.unit_of(number),
         confidence=decision.confidence,
         evidence=decision.evidence or "declared",

@@ -305,15 +305,11 @@ class DemonstrationSource(Sequence[Demonstration]):
             entries: Episodes, in order.
             decisions: Unit of each quantity on disk, by role.
             joint_names: Joints wanted; None takes all in their order.
-
-        Raises:
-            DatasetError: A joint does not exist.
         """
         columns, root = dataset.columns, dataset.folder.root
         self._dataset, self._entries = dataset, tuple(entries)
         self._decisions = dict(decisions)
         names = columns.joint_names if joint_names is None else joint_names
-        joint_columns(columns.joint_names, names)
         self.joint_names, self.source = tuple(names), str(root)
         noted = [*columns.notes]
         noted += [f"{role} {note}" for role, note in columns.unmatched.items()]
