@@ -18,7 +18,6 @@ from hrc_learn.demos.read.columns import (
     MappingSpec,
     map_columns,
     parse_mapping,
-    replaced_roles,
 )
 from hrc_learn.demos.read.contract import infer_contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
@@ -89,7 +88,7 @@ def check_dataset(
         columns = map_columns(folder.features, Sidecar(), mapping)
         dataset = OpenedDataset(folder=folder, columns=columns)
     report.attempt(lambda: check_videos(folder, report))
-    report.attempt(lambda: _check_content(dataset, report, mapping or {}, units or {}))
+    report.attempt(lambda: _check_content(dataset, report, units or {}))
     return report
 
 
@@ -112,10 +111,7 @@ def _first_pass(
 
 
 def _check_content(
-    dataset: OpenedDataset,
-    report: ValidationReport,
-    mapping: MappingSpec,
-    units: Mapping[str, str],
+    dataset: OpenedDataset, report: ValidationReport, units: Mapping[str, str]
 ) -> None:
     """Decide on the units; check every motion, and episodes against others.
 
@@ -157,14 +153,7 @@ def _check_content(
                 report.run(check, feature)
     report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
     if dataset.contract is not None:
-        kept = dataset.contract.selections(folder.features)
-        overruled = {
-            column
-            for selections in (kept, columns.selections)
-            for role in (replaced_roles(mapping) | {*units}) & selections.keys()
-            for column in selections[role].columns
-        }
-        report.contract = report.contract.keeping(dataset.contract, overruled)
+        report.contract = report.contract.keeping(dataset.contract)
 
 
 def _check_motions(

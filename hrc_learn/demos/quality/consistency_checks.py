@@ -500,19 +500,15 @@ def _component_tracking(
     names: tuple[str, ...],
 ) -> Iterator[tuple[str, Literal["error", "warning"]]]:
     """Components that follow their command in the other episodes, but not in this one."""
-    fit, slope, partner = tracking.fit, tracking.slope, tracking.partner
+    fit, slope = tracking.fit, tracking.slope
     follows = follow & (fit > FOLLOWS)
     lost = np.flatnonzero(follow & ~(fit > _LOST) & ~np.isnan(fit))
     # The slope equals minus the usual one, within half of it.
     opposite = np.abs(slope + usual_slope) < 0.5 * np.abs(usual_slope)
     against = np.flatnonzero(follows & opposite)
-    swapped = [i for i in lost if tracking.similarity[i] > 0.9 and partner[i] != i]
     if len(against):
         text = "the state goes the other way than its command, in this episode alone"
         yield f"{text}: {_listed(names, against)}", "error"
-    elif len(swapped) > 1:
-        pairs = ", ".join(f"{names[i]} as {names[partner[i]]}" for i in swapped[:4])
-        yield f"columns look exchanged against the state: {pairs}", "error"
     elif len(lost):
         text = "the state does not follow its command, as it does in the other episodes"
         yield f"{text}: {_listed(names, lost)}", "warning"

@@ -61,7 +61,7 @@ def read_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
 def read_sound_episodes(
     folder: DatasetFolder, report: ValidationReport
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    """Episodes that can be read, with their sound columns; faults go into the report."""
+    """Episodes that can be read, with their numbers; faults go into the report."""
     for file, entries in folder.files.items():
         found = report.attempt(partial(_sound_keys, folder, file, entries, report))
         if not found:
@@ -71,8 +71,8 @@ def read_sound_episodes(
         read = read_each(folder, listed, keys, strict=False) if keys else ()
         for entry, frames in zip(listed, read, strict=False):
             if isinstance(frames, DatasetError):
-                frames = _sound_columns(folder, entry, keys, report)
-            if frames:
+                report.add_error(frames)
+            else:
                 yield entry, frames
 
 
@@ -87,20 +87,6 @@ def _sound_keys(
     numeric = [key for key, feature in folder.features.items() if feature.numeric]
     counts = Counter(schema.names)
     return [key for key in numeric if counts[key] == 1], rows
-
-
-def _sound_columns(
-    folder: DatasetFolder, entry: EpisodeEntry, keys: list[str], report: ValidationReport
-) -> RawFrames:
-    """Columns of one episode that can be read, one at a time."""
-    columns: RawFrames = {}
-    for key in keys:
-        for found in read_each(folder, [entry], [key], strict=False):
-            if isinstance(found, DatasetError):
-                report.add_error(found)
-            else:
-                columns |= found
-    return columns
 
 
 def _column_faults(

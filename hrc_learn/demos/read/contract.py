@@ -8,7 +8,7 @@ be edited there, and every reader of the dataset obeys it.
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -178,22 +178,19 @@ class Contract:
             for role, parts in found.items()
         }
 
-    def keeping(self, kept: "Contract", overruled: Collection[tuple[str, int]]) -> "Contract":
-        """This contract with the names, roles and units of an older one, perhaps edited.
+    def keeping(self, kept: "Contract") -> "Contract":
+        """This contract with the names of an older one, perhaps edited, and its roles.
 
-        Args:
-            kept: The older contract.
-            overruled: Columns whose role or unit the caller gives now.
+        A component that is now read as another quantity has its new role. The older units are
+        those of the quantities already; those of other components are kept as well.
         """
-        known = {part.column: part for part in kept.components}
-        parts = []
+        known, parts = {part.column: part for part in kept.components}, []
         for part in self.components:
             old = known.get(part.column, part)
-            same = (part.role, part.unit) == (old.role, old.unit)
-            if same or part.column in overruled:
-                parts.append(replace(part, name=old.name))
-            else:
-                parts.append(replace(old, low=part.low, high=part.high))
+            if part.quantity == old.quantity:
+                unit = part.unit if part.quantity else old.unit
+                part = replace(part, role=old.role, unit=unit)
+            parts.append(replace(part, name=old.name))
         return replace(self, components=tuple(parts))
 
     def without_doubt(self) -> tuple["Contract", list[str]]:

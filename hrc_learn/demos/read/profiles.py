@@ -85,10 +85,6 @@ class Tracking:
     """Change of the state per change of the command, at that delay."""
     fit: Float64[np.ndarray, " components"]
     """Fraction of the state's variance that the command explains (R squared)."""
-    partner: Int64[np.ndarray, " components"]
-    """State component most similar to each command component."""
-    similarity: Float64[np.ndarray, " components"]
-    """Absolute correlation with the partner; 0 if either rests."""
     offset: Float64[np.ndarray, " components"]
     """Command minus state while both rest; NaN where they rest too seldom."""
 
@@ -260,16 +256,12 @@ def track(
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = product / power
         fit = product**2 / (power * answer)
-        similarity = np.nan_to_num(np.abs(a0.T @ s0) / np.sqrt(np.outer(power, answer)))
     slope[~moving] = fit[~moving] = np.nan
-    similarity[~moving] = similarity[:, ~moving] = 0.0
     return Tracking(
         delay=delay,
         residual=residual.astype(np.float32),
         slope=slope,
         fit=fit,
-        partner=similarity.argmax(1),
-        similarity=similarity.max(1),
         offset=offset,
     )
 
