@@ -183,23 +183,19 @@ class _Merge:
             if without:
                 self.report.notes.append(f"{key}: left out, {', '.join(without)} has none")
             elif self.first.features[key].dtype != "video" or self.videos:
-                self._require_same_kind(key)
                 common[key] = self.first.features[key]
-        return common
-
-    def _require_same_kind(self, key: str) -> None:
-        own = self.first.features[key]
         for source in self.sources:
-            other = source.features[key]
-            if own.numeric and other.numeric and own.width == other.width:
-                continue
-            if (other.dtype, other.shape) != (own.dtype, own.shape):
-                advice = "; --no-videos leaves videos out" if own.is_picture else ""
-                raise source.fault(
-                    f"is {other.dtype} of shape {list(other.shape)}, but {own.dtype} of shape "
-                    f"{list(own.shape)} in {self.first.root}{advice}",
-                    key,
-                )
+            for key, own in common.items():
+                other = source.features[key]
+                alike = (other.dtype, other.shape) == (own.dtype, own.shape)
+                if not (alike or (own.numeric and other.numeric and own.width == other.width)):
+                    advice = "; --no-videos leaves videos out" if own.is_picture else ""
+                    raise source.fault(
+                        f"is {other.dtype} of shape {list(other.shape)}, but {own.dtype} of "
+                        f"shape {list(own.shape)} in {self.first.root}{advice}",
+                        key,
+                    )
+        return common
 
     def _match(self, source: _Source, key: str) -> None:
         """Find the component of a source for each of the first dataset, and its factor.

@@ -93,10 +93,17 @@ _COMPONENTS: list[tuple[str, str]] = [
     ("rotation", r"r_?(?P<slot>[wxyz])"),
     ("rotation", rf"(?:{_ROTATION}_)?(?:matrix|mat)_?(?P<slot>[0-8])"),
 ]
-_NAMES = [(role, re.compile(_BEFORE + rest)) for role, rest in _COMPONENTS]
 # A number after `pos` may count joints: only with a word for the tool before it.
-_NUMBERED_POSITION = re.compile(rf"{_BEFORE}{_POSITION}_?(?P<slot>[0-2])")
-_MATRIX = re.compile(rf"{_BEFORE}(?:pose|matrix|transform)?_?(?P<slot>\d\d?)")
+_NUMBERED = [
+    ("position", rf"{_POSITION}_?(?P<slot>[0-2])"),
+    ("pose_matrix", r"(?:pose|matrix|transform)?_?(?P<slot>0?\d|1[0-5])"),
+]
+_NAMES = [
+    (role, re.compile(_BEFORE + rest), rows is _NUMBERED)
+    for rows in (_COMPONENTS, _NUMBERED)
+    for role, rest in rows
+]
+"""Role, pattern of the whole name, and True if it needs a word for the tool."""
 _SLOTS = {"x": 0, "y": 1, "z": 2, "roll": 0, "pitch": 1, "yaw": 2}
 _QUATERNION_SLOTS = {"w": 0, "x": 1, "y": 2, "z": 3}
 
@@ -174,19 +181,17 @@ def meaning_of_component(name: str) -> ComponentMeaning | None:
 def _meaning_in_pose(plain: str) -> ComponentMeaning | None:
     """Meaning of a name in lower case as a component of a pose, or None."""
     words = re.sub(r"[^a-z\d]+", "_", plain).strip("_")
-    for role, pattern in _NAMES:
-        if match := pattern.fullmatch(words):
-            slots = _QUATERNION_SLOTS if role == "quaternion_wxyz" else _SLOTS
-            slot = match["slot"]
-            if role == "rotation" and not slot.isdigit():
-                place: str | int = slot
-            else:
-                place = int(slot) if slot.isdigit() else slots[slot]
-            return ComponentMeaning(role, place, match["side"] or match["side2"] or "")
-    if (match := _NUMBERED_POSITION.fullmatch(words)) and match["tool"]:
-        return ComponentMeaning("position", int(match["slot"]), match["side"] or "")
-    if (match := _MATRIX.fullmatch(words)) and match["tool"] and int(match["slot"]) < 16:
-        return ComponentMeaning("pose_matrix", int(match["slot"]), match["side"] or "")
+    for role, pattern, needs_tool in _NAMES:
+        match = pattern.fullmatch(words)
+        if match is None or (needs_tool and not match["tool"]):
+            continue
+        slots = _QUATERNION_SLOTS if role == "quaternion_wxyz" else _SLOTS
+        slot = match["slot"]
+        if role == "rotation" and not slot.isdigit():
+            place: str | int = slot
+        else:
+            place = int(slot) if slot.isdigit() else slots[slot]
+        return ComponentMeaning(role, place, match["side"] or match["side2"] or "")
     return None
 
 

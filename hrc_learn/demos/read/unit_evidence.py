@@ -202,17 +202,20 @@ def guess_fingers(
     """Unit of each component if it is a finger, from its size and the unit of the arm."""
     # A hand counts all its fingers alike, also those that move little.
     counted = hand & sizes.whole & (sizes.peak > _FINGER_RATIO) & (sizes.peak <= _BYTE)
-    counts = bool((sizes.peak[counted] > _PERCENT).any())
+    counted &= (sizes.peak[counted] > _PERCENT).any()
     slides = np.array(["finger" in label.lower() for label in labels])
-    units = [
-        _finger_unit(float(peak), bool(whole), arm_unit, hobby)
-        for peak, whole in zip(sizes.peak, sizes.whole, strict=True)
-    ]
     metres = slides & (sizes.peak > 0) & (sizes.peak <= _SLIDE)
-    return [
-        "byte" if counts and counted[i] else "m" if metres[i] else unit
-        for i, unit in enumerate(units)
-    ]
+    degrees = arm_unit == "deg"
+    # LeRobot gives grippers from 0 to 100, also where its arms are in degrees.
+    rules = (
+        ("byte", counted),
+        ("m", metres),
+        ("1", sizes.peak <= _FINGER_RATIO),
+        ("rad", (sizes.peak <= _RADIANS) & (not hobby)),
+        ("%", (sizes.peak <= _PERCENT) & (hobby or not degrees)),
+        ("byte", (sizes.peak <= _BYTE) & (sizes.whole | (not degrees))),
+    )
+    return [next((u for u, holds in rules if holds[i]), arm_unit) for i in range(len(hand))]
 
 
 def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: bool) -> Guess:
@@ -240,19 +243,6 @@ def doubt_meaning(guess: Guess, sizes: Sizes, labels: Sequence[str], numbered: b
         f"read with --mapping position KEY[0:3]"
     )
     return guess._replace(confidence=min(guess.confidence, 0.5), evidence=text)
-
-
-def _finger_unit(peak: float, whole: bool, arm_unit: str, hobby: bool) -> str:
-    if peak <= _FINGER_RATIO:
-        return "1"
-    if peak <= _RADIANS and not hobby:
-        return "rad"
-    # LeRobot gives grippers from 0 to 100, also where its arms are in degrees.
-    if peak <= _PERCENT and (hobby or arm_unit != "deg"):
-        return "%"
-    if peak <= _BYTE and (whole or arm_unit != "deg"):
-        return "byte"
-    return arm_unit
 
 
 def guess_by_size(role: str, sizes: Sizes) -> Guess:
