@@ -529,23 +529,17 @@ class WithDriver(WithRobot):
         if self.arm in ("lerobot", "ros2"):
             text = "is for Franka arms: LeRobot's have --robot.port, ROS 2 has ROS_DOMAIN_ID"
             refuse_given(self, ["ip"], text)
-            refuse_given(self, simulated_only, "is for simulated arms, not for a real one")
-            return True
-        if self.arm == "sim":
-            if self.ip:
-                raise ValueError(
-                    f"--ip {self.ip} needs a driver: --arm franky or --arm franka."
-                )
-            return False
-        if self.ip == "sim":
-            return False
-        if not self.ip:
+        elif self.arm == "sim" and self.ip:
+            raise ValueError(f"--ip {self.ip} needs a driver: --arm franky or --arm franka.")
+        elif self.arm != "sim" and not self.ip:
             raise ValueError(
                 f"--arm {self.arm} needs --ip with the address of the arm's control box; "
                 "--ip sim serves the simulated arm there."
             )
-        refuse_given(self, simulated_only, "is for simulated arms, not for a real one (--ip)")
-        return True
+        real = self.arm != "sim" and self.ip != "sim"
+        if real:
+            refuse_given(self, simulated_only, "is for simulated arms, not for a real one")
+        return real
 
 
 @dataclass(frozen=True, kw_only=True)

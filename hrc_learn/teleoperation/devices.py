@@ -231,9 +231,7 @@ class KeyboardState:
         """The direction asked for now: a unit vector, or zero."""
         now = self._clock()
         held = [DIRECTIONS[key] for key, until in self._until.items() if now < until]
-        total = np.sum(held, axis=0) if held else np.zeros(3)
-        length = float(np.linalg.norm(total))
-        return total / length if length > 0 else total
+        return capped(np.sum([(0.0, 0.0, 0.0), *held], axis=0), 1.0)
 
 
 KEYS: MappingProxyType[str, Request] = MappingProxyType(

@@ -192,18 +192,16 @@ def explain(
     """
     loaded = rows * spread
     covariance = loaded @ loaded.T + unknown
-    weighted = np.linalg.solve(covariance, torque)
-    _, size = np.linalg.slogdet(covariance)
-    loads = spread * (loaded.T @ weighted)
-    return Explanation(force=loads[:3], evidence=-0.5 * float(torque @ weighted + size))
+    loads = spread * (loaded.T @ np.linalg.solve(covariance, torque))
+    return Explanation(force=loads[:3], evidence=log_density(torque, covariance))
 
 
-def evidence_of_none(
-    torque: Float[np.ndarray, " joints"], unknown: Float[np.ndarray, "joints joints"]
+def log_density(
+    torque: Float[np.ndarray, " joints"], covariance: Float[np.ndarray, "joints joints"]
 ) -> float:
-    """Log probability density of the torques [N m] of an untouched arm."""
-    _, size = np.linalg.slogdet(unknown)
-    return -0.5 * float(torque @ np.linalg.solve(unknown, torque) + size)
+    """Logarithm of the normal density of torques [N m], but for its constant."""
+    _, size = np.linalg.slogdet(covariance)
+    return -0.5 * float(torque @ np.linalg.solve(covariance, torque) + size)
 
 
 # Forces of people, and moments that they have about the tool centre point: of a hand that
@@ -315,7 +313,7 @@ class Touch(Human):
         if meets:  # whatever the hand meets says nothing of the elbow
             unknown = unknown + arm.jacobian.T @ np.diag(_MET**2) @ arm.jacobian
         above, hand = arm.explained(self._felt, unknown)
-        self._look(above, hand, evidence_of_none(self._felt, unknown))
+        self._look(above, hand, log_density(self._felt, unknown))
         self._watch_for_collision(arm, free, unknown, max(above, hand), meets)
         if self._nobody_touches():
             self._bias.follow(arm.jacobian, state.joint_velocity, state.external_torque, dt)
@@ -393,7 +391,7 @@ class Touch(Human):
         rise = torque - self._lately[0][1] if self._lately else np.zeros_like(torque)
         self._lately.append((time, torque))
         found = max(arm.explained(rise, unknown))
-        sure = found.evidence - evidence_of_none(rise, unknown) > config.evidence
+        sure = found.evidence - log_density(rise, unknown) > config.evidence
         sudden = found.size if sure else 0.0
         if now.size > config.collision_force:
             self._why = f"something holds the arm with {now.size:.0f} N"

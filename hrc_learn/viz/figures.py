@@ -22,7 +22,7 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from hrc_learn.geometry import Box
 from hrc_learn.log import JointRanges, RunRecording
 from hrc_learn.viz import palette
-from hrc_learn.viz.panels import Plot
+from hrc_learn.viz.panels import Curves, Plot
 
 STYLE: dict[Any, Any] = {
     "font.size": 9.0,
@@ -80,23 +80,6 @@ def draw_limits(axes: Axes, lower: float, upper: float) -> None:
     if not (bottom <= lower and upper <= top):
         said = f"limits {lower:.2f}, {upper:.2f}"
         axes.set_title(said, loc="right", fontsize=7, color=palette.LIMIT)
-
-
-def legend_in_free_cell(figure: Figure, grid: np.ndarray, used: int) -> None:
-    """Draw one legend for all cells, in the first unused one, or above if all are used."""
-    unique = {}
-    for axes in grid[:used]:
-        handles, labels = axes.get_legend_handles_labels()
-        unique |= dict(zip(labels, handles, strict=True))
-    for axes in grid[used:]:
-        axes.set_axis_off()
-    if used < len(grid):
-        grid[used].legend(unique.values(), unique.keys(), loc="center left", fontsize=9)
-    else:
-        figure.legend(unique.values(), unique.keys(), loc="outside upper right", ncols=3)
-    for axes in grid[max(used - 2, 0) : used]:
-        axes.tick_params(labelbottom=True)
-    figure.supxlabel("time [s]", fontsize=9)
 
 
 def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
@@ -157,7 +140,19 @@ class JointCurves:
     position: Float[np.ndarray, "time joints"]
     """Joint positions [rad, or m for sliding joints]."""
     colour: str = palette.RUN
-    width: float = 1.4
+    width: float = 1.8
+
+    def curves(self, joint: int) -> Curves:
+        """Curve of one joint."""
+        values, colours = self.position[:, [joint]], (palette.rgba(self.colour),)
+        return Curves(
+            path="",
+            names=(self.label,),
+            values=values,
+            colours=colours,
+            width=self.width,
+            time=self.time,
+        )
 
 
 def demonstrated_joints(
@@ -165,7 +160,7 @@ def demonstrated_joints(
 ) -> JointCurves:
     """Thick grey curves of a demonstration."""
     return JointCurves(
-        label="demonstration", time=time, position=position, colour=palette.DEMO, width=3.5
+        label="demonstration", time=time, position=position, colour=palette.DEMO, width=4.5
     )
 
 
@@ -183,24 +178,18 @@ def joint_grid_figure(
         limits: Joint limits; None: none are drawn.
         unit: Unit of the positions.
     """
-    rows = -(-len(names) // 2)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 1.45 * rows + 0.5))
-        grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
-        for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
-            for motion in motions:
-                axes.plot(
-                    motion.time,
-                    motion.position[:, i],
-                    color=motion.colour,
-                    lw=motion.width,
-                    label=motion.label,
-                )
-            axes.set(title=name, ylabel=unit)
-            axes.margins(x=0)
-            if limits is not None:
-                draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))
-        legend_in_free_cell(figure, grid, len(names))
+    plots = [
+        Plot(
+            title=f"{name} [{unit}]",
+            curves=tuple(motion.curves(i) for motion in motions),
+            legend=i == 0,
+        )
+        for i, name in enumerate(names)
+    ]
+    figure = plots_figure(motions[0].time, plots, columns=2)
+    if limits is not None:
+        for axes, lower, upper in zip(figure.axes, limits.lower, limits.upper, strict=False):
+            draw_limits(axes, float(lower), float(upper))
     return figure
 
 
@@ -239,7 +228,8 @@ def plots_figure(
                 columned = zip(curves.names, curves.values.T, curves.colours, strict=True)
                 for name, values, colour in columned:
                     look = palette.on_white(colour)
-                    axes.plot(time, values, color=look, lw=0.8 * curves.width, label=name)
+                    at = time if curves.time is None else curves.time
+                    axes.plot(at, values, color=look, lw=0.8 * curves.width, label=name)
             if shaded is not None:
                 shade(axes, time, shaded)
             axes.set_title(plot.title, fontsize=10 if columns == 1 else 8)

@@ -24,6 +24,8 @@ class Curves:
     width: float = 1.5
     marks: bool = False
     """Draw points rather than lines, so that single steps are visible."""
+    time: Shaped[np.ndarray, " time"] | None = None
+    """Time of these curves in a figure [s]; None: that of all curves."""
 
 
 @dataclass(frozen=True, kw_only=True)

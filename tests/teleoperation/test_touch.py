@@ -17,7 +17,7 @@ from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import StoppedByPersonError, WorkCell, WorkCellConfig, joint_line
 from hrc_learn.teleoperation import CombinedInput, Touch, TouchConfig
-from hrc_learn.teleoperation.touch import TorqueBias, evidence_of_none, explain
+from hrc_learn.teleoperation.touch import TorqueBias, explain, log_density
 
 pytestmark = pytest.mark.simulation
 
@@ -48,7 +48,7 @@ def test_the_evidence_of_loads_is_a_normal_density():
         np.testing.assert_allclose(found.force, load[:3])
         assert found.size == pytest.approx(np.linalg.norm(load[:3]))
     none = multivariate_normal.logpdf(torque, cov=unknown)  # pyright: ignore[reportArgumentType]
-    assert evidence_of_none(torque, unknown) - 3.5 * np.log(2 * np.pi) == pytest.approx(none)
+    assert log_density(torque, unknown) - 3.5 * np.log(2 * np.pi) == pytest.approx(none)
 
 
 def test_a_bias_learns_load_offsets_and_friction():

@@ -47,7 +47,10 @@ def _words(figure) -> list[str]:
 def test_joints_figure_shows_every_joint_with_its_limits():
     run = sample_run()
     axes = [a for a in figures.joints_figure(run).axes if a.axison]
-    assert [a.get_title(loc="left") for a in axes] == list(NAMES)
+    assert [a.get_title(loc="left") for a in axes] == [f"{name} [rad]" for name in NAMES]
+    legends = [a.get_legend() for a in axes]
+    assert [text.get_text() for text in legends[0].get_texts()] == ["demonstration", "run"]
+    assert legends[1:] == [None] * (len(NAMES) - 1)
     for i, a in enumerate(axes):
         shown = lines(a)
         np.testing.assert_array_equal(shown["run"], run.joint_position[:, i])
