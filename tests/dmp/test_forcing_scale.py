@@ -237,7 +237,7 @@ def test_a_filtered_goal_that_scales_the_forcing_is_of_first_order():
         return state.position
 
     with torch.no_grad(), shapes_unchecked():
-        finest = end(640)
+        finest = end(400)
         errors = [(end(n) - finest).norm().item() for n in (20, 40, 80)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert ((orders > 0.9) & (orders < 1.3)).all(), orders

@@ -47,10 +47,10 @@ def test_no_goal_makes_the_path_flip():
 
 def test_goals_close_to_each_other_have_paths_close_to_each_other():
     dmp = fitted(approach=1.0)
-    near = torch.deg2rad(torch.arange(0, 150, 3.0)).double()[:, None, None] * axes()
+    near = torch.deg2rad(torch.arange(0, 150, 6.0)).double()[:, None, None] * axes()
     motion = dmp.rollout(goal=quaternion.multiply(quaternion.exp(near), dmp.goal))
     q = motion.orientation
-    assert torch.rad2deg(quaternion.angle(q[1:], q[:-1])).max() < 9
+    assert torch.rad2deg(quaternion.angle(q[1:], q[:-1])).max() < 18
 
 
 def test_switched_at_half_time_the_acceleration_goes_on_and_no_path_flips():

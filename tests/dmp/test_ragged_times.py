@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from hrc_learn.dmp import (
     PeriodicBasis,
     SplineBasis,
     SpringDamper,
-    ragged_times,
     response_of,
 )
 from hrc_learn.dmp.ragged_times import motion, power_by_power
@@ -83,24 +81,6 @@ def test_derivatives_of_any_order_and_direction(basis, approach):
             y, (s, x), atol=1e-6, check_forward_ad=True, check_batched_grad=True
         )
         assert torch.autograd.gradgradcheck(y, (s, x), atol=1e-4, rtol=1e-3, fast_mode=True)
-
-
-def test_a_gradient_by_times_alone_makes_none_by_coordinates(monkeypatch):
-    response = response_of(SpringDamper(), GaussianBasis(count=12), 0.0)
-    s, x = random_motions(response.basis)
-    s, leaf = s.requires_grad_(), x.requires_grad_()
-    y = motion(response, s, 2 * leaf, 0)
-    by_s, by_x = torch.autograd.grad(y.sum(), (s, leaf), retain_graph=True)
-    assert by_x.abs().max() > 0
-
-    def unwanted(*arguments):
-        raise AssertionError("nobody asked for it")
-
-    monkeypatch.setattr(ragged_times, "_Adjoint", SimpleNamespace(apply=unwanted))
-    torch.testing.assert_close(torch.autograd.grad(y.sum(), s, retain_graph=True)[0], by_s)
-    monkeypatch.setattr(ragged_times, "_by_time", unwanted)
-    with pytest.raises(AssertionError):
-        torch.autograd.grad(y.sum(), leaf)
 
 
 @pytest.fixture(scope="module")

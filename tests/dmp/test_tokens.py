@@ -71,7 +71,7 @@ def test_unseen_motions_decode_to_the_tolerance(tokenizer):
 
 
 def test_a_smaller_tolerance_takes_more_tokens():
-    position, _ = motions(200)
+    position, _ = motions(80)
     counts = []
     for tolerance in (0.05, 0.02, 0.005):
         tokenizer = MotionTokenizer.fit(TIME, position, VOCABULARY, tolerance=tolerance)
@@ -313,7 +313,7 @@ class TestCode:
         values = np.round(rng.laplace(scale=scale, size=(500, 30))).astype(int)
         return TokenCode.fit(values, vocabulary), values
 
-    @pytest.mark.parametrize("vocabulary", [16, 32, 1024])
+    @pytest.mark.parametrize("vocabulary", [16, 32, 256])
     def test_vectors_are_restored(self, vocabulary):
         code, values = self.code(vocabulary)
         for row in values[:30]:
@@ -326,8 +326,8 @@ class TestCode:
             assert (restored == row).all()
 
     def test_tokens_carry_nearly_the_most_information(self):
-        code, values = self.code(1024)
-        bits = np.mean([10 * len(code.encode(row.tolist())) for row in values[:150]])
+        code, values = self.code(256)
+        bits = np.mean([8 * len(code.encode(row.tolist())) for row in values[:150]])
         entropy = sum(
             -(p * np.log2(p)).sum()
             for k in range(30)
