@@ -3,6 +3,7 @@
 from hrc_learn.hardware.camera_delay import DelayMotion as DelayMotion
 from hrc_learn.hardware.camera_delay import MeasuredDelay as MeasuredDelay
 from hrc_learn.hardware.camera_delay import measure_delay as measure_delay
+from hrc_learn.hardware.driver_process import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.driver_process import ArmProcess as ArmProcess
 from hrc_learn.hardware.driver_process import DriverError as DriverError
 from hrc_learn.hardware.driver_process import ending_at_rest as ending_at_rest
@@ -13,7 +14,6 @@ from hrc_learn.hardware.franka_settings import FrankaConfig as FrankaConfig
 from hrc_learn.hardware.franka_settings import FrankyConfig as FrankyConfig
 from hrc_learn.hardware.franka_settings import Load as Load
 from hrc_learn.hardware.franka_settings import RealtimeError as RealtimeError
-from hrc_learn.hardware.franky_arm import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm
 from hrc_learn.hardware.gripper import GripperError as GripperError
 from hrc_learn.hardware.gripper import GripperThread as GripperThread

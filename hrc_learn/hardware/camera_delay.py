@@ -22,6 +22,10 @@ from hrc_learn.vision import MarkerDetector, centre
 # Rates at which the joint turns back and forth at the beginning and at the end [Hz]: of one
 # rate alone delays that are a period apart would fit alike.
 _SLOWEST, _FASTEST = 0.4, 1.0
+# Fastest turn [rad/s]: of a hand at 0.5 m, 75 mm/s, by 3 cm to each side.
+_SPEED = 0.15
+# Time from one reading of arm and camera to the next, and the longest delay looked for [s].
+_DT, _LONGEST = 0.01, 0.5
 # Powers of the joint position in the fit of a pixel: perspective bends its line.
 _POWERS = 3
 # Between the delays that are tried [s]; the smallest rest is found between them.
@@ -38,19 +42,12 @@ class DelayMotion:
 
     joint: int = 1
     """Joint that turns, counted from 1; its motion must move the marker across the image."""
-    speed: float = 0.15
-    """Its fastest [rad/s]: of a hand at 0.5 m, 75 mm/s, by 3 cm to each side."""
     duration: float = 8.0
     """[s]"""
-    dt: float = 0.01
-    """Time from one reading of arm and camera to the next [s]."""
-    longest: float = 0.5
-    """Delays up to it are found [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("speed", "duration", "dt", "longest"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        if not self.duration > 0:
+            raise ValueError(f"duration must be positive, but is {self.duration}.")
         if self.joint < 1:
             raise ValueError(f"joint is counted from 1, but is {self.joint}.")
 
@@ -59,7 +56,7 @@ class DelayMotion:
         progress = passed / self.duration
         turns = passed * (_SLOWEST + 0.5 * (_FASTEST - _SLOWEST) * progress)
         gentle = min(1.0, 8 * progress, 8 * (1 - progress))
-        return self.speed * gentle * math.sin(2 * math.pi * turns)
+        return _SPEED * gentle * math.sin(2 * math.pi * turns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,11 +106,11 @@ def measure_delay(
     home, times, positions = float(begun.joint_position[joint]), [], []
     taken, pixels, last = [], [], None
     try:
-        for k in range(round(motion.duration / motion.dt)):
+        for k in range(round(motion.duration / _DT)):
             velocity = np.zeros(joints)
-            velocity[joint] = motion.velocity(k * motion.dt)
+            velocity[joint] = motion.velocity(k * _DT)
             arm.command(velocity)
-            advance(motion.dt)
+            advance(_DT)
             state = arm.read()
             times.append(state.time)
             positions.append(float(state.joint_position[joint]))
@@ -126,7 +123,7 @@ def measure_delay(
                 age = camera.age if isinstance(camera, TimedCamera) else 0.0
                 taken.append(state.time - age)
                 pixels.append(centre(seen))
-        _go_back(arm, joint, home, advance, motion.dt)
+        _go_back(arm, joint, home, advance)
     finally:
         arm.command(np.zeros(joints))
     if len(taken) < _FEWEST:
@@ -135,22 +132,20 @@ def measure_delay(
             f"{_FEWEST} are needed: put the arm where it is seen, and light it."
         )
     return fit_delay(
-        np.array(times), np.array(positions), np.array(taken), np.array(pixels), motion.longest
+        np.array(times), np.array(positions), np.array(taken), np.array(pixels), _LONGEST
     )
 
 
-def _go_back(
-    arm: Arm, joint: int, home: float, advance: Callable[[float], None], dt: float
-) -> None:
+def _go_back(arm: Arm, joint: int, home: float, advance: Callable[[float], None]) -> None:
     """Bring a joint back to where it was [rad]."""
-    for _ in range(round(3.0 / dt)):
+    for _ in range(round(3.0 / _DT)):
         state = arm.read()
         velocity = np.zeros_like(state.joint_position)
         velocity[joint] = _RETURN * (home - state.joint_position[joint])
         if abs(velocity[joint]) < _RETURN * _BACK:
             return
         arm.command(velocity)
-        advance(dt)
+        advance(_DT)
 
 
 def fit_delay(

@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection
@@ -37,6 +37,30 @@ _STARTUP = 60.0
 
 class DriverError(RuntimeError):
     """The driver of a device raised an exception; the message has it."""
+
+
+class ArmFaultError(RuntimeError):
+    """The arm has stopped and takes no commands until `recover` is called."""
+
+
+def checked_velocity(
+    velocity: Float[np.ndarray, "..."], names: Sequence[str], fastest: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Joint velocities to command [rad/s], at most the fastest.
+
+    Raises:
+        ValueError: They are not finite, or beyond the fastest by more than rounding.
+    """
+    velocity = np.asarray(velocity, dtype=float)
+    if velocity.shape != (len(names),) or not np.isfinite(velocity).all():
+        raise ValueError(
+            f"joint_velocity must be {len(names)} finite numbers, but is {velocity}."
+        )
+    # A filter that leads along a limit rounds.
+    for i in np.flatnonzero(np.abs(velocity) > fastest * (1 + 1e-6))[:1]:
+        text = f"{names[i]}: {velocity[i]:.3f} rad/s is beyond its limit"
+        raise ValueError(f"{text} of {fastest[i]:.3f} rad/s.")
+    return np.clip(velocity, -fastest, fastest)
 
 
 @final

@@ -32,7 +32,7 @@ from hrc_learn.deploy import (
     export_step,
 )
 from hrc_learn.distributed import ByValue
-from hrc_learn.hardware.driver_process import DriverError
+from hrc_learn.hardware.driver_process import DriverError, checked_velocity
 from hrc_learn.hardware.franka_loop import import_pylibfranka, serve
 from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
 from hrc_learn.hardware.franka_settings import CYCLE, FrankaConfig
@@ -119,7 +119,8 @@ class FrankaArm:
             raise ValueError(
                 f"a Franka arm has {JOINTS} joints, but the chain {len(chain.joint_names)}."
             )
-        self._config = config = config or FrankaConfig()
+        self._config, self._names = config or FrankaConfig(), chain.joint_names
+        config = self._config
         self._shared, self._orders = Shared(), Orders()
         # Of the threads here that command: the loop is never held up by it.
         self._writing = threading.Lock()
@@ -194,9 +195,8 @@ class FrankaArm:
             ValueError: They are not seven finite numbers.
             DriverError: The arm has been stopped; `recover` makes it move again.
         """
-        velocity = np.asarray(joint_velocity, dtype=float)
-        if velocity.shape != (JOINTS,) or not np.isfinite(velocity).all():
-            raise ValueError(f"joint_velocity must be 7 finite numbers, but is {velocity}.")
+        # The loop's filter keeps the limits, whatever is wanted.
+        velocity = checked_velocity(joint_velocity, self._names, np.full(JOINTS, np.inf))
         self._check()
         self._order(joint_velocity=velocity, stamp=time.monotonic(), stop=False)
 

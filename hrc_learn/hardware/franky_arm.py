@@ -17,23 +17,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.hardware.driver_process import ArmFaultError, checked_velocity
 from hrc_learn.hardware.franka_settings import FrankyConfig, RealtimeError
 from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
 
 _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 """Holds 1 under a kernel with PREEMPT_RT."""
-_ROUNDING = 1e-6
-"""Fraction of a limit by which a velocity may be beyond it, and is cut: a filter that leads
-along a limit rounds."""
-
+_JOINTS = tuple(f"joint {k}" for k in range(1, 8))
 _COMING_TO_REST = 2.0
 """Longest wait for the arm to rest [s]: from the fastest velocity with 0.15 of the driver's
 acceleration."""
-
-
-class ArmFaultError(RuntimeError):
-    """The arm has stopped and takes no commands until `recover` is called."""
 
 
 class FrankyArm:
@@ -106,7 +100,7 @@ class FrankyArm:
             ValueError: They are not finite, or beyond the driver's limits.
             ArmFaultError: The arm has stopped, or another one before this has been lost.
         """
-        velocity = self._checked(joint_velocity)
+        velocity = checked_velocity(joint_velocity, _JOINTS, self._fastest)
         self._raise_fault()
         motion = self._franky.JointVelocityMotion(velocity.tolist(), duration=self._hold)
         try:
@@ -253,19 +247,6 @@ class FrankyArm:
         if self._newest is None or state.time.to_msec() >= self._newest.time.to_msec():
             self._newest = state
         return self._newest
-
-    def _checked(self, velocity: Float[np.ndarray, "7"]) -> Float[np.ndarray, "7"]:
-        if not np.isfinite(velocity).all():
-            raise ValueError(f"joint_velocity must be finite, but is {velocity}.")
-        beyond = np.abs(velocity) > self._fastest * (1 + _ROUNDING)
-        if beyond.any():
-            k = int(beyond.argmax())
-            # The driver would refuse it too, but only to the command after this.
-            raise ValueError(
-                f"joint_velocity of joint {k + 1} must be at most {self._fastest[k]:g} rad/s, "
-                f"the driver's limit, but is {velocity[k]:g}."
-            )
-        return np.clip(velocity, -self._fastest, self._fastest)
 
     def _require_ready(self, state: Any) -> None:
         mode = self._franky.RobotMode

@@ -11,7 +11,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.franky_arm import ArmFaultError
+from hrc_learn.hardware.driver_process import ArmFaultError, checked_velocity
 from hrc_learn.hardware.lerobot_device import JointUnits, forget_late_replies, open_device
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
@@ -288,25 +288,6 @@ class LeRobotArm:
                 f"no reading of the arm for {silent:.2f} s{why}: its servos hold the last "
                 "positions. Check cable and power, and connect again."
             )
-
-
-def checked_velocity(
-    velocity: Float[np.ndarray, "..."], names: Sequence[str], fastest: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
-    """Joint velocities to command [rad/s].
-
-    Raises:
-        ValueError: They are not finite, or beyond the limits of the arm's description.
-    """
-    velocity = np.asarray(velocity, dtype=float)
-    if velocity.shape != (len(names),) or not np.isfinite(velocity).all():
-        raise ValueError(
-            f"joint_velocity must be {len(names)} finite numbers, but is {velocity}."
-        )
-    for i in np.flatnonzero(np.abs(velocity) > fastest * (1 + 1e-6))[:1]:
-        text = f"{names[i]}: {velocity[i]:.3f} rad/s is beyond its limit"
-        raise ValueError(f"{text} of {fastest[i]:.3f} rad/s.")
-    return velocity
 
 
 def led_goal(

@@ -42,7 +42,6 @@ class CaptureCamera(TimedCamera):
         self,
         source: int | str | Path,
         *,
-        size: tuple[int, int] | None = None,
         delay: float = 0.0,
         timeout: float = 1.0,
     ):
@@ -51,14 +50,13 @@ class CaptureCamera(TimedCamera):
         Args:
             source: Number of a device ("0" too), path of one (/dev/video0), URL of a stream
                 (rtsp://..., http://...), or path of a video file.
-            size: Requested width and height of the images [px]; None: the device's own.
             delay: Time between exposure and arrival of an image [s], in addition to what the
                 backend reports; see `measure_delay`.
             timeout: Longest time without an image [s].
 
         Raises:
             FileNotFoundError: There is no such file.
-            CameraError: It cannot be opened, or sends no image of this size.
+            CameraError: It cannot be opened, or sends no image.
             ValueError: The delay is negative, or the timeout is not positive.
         """
         if not delay >= 0:
@@ -69,13 +67,8 @@ class CaptureCamera(TimedCamera):
         device = name.isdecimal() or name.startswith("/dev/")
         self._is_file = not device and "://" not in name
         self._name = f"video {name}" if self._is_file else f"camera {name}"
-        self._size, self._delay, self._timeout, self._age = size, delay, timeout, 0.0
+        self._delay, self._timeout, self._age = delay, timeout, 0.0
         self._capture = _opened(name, self._name, timeout)
-        if size is not None and not self._is_file:
-            import cv2
-
-            self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-            self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
         self._arrived = threading.Condition()
         # Time at which it was taken as far as is known [s], and the image, BGR. Times of a file
         # count from its first reading.
@@ -85,7 +78,7 @@ class CaptureCamera(TimedCamera):
         self._thread = threading.Thread(target=self._keep_newest, name=self._name, daemon=True)
         self._thread.start()
         try:
-            _as_rgb(self._first_image(), self._name, size)
+            _as_rgb(self._first_image(), self._name)
         except BaseException:
             self.close()
             raise
@@ -112,7 +105,7 @@ class CaptureCamera(TimedCamera):
         if since > self._timeout:
             raise CameraError(failure or self._silent(since))
         self._age = since + self._delay
-        return _as_rgb(newest[1], self._name, self._size)
+        return _as_rgb(newest[1], self._name)
 
     def close(self) -> None:
         """Give the camera back."""
@@ -233,21 +226,15 @@ def _opened(source: str, name: str, timeout: float) -> Any:
     return capture
 
 
-def _as_rgb(image: np.ndarray, name: str, size: tuple[int, int] | None) -> RGB:
+def _as_rgb(image: np.ndarray, name: str) -> RGB:
     """RGB image of a BGR one.
 
     Raises:
-        CameraError: It is no colour image of 8 bits, or not of the size.
+        CameraError: It is no colour image of 8 bits.
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         raise CameraError(
             f"{name} sends images of shape {image.shape} and type {image.dtype}, and not of "
             "(height, width, 3) and uint8: choose one of its colour streams."
-        )
-    height, width, _ = image.shape
-    if size is not None and (width, height) != size:
-        raise CameraError(
-            f"{name} sends images of {width} x {height} pixels instead of {size[0]} x "
-            f"{size[1]}: ask for a size that it has."
         )
     return np.ascontiguousarray(image[..., ::-1])

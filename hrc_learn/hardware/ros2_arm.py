@@ -17,8 +17,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.hardware.franky_arm import ArmFaultError
-from hrc_learn.hardware.lerobot_arm import checked_velocity, led_goal
+from hrc_learn.hardware.driver_process import ArmFaultError, checked_velocity
+from hrc_learn.hardware.lerobot_arm import led_goal
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of, start_guard
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState

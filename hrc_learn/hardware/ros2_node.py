@@ -23,7 +23,7 @@ from hrc_learn.controller import (
 )
 from hrc_learn.demos.recording_messages import image_of
 from hrc_learn.deploy import EagerRunner, StepRunner
-from hrc_learn.hardware.franky_arm import ArmFaultError
+from hrc_learn.hardware.driver_process import ArmFaultError
 from hrc_learn.hardware.ros2_arm import Ros2Arm, Ros2Config
 from hrc_learn.hardware.ros2_topics import Ros2Session, quality, stamp_of
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid

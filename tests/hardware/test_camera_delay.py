@@ -126,7 +126,7 @@ def test_a_marker_that_is_not_seen_is_told():
         )
 
 
-@pytest.mark.parametrize("setting", [{"speed": 0.0}, {"joint": 0}, {"dt": -1.0}])
+@pytest.mark.parametrize("setting", [{"duration": 0.0}, {"joint": 0}])
 def test_a_motion_that_makes_no_sense_is_refused(setting):
     with pytest.raises(ValueError, match=next(iter(setting))):
         DelayMotion(**setting)

@@ -82,7 +82,7 @@ def test_torchvisions_weights_make_torchvisions_features(tmp_path):
     [
         (None, "there is no file"),
         (lambda file: file.write_bytes(b"no weights"), "is no safetensors file"),
-        (lambda file: save_file({"conv1.weight": torch.ones(64, 3, 7, 7)}, file), "first bn1"),
+        (lambda file: save_file({"conv1.weight": torch.ones(64, 3, 7, 7)}, file), ": bn1"),
         (lambda file: save_file(resnet34().state_dict(), file), "holds no weights"),
     ],
 )

@@ -97,7 +97,7 @@ def test_steps_are_put_at_both_ends_and_taken_out_again(checkpoint):
     [
         ([0.1, 2.0], [0.3, 0.5], None),
         ([0.2, 1.9], [0.25, 0.6], None),  # trained on a part of the episodes
-        ([2.0, 0.1], [0.5, 0.3], "in another order .*: b.pos, a.pos"),
+        ([9.0, 0.1], [0.5, 0.3], "a.pos of .* is 9 .*another robot, unit or order"),
         ([5.7, 114.6], [17.0, 28.6], "another robot, unit or order"),
     ],
 )

@@ -98,16 +98,15 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
             f"vision_weights: {path} is no safetensors file ({error}); of what torchvision "
             "downloads make one by safetensors.torch.save_file(torch.load(PTH), FILE)"
         ) from error
-    own = backbone.state_dict()
-    wrong = [
-        name for name, x in own.items() if name not in weights or weights[name].shape != x.shape
-    ]
-    if wrong:
+    try:
+        missing = backbone.load_state_dict(weights, strict=False).missing_keys
+    except RuntimeError as error:
+        missing = [" ".join(str(error).split())]
+    if missing:
         raise ValueError(
-            f"vision_weights: {path} holds no weights of this ResNet; {len(wrong)} of "
-            f"{len(own)} are missing or of another shape, the first {wrong[0]}"
+            f"vision_weights: {path} holds no weights of this ResNet: {missing[0][:200]} is "
+            "missing, or of another shape"
         )
-    backbone.load_state_dict({name: weights[name] for name in own})
 
 
 # What a policy makes of an observation: whitened numbers, and places in images.

@@ -320,7 +320,7 @@ def _require_same_actions(checkpoint: Path, dataset: Path, names: list[str]) -> 
     """Compare the statistics of actions that both keep.
 
     Raises:
-        ValueError: The dataset has them in another order, or far from those of the policy.
+        ValueError: Those of the dataset are far from those of the policy.
     """
     trained, path = _trained_statistics(checkpoint), dataset / "meta" / "stats.json"
     shown = (read_json(path) if path.is_file() else {}).get(ACTION) or {}
@@ -329,15 +329,6 @@ def _require_same_actions(checkpoint: Path, dataset: Path, names: list[str]) -> 
     found = np.array([shown["mean"], shown["std"]], dtype=np.float64).reshape(2, -1)
     if found.shape != trained.shape or np.allclose(found, trained, rtol=_CLOSE, atol=_SAME):
         return
-    pairs = np.isclose(found[:, :, None], trained[:, None, :], rtol=_CLOSE, atol=_SAME)
-    alike = pairs[0] & pairs[1]
-    places = alike.argmax(1)
-    if alike.any(1).all() and len({*places.tolist()}) == len(names):
-        order = ", ".join(names[i] for i in np.argsort(places))
-        raise ValueError(
-            f"the policy of {checkpoint} has its actions in another order than {dataset}: "
-            f"{order}, not {', '.join(names)}; give the dataset that it was trained on"
-        )
     (mean, std), trained_std = found, trained[1]
     wide = np.maximum(std, trained_std)
     ratio = np.abs(np.log(np.maximum(std, _SAME) / np.maximum(trained_std, _SAME)))
