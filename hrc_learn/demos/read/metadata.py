@@ -14,6 +14,7 @@ files; the sidecar holds them.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Literal
@@ -294,17 +295,14 @@ def _column_statistics(values: np.ndarray) -> dict[str, list]:
 
 
 def _combine(stacked: Mapping[str, np.ndarray]) -> dict[str, list]:
-    weights = (stacked["count"] / stacked["count"].sum()).reshape(
-        -1, *[1] * (stacked["mean"].ndim - 1)
-    )
-    mean = (weights * stacked["mean"]).sum(0)
-    variance = (weights * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(0)
+    average = partial(np.average, axis=0, weights=stacked["count"].reshape(-1))
+    mean = average(stacked["mean"])
     combined = {
         "min": stacked["min"].min(0),
         "max": stacked["max"].max(0),
         "mean": mean,
-        "std": np.sqrt(variance),
+        "std": np.sqrt(average(stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)),
         "count": stacked["count"].sum(0),
-        **{name: (weights * stacked[name]).sum(0) for name in QUANTILES},
+        **{name: average(stacked[name]) for name in QUANTILES},
     }
     return {name: values.tolist() for name, values in combined.items()}
