@@ -4,13 +4,11 @@ No ROS is needed: the packages rosbags and mcap read the files.
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -36,11 +34,7 @@ _SAME_CLOCK = 0.5
 """Largest difference between a message's own stamp and its reception on one clock [s]."""
 _BURST = 2e-4
 """Messages that follow each other this fast were written by a program, not by an arm [s]."""
-_ALIKE = 0.3
-"""Distance of commands from their joint, as a fraction of that from any other joint, below
-which their order is known."""
 _ROS = {"cdr": "deserialize_cdr", "ros1": "deserialize_ros1"}
-_COMMAND = re.compile(r"(?:^|[/_])(?:commands?|cmd|goal|target|desired)(?:$|[/_])")
 
 
 def is_bag(path: Path) -> bool:
@@ -58,7 +52,7 @@ def read_bag(path: Path) -> list[Recording]:
         DatasetError: The bag is damaged, or holds no topic that is understood.
     """
     types, messages = _opened_mcap(path) if path.suffix == ".mcap" else _opened_bag(path)
-    topics, order = _gathered(types, messages)
+    topics = _gathered(types, messages)
     if not topics:
         kinds = ", ".join(f"{topic} ({kind})" for topic, kind in types.items())
         raise DatasetError(f"no topic holds joints, poses or images: {kinds}", file=path)
@@ -67,7 +61,7 @@ def read_bag(path: Path) -> list[Recording]:
     for name, one in topics.items():
         time, places = np.unique(times[name], return_index=True)
         if one.values[0].size:
-            made = _numbers(name, one, places, order, notes)
+            made = _numbers(name, one, places, notes)
         else:
             made = image_field(name, one, messages, notes)
             if len(places) < len(one.received) or (np.diff(places) < 0).any():
@@ -76,7 +70,6 @@ def read_bag(path: Path) -> list[Recording]:
             clock = f"{name}/stamp"
             fields[name] = replace(made, clock=clock)
             fields[clock] = array_field(clock, time, unit="s")
-    fields = _with_joints_of_commands(fields)
     used = " ".join(f"/{name}/" for name in topics)
     unread = [t for t in types if f"/{t.strip('/')}/" not in used]
     if unread:
@@ -146,21 +139,16 @@ def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
     return names, messages
 
 
-def _gathered(
-    types: Mapping[str, str], messages: Messages
-) -> tuple[dict[str, Topic], list[str]]:
-    """Topics by field, and joints in the order of the robot's description."""
+def _gathered(types: Mapping[str, str], messages: Messages) -> dict[str, Topic]:
+    """Topics by field."""
     sets: dict[str, dict[frozenset[str], Topic]] = {}
     edges: dict[tuple[str, str], list[tuple[float, float, np.ndarray]]] = {}
-    order: list[str] = []
     for topic, received, message in messages([*types]):
-        stamp, data = stamp_of(message), getattr(message, "data", None)
+        stamp = stamp_of(message)
         for one in getattr(message, "transforms", ()):
             edge = (one.header.frame_id.strip("/"), one.child_frame_id.strip("/"))
             pose = matrix_of(one.transform.translation, one.transform.rotation)
             edges.setdefault(edge, []).append((received * 1e-9, stamp_of(one), pose))
-        if isinstance(data, str) and topic.endswith("robot_description") and not order:
-            order = [j.get("name", "") for j in ElementTree.fromstring(data).iter("joint")]
         for name, names, value in parts_of(topic.strip("/"), message):
             group = sets.setdefault(name, {})
             one = group.setdefault(frozenset(names or ()), Topic(names))
@@ -173,9 +161,7 @@ def _gathered(
         for one in ranked[1:]:  # a gripper's driver may publish to the same topic
             parent, _, last = name.rpartition("/")
             topics["/".join(filter(None, (parent, (one.names or "?")[0], last)))] = one
-    joints = [one for name, one in topics.items() if name.endswith("joint_positions")]
-    main = max(joints, key=lambda one: len(one.values), default=Topic())
-    return topics | poses_of_frames(edges), order or [*(main.names or ())]
+    return topics | poses_of_frames(edges)
 
 
 def _times(
@@ -201,7 +187,6 @@ def _numbers(
     name: str,
     one: Topic,
     places: Int64[np.ndarray, " _frames"],
-    order: Sequence[str],
     notes: list[str],
 ) -> Field | None:
     """Field of a topic of numbers; None if it cannot be used, which a note says.
@@ -210,52 +195,20 @@ def _numbers(
         name: Name of the field.
         one: Messages of the topic.
         places: Messages in the order of their times, each time once.
-        order: Joints in the order of the robot's description.
         notes: Receives what is left out.
     """
     if len({value.shape for value in one.values}) > 1:
         notes.append(f"{name} is left out: its messages differ in size")
         return None
-    values, names = np.stack(one.values), one.names
+    values = np.stack(one.values)
     if not np.isfinite(values).all() and not name.endswith("joint_positions"):
         notes.append(f"{name} is left out: it holds NaN")
         return None
     if len(places) < len(values):
         notes.append(f"{name}: {len(values) - len(places)} messages with repeated stamps")
-    if names and {*names} <= {*order}:
-        columns = [names.index(name) for name in order if name in names]
-        values, names = values[:, columns], tuple(names[i] for i in columns)
-    made = array_field(name, values[places], names=names)
+    made = array_field(name, values[places], names=one.names)
     is_pose = values.shape[1:] == (4, 4) and not TOOL.search(name)
     return replace(made, kind="pose") if is_pose else made
-
-
-def _with_joints_of_commands(fields: Mapping[str, Field]) -> dict[str, Field]:
-    """Name the columns of commands that have no names, by the joints that follow them.
-
-    A controller has an order of its own, which such messages do not tell.
-    """
-    found = dict(fields)
-    states = [
-        one
-        for name, one in fields.items()
-        if name.endswith("joint_positions") and not _COMMAND.search(name)
-    ]
-    for name, one in fields.items():
-        state = next((s for s in states if s.width == one.width > 1 and s.names), None)
-        if one.kind != "number" or one.names or state is None or not _COMMAND.search(name):
-            continue
-        time, own = (fields[f.clock].numbers()[:, 0] for f in (one, state))
-        at = np.clip(np.searchsorted(own, time), 0, len(own) - 1)
-        apart = np.abs(one.numbers()[:, :, None] - state.numbers()[at][:, None]).mean(0)
-        joints = apart.argmin(axis=1)
-        nearest, second = np.partition(apart, 1, axis=1)[:, :2].T
-        if len({*joints}) == one.width and (nearest < _ALIKE * second).all():
-            values = one.numbers()[:, np.argsort(joints)]
-            made = array_field(name, values, names=state.names, clock=one.clock)
-            found[f"{name}/joint_positions"] = made
-            del found[name]
-    return found
 
 
 def _without_gaps(whole: Recording, notes: list[str]) -> list[Recording]:

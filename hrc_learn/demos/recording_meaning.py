@@ -33,6 +33,9 @@ _REACH = 5.0
 _ANGLES = re.compile(r"(?:^|[._])r_?x$", re.IGNORECASE)
 _CHECKED_EPISODES, _CHECK_RATE = 5, 20.0
 """Episodes and frame rate [1/s] with which a command is compared: 30 frames of delay."""
+_ALIKE = 0.3
+"""Distance of a command from its joint, as a fraction of that of any other command, below which
+their order is known."""
 _SLOPES = (0.5, 2.0)
 """Change of the joints per change of the command, if both are in the same unit."""
 
@@ -366,33 +369,67 @@ def _decide_commands(
     """
     selections, kept, first = meaning.selections, meaning.kept, recordings[0]
     joints, command = selections.get("joint_position"), selections.get("command_position")
-    if (
-        command is not None
-        and joints is not None
-        and not named
-        and not _followed(recordings, command.columns, joints.columns)
-    ):
-        del selections["command_position"], meaning.decisions["command_position"]
-        kept.setdefault("action", (command.columns, column_names(first, command.columns)))
-        meaning.notes.append("the joints do not follow the recorded action: kept as recorded")
+    if command is not None and joints is not None and not named:
+        if command.numbered:
+            columns = _in_order(first, command.columns, joints.columns)
+            selections["command_position"] = command = replace(command, columns=columns)
+        if not _followed(recordings, command.columns, joints.columns):
+            del selections["command_position"], meaning.decisions["command_position"]
+            kept.setdefault("action", (command.columns, column_names(first, command.columns)))
+            text = "the joints do not follow the recorded action: kept as recorded"
+            meaning.notes.append(text)
     for name in actions:
         if "command_position" in selections or "action" in kept:
             meaning.left_out[name] = "another action"
             continue
-        places = first.places(name, "action")
+        places = tuple(first.places(name, "action"))
         width = len(joints.columns) if joints else 0
         arm, rest = places[:width], places[width:]
         fits = len(arm) == width and (not rest or (len(rest) == 1 and "gripper" in selections))
+        arm = _in_order(first, arm, joints.columns) if joints and fits else arm
         if joints and fits and _followed(recordings, arm, joints.columns):
             role, unit = "command_position", meaning.decisions["joint_position"]
-            selections[role] = replace(joints, role=role, columns=tuple(arm))
+            selections[role] = replace(joints, role=role, columns=arm)
             meaning.decisions[role] = replace(unit, role=role, evidence="the joints follow it")
             if rest:
-                kept["action"] = (tuple(rest), ("gripper.pos",))
+                kept["action"] = (rest, ("gripper.pos",))
             continue
-        kept["action"] = (tuple(places), column_names(first, places))
+        kept["action"] = (places, column_names(first, places))
         if joints:
             meaning.notes.append(f"the joints do not follow {name}: it is kept as recorded")
+
+
+def _matched(
+    one: Recording, command: Sequence[Place], state: Sequence[Place]
+) -> tuple[Float64[np.ndarray, "times _commands"], Float64[np.ndarray, "times _joints"]]:
+    """Values of commands and of joints at the same times."""
+    given, measured = read_columns(one, command), read_columns(one, state)
+    if one.streams:  # each topic has its own rate
+        own = [one.fields[places[0][0]].clock for places in (command, state)]
+        times = [one.fields[clock].numbers()[:, 0] for clock in own]
+        first, last = max(t[0] for t in times), min(t[-1] for t in times)
+        ticks = np.arange(first, last, 1 / _CHECK_RATE)
+        at = [np.searchsorted(t, ticks, side="right") - 1 for t in times]
+        given, measured = given[at[0]], measured[at[1]]
+    count = min(len(given), len(measured))
+    return given[:count], measured[:count]
+
+
+def _in_order(
+    first: Recording, command: tuple[Place, ...], joints: Sequence[Place]
+) -> tuple[Place, ...]:
+    """Commands without names in the order of the joints, where it is another and clear.
+
+    A controller has an order of its own, which such commands do not tell.
+    """
+    if not len(command) == len(joints) > 1:
+        return command
+    given, measured = _matched(first, command, joints)
+    apart = np.abs(given[:, :, None] - measured[:, None]).mean(axis=0)
+    order = apart.argmin(axis=0)
+    nearest, second = np.partition(apart, 1, axis=0)[:2]
+    clear = len({*order}) == len(order) and (nearest < _ALIKE * second).all()
+    return tuple(command[k] for k in order) if clear else command
 
 
 def _followed(
@@ -401,16 +438,7 @@ def _followed(
     """True if the joints move as the command does, in the same unit."""
     votes = []
     for one in recordings[:: max(1, len(recordings) // _CHECKED_EPISODES)]:
-        given, measured = read_columns(one, command), read_columns(one, state)
-        if one.streams:  # each topic has its own rate
-            own = [one.fields[places[0][0]].clock for places in (command, state)]
-            times = [one.fields[clock].numbers()[:, 0] for clock in own]
-            first, last = max(t[0] for t in times), min(t[-1] for t in times)
-            ticks = np.arange(first, last, 1 / _CHECK_RATE)
-            at = [np.searchsorted(t, ticks, side="right") - 1 for t in times]
-            given, measured = given[at[0]], measured[at[1]]
-        count = min(len(given), len(measured))
-        given, measured = given[:count], measured[:count]
+        given, measured = _matched(one, command, state)
         span = np.ptp(measured, axis=0)
         near = np.median(np.abs(given - measured), axis=0) <= 0.1 + 0.5 * span
         tracking = track(given, measured, _CHECK_RATE)

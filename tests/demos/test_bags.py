@@ -221,9 +221,7 @@ def test_commands_that_pause_are_left_out_and_named(tmp_path):
     messages.array("/forward_position_controller/commands", START + 1.9, joints(1.9))
     made = plan(write2(tmp_path / "bag", messages))
     assert not made.has_actions
-    assert "commands/joint_positions is left out: it is silent for 1.4" in "\n".join(
-        made.lines()
-    )
+    assert "commands is left out: it is silent for 1.4" in "\n".join(made.lines())
 
 
 def test_a_gripper_on_the_topic_of_the_arm_is_kept_apart(tmp_path):
@@ -238,19 +236,24 @@ def test_a_gripper_on_the_topic_of_the_arm_is_kept_apart(tmp_path):
     np.testing.assert_allclose(demo.gripper, 0.04 * now, atol=5e-4)
 
 
-def test_joints_keep_the_order_of_the_robot_description(tmp_path):
-    messages = ros2()
-    links = "".join(f'<joint name="{name}" type="revolute"/>' for name in UR)
-    text = f'<robot name="ur">{links}</robot>'
-    messages.add("/robot_description", START, "std_msgs/msg/String", data=text)
+def test_commands_of_a_trajectory_are_put_in_the_order_of_the_joints(tmp_path):
+    messages, empty = ros2(), np.zeros(0)
     for t in START + STATES:
-        values = [position_of(name, t - START) for name in SORTED]
-        messages.state("/joint_states", t, SORTED, values)
+        messages.state("/joint_states", t, UR, joints(t - START))
+        point = messages.of(
+            "trajectory_msgs/msg/JointTrajectoryPoint",
+            positions=np.array([position_of(name, t - START + 0.02) for name in SORTED]),
+            velocities=empty,
+            accelerations=empty,
+            effort=empty,
+            time_from_start=messages.of("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        )
+        content = {"header": messages.header(t), "joint_names": list(SORTED), "points": [point]}
+        messages.add("/arm/trajectory", t, "trajectory_msgs/msg/JointTrajectory", **content)
     (episode,) = plan(write2(tmp_path / "bag", messages)).episodes()
     demo = episode.demonstration
-    assert demo.joint_names == UR
-    expected = joints(demo.time + demo.start_time - START)
-    np.testing.assert_allclose(demo.joint_position, expected, atol=1e-5)
+    late = joints(demo.time + demo.start_time - START + 0.02)
+    np.testing.assert_allclose(demo.command_position, late, atol=0.03)
 
 
 @pytest.mark.parametrize("offset", [-START, 40.0])
