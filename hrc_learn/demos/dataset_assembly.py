@@ -49,7 +49,6 @@ def assemble(
     earlier: Path | None = None,
     videos: Sequence[Segments] | None = None,
     tasks: Sequence[str] = (),
-    link_videos: bool = True,
 ) -> None:
     """Write the dataset of staged episodes.
 
@@ -58,15 +57,15 @@ def assemble(
         target: Folder of the new dataset.
         earlier: Dataset written by this package that the episodes are appended to. It is not
             changed; its files are linked into the new dataset, or copied.
-        videos: Video segments of each episode; None for those recorded with the episodes.
+        videos: Video segments of each episode, whose files are copied; None for those recorded
+            with the episodes, which are linked where possible.
         tasks: Task texts that already have an index, in order of the index.
-        link_videos: Hard-link videos instead of copying them, where possible.
     """
     header = read_episode(paths[0])[0].header
     for folder in ("meta/episodes/chunk-000", "data"):
         (target / folder).mkdir(parents=True)
     cameras = [key for key, f in header.features.items() if f["dtype"] == "video"]
-    listed = _EpisodeList(target, link_videos)
+    listed = _EpisodeList(target, link_videos=videos is None)
     sidecar = header.sidecar
     if earlier is not None:
         _carry_over(earlier, listed, cameras)

@@ -1,6 +1,6 @@
 """Preparation of demonstrations for learning: cutting, filtering, resampling, alignment."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -57,7 +57,7 @@ def local_polynomial(
     return coefficients[:, 0], coefficients[:, 1] / scale
 
 
-MOVING_FIELDS = (
+_SMOOTHED = (
     "joint_position",
     "joint_velocity",
     "joint_effort",
@@ -65,19 +65,14 @@ MOVING_FIELDS = (
     "position",
     "orientation",
 )
-"""Fields that are smoothed by default."""
+"""Fields that are smoothed."""
 
 _EVEN = 0.01
 """Largest difference of even steps, as a fraction of a step."""
 
 
-def savitzky_golay(
-    demo: Demonstration,
-    window: float | int,
-    degree: int = 3,
-    fields: Sequence[str] = MOVING_FIELDS,
-) -> Demonstration:
-    """Smooth by polynomials fitted around each frame; stamps may be uneven.
+def savitzky_golay(demo: Demonstration, window: float | int, degree: int = 3) -> Demonstration:
+    """Smooth motion and efforts by polynomials around each frame; stamps may be uneven.
 
     Orientations are filtered as quaternions of continuous sign and normalised, which does not
     depend on their reference frame.
@@ -86,25 +81,18 @@ def savitzky_golay(
         demo: The demonstration.
         window: Width of the neighbourhood [s].
         degree: Degree of the polynomials.
-        fields: Fields to smooth, where recorded.
 
     Raises:
-        ValueError: There are too few frames, or a field cannot be smoothed.
+        ValueError: There are too few frames.
     """
     return _filtered(
         demo,
-        fields,
         lambda values: local_polynomial(demo.time, values, window=window, degree=degree)[0],
     )
 
 
-def butterworth(
-    demo: Demonstration,
-    cutoff: float | int,
-    order: int = 2,
-    fields: Sequence[str] = MOVING_FIELDS,
-) -> Demonstration:
-    """Smooth by a Butterworth low-pass run forwards and backwards, without any lag.
+def butterworth(demo: Demonstration, cutoff: float | int, order: int = 2) -> Demonstration:
+    """Smooth motion and efforts by a Butterworth low-pass, forwards and backwards: no lag.
 
     The cut-off of each pass is raised such that both together halve the power at `cutoff`
     (Winter, Biomechanics and Motor Control of Human Movement, 4th ed., section 3.4.4). The ends
@@ -114,11 +102,10 @@ def butterworth(
         demo: Demonstration with even stamps, such as from `resample`.
         cutoff: Frequency whose power is halved [Hz].
         order: Order of each pass.
-        fields: Fields to smooth, where recorded.
 
     Raises:
-        ValueError: The stamps are uneven, the cut-off exceeds half the frame rate, there are
-            too few frames, or a field cannot be smoothed.
+        ValueError: The stamps are uneven, the cut-off exceeds half the frame rate, or there are
+            too few frames.
     """
     from scipy.signal import butter, sosfiltfilt
 
@@ -134,26 +121,14 @@ def butterworth(
     raised = np.arctan(np.tan(np.pi * cutoff / rate) / correction) * rate / np.pi
     sections = np.asarray(butter(order, raised, fs=rate, output="sos"))
     return _filtered(
-        demo,
-        fields,
-        lambda values: sosfiltfilt(sections, values, axis=0, padlen=3 * (order + 1)),
+        demo, lambda values: sosfiltfilt(sections, values, axis=0, padlen=3 * (order + 1))
     )
 
 
-def _filtered(
-    demo: Demonstration, fields: Sequence[str], smooth: Callable[[np.ndarray], np.ndarray]
-) -> Demonstration:
-    seen, smoothed = demo.feature_visible, {}
-    for name in (name for name in fields if name in demo.recorded):
-        if name in ("time", "feature_visible"):
-            raise ValueError(f"{name} cannot be smoothed")
-        if name == "feature" and seen is not None and not seen.all():
-            raise ValueError(
-                f"the feature is not visible at frame {int(np.argmin(seen))}: cut the "
-                f"demonstration to the visible part, or do not smooth the feature"
-            )
-        values = getattr(demo, name)
-        result = smooth(values.reshape(len(demo), -1)).reshape(values.shape)
+def _filtered(demo: Demonstration, smooth: Callable[[np.ndarray], np.ndarray]) -> Demonstration:
+    smoothed = {}
+    for name in (name for name in _SMOOTHED if name in demo.recorded):
+        result = smooth(getattr(demo, name))
         if name == "orientation":
             result /= np.linalg.norm(result, axis=1, keepdims=True)
         smoothed[name] = result

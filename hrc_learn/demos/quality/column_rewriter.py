@@ -83,7 +83,7 @@ def write_copy(
             frames += len(episode.edit)
         if not paths:
             raise DatasetError("no episode could be repaired", file=notes_of)
-        assemble(paths, target, videos=videos, tasks=tasks, link_videos=False)
+        assemble(paths, target, videos=videos, tasks=tasks)
         if notes_of is not None:
             _copy_notes(notes_of, target)
         if contract is not None:
