@@ -135,9 +135,7 @@ def _filtered(demo: Demonstration, smooth: Callable[[np.ndarray], np.ndarray]) -
     return replace(demo, **smoothed)
 
 
-def estimate_joint_velocity(
-    demo: Demonstration, window: float | int = 0.1, degree: int = 3
-) -> Demonstration:
+def estimate_joint_velocity(demo: Demonstration, window: float | int = 0.1) -> Demonstration:
     """Estimate `joint_velocity` from the joint positions.
 
     Differences of jittered stamps multiply the noise; a polynomial fitted around each frame
@@ -146,19 +144,18 @@ def estimate_joint_velocity(
     Args:
         demo: Demonstration with joint positions.
         window: Width of the neighbourhood [s].
-        degree: Degree of the polynomials.
 
     Raises:
         ValueError: No joint positions are recorded, or there are too few frames.
     """
     if demo.joint_position is None:
         raise ValueError("joint velocities come from joint positions; none are recorded")
-    _, velocity = local_polynomial(demo.time, demo.joint_position, window=window, degree=degree)
+    _, velocity = local_polynomial(demo.time, demo.joint_position, window=window)
     return replace(demo, joint_velocity=velocity)
 
 
 def estimate_twist(
-    demo: Demonstration, window: float | int = 0.1, degree: int = 3
+    demo: Demonstration, window: float | int = 0.1
 ) -> Float64[np.ndarray, "_frames 6"]:
     """Linear [m/s] and angular [rad/s] velocity of the end effector, in the base frame.
 
@@ -168,7 +165,6 @@ def estimate_twist(
     Args:
         demo: Demonstration with position and orientation.
         window: Width of the neighbourhood [s].
-        degree: Degree of the polynomials.
 
     Raises:
         ValueError: The pose is not recorded, or there are too few frames.
@@ -176,7 +172,7 @@ def estimate_twist(
     if demo.position is None or demo.orientation is None:
         raise ValueError("a twist needs position and orientation; one is not recorded")
     pose = np.hstack([demo.position, demo.orientation])
-    smooth, rate = local_polynomial(demo.time, pose, window=window, degree=degree)
+    smooth, rate = local_polynomial(demo.time, pose, window=window)
     q, q_dot = torch.from_numpy(smooth[:, 3:]), torch.from_numpy(rate[:, 3:])
     # A fitted quaternion is not exactly of unit length; the vector part ignores its growth.
     product = quaternion.multiply(q_dot, quaternion.conjugate(q))
@@ -399,22 +395,15 @@ def set_duration(demo: Demonstration, duration: float | int) -> Demonstration:
     return replace(demo, time=demo.time * scale, fps=demo.fps / scale, **scaled)
 
 
-def equalise_durations(
-    demos: DemonstrationSet, duration: float | int | None = None
-) -> DemonstrationSet:
-    """Scale all demonstrations to one duration.
-
-    Args:
-        demos: At least one demonstration.
-        duration: Common duration [s]; None for the median.
+def equalise_durations(demos: DemonstrationSet) -> DemonstrationSet:
+    """Scale all demonstrations to their median duration.
 
     Raises:
         ValueError: The set is empty, or as in `set_duration`.
     """
     if not len(demos):
         raise ValueError("an empty set of demonstrations has no duration")
-    if duration is None:
-        duration = float(np.median([demo.duration for demo in demos]))
+    duration = float(np.median([demo.duration for demo in demos]))
     return demos.map(lambda demo: set_duration(demo, duration))
 
 
@@ -493,8 +482,8 @@ _VELOCITY_WINDOW = 0.1
 """Width of the neighbourhood for times and velocities [s]."""
 
 
-def align(demos: DemonstrationSet, reference: int | None = None) -> DemonstrationSet:
-    """Warp every demonstration to the timing of one of them, by dynamic time warping.
+def align(demos: DemonstrationSet) -> DemonstrationSet:
+    """Warp every demonstration to the timing of that of median duration, by time warping.
 
     Joint motions are compared, each joint scaled by its range over all demonstrations; without
     joints, the position and the orientation (its angle relative to the largest rotation).
@@ -503,17 +492,13 @@ def align(demos: DemonstrationSet, reference: int | None = None) -> Demonstratio
 
     Args:
         demos: At least one demonstration, all of the same quantities.
-        reference: Index of the reference; None for the one of median duration.
 
     Raises:
-        ValueError: There are no demonstrations, no such reference, or nothing to compare.
+        ValueError: There are no demonstrations, or nothing to compare.
     """
     if not len(demos):
         raise ValueError("an empty set of demonstrations cannot be aligned")
-    if reference is None:
-        order = np.argsort([demo.duration for demo in demos])
-        reference = int(order[(len(demos) - 1) // 2])
-    leader = demos[reference]
+    leader = sorted(demos, key=lambda demo: demo.duration)[(len(demos) - 1) // 2]
     common = set.intersection(*(set(demo.recorded) for demo in demos))
     names = {"joint_position"} & common or {"position", "orientation"} & common
     if not names:
