@@ -50,7 +50,8 @@ NEEDED = {
 
 def pytest_terminal_summary(terminalreporter):
     """Say last which tests did not run, as a suite that skipped them looks as green."""
-    skipped = terminalreporter.stats.get("skipped", [])
+    # A whole module that was skipped has no marks.
+    skipped = [r for r in terminalreporter.stats.get("skipped", []) if hasattr(r, "keywords")]
     for mark, need in NEEDED.items():
         missing = sorted({report.nodeid for report in skipped if mark in report.keywords})
         if missing:

@@ -40,7 +40,10 @@ TESTED = (
     *("dmp/test_contract.py", "dmp/test_exported_dmp.py", "deploy/test_batch_export.py"),
 )
 # Not with a lowest version of their own: no user installs them with us.
-TOOLS = ("pytest>=8.3", "hypothesis>=6.100", "beartype>=0.19", "playwright>=1.49")
+TOOLS = (
+    *("pytest>=8.3", "hypothesis>=6.100", "beartype>=0.19", "playwright>=1.49"),
+    "pytorch-kinematics>=0.7.6",
+)
 REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[(?P<extras>[^]]*)\])?(?P<bounds>[^;]*)")
 ENVIRONMENTS = ("lowest", "newest", "edges")
 
@@ -131,9 +134,10 @@ def test(python: Path, folder: Path, tests: list[str]) -> int:
         here, there = ROOT / "tests" / name, folder / "tests" / name
         there.parent.mkdir(exist_ok=True)
         shutil.copytree(here, there) if here.is_dir() else shutil.copy(here, there)
-    for helper in (ROOT / "tests").glob("*.py"):
+    (folder / "benchmarks").mkdir()
+    for helper in (*(ROOT / "tests").glob("*.py"), *(ROOT / "benchmarks").glob("*.py")):
         if not helper.name.startswith("test_"):
-            shutil.copy(helper, folder / "tests")
+            shutil.copy(helper, folder / helper.parent.name)
     shutil.copy(ROOT / "pyproject.toml", folder)
     # Nothing of the caller's environment may put the checkout back on the path.
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
