@@ -9,6 +9,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 import torch
+from shape_checks import first_calls_checked
 from unchecked import shapes_unchecked
 
 torch.set_num_threads(1)
@@ -35,7 +36,8 @@ def ordinary_priority():
 def pytest_runtest_protocol(item):
     """Simulations, with their fixtures, cost twice as much with shape checks and autograd."""
     if item.get_closest_marker("simulation") is None:
-        return (yield)
+        with first_calls_checked():
+            return (yield)
     differentiates = item.get_closest_marker("gradients") is not None
     with shapes_unchecked(), torch.inference_mode(not differentiates):
         return (yield)
