@@ -12,6 +12,7 @@ import pytest
 import torch
 from commands import done, hrc
 from taught_models import teach
+from unchecked import shapes_unchecked
 
 from hrc_learn.experiments import collaboration_experiment as experiment
 from hrc_learn.experiments.collaboration_metrics import collaboration_metrics
@@ -64,6 +65,7 @@ SLOW = 0.02
 RUN_OPTIONS = ("workplace", "access", "seed", "observer")
 
 
+@shapes_unchecked()  # thousands of steps of the controller: twice as long checked
 def simulate(aiming, placing, shelves, **options):
     """Run a scenario with the given settings."""
     run = {name: options.pop(name) for name in RUN_OPTIONS if name in options}

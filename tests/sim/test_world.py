@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter
 from hrc_learn.kinematics import panda
@@ -44,6 +45,7 @@ def test_arm_follows_a_velocity_without_lag(world):
 
 
 @pytest.mark.parametrize("joint", range(7))
+@shapes_unchecked()
 def test_the_filter_allows_for_what_the_servo_overshoots(world, joint):
     """What counts is the measured velocity: it keeps the limit, and breaks it if the command
     may use all of it."""

@@ -126,15 +126,15 @@ def inside(position, region, tolerance=1e-3):
 
 def test_a_drawing_leads_the_end_effector_and_what_was_planned_does_so_again_afterwards():
     loop = Loop()
-    at_plan = loop.run(2.0)
+    at_plan = loop.run(1.5)
     assert np.abs(at_plan - CENTRE.numpy())[2] < 5e-3
     assert not inside(at_plan, ELSEWHERE)
-    led = loop.run(4.0, region=ELSEWHERE, target=TARGET)
+    led = loop.run(3.0, region=ELSEWHERE, target=TARGET)
     assert inside(led, ELSEWHERE)
     # The box of a target is approached from outside: within its walls, and a little beyond.
     np.testing.assert_allclose(led, TARGET, atol=CONFIG.target_half_size + 5e-4)
     assert loop.drawn.away
-    back = loop.run(4.0)
+    back = loop.run(3.0)
     assert np.abs(back - CENTRE.numpy())[2] < 5e-3
     # Without the camera the last centimetres to the wide planned box take long.
     assert (np.abs(back - CENTRE.numpy())[:2] < 0.16).all()
@@ -150,7 +150,7 @@ def test_between_changes_the_potential_only_falls():
     loop = Loop()
     for asked in ({}, {"region": ELSEWHERE, "target": TARGET}, {"region": ELSEWHERE}, {}):
         loop.potential.clear()
-        loop.run(2.0, **asked)
+        loop.run(1.4, **asked)
         # An arm that changes its direction first has to brake, by 7.5 rad/s^2 at least.
         braked = loop.potential[12:]
         assert np.diff(braked).max() <= 1e-9 + 1e-6 * braked[0]
@@ -171,12 +171,12 @@ def test_what_the_camera_sees_beyond_the_walls_does_not_draw_it_out():
     x, y, z = CENTRE.tolist()
     box = DrawnRegion(centre=(x + 0.16, y, z), half_size=(0.08, 0.08, 0.06))
     loop = Loop(camera=overhead_camera())
-    assert not inside(loop.run(3.0), box)
-    assert inside(loop.run(5.0, region=box), box)
+    assert not inside(loop.run(1.5), box)
+    assert inside(loop.run(3.5, region=box), box)
     # The camera leads up to where its share ends: beyond the middle, towards its target.
     beside = (loop.pose.position.numpy() - box.centre)[0]
     assert beside < -0.5 * box.half_size[0]
-    loop.run(4.0)
+    loop.run(3.0)
     pixel, _ = loop.camera.project(loop.pose)
     assert float((pixel - loop.planned.vision.target).norm()) < 2
 
@@ -185,7 +185,7 @@ def test_in_a_region_over_the_planned_place_the_task_goes_on():
     x, y, z = CENTRE.tolist()
     box = DrawnRegion(centre=(x + 0.02, y, z), half_size=(0.14, 0.14, 0.1))
     loop = Loop(camera=overhead_camera())
-    loop.run(5.0, region=box)
+    loop.run(3.5, region=box)
     pixel, _ = loop.camera.project(loop.pose)
     assert float((pixel - loop.planned.vision.target).norm()) < 2
     assert inside(loop.pose.position.numpy(), box)
@@ -196,8 +196,7 @@ def test_in_a_region_over_the_planned_place_the_task_goes_on():
 @pytest.mark.parametrize("turn", [(0.0, -0.2, 0.2), (0.0, 1.5, 0.0)])
 def test_the_turn_comes_on_top_of_the_planned_orientation(turn):
     loop = Loop()
-    loop.run(1.0)
-    loop.run(3.0, turn=turn)
+    loop.run(2.2, turn=turn)
     angle = min(np.linalg.norm(turn), CONFIG.largest_turn)
     # By Rodrigues' formula, not by quaternions.
     n = np.array(turn) / np.linalg.norm(turn)
@@ -208,7 +207,7 @@ def test_the_turn_comes_on_top_of_the_planned_orientation(turn):
     missing = np.arccos(np.clip((np.trace(wanted.T @ now) - 1) / 2, -1, 1))
     tolerance = loop.planned.orientation.tolerance
     assert missing < tolerance + 0.01
-    loop.run(3.0)
+    loop.run(2.2)
     assert float(quaternion.angle(loop.pose.orientation, DOWN)) < tolerance + 0.01
 
 
@@ -233,11 +232,11 @@ def test_a_drawing_that_is_refused_leaves_the_plan_in_the_lead():
 
     loop = Loop(refusal=refusal)
     alone = Loop()
-    np.testing.assert_allclose(loop.run(2.0, target=TARGET), alone.run(2.0), atol=1e-12)
+    np.testing.assert_allclose(loop.run(0.8, target=TARGET), alone.run(0.8), atol=1e-12)
     assert loop.said == ["Refused the target: a wall."]
     (pose,) = asked  # once a change
     np.testing.assert_allclose(pose.position, TARGET)
-    loop.run(1.0, target=(0.3, 0.4, 0.4))
+    loop.run(0.4, target=(0.3, 0.4, 0.4))
     assert loop.said[-1] == "The target guides the end effector; the task waits."
 
 

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.simulation
 
 WORKPLACE = Workplace()
 HOME = WORKPLACE.home_joints()
-DURATION = 9.0
+DURATION = 7.0
 """Duration of a demonstration [s]."""
 
 
