@@ -7,8 +7,8 @@ for other scenes.
 
 from __future__ import annotations
 
-import importlib
 import multiprocessing
+import pkgutil
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -258,10 +258,9 @@ def _function(text: str) -> Callable[[Any, Any], bool]:
     Raises:
         ValueError: There is none.
     """
-    module, _, name = text.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
-        return getattr(importlib.import_module(module), name)
+        return pkgutil.resolve_name(text)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"judge.success={text!r} is no MODULE:FUNCTION that can be imported ({error})"

@@ -5,7 +5,6 @@ import math
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -184,6 +183,8 @@ def repeat(
         ValueError: Without seeds or processes, or if the file has other settings.
         BusyError: Another process is adding trials to the file.
     """
+    from rich.progress import track
+
     seeds = list(dict.fromkeys(seeds))
     if not seeds or processes < 1:
         raise ValueError(
@@ -192,11 +193,9 @@ def repeat(
         )
     with TrialFile(file, made_by) as done:
         waiting = [seed for seed in seeds if seed not in done.trials]
-        known = [done.trials[seed] for seed in seeds if seed in done.trials]
-        with _progress(title, len(seeds), known) as tell:
-            for trial in _trials(run, waiting, min(processes, len(waiting)), failures):
-                done.append(trial)
-                tell(trial)
+        trials = _trials(run, waiting, min(processes, len(waiting)), failures)
+        for trial in track(trials, title, total=len(waiting)):
+            done.append(trial)
     return [done.trials[seed] for seed in seeds]
 
 
@@ -236,22 +235,3 @@ def _trial(run: TrialRun, seed: int, failures: tuple[type[Exception], ...]) -> T
         # World, cell and log of a trial refer to each other, and the garbage collector does
         # not count the memory of the simulator: fifty trials would occupy two gigabytes.
         gc.collect()
-
-
-@contextmanager
-def _progress(
-    title: str, total: int, done: Iterable[Trial]
-) -> Iterator[Callable[[Trial], None]]:
-    """Progress bar with the number of failures; yields a function to call after each trial."""
-    from rich.progress import Progress
-
-    with Progress(*Progress.get_default_columns(), "{task.fields[failed]} failed") as bar:
-        task = bar.add_task(title, total=total, failed=0)
-
-        def tell(trial: Trial) -> None:
-            failed = bar.tasks[task].fields["failed"] + bool(trial.failure)
-            bar.update(task, advance=1, failed=failed)
-
-        for trial in done:
-            tell(trial)
-        yield tell

@@ -66,10 +66,8 @@ def joint_line(
     # A minimum jerk motion peaks at 1.875 times its mean speed.
     duration = max(1.875 * float((goal - start).abs().max()) / speed, dt)
     steps = round(duration / dt) + 1
-    progress = torch.tensor(
-        [minimum_jerk(k * dt / duration)[0] for k in range(steps + 1)], dtype=start.dtype
-    )
-    return torch.lerp(start, goal, progress[:, None])
+    progress = [minimum_jerk(k * dt / duration)[0] for k in range(steps + 1)]
+    return torch.lerp(start, goal, torch.tensor(progress, dtype=start.dtype)[:, None])
 
 
 def joints_near(

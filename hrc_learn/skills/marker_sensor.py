@@ -209,8 +209,9 @@ class DelayedDetection:
             joints: Present joint positions [rad].
             ids: Markers to search for; None: all.
         """
-        found = {} if self._sensor is None else self._sensor.features(ids)
-        taken = time - (0.0 if self._sensor is None else self._sensor.age)
+        found, taken = {}, time
+        if self._sensor is not None:
+            found, taken = self._sensor.features(ids), time - self._sensor.age
         # A camera that is slower than the detection returns the same image again.
         if abs(taken - self._taken) > _SAME_IMAGE:
             self._taken = taken

@@ -57,12 +57,10 @@ _INTERVENTIONS: Mapping[str, Hindrance] = {
 
 def filter_hindrance(report: SafetyReport) -> Hindrance | None:
     """Cause by which a safety filter may have reduced a motion; None: at most a delay."""
-    flags = report.flags.tolist()
-    if True in flags:
-        for kind, hindrance in _INTERVENTIONS.items():
-            if flags[INTERVENTIONS.index(kind)]:
-                return hindrance
-    return None
+    acted = {INTERVENTIONS[int(k)] for k in report.flags.nonzero()}
+    return next(
+        (hindrance for kind, hindrance in _INTERVENTIONS.items() if kind in acted), None
+    )
 
 
 def contact_force(
@@ -183,15 +181,13 @@ class PersonFeedback:
             if person_distance is not None and pace < _FOLLOWED:
                 self.note("person", mention=True)
             known = {"joint": self._nearest, "person": _person_text(person_distance, pace)}
-            strongest_first = sorted(self._causes.items(), key=lambda item: item[1][0])
-            followed, reasons = (
-                self._followed,
-                tuple(
-                    Reason(
-                        hindrance=cause, kept=kept, text=_TEXTS[cause].format(**known | details)
-                    )
-                    for cause, (kept, details) in strongest_first
-                ),
+            followed = self._followed
+            reasons = tuple(
+                Reason(hindrance=cause, kept=kept, text=_TEXTS[cause].format(**known | details))
+                # The strongest first.
+                for cause, (kept, details) in sorted(
+                    self._causes.items(), key=lambda item: item[1][0]
+                )
             )
         self._followed, self._causes = 1.0, {}
         return Feedback(

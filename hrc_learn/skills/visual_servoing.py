@@ -516,7 +516,21 @@ class VisualServo:
         if self._law.out_of_view(self.state, self._cell.time):
             self.state = replace(self.state, detected=False)
         self._step(target)
-        self._check_timeouts(target, self._clock - start)
+        if self.state.drawn.away:
+            self.state = replace(self.state, last_detection=self._cell.time)
+            return
+        config, spent = self._config, self._clock - start
+        if self._cell.time - self.state.last_detection > config.occlusion_timeout:
+            raise MissedGraspError(
+                f"visual servoing: the end effector's marker {self._law.marker} was not "
+                f"detected for {config.occlusion_timeout:.0f} s. Remove what hides it, or move "
+                "the object nearer to the middle of the image."
+            )
+        if spent > config.timeout:
+            raise MissedGraspError(
+                f"visual servoing: after {spent:.0f} s the marker is still "
+                f"{self.error(target):.1f} px from its target (NaN: not detected)."
+            )
 
     def _step(self, target: ServoTarget) -> None:
         """Take one step and execute its command."""
@@ -552,20 +566,3 @@ class VisualServo:
     def _clock(self) -> float:
         """Time of the task without that guided by a person [s]."""
         return self._cell.task_time - self._override_time
-
-    def _check_timeouts(self, target: ServoTarget, spent: float) -> None:
-        if self.state.drawn.away:
-            self.state = replace(self.state, last_detection=self._cell.time)
-            return
-        config = self._config
-        if self._cell.time - self.state.last_detection > config.occlusion_timeout:
-            raise MissedGraspError(
-                f"visual servoing: the end effector's marker {self._law.marker} was not "
-                f"detected for {config.occlusion_timeout:.0f} s. Remove what hides it, or move "
-                "the object nearer to the middle of the image."
-            )
-        if spent > config.timeout:
-            raise MissedGraspError(
-                f"visual servoing: after {spent:.0f} s the marker is still "
-                f"{self.error(target):.1f} px from its target (NaN: not detected)."
-            )

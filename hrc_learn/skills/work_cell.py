@@ -27,7 +27,7 @@ from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.log import Event, StepLog
-from hrc_learn.protocols import Arm, ArmState, Feedback, Gripper, Human, HumanInput
+from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import StraightLine
 from hrc_learn.skills.marker_sensor import (
@@ -398,26 +398,24 @@ class WorkCell:
         """
         if not len(path):
             return 0
-        self.plan = path
-        try:
-            return self._follow(path, until)
-        finally:
-            self.plan = None
-
-    def _follow(
-        self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool]
-    ) -> int:
         paths = JointPaths.of(self.chain, [path], self.config.dt)
         request = FollowPath(paths=paths, path=torch.tensor(0))
         self.loop_state = self._loop.begin_path(self.loop_state, self.joints, request)
-        while not self.loop_state.path.finished:
-            if until():
-                return int(self.loop_state.path.progress)
-            self._act(request)
-        if self.config.after_push == "return":
-            deadline = self.time + _LONGEST_RETURN
-            while self.loop_state.aside and not self.loop_state.pushed and self.time < deadline:
+        self.plan = path
+        try:
+            while not self.loop_state.path.finished:
+                if until():
+                    return int(self.loop_state.path.progress)
                 self._act(request)
+            deadline = self.time + _LONGEST_RETURN
+            while (
+                self.config.after_push == "return"
+                and (self.loop_state.aside and not self.loop_state.pushed)
+                and self.time < deadline
+            ):
+                self._act(request)
+        finally:
+            self.plan = None
         return len(path)
 
     def _track_line(
@@ -461,7 +459,16 @@ class WorkCell:
         if (watched := self._watched) is not None:
             separation, scale = self.config.safety.separation, float(self.pace.people_scale)
             columns = columns | separation_columns(watched, separation, velocity, scale)
-        effort, told = self.human_input.effort(len(self.joints)), self._told()
+        told = self._feedback.told(
+            self.state,
+            self.jacobian,
+            pushed=reading.explain,
+            person_distance=None if watched is None else watched.nearest,
+            pace=float(self.pace.scale),
+            load=self.load,
+            contact_expected=self.time < self._contact_expected,
+        )
+        effort = self.human_input.effort(len(self.joints))
         self.log.append(**step_columns(self.state, velocity, effort, report, told), **columns)
         self._arm.command(velocity.numpy())
         self.human.tell(told)
@@ -554,16 +561,3 @@ class WorkCell:
             self.tell("The task waits.")
         if now == full and before < full:
             self.tell("The task goes on.")
-
-    def _told(self) -> Feedback:
-        """Feedback to the person in this step."""
-        watched = self._watched
-        return self._feedback.told(
-            self.state,
-            self.jacobian,
-            pushed=self._reading.explain,
-            person_distance=None if watched is None else watched.nearest,
-            pace=float(self.pace.scale),
-            load=self.load,
-            contact_expected=self.time < self._contact_expected,
-        )
