@@ -92,11 +92,8 @@ class CollaborationExperiment(CollaborationScenario):
             workplace_for(self.shelves, robot),
         )
         if self.look is not None:
-            scene = unmarked_for(workplace.scene, skill, self.look, seed)
-            workplace, scenario = (
-                replace(workplace, scene=scene),
-                replace(scenario, camera="egl"),
-            )
+            workplace = unmarked_for(workplace, skill, self.look, seed)
+            scenario = replace(scenario, camera="egl")
         return simulate_collaboration(
             skill,
             PlacingSkill.load(self.placing, robot),

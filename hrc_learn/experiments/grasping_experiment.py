@@ -291,8 +291,8 @@ class GraspingExperiment:
         )
         camera, placed = self.camera, self.camera
         if self.look is not None:
-            scene = unmarked_for(workplace.scene, skill, self.look, seed)
-            workplace, camera, placed = replace(workplace, scene=scene), "egl", "synthetic"
+            workplace = unmarked_for(workplace, skill, self.look, seed)
+            camera, placed = "egl", "synthetic"
         return simulate_grasp(
             skill,
             GraspingScene.draw(workplace, self.scene, rng, placed, self.imperfections),

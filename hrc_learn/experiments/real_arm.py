@@ -134,26 +134,24 @@ def opened_arm(site: ArmSite, chain: SerialChain | None = None) -> Iterator[Stop
         ValueError: If the site has no address.
         DriverError: If the arm cannot be reached; says why.
     """
-    if site.driver in ("lerobot", "ros2"):
-        opened: Callable[[], StoppableArm] = partial(
-            LeRobotArm, site.device, chain or site.chain, site.lerobot
-        )
-        if site.driver == "ros2":
-            print(ros2_origin(), file=sys.stderr)
-            opened = partial(Ros2Arm, chain or site.chain, site.ros2)
-        with ArmProcess(opened, timeout=_SILENCE) as arm:
-            yield arm
-        return
-    if not site.ip:
+    opened: Callable[[], StoppableArm]
+    if site.driver == "lerobot":
+        opened = partial(LeRobotArm, site.device, chain or site.chain, site.lerobot)
+    elif site.driver == "ros2":
+        print(ros2_origin(), file=sys.stderr)
+        opened = partial(Ros2Arm, chain or site.chain, site.ros2)
+    elif not site.ip:
         raise ValueError("ip is empty: give the address of the control box of the arm.")
     # Never both: each driver registers the same types, and refuses to be loaded with the other.
-    if site.driver == "franky":
-        config = FrankyConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
-        with ArmProcess(partial(FrankyArm, site.ip, config), timeout=_SILENCE) as arm:
+    elif site.driver == "franka":
+        loop = FrankaConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
+        with FrankaArm(site.ip, site.chain, loop) as arm:
             yield arm
         return
-    config = FrankaConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
-    with FrankaArm(site.ip, site.chain, config) as arm:
+    else:
+        config = FrankyConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=site.realtime)
+        opened = partial(FrankyArm, site.ip, config)
+    with ArmProcess(opened, timeout=_SILENCE) as arm:
         yield arm
 
 

@@ -21,7 +21,6 @@ from hrc_learn.sim import (
     Imperfections,
     MotionLog,
     ObjectConfig,
-    SceneConfig,
     Touch,
     Worker,
     WorkerConfig,
@@ -64,12 +63,12 @@ _OTHER_LOOK = 10_000
 
 
 def unmarked_for(
-    scene: SceneConfig, skill: VisualServoSkill, look: UnmarkedLook, seed: int
-) -> SceneConfig:
-    """Scene without markers for a skill that was learned without them.
+    workplace: Workplace, skill: VisualServoSkill, look: UnmarkedLook, seed: int
+) -> Workplace:
+    """Workplace without markers for a skill that was learned without them.
 
     Args:
-        scene: Scene with markers.
+        workplace: Workplace with markers.
         skill: Skill with landmarks; the place on the tool that it sees is what measures use.
         look: Look of the scene.
         seed: Draws clutter and light.
@@ -84,7 +83,8 @@ def unmarked_for(
             "image-jacobian --markerless`, or leave out --aiming to use that of `hrc demo`."
         )
     look = replace(look, seed=seed + _OTHER_LOOK)
-    return unmarked(scene, look, camera[MARKER].numpy())
+    scene = unmarked(workplace.scene, look, camera[MARKER].numpy())
+    return replace(workplace, scene=scene)
 
 
 OBJECT_REACH = (0.10, 0.08, 0.0)

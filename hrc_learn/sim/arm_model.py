@@ -70,9 +70,8 @@ def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
     )
     mesh = spec.add_mesh(name=name)
     mesh.uservert = [-half, -half, 0, half, -half, 0, half, half, 0, -half, half, 0]
-    mesh.userface = [0, 1, 2, 0, 2, 3]
+    mesh.userface = mesh.userfacetexcoord = [0, 1, 2, 0, 2, 3]
     mesh.usertexcoord = [0, 1, 1, 1, 1, 0, 0, 0]
-    mesh.userfacetexcoord = [0, 1, 2, 0, 2, 3]
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     body.add_geom(
         name=name,

@@ -263,12 +263,8 @@ def table_top(width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """A plain wooden surface, lit from one side."""
     u = np.linspace(-1, 1, width)[None, :, None]
     v = np.linspace(-1, 1, height)[:, None, None]
-    wood = np.empty((height, width, 3), dtype=np.uint8)
-    for top in range(0, height, _BAND):
-        low = v[top : top + _BAND]
-        light = 1.0 - 0.12 * u - 0.08 * low - 0.1 * (u * u + low * low)
-        wood[top : top + _BAND] = np.rint(light * [168.0, 148.0, 124.0]).clip(0, 255)
-    return wood
+    light = 1.0 - 0.12 * u - 0.08 * v - 0.1 * (u * u + v * v)
+    return np.rint(light * [168.0, 148.0, 124.0]).clip(0, 255).astype(np.uint8)
 
 
 def carton(
