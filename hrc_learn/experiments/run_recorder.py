@@ -29,13 +29,8 @@ from hrc_learn.geometry.shapes import Line
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.log import CameraRecording, JointRanges, LoggedSteps, RunRecording
 from hrc_learn.protocols import HINDRANCES
-from hrc_learn.sim import (
-    MotionLog,
-    OffscreenRenderer,
-    RecordedWorld,
-    RenderingUnavailableError,
-    World,
-)
+from hrc_learn.sim import MotionLog, RecordedWorld, RenderingUnavailableError, World
+from hrc_learn.sim.cameras import OffscreenRenderer
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import HOME, INTERACT, RELEASE, TRANSFER
 from hrc_learn.skills.placing import Plan

@@ -4,17 +4,9 @@ from hrc_learn.skills.arm_motion import PositionServo as PositionServo
 from hrc_learn.skills.arm_motion import joint_line as joint_line
 from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
 from hrc_learn.skills.grasping import Grasping as Grasping
-from hrc_learn.skills.grasping import GraspingConfig as GraspingConfig
-from hrc_learn.skills.marker_sensor import LatencyConfig as LatencyConfig
-from hrc_learn.skills.marker_sensor import MarkerObservation as MarkerObservation
-from hrc_learn.skills.marker_sensor import MarkerSensor as MarkerSensor
 from hrc_learn.skills.pick_and_place import PickAndPlace as PickAndPlace
-from hrc_learn.skills.pick_and_place import PickAndPlaceConfig as PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill as PlacingSkill
-from hrc_learn.skills.servo_target import ServoTarget as ServoTarget
-from hrc_learn.skills.servo_target import VisualServoConfig as VisualServoConfig
 from hrc_learn.skills.task_workplace import Workplace as Workplace
-from hrc_learn.skills.visual_servoing import VisualServo as VisualServo
 from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
 from hrc_learn.skills.work_cell import BlockedPathError as BlockedPathError
 from hrc_learn.skills.work_cell import MissedGraspError as MissedGraspError

@@ -12,7 +12,6 @@ from hrc_learn.sim import (
     NOWHERE,
     CameraChange,
     ChangingCamera,
-    EGLCamera,
     OcclusionInterval,
     RecordedWorld,
     RenderingUnavailableError,
@@ -22,6 +21,7 @@ from hrc_learn.sim import (
     cameras,
     open_camera,
 )
+from hrc_learn.sim.cameras import EGLCamera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.vision import MarkerDetector, SyntheticCamera, centre

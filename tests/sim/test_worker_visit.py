@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from hrc_learn.kinematics.collision import segment_box_distance
-from hrc_learn.sim import HumanSpeeds, SceneConfig, Worker, WorkerConfig, random_visit
+from hrc_learn.sim import SceneConfig, Worker, WorkerConfig, random_visit
 from hrc_learn.sim.worker import PARTS, WORKER_ITEM_HALF_SIZE
+from hrc_learn.sim.worker_visit import HumanSpeeds
 
 TABLE = SceneConfig().table
 UNDER = (0.24, 0.54)

@@ -16,15 +16,10 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import HumanInput
 from hrc_learn.sim.scene import overhead_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills import (
-    MarkerObservation,
-    MissedGraspError,
-    ServoTarget,
-    VisualServo,
-    VisualServoConfig,
-)
-from hrc_learn.skills.servo_target import VisualTarget
-from hrc_learn.skills.visual_servoing import ServoReading, ServoStep
+from hrc_learn.skills import MissedGraspError
+from hrc_learn.skills.marker_sensor import MarkerObservation
+from hrc_learn.skills.servo_target import ServoTarget, VisualServoConfig, VisualTarget
+from hrc_learn.skills.visual_servoing import ServoReading, ServoStep, VisualServo
 from hrc_learn.vision.camera_model import IMAGE_SIZE
 
 CONFIG = VisualServoConfig()
