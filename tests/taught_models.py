@@ -15,7 +15,10 @@ from hrc_learn.skills.visual_skill import VisualServoSkill
 def teach(folder: Path) -> tuple[VisualServoSkill, PlacingSkill]:
     """Record, fit and load; the models are in `folder/aiming` and `folder/placing`."""
     placing, servoing = folder / "placing_demos", folder / "servoing_demos"
-    done("record", "placing", "--out", placing, "--episodes", 1)
+    done(
+        *("record", "placing", "--out", placing, "--episodes", 1),
+        *("--config", "demonstration.duration=10"),
+    )
     done(
         *("record", "servoing", "--out", servoing, "--episodes", 3),
         *("--config", "demonstration.duration=4", "--json", folder / "servoing.json"),

@@ -46,7 +46,7 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """What happened."""
+    """Course and outcome of a judged motion."""
 
     joints: Float[np.ndarray, "T joints"]
     """Measured joint positions [rad]."""
@@ -157,7 +157,7 @@ class CellJudge(_Judge):
         self.run.servo.restart()
 
     def read(self) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
-        """What the simulated sensors and MuJoCo say."""
+        """Readings of the simulated sensors, and the true pose of the object."""
         state = self.run.world.arm.read()
         pose = Pose.from_matrix(self.run.world.object_pose(self._item))
         moved = torch.cat([pose.position, pose.orientation]).numpy()
@@ -169,7 +169,7 @@ class CellJudge(_Judge):
         return self.run.command(joints, width)
 
     def failure(self) -> str:
-        """A contact that was not wanted, or a task that was not done."""
+        """First unwanted contact, or a note that the task was not done."""
         touched = self.run.world.touched_since(0.0)
         done = "" if self.run.succeeded() else "the task was not done in simulation"
         return touched[0] if touched else done
@@ -235,7 +235,7 @@ class SceneJudge(_Judge):
         return joints
 
     def failure(self) -> str:
-        """What the success function says."""
+        """Answer of the success function."""
         done = bool(self.succeeded(self.model, self.data))
         return "" if done else f"{self._config.success} says no"
 

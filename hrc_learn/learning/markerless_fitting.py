@@ -97,7 +97,7 @@ class MarkerlessFit:
         }
 
     def __str__(self) -> str:
-        """What was found, in words."""
+        """Findings in words."""
         figures = self.figures()
         item = (
             f"the object in {figures['objects_found']:.0f} of {len(self.demos)} demonstrations"

@@ -192,7 +192,7 @@ class DrawnImperfections:
     base_shift: Float[np.ndarray, "3"]
     """True minus assumed position of the base [m]."""
     base_turn: float
-    """About the vertical [rad]."""
+    """True minus assumed turn of the base about the vertical [rad]."""
     tool_shift: Float[np.ndarray, "3"]
     """True minus assumed position of the tool, in the gripper's frame [m]."""
     tool_turn: Float[np.ndarray, "3"]

@@ -42,7 +42,7 @@ class HumanSpeeds:
     reaching: float = 2.0
     """Speed of a hand [m/s]."""
     turning: float = 2.5
-    """About the vertical [rad/s]."""
+    """Turning speed about the vertical [rad/s]."""
 
     def drawn(self, rng: np.random.Generator) -> HumanSpeeds:
         """Speeds of one visit: 50 to 95 % of these."""

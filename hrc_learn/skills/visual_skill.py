@@ -164,7 +164,7 @@ class VisualServoSkill:
     learned: EvidenceResult | None = None
     """Learning of RBF centres, noise and prior; None if they were given."""
     landmarks: Landmarks | None = None
-    """What is found without markers; None: tool and objects carry them."""
+    """Landmarks of tool and objects; None: they carry markers."""
     cells: CellErrors | None = None
     """Held-out errors by cell of a grid; None for a loaded skill."""
 

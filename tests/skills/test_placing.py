@@ -239,8 +239,8 @@ def test_a_skill_of_another_arm_is_refused(fitted, tmp_path):
 def _renamed(fitted):
     from hrc_learn.demos import Demonstration, DemonstrationSet
 
-    q = fitted.demonstrations.joint_position[0].numpy()
-    time = fitted.demonstrations.time[0].numpy()
+    q = fitted.motions.demos.joint_position[0].numpy()
+    time = fitted.motions.demos.time[0].numpy()
     names = tuple(f"j{i}" for i in range(1, 8))
     demo = Demonstration(time=time, joint_position=q, joint_names=names, fps=50.0)
     return DemonstrationSet([demo])

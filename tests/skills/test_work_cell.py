@@ -58,7 +58,7 @@ class SlowCamera:
         taken = 0.07 * np.floor((now - 0.05) / 0.07)
         self.age = now - taken + 1e-4 * np.sin(1e3 * now)  # the clocks differ a little
         pixel = np.array([taken, 0.0])
-        return {7: SeenFeature(pixel=pixel, angle=0.0, covariance=np.eye(2))}
+        return {7: SeenFeature(pixel, 0.0)}
 
     def read(self):
         return np.zeros((2, 2, 3), np.uint8)
