@@ -1,0 +1,151 @@
+"""Models of a Panda and of an SO-101 carried out to goals, judged by Pinocchio."""
+
+import re
+from importlib.metadata import distribution
+
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.geometry import minimum_jerk
+from hrc_learn.kinematics import panda
+from hrc_learn.kinematics.registry import arm
+from hrc_learn.learning import fit_primitives
+from hrc_learn.learning.fitted_model import FittedModel, Target, arm_for
+from hrc_learn.learning.motion_playing import play_on_arm, play_path
+
+DESCRIPTIONS = {
+    "panda": ("panda_description/urdf/panda.urdf", "panda_hand_tcp"),
+    "so101": ("so_arm_description/urdf/so101.urdf", "gripper_frame_link"),
+}
+MOVES = {
+    "panda": [(0.3, 0.1, -0.1, 0.2, 0.1, 0.0, 0.1), (-0.3, 0.2, 0.1, 0.1, 0.0, 0.2, 0.1)],
+    "so101": [(0.3, 0.2, -0.2, 0.1, 0.3), (-0.3, 0.3, -0.2, -0.1, 0.2)],
+}
+GOALS = {"panda": (0.5, -0.1, 0.4), "so101": (0.25, 0.1, 0.15)}
+
+
+def taught(name, folder, factor=1.0):
+    """Model of two demonstrations of an arm, with joints in units of `1 / factor` rad."""
+    robot, demos, s = arm(name), [], np.linspace(0, 1, 101)[:, None]
+    progress = minimum_jerk(torch.from_numpy(s))[0].numpy()
+    for episode, move in enumerate(MOVES[name]):
+        q = robot.ready.numpy() + progress * np.array(move) + 0.05 * np.sin(np.pi * s)
+        tool = robot.forward(torch.from_numpy(q))
+        demos.append(
+            Demonstration(
+                episode=episode,
+                fps=50,
+                time=2 * s[:, 0],
+                joint_names=robot.chain.joint_names,
+                joint_position=factor * q,
+                position=tool.position.numpy(),
+                orientation=tool.orientation.numpy(),
+            )
+        )
+    unit = "rad" if factor == 1.0 else "deg"
+    fit_primitives(DemonstrationSet(demos, joint_unit=unit), 20).save(folder)
+    return FittedModel.load(folder)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("play")
+    return {name: taught(name, folder / name) for name in MOVES}
+
+
+def moved(model, name, goal, start=None, duration=None):
+    return play_on_arm(model, arm_for(model, name), start, goal, duration)
+
+
+def at(position, **values):
+    return Target(position=torch.tensor(position).double(), **values)
+
+
+def tool_by_pinocchio(name, joints):
+    """Position of the tool by Pinocchio, from the maker's description [m]."""
+    pin = pytest.importorskip("pinocchio")
+    file, frame = DESCRIPTIONS[name]
+    share = "cmeel.prefix/share/example-robot-data/robots"
+    path = str(distribution("example-robot-data").locate_file(f"{share}/{file}"))
+    model = pin.buildModelFromUrdf(path)
+    q = pin.neutral(model)
+    for joint, value in zip(arm(name).chain.joint_names, joints, strict=True):
+        q[model.joints[model.getJointId(joint)].idx_q] = value
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    return data.oMf[model.getFrameId(frame)].translation
+
+
+def beyond(name, joints):
+    """Largest ratio of a motion at 50 Hz to the limits of velocity, acceleration and jerk."""
+    limits, padded = arm(name).limits, np.concatenate([joints[:1]] * 3 + [joints])
+    ratios = [
+        np.abs(np.diff(padded, n, axis=0) * 50.0**n).max(0) / getattr(limits, kind).numpy()
+        for n, kind in enumerate(("velocity", "acceleration", "jerk"), 1)
+    ]
+    assert (joints >= limits.lower.numpy()).all()
+    assert (joints <= limits.upper.numpy()).all()
+    return float(np.max(ratios))
+
+
+@pytest.mark.parametrize("name", GOALS)
+def test_an_arm_reaches_a_position_within_its_limits(name, models):
+    motion = moved(models[name], name, at(GOALS[name]))
+    assert tool_by_pinocchio(name, motion.joints[-1]) == pytest.approx(GOALS[name], abs=1e-3)
+    assert motion.goal_errors["goal_position_error_mm"] < 1
+    assert beyond(name, motion.joints) <= 1 + 1e-6
+    assert np.abs(np.diff(motion.joints, axis=0)).max() < 0.1  # continuous
+    # It begins where the model does, and the other joints bend towards its goal.
+    assert motion.joints[0] == pytest.approx(arm(name).ready.numpy(), abs=1e-3)
+
+
+def test_a_pose_is_reached_with_its_orientation(models):
+    turned = panda.forward(panda.ready + 0.1)
+    goal = Target(position=turned.position + 0.05, orientation=turned.orientation)
+    motion = moved(models["panda"], "panda", goal)
+    end = panda.forward(torch.from_numpy(motion.joints[-1]))
+    assert end.position.tolist() == pytest.approx(goal.position.tolist(), abs=1e-3)
+    assert abs(float(end.orientation @ turned.orientation)) == pytest.approx(1, abs=1e-5)
+    assert motion.goal_errors["goal_turn_error_deg"] < 0.5
+
+
+def test_fewer_joints_turn_the_tool_as_far_as_they_can(models):
+    """A posture of the SO-101 gives a pose that it can reach whole."""
+    robot = arm("so101")
+    wanted = robot.forward(robot.ready + torch.tensor([0.2, 0.1, 0.1, 0.2, 0.6]).double())
+    goal = Target(position=wanted.position, orientation=wanted.orientation)
+    motion = moved(models["so101"], "so101", goal)
+    assert motion.goal_errors["goal_position_error_mm"] < 1
+    assert motion.goal_errors["goal_turn_error_deg"] < 5
+
+
+def test_what_is_too_fast_takes_longer_and_says_why(models):
+    goal = (0.6, 0.4, 0.3, -2.0, 0.2, 1.9, 1.2)
+    joints = Target(joints=torch.tensor(goal).double())
+    motion = moved(models["panda"], "panda", joints, duration=0.3)
+    assert re.fullmatch(r"\w+ of panda_joint\d", motion.slowed_by)
+    assert motion.planned_duration == 0.3
+    assert motion.joints[-1] == pytest.approx(goal, abs=2e-3)  # the allowed deviation
+    error = np.abs(motion.joints[-1] - goal).max()
+    assert motion.goal_errors["goal_joint_error"] == pytest.approx(error, rel=1e-6)
+    assert 0.9 * 0.3 < beyond("panda", motion.joints) <= 1 + 1e-6
+    # Its spring pulls it towards a distant goal: 1.2 rad take 4.4 s at 7.5 rad/s^2.
+    assert 0.5 < motion.time[-1] < 6.0
+
+
+def test_a_path_without_an_arm_is_the_models_own(models):
+    goal = torch.tensor((0.6, 0.4, 0.3, -2.0, 0.2, 1.9, 1.2)).double()
+    motion = play_path(models["panda"], None, Target(joints=goal), 1.0)
+    assert motion.time[[0, -1]].tolist() == pytest.approx([0.0, 1.0])
+    assert motion.joints[0] == pytest.approx(panda.ready.numpy(), abs=1e-3)
+    apart = np.abs(motion.joints[-1] - goal.numpy())
+    assert motion.goal_errors == {"goal_joint_error": pytest.approx(apart.max(), rel=1e-6)}
+
+
+def test_degrees_move_an_arm_as_radians_do(models, tmp_path):
+    degrees = taught("panda", tmp_path, factor=180 / np.pi)
+    expected = moved(models["panda"], "panda", at(GOALS["panda"]))
+    found = moved(degrees, "panda", at(GOALS["panda"]))
+    assert found.joints == pytest.approx(expected.joints, abs=1e-4)
