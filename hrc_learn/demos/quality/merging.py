@@ -8,13 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hrc_learn.demos.issues import DatasetError
-from hrc_learn.demos.quality.column_rewriter import (
-    ColumnRewriter,
-    Rewritten,
-    listed_tasks,
-    new_header,
-    write_copy,
-)
+from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality.episode_edits import EpisodeEdit
 from hrc_learn.demos.quality.repair import RepairOptions, repair_dataset
 from hrc_learn.demos.read.frames import RawFrames, read_frames
@@ -262,23 +256,25 @@ class _Merge:
         """Write the merged dataset."""
         report, segments = self.report, [self._segments(source) for source in self.sources]
         tasks = [
-            *dict.fromkeys(t for source in self.sources for t in listed_tasks(source.folder))
+            *dict.fromkeys(
+                t for source in self.sources for t in copying.listed_tasks(source.folder)
+            )
         ]
-        header = self._header(new_header(self.first.dataset, {}, segments[0]))
+        header = self._header(copying.new_header(self.first.dataset, {}, segments[0]))
         contract = self.first.dataset.contract
         if contract is not None:
             parts = tuple(part for part in contract.components if part.key in self.features)
             contract = replace(contract, components=parts)
 
-        def rewritten() -> Iterator[Rewritten]:
+        def rewritten() -> Iterator[copying.Rewritten]:
             for source, shown in zip(self.sources, segments, strict=True):
-                writer = ColumnRewriter(source.folder, header, shown)
+                writer = copying.ColumnRewriter(source.folder, header, shown)
                 for edit in self._episodes(source, header.features):
                     report.episodes += 1
                     report.frames += len(edit)
                     yield writer.rewritten(edit)
 
-        write_copy(report.path, rewritten(), tasks, contract)
+        copying.write_copy(report.path, rewritten(), tasks, contract)
         report.tasks = len(tasks)
 
     def _segments(self, source: _Source) -> dict[int, Segments]:

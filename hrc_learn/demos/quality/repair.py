@@ -8,15 +8,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality import episode_edits as edits
-from hrc_learn.demos.quality.column_rewriter import (
-    NO_TASK,
-    ColumnRewriter,
-    Rewritten,
-    listed_tasks,
-    new_header,
-    write_copy,
-)
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.contract import Contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry, Progress, open_folder
@@ -140,7 +133,7 @@ def repair_dataset(
             pass
     else:
         root = dataset.folder.root
-        write_copy(Path(out), rewritten, repair.tasks, repair.contract(), notes_of=root)
+        copying.write_copy(Path(out), rewritten, repair.tasks, repair.contract(), notes_of=root)
     return repair.report
 
 
@@ -155,7 +148,7 @@ class _Repair:
         kept: Mapping[int, slice] | None,
     ):
         self.dataset, self.folder, self.units, self.kept = dataset, dataset.folder, units, kept
-        self.options, self.tasks = options, listed_tasks(dataset.folder)
+        self.options, self.tasks = options, copying.listed_tasks(dataset.folder)
         self._regular = True
         """True if the increasing stamps of LeRobot are 1/fps apart in all episodes."""
         self.decisions, faults = dataset.units_from(self._readable(), units)
@@ -167,8 +160,10 @@ class _Repair:
             and (options.drop_bad_frames or options.drop_repeats or not self._regular)
         )
         segments = read_segments(self.folder) if options.videos else {}
-        header = new_header(dataset, units, segments, fps=options.fps, add_time=add_time)
-        self.writer = ColumnRewriter(self.folder, header, segments)
+        header = copying.new_header(
+            dataset, units, segments, fps=options.fps, add_time=add_time
+        )
+        self.writer = copying.ColumnRewriter(self.folder, header, segments)
         self.report = RepairReport(notes=self._notes(header.features), dry_run=options.dry_run)
 
     def _notes(self, features: Collection[str]) -> list[str]:
@@ -177,8 +172,8 @@ class _Repair:
         reason = missing if self.options.videos else "videos left out"
         notes = [self.dataset.contract_note] if self.dataset.contract_note else []
         notes += [f"{key}: {reason}" for key in video_keys(self.folder) if key not in features]
-        if self.tasks == [NO_TASK]:
-            notes.append(f"no task is listed: every episode shows {NO_TASK!r} now")
+        if self.tasks == [copying.NO_TASK]:
+            notes.append(f"no task is listed: every episode shows {copying.NO_TASK!r} now")
         return notes
 
     def _readable(self) -> Iterator[tuple[EpisodeEntry, Quantities]]:
@@ -197,7 +192,7 @@ class _Repair:
         keys = [key for key, f in features if f.numeric and key not in INDEX_KEYS]
         return read_each(self.folder, self.folder.episodes, keys)
 
-    def episodes(self, progress: Progress | None) -> Iterator[Rewritten]:
+    def episodes(self, progress: Progress | None) -> Iterator[copying.Rewritten]:
         """Repaired episodes; the report counts them, and those that are left out."""
         report = self.report
         entries = progress(self.folder.episodes) if progress else self.folder.episodes

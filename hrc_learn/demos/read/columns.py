@@ -12,17 +12,10 @@ from typing import Protocol, runtime_checkable
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read import naming
 from hrc_learn.demos.read.dataset_files import INFO_PATH
 from hrc_learn.demos.read.metadata import Feature, Sidecar
-from hrc_learn.demos.read.naming import (
-    ComponentMeaning,
-    joint_of,
-    meaning_of_component,
-    names_joint_quantity,
-    names_no_joint,
-    role_of_key,
-    without_unit,
-)
+from hrc_learn.demos.read.naming import ComponentMeaning
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ORIENTATION_ROLES, ROLES
 
 MappingSpec = Mapping[str, str | Sequence[str] | None]
@@ -143,8 +136,8 @@ def _with_units(selection: ColumnSelection, features: Mapping[str, Feature]) -> 
     units = []
     for key, index in selection.columns:
         names = features[key].names
-        unit = "" if names is None else without_unit(names[index])[1]
-        units.append(unit or without_unit(re.split(r"[./]", key)[-1])[1])
+        unit = "" if names is None else naming.without_unit(names[index])[1]
+        units.append(unit or naming.without_unit(re.split(r"[./]", key)[-1])[1])
     return replace(selection, units=tuple(units) if any(units) else ())
 
 
@@ -199,7 +192,7 @@ def _named_selection(
     named, labels = [features[key].names for key, _ in places], []
     for number, (names, (_, index)) in enumerate(zip(named, places, strict=True), start=1):
         name = f"joint_{number}" if names is None else names[index]
-        labels.append(joint_of(name) if role in JOINT_FIELDS else name)
+        labels.append(naming.joint_of(name) if role in JOINT_FIELDS else name)
     return ColumnSelection(
         role=role, columns=tuple(places), labels=tuple(labels), numbered=None in named
     )
@@ -283,7 +276,7 @@ class _Conventions:
 
     def find(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:
         self._commanded = {
-            joint_of(name)
+            naming.joint_of(name)
             for feature in features.values()
             if feature.key in _ACTION_KEYS
             for name in feature.names or ()
@@ -301,10 +294,10 @@ class _Conventions:
 
     def _whole_feature(self, feature: Feature) -> list[ComponentMeaning | None] | None:
         """Meanings of the components where the key of the feature tells them; else None."""
-        role, width = role_of_key(feature.key), feature.width
+        role, width = naming.role_of_key(feature.key), feature.width
         if role is None or (_is_command(feature) and role not in _COMMANDS):
             return None
-        named = [meaning_of_component(name) for name in feature.names or ()]
+        named = [naming.meaning_of_component(name) for name in feature.names or ()]
         if any(meaning and meaning.role in _ORIENTATIONS for meaning in named):
             return named
         if role == "cartesian" and width in (16, *_CARTESIAN):
@@ -323,7 +316,7 @@ class _Conventions:
         elif role not in ROLES or ROLES[role].width not in (None, width):
             return None
         names = feature.names or tuple(f"joint_{k + 1}" for k in range(width))
-        slots = map(joint_of, names) if role in JOINT_FIELDS else range(width)
+        slots = map(naming.joint_of, names) if role in JOINT_FIELDS else range(width)
         return [ComponentMeaning(role, slot) for slot in slots]
 
     def _components(self, feature: Feature) -> list[ComponentMeaning | None]:
@@ -337,14 +330,16 @@ class _Conventions:
             self._notes.append(
                 f"{feature.key} names no components: taken for {feature.width} joints"
             )
-        meanings = [meaning_of_component(name) for name in names]
+        meanings = [naming.meaning_of_component(name) for name in names]
         if not mixed:
             # In other features x, y, z may belong to an object: only explicit names count.
             return [
-                meaning if names_joint_quantity(name) or name.lower().startswith("ee") else None
+                meaning
+                if naming.names_joint_quantity(name) or name.lower().startswith("ee")
+                else None
                 for name, meaning in zip(names, meanings, strict=True)
             ]
-        usual = None if any(map(names_joint_quantity, names)) else "joint_position"
+        usual = None if any(map(naming.names_joint_quantity, names)) else "joint_position"
         return [
             self._joint(feature, name, meaning)
             if (meaning.role if meaning else usual) == "joint_position"
@@ -359,10 +354,10 @@ class _Conventions:
 
         An action names the joints that move: what only the state has is no joint of the arm.
         """
-        joint = joint_of(name)
-        named = {joint_of(other) for other in feature.names or ()}
+        joint = naming.joint_of(name)
+        named = {naming.joint_of(other) for other in feature.names or ()}
         compared = not _is_command(feature) and bool(named & self._commanded)
-        if names_no_joint(name):
+        if naming.names_no_joint(name):
             reason = "its name is not that of a joint"
         elif compared and joint not in self._commanded:
             reason = "no action has it"

@@ -12,24 +12,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read import unit_evidence
 from hrc_learn.demos.read.columns import ColumnSelection
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.naming import is_hand, role_of_key
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
-from hrc_learn.demos.read.unit_evidence import (
-    CONFIDENT,
-    GUESSED_BY_SIZE,
-    Guess,
-    Sizes,
-    doubt_meaning,
-    guess_by_size,
-    guess_fingers,
-    guess_joints,
-    is_hobby_arm,
-    measure,
-    typical,
-)
+from hrc_learn.demos.read.unit_evidence import CONFIDENT, Guess, Sizes
 
 _DIMENSIONS: dict[str, dict[str, float]] = {
     "angle": {"rad": 1.0, "deg": math.pi / 180, "tick": 2 * math.pi / 4096},
@@ -51,7 +40,7 @@ _FOLLOWERS = {
 }
 """Quantity -> quantity whose unit it takes over if nothing is declared."""
 _JOINTS = ("joint_position", "command_position")
-_GUESSABLE = (*_JOINTS, *GUESSED_BY_SIZE)
+_GUESSABLE = (*_JOINTS, *unit_evidence.GUESSED_BY_SIZE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,7 +235,7 @@ def _guess(
             own = _with_command(own, sizes["command_position"])
         guess, units = _guess_joint_units(own, selection, robot_type, named)
     else:
-        guess = guess_by_size(role, own)
+        guess = unit_evidence.guess_by_size(role, own)
     return UnitDecision(
         role=role,
         unit=guess.unit,
@@ -279,11 +268,13 @@ def _guess_joint_units(
     # A gripper without a name of its own comes last.
     hand[-1] |= sizes.opening[-1] and not sizes.opening.all()
     stated = np.array([bool(unit) for unit in named])
-    guess = guess_joints(sizes, ~hand & ~stated, labels, robot_type)
+    guess = unit_evidence.guess_joints(sizes, ~hand & ~stated, labels, robot_type)
     # The key of a whole feature may tell its content, such as `qpos`.
     unnamed = selection.numbered and role_of_key(selection.columns[0][0]) is None
-    guess = doubt_meaning(guess, sizes, labels, unnamed)
-    fingers = guess_fingers(sizes, hand, labels, guess.unit, is_hobby_arm(robot_type, labels))
+    guess = unit_evidence.doubt_meaning(guess, sizes, labels, unnamed)
+    fingers = unit_evidence.guess_fingers(
+        sizes, hand, labels, guess.unit, unit_evidence.is_hobby_arm(robot_type, labels)
+    )
     units = tuple(
         named[i] if stated[i] else fingers[i] if hand[i] else guess.unit
         for i in range(len(hand))
@@ -347,7 +338,9 @@ def units_from_episodes(
     for entry, quantities in episodes:
         known = {r: quantities[r] for r in guessed if r in quantities}
         some = {r: values[:: 1 + len(values) // _SAMPLED_FRAMES] for r, values in known.items()}
-        measured.append((entry, {r: measure(v) for r, v in some.items() if len(v)}))
+        measured.append(
+            (entry, {r: unit_evidence.measure(v) for r, v in some.items() if len(v)})
+        )
         time = quantities.get("time", np.empty((0, 1)))
         if len(time) > 1:
             # As a multiple of the nominal period.
@@ -355,7 +348,7 @@ def units_from_episodes(
     deciding = [m for entry, m in measured if sample is None or entry.index in sample]
     deciding = deciding or [m for _, m in measured]
     found = {role: [own[role] for own in deciding if role in own] for role in guessed}
-    sizes = {role: typical(known) for role, known in found.items() if known}
+    sizes = {role: unit_evidence.typical(known) for role, known in found.items() if known}
     step = float(np.median(steps)) if steps else 1.0
     decisions = decide_units(selections, sizes, {**declared, **given}, step, robot_type)
     faults = [
