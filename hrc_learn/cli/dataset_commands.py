@@ -21,8 +21,9 @@ from hrc_learn.demos import (
 )
 from hrc_learn.demos.quality.ranking import Ranking, rank_episodes
 from hrc_learn.demos.quality.repair import (
+    Decision,
     Decisions,
-    decide,
+    Verdict,
     decisions_path,
     keep_decisions,
     read_decisions,
@@ -209,7 +210,7 @@ def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:
     """Stored decisions, updated and stored again with those of the command line."""
     decisions = read_decisions(args.dataset)
     lengths = {quality.episode: quality.length for quality in ranking.episodes}
-    typed = {
+    typed: dict[int, tuple[Verdict, str]] = {
         **dict.fromkeys(args.accept, ("accept", "")),
         **{episode: ("cut", text) for episode, text in args.cut.items()},
         **dict.fromkeys(args.reject, ("reject", "")),
@@ -222,7 +223,9 @@ def _typed_decisions(args: Curate, ranking: Ranking) -> Decisions:
     for episode, (verdict, text) in typed.items():
         try:
             start, stop = (int(part) for part in text.split(":")) if text else (0, 0)
-            decisions[episode] = decide(verdict, lengths[episode], start, stop)
+            decisions[episode] = Decision(
+                verdict=verdict, length=lengths[episode], start=start, stop=stop
+            )
         except ValueError as error:
             raise ValueError(
                 f"--cut {episode} {text}: give the first frame to keep and the one after the "

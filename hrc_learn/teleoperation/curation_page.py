@@ -23,7 +23,6 @@ from hrc_learn.demos.issues import plain_text
 from hrc_learn.demos.quality.ranking import MEASURES, Ranking
 from hrc_learn.demos.quality.repair import (
     Decision,
-    decide,
     keep_decisions,
     read_decisions,
     write_curated,
@@ -232,8 +231,12 @@ class CurationPage:
             raise ValueError(f"There is no episode {episode}.")
         decisions = {index: d for index, d in self.decisions.items() if index != episode}
         if message.verdict is not None:
-            length = self._lengths[episode]
-            decisions[episode] = decide(message.verdict, length, message.start, message.stop)
+            decisions[episode] = Decision(
+                verdict=message.verdict,
+                length=self._lengths[episode],
+                start=message.start,
+                stop=message.stop,
+            )
         keep_decisions(self.ranking.path, decisions)
         self.decisions = decisions
 

@@ -16,7 +16,7 @@ from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.images import load_images
 from hrc_learn.demos.quality.ranking import gripper_moves, log_dimensionless_jerk, rank_episodes
 from hrc_learn.demos.quality.repair import (
-    decide,
+    Decision,
     decisions_path,
     keep_decisions,
     read_decisions,
@@ -29,6 +29,10 @@ from hrc_learn.teleoperation.curation_page import CurationPage
 pytestmark = pytest.mark.simulation
 
 NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]
+
+
+def decide(verdict, length, start=0, stop=0):
+    return Decision(verdict=verdict, length=length, start=start, stop=stop)
 
 
 def odd_set(root: Path) -> Path:
@@ -172,6 +176,11 @@ def test_cuts_that_leave_nothing_or_do_not_exist_are_refused(cut):
     with pytest.raises(ValueError, match="no part"):
         decide("cut", 100, *cut)
     assert decide("cut", 100, 98, 100).stop == 100
+
+
+def test_no_decision_begins_before_its_episode():
+    with pytest.raises(ValueError, match="frames -1 to 0"):
+        decide("accept", 100, -1)
 
 
 def test_the_cleaned_set_is_what_was_decided_and_the_source_as_it_was(tmp_path):

@@ -295,9 +295,9 @@ class _Merge:
         wanted = {*self.features, *INDEX_KEYS}
         features = {key: dict(value) for key, value in own.features.items() if key in wanted}
         for key, feature in features.items():
-            declared = [s.folder.info["features"].get(key, {}) for s in self.sources]
-            if feature["dtype"] == "video":
-                feature["info"] = _agreed([d.get("info") or {} for d in declared])
+            others = [source.folder.info["features"].get(key, {}) for source in self.sources]
+            if any(other.get("info") != feature.get("info") for other in others):
+                feature.pop("info", None)  # of the videos; LeRobot finds it anew
         columns = {r: c for r, c in own.sidecar.columns.items() if c.key in features}
         return replace(own, features=features, sidecar=replace(own.sidecar, columns=columns))
 
@@ -314,11 +314,3 @@ class _Merge:
                 time=np.arange(entry.length) / fps,
                 kept=np.arange(entry.length),
             )
-
-
-def _agreed(infos: Sequence[Mapping[str, object]]) -> dict[str, object]:
-    """Entries of the videos' descriptions; null where the datasets differ."""
-    return {
-        name: value if all(info.get(name) == value for info in infos) else None
-        for name, value in infos[0].items()
-    }

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -293,6 +293,16 @@ class Decision:
     stop: Count = 0
     """End of the frames kept by a cut (exclusive)."""
 
+    def __post_init__(self) -> None:
+        is_cut = self.verdict == "cut"
+        if min(self.start, self.stop) < 0 or (
+            is_cut and not self.start < self.stop - 1 < self.length
+        ):
+            raise ValueError(
+                f"frames {self.start} to {self.stop} are no part of two frames or more of an "
+                f"episode of {self.length} frames"
+            )
+
 
 Decisions = dict[int, Decision]
 """Episode index -> decision; episodes without one are accepted."""
@@ -302,24 +312,6 @@ Decisions = dict[int, Decision]
 class _DecisionFile:
     decisions: dict[Count, Decision]
     format: Literal[1] = 1
-
-
-def decide(verdict: str, length: int, start: int = 0, stop: int = 0) -> Decision:
-    """A valid decision on an episode of this length [frames].
-
-    Raises:
-        ValueError: The verdict is unknown, or the cut keeps fewer than two frames.
-    """
-    if verdict == "cut":
-        if not 0 <= start < stop - 1 < length:
-            raise ValueError(
-                f"frames {start} to {stop} are no part of two frames or more of an episode of "
-                f"{length} frames"
-            )
-        return Decision(verdict=verdict, length=length, start=start, stop=stop)
-    if verdict not in get_args(Verdict):
-        raise ValueError(f"{verdict!r} is none of {', '.join(get_args(Verdict))}")
-    return Decision(verdict=verdict, length=length)  # type: ignore[arg-type]
 
 
 def decisions_path(root: Path) -> Path:
@@ -342,18 +334,15 @@ def read_decisions(root: Path) -> Decisions:
         kept = read_json(path, _DecisionFile, advice).decisions
     except ValueError as error:
         raise DatasetError(str(error).removeprefix(f"{path}: "), file=path) from error
-    decisions: Decisions = {}
     for index, known in kept.items():
-        try:
-            if known.length != lengths.get(index):
-                raise ValueError(
-                    f"decides on an episode of {known.length} frames, the dataset has "
-                    f"{lengths.get(index, 'no such episode')}: it belongs to another dataset"
-                )
-            decisions[index] = decide(known.verdict, known.length, known.start, known.stop)
-        except ValueError as error:
-            raise DatasetError(f"{error}; {advice}", file=path, episode=index) from error
-    return decisions
+        if known.length != lengths.get(index):
+            text = (
+                f"decides on an episode of {known.length} frames, the dataset has "
+                f"{lengths.get(index, 'no such episode')}: it belongs to another dataset; "
+                f"{advice}"
+            )
+            raise DatasetError(text, file=path, episode=index)
+    return kept
 
 
 def keep_decisions(root: Path, decisions: Mapping[int, Decision]) -> None:
