@@ -92,9 +92,7 @@ class ComponentContract:
 
     def unit_as(self, role: str) -> str:
         """Unit of the component if it is read as this quantity; "" if unknown."""
-        if self.quantity == role:
-            return self.unit or ROLES[role].unit
-        return self.unit if self.unit in units_of(role) else ""
+        return self.unit if self.quantity == role or self.unit in units_of(role) else ""
 
 
 @dataclass(frozen=True, kw_only=True)
