@@ -28,7 +28,6 @@ from hrc_learn.viz.figures import (
     JointCurves,
     demonstrated_joints,
     joint_grid_figure,
-    residual_figure,
 )
 from hrc_learn.viz.panels import Plot, Tab, joint_plot, joints_title, several, single, slug
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, software_versions
@@ -204,9 +203,6 @@ def fit_report(
     joints = joint_grid_figure(fit.names, motions, fit.limits, fit.unit)
     caption = "The first four demonstrations and their reproductions."
     figures = [Picture("position" if fit.unit == "m" else "joints", joints, caption)]
-    if fit.residual:
-        caption = "Held-out error by number of basis functions, and the selected number."
-        figures.append(Picture("n_basis", residual_figure(fit.residual, fit.n_basis), caption))
     return Report(
         title=fit.title,
         summary=f"A movement primitive of {fit.n_basis} basis functions for each "

@@ -249,22 +249,6 @@ def plots_figure(
     return figure
 
 
-def residual_figure(residual: Mapping[int, float], used: int) -> Figure:
-    """Held-out error against the number of basis functions, and the number used."""
-    counts = sorted(residual)
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(0.62 * WIDTH, 2.7))
-        axes = figure.subplots()
-        axes.plot(counts, [residual[n] for n in counts], "o-", color=palette.RUN, ms=4)
-        axes.plot(used, residual[used], "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
-        offset = {"xytext": (8, 8), "textcoords": "offset points"}
-        axes.annotate(f"used: {used}", (used, residual[used]), color=palette.LIMIT, **offset)
-        axes.set(yscale="log", xlabel="basis functions N", ylabel="normalised RMS error [-]")
-        axes.set_title("Error of the primitive on the demonstrations")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return figure
-
-
 def measures_figure(
     measures: Mapping[str, Float[np.ndarray, " demos"]],
     episodes: Sequence[int],

@@ -124,14 +124,6 @@ def test_jacobian_figure_shows_twelve_estimates_and_twelve_truths():
     assert (pale[:3] > thin[:3]).all()
 
 
-def test_residual_figure_marks_the_number_used():
-    (axes,) = figures.residual_figure(RESIDUAL, 50).axes
-    curve, mark = axes.get_lines()
-    assert curve.get_xdata().tolist() == [10, 30, 50]
-    assert curve.get_ydata().tolist() == [1e-2, 1e-3, 1e-4]
-    assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (50, 1e-4)
-
-
 def test_active_intervals_are_runs_of_true_samples():
     active = np.zeros(STEPS, dtype=bool)
     active[[0, 1, 5, 198, 199]] = True
