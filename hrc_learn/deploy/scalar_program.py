@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterable, Sequence
+from functools import partialmethod
 from typing import Any, final
 
 import numpy as np
@@ -140,7 +141,8 @@ class ScalarProgram:
         tensors = [
             torch.tensor(x, dtype=torch.bool if isinstance(x, bool) else dtype) for x in values
         ]
-        return self.constant(_CALCULATION[name](*tensors).item())
+        calculate = getattr(torch, _TORCH_NAMES.get(name, name))
+        return self.constant(calculate(*tensors).item())
 
 
 def operands(instruction: Instruction) -> tuple[int, ...]:
@@ -148,19 +150,11 @@ def operands(instruction: Instruction) -> tuple[int, ...]:
     return () if instruction[0] in ("input", "constant") else instruction[1:]
 
 
-_CALCULATION: dict[str, Callable[..., Tensor]] = {
-    "add": torch.add, "sub": torch.sub, "mul": torch.mul, "div": torch.div,
-    "neg": torch.neg, "abs": torch.abs, "sqrt": torch.sqrt, "trunc": torch.trunc,
-    "floor": torch.floor, "ceil": torch.ceil, "round": torch.round,
-    "sin": torch.sin, "cos": torch.cos, "exp": torch.exp, "log": torch.log,
-    "tanh": torch.tanh, "asin": torch.asin, "acos": torch.acos, "atan": torch.atan,
-    "atan2": torch.atan2, "pow": torch.pow, "copysign": torch.copysign,
-    "max": torch.maximum, "min": torch.minimum,
-    "gt": torch.gt, "lt": torch.lt, "ge": torch.ge, "le": torch.le, "eq": torch.eq,
-    "ne": torch.ne, "and": torch.logical_and, "or": torch.logical_or,
-    "not": torch.logical_not,
+# PyTorch's names of our operations, where they differ.
+_TORCH_NAMES = {
+    "max": "maximum", "min": "minimum",
+    "and": "logical_and", "or": "logical_or", "not": "logical_not",
 }  # fmt: skip
-"""Operations of instructions; both operands of each are of one type."""
 
 
 def _operations(names: str) -> dict[Any, str]:
@@ -192,7 +186,27 @@ _MOVES = {operator.getitem} | set(
     )
 )
 # Operations of shapes and constants alone.
-_FILLS = set(_operations("arange eye full ones scalar_tensor zeros"))
+_FILLS = set(
+    _operations(
+        "arange eye full full_like new_zeros ones ones_like scalar_tensor zeros zeros_like"
+    )
+)
+type _Each = Callable[..., Tensor]
+# Operations made of others, which the first argument calculates; the rest as in PyTorch.
+_COMPOSED: dict[str, _Each] = {
+    "addcdiv": lambda of, x, a, b, value=1: of("add", x, of("div", of("mul", a, value), b)),
+    "addcmul": lambda of, x, a, b, value=1: of("add", x, of("mul", of("mul", a, value), b)),
+    "isfinite": lambda of, x: of("lt", of("abs", x), math.inf),
+    "isnan": lambda of, x: of("ne", x, x),
+    "lerp": lambda of, a, b, weight: of("add", a, of("mul", weight, of("sub", b, a))),
+    "masked_fill": lambda of, x, mask, value: of("select", mask, value, x),
+    "reciprocal": lambda of, x: of("div", 1.0, x),
+    "rsqrt": lambda of, x: of("div", 1.0, of("sqrt", x)),
+    "rsub": lambda of, x, other: of("sub", other, x),
+    "sigmoid": lambda of, x: of("div", 1.0, of("add", of("exp", of("neg", x)), 1.0)),
+    "sign": lambda of, x: of("sub", of("gt", x, 0.0), of("lt", x, 0.0)),
+    "square": lambda of, x: of("mul", x, x),
+}
 
 
 def scalar_program(program: ExportedProgram, dtype: torch.dtype) -> ScalarProgram:
@@ -271,8 +285,13 @@ class _Unroller:
         if operation in _MOVES:
             return node.target(*args, **keywords)
         if operation in _FILLS:
+            # Of a tensor, only shape and type count.
+            args = [x.double() if isinstance(x, Tensor) else x for x in args]
             return self._constants(node.target(*args, **keywords))
-        method = getattr(self, f"aten_{operation.__name__.lstrip('_')}", None)
+        name = operation.__name__.lstrip("_")
+        if name in _COMPOSED:
+            return _COMPOSED[name](self._each, *args, **keywords)
+        method = getattr(self, f"aten_{name}", None)
         if method is None:
             raise UnknownOperationError(f"operation {node.target} of the step is not known")
         return method(*args, **keywords)
@@ -289,15 +308,17 @@ class _Unroller:
             return x
         return torch.tensor(self.result.constant(x if isinstance(x, bool) else float(x)))
 
-    def _reduced(self, name: str, x: Tensor, dims: Any, keep: bool, first: Any) -> Tensor:
+    def _reduced(
+        self, name: str, first: Any, x: Tensor, dim: Any = None, keepdim: bool = False, **_: Any
+    ) -> Tensor:
         """A reduction of elements; `first` is the result of none."""
-        axes = list(range(x.ndim)) if dims in (None, []) else dims
+        axes = list(range(x.ndim)) if dim in (None, []) else dim
         axes = [axis % x.ndim for axis in ([axes] if isinstance(axes, int) else axes)]
         others = [axis for axis in range(x.ndim) if axis not in axes]
         shape = [x.shape[axis] for axis in others]
         rows = x.permute(*others, *axes).reshape(math.prod(shape), -1).tolist()
         kept = [self._joined(name, row or [self.result.constant(first)]) for row in rows]
-        if keep:
+        if keepdim:
             shape = [1 if axis in axes else x.shape[axis] for axis in range(x.ndim)]
         return torch.tensor(kept, dtype=torch.int64).reshape(shape)
 
@@ -310,30 +331,21 @@ class _Unroller:
 
     # Operations of PyTorch, by name; arguments as there.
 
-    def aten_sum(self, x: Tensor, dim: Any = None, keepdim: bool = False, **_: Any) -> Tensor:
-        return self._reduced("add", x, dim, keepdim, 0.0)
+    aten_sum = partialmethod(_reduced, "add", 0.0)
+    aten_amax = partialmethod(_reduced, "max", -math.inf)
+    aten_amin = partialmethod(_reduced, "min", math.inf)
+    aten_any = partialmethod(_reduced, "or", False)
+    aten_all = partialmethod(_reduced, "and", True)
 
     def aten_mean(self, x: Tensor, dim: Any = None, keepdim: bool = False, **_: Any) -> Tensor:
         total = self.aten_sum(x, dim, keepdim)
         return self._each("div", total, float(x.numel() // total.numel()))
 
-    def aten_amax(self, x: Tensor, dim: Any = (), keepdim: bool = False) -> Tensor:
-        return self._reduced("max", x, list(dim), keepdim, -math.inf)
-
-    def aten_amin(self, x: Tensor, dim: Any = (), keepdim: bool = False) -> Tensor:
-        return self._reduced("min", x, list(dim), keepdim, math.inf)
-
-    def aten_any(self, x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
-        return self._reduced("or", x, dim, keepdim, False)
-
-    def aten_all(self, x: Tensor, dim: Any = None, keepdim: bool = False) -> Tensor:
-        return self._reduced("and", x, dim, keepdim, True)
-
     def aten_linalg_vector_norm(
         self, x: Tensor, ord: float | int = 2, dim: Any = None, keepdim: bool = False, **_: Any
     ) -> Tensor:
         if ord == math.inf:
-            return self._reduced("max", self._each("abs", x), dim, keepdim, 0.0)
+            return self._reduced("max", 0.0, self._each("abs", x), dim, keepdim)
         if ord != 2:
             raise UnknownOperationError(f"norm of order {ord}")
         return self._each("sqrt", self.aten_sum(self._each("mul", x, x), dim, keepdim))
@@ -342,13 +354,7 @@ class _Unroller:
         weights = self._each("exp", self._each("sub", x, self.aten_amax(x, [dim], True)))
         return self._each("div", weights, self.aten_sum(weights, dim, True))
 
-    def aten_argmax(self, x: Tensor, dim: int, keepdim: bool = False) -> Tensor:
-        return self._best("gt", x, dim, keepdim)
-
-    def aten_argmin(self, x: Tensor, dim: int, keepdim: bool = False) -> Tensor:
-        return self._best("lt", x, dim, keepdim)
-
-    def _best(self, better: str, x: Tensor, dim: int, keepdim: bool) -> Tensor:
+    def _best(self, better: str, x: Tensor, dim: int, keepdim: bool = False) -> Tensor:
         """Position of the first best element along an axis; NaN is better than any number."""
         first, *others = x.unbind(dim)
         best, position = first, self._tensor(0.0).expand(first.shape)
@@ -359,6 +365,9 @@ class _Unroller:
             best = self._each("select", replaces, element, best)
             position = self._each("select", replaces, float(k), position)
         return position.unsqueeze(dim) if keepdim else position
+
+    aten_argmax = partialmethod(_best, "gt")
+    aten_argmin = partialmethod(_best, "lt")
 
     def aten_gather(self, x: Tensor, dim: int, index: Tensor) -> Tensor:
         part = x[tuple(slice(None) if k == dim % x.ndim else slice(size)
@@ -381,41 +390,13 @@ class _Unroller:
             x = self._each("max", x, low)
         return x if high is None else self._each("min", x, high)
 
-    def aten_rsub(self, x: Tensor, other: Any) -> Tensor:
-        return self._each("sub", other, x)
-
-    def aten_addcmul(
-        self, x: Tensor, a: Tensor, b: Tensor, *, value: float | int = 1
-    ) -> Tensor:
-        return self._each("add", x, self._each("mul", self._each("mul", a, value), b))
-
-    def aten_addcdiv(
-        self, x: Tensor, a: Tensor, b: Tensor, *, value: float | int = 1
-    ) -> Tensor:
-        return self._each("add", x, self._each("div", self._each("mul", a, value), b))
-
-    def aten_lerp(self, start: Tensor, end: Tensor, weight: Any) -> Tensor:
-        step = self._each("mul", weight, self._each("sub", end, start))
-        return self._each("add", start, step)
+    def aten_linalg_cross(self, a: Tensor, b: Tensor, *, dim: int = -1) -> Tensor:
+        a, b = torch.broadcast_tensors(a, b)
+        there = self._each("mul", a.roll(-1, dim), b.roll(-2, dim))
+        return self._each("sub", there, self._each("mul", a.roll(-2, dim), b.roll(-1, dim)))
 
     def aten_linalg_vecdot(self, a: Tensor, b: Tensor, *, dim: int = -1) -> Tensor:
         return self.aten_sum(self._each("mul", a, b), dim)
-
-    def aten_masked_fill(self, x: Tensor, mask: Tensor, value: Any) -> Tensor:
-        return self._each("select", mask, value, x)
-
-    def aten_reciprocal(self, x: Tensor) -> Tensor:
-        return self._each("div", 1.0, x)
-
-    def aten_rsqrt(self, x: Tensor) -> Tensor:
-        return self._each("div", 1.0, self._each("sqrt", x))
-
-    def aten_sign(self, x: Tensor) -> Tensor:
-        return self._each("sub", self._each("gt", x, 0.0), self._each("lt", x, 0.0))
-
-    def aten_sigmoid(self, x: Tensor) -> Tensor:
-        exponential = self._each("exp", self._each("neg", x))
-        return self._each("div", 1.0, self._each("add", exponential, 1.0))
 
     def aten_pow(self, x: Tensor, exponent: Any) -> Tensor:
         if exponent == 0.5:
@@ -425,15 +406,6 @@ class _Unroller:
             rest = {2: None, 3: x, 4: square}[exponent]
             return square if rest is None else self._each("mul", square, rest)
         return self._each("pow", x, exponent)
-
-    def aten_square(self, x: Tensor) -> Tensor:
-        return self._each("mul", x, x)
-
-    def aten_isnan(self, x: Tensor) -> Tensor:
-        return self._each("ne", x, x)
-
-    def aten_isfinite(self, x: Tensor) -> Tensor:
-        return self._each("lt", self._each("abs", x), math.inf)
 
     def aten_to(self, x: Tensor, dtype: Any = None, *_: Any, **__: Any) -> Tensor:
         if not isinstance(dtype, torch.dtype) or not x.numel():
@@ -445,18 +417,6 @@ class _Unroller:
             return values
         # Whole numbers are kept as floating-point ones, exact to 2^53.
         return self._each("trunc", values)
-
-    def aten_full_like(self, x: Tensor, value: Any, **_: Any) -> Tensor:
-        return self._tensor(value).expand(x.shape).clone()
-
-    def aten_zeros_like(self, x: Tensor, **_: Any) -> Tensor:
-        return self.aten_full_like(x, 0.0)
-
-    def aten_ones_like(self, x: Tensor, **_: Any) -> Tensor:
-        return self.aten_full_like(x, 1.0)
-
-    def aten_new_zeros(self, _: Tensor, size: Sequence[int], **__: Any) -> Tensor:
-        return self._tensor(0.0).expand(tuple(size)).clone()
 
     def aten_pad(
         self, x: Tensor, pad: Iterable[int], mode: str = "constant", value: Any = None

@@ -27,6 +27,7 @@ def operations(x: Tensor) -> list[Tensor]:
         a**2, a**3, a**4, a.abs() ** 0.5, a.abs() ** 1.3, a.reciprocal(), 2 - a, a.sign(),
         a.sigmoid(), torch.addcmul(a, b, c, value=0.5), torch.addcdiv(a, b, c),
         torch.lerp(a, b, 0.3), torch.where(yes, a, b), a.masked_fill(no, 7.0),
+        torch.linalg.cross(a[:3], b[3:6], dim=0),
         torch.where(torch.zeros_like(yes), a, b), torch.where(yes & ~no, yes, no).to(x.dtype),
         (yes | no).to(x.dtype), (a <= b).to(x.dtype), (a < b).to(x.dtype), (a != b).to(x.dtype),
         (~(a <= b)).to(x.dtype), (~(a < b)).to(x.dtype), (~(a > b)).to(x.dtype),

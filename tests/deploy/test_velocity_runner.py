@@ -49,7 +49,9 @@ def test_a_field_that_there_is_not_is_named():
 
 
 def test_the_exported_step_equals_the_eager_one(tmp_path):
-    runners = [EagerRunner(STEP, EXAMPLE), PackageRunner(export_step(STEP, EXAMPLE, tmp_path))]
+    loaded = replace(EXAMPLE, load=torch.tensor([0.0, 0.05, 0.2], dtype=torch.float64))
+    runners = [EagerRunner(STEP, loaded), PackageRunner(export_step(STEP, loaded, tmp_path))]
+    runners[1].observe(loaded)
     rng, q = np.random.default_rng(0), READY.copy()
     for runner in runners:
         runner.start(q)
