@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,12 +63,10 @@ def export_step(
     if folder is None:
         folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hrc_learn"
     step = PackedStep(controller, observation)
-    program = None
     try:
         key = content_hash(machine(), controller, _structure(observation))
     except UnknownCodeError:
-        program = trace(step, observation)
-        key = _digest(step, program)
+        key = _hash_of_trace(step, trace(step, observation))
     target = folder / f"step-{key[:24]}"
     code = target / CODE
     if code.is_file():
@@ -171,17 +169,12 @@ def _structure(observation: StepObservation) -> list[tuple[str, str]]:
     ]
 
 
-def _digest(step: PackedStep, program: torch.export.ExportedProgram) -> str:
+def _hash_of_trace(step: PackedStep, program: torch.export.ExportedProgram) -> str:
     """Hash of a traced step, its constants and the machine."""
-    digest = hashlib.sha256()
-    fields = [field for layout in step.layouts for field in layout.fields]
-    for text in (machine(), program.graph, program.graph_signature, fields):
-        digest.update(str(text).encode())
-    digest.update(step.first_state.numpy().tobytes())
-    for name, value in sorted((program.state_dict | program.constants).items()):
-        assert isinstance(value, Tensor)
-        digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
-    return digest.hexdigest()
+    graph = str(program.graph), str(program.graph_signature)
+    fields = [layout.fields for layout in step.layouts]
+    constants = dict(program.state_dict) | program.constants
+    return content_hash(machine(), graph, fields, step.first_state, constants)
 
 
 # Sources of a compiled step, all hashed: equal hashes mean equal compiled code.
@@ -212,58 +205,50 @@ def content_hash(*objects: Any) -> str:
     Raises:
         UnknownCodeError: They hold an object of a class outside this library and torch.
     """
-    hasher = _ObjectHasher()
+    digest, seen = hashlib.sha256(_source_hash()), {}
     for x in objects:
-        hasher.add(x)
-    hasher.digest.update(_source_hash())
-    return hasher.digest.hexdigest()
+        for part in _hashed(x, seen):
+            digest.update(part)
+    return digest.hexdigest()
 
 
-@final
-class _ObjectHasher:
-    """Hash of values in a fixed order; each object once, further references by its number."""
+def _hashed(x: Any, seen: dict[int, Any]) -> Iterator[bytes]:
+    """All values in an object, in a fixed order; each object once, then by its number.
 
-    def __init__(self):
-        self.digest = hashlib.sha256()
-        self.seen: dict[int, Any] = {}  # keeps the objects alive, so that ids stay unique
+    Args:
+        x: The object.
+        seen: Objects so far by their id; it keeps them alive, so ids stay unique.
+    """
+    kind = type(x)
+    yield f"{kind.__module__}.{kind.__qualname__}\n".encode()
+    if isinstance(x, Tensor):
+        yield f"{x.dtype} {tuple(x.shape)} {x.device}\n".encode()
+        yield x.detach().cpu().contiguous().numpy().tobytes()
+    elif isinstance(x, _PLAIN):
+        yield f"{x!r}\n".encode()
+    elif id(x) in seen:
+        yield f"again {list(seen).index(id(x))}\n".encode()
+    else:
+        seen[id(x)] = x
+        for part in _parts(x):
+            yield from _hashed(part, seen)
+        yield b"end\n"
 
-    def add(self, x: Any) -> None:
-        kind = type(x)
-        self._update(f"{kind.__module__}.{kind.__qualname__}")
-        if isinstance(x, Tensor):
-            self._update(f"{x.dtype} {tuple(x.shape)} {x.device}")
-            self.digest.update(x.detach().cpu().contiguous().numpy().tobytes())
-        elif isinstance(x, _PLAIN):
-            self._update(repr(x))
-        elif id(x) in self.seen:
-            self._update(f"again {list(self.seen).index(id(x))}")
-        else:
-            self.seen[id(x)] = x
-            self._add_parts(x)
 
-    def _add_parts(self, x: Any) -> None:
-        if isinstance(x, Mapping):
-            for key, value in x.items():
-                self.add(key)
-                self.add(value)
-        elif isinstance(x, set):
-            self.add(sorted(x, key=repr))
-        elif isinstance(x, list | tuple):
-            for value in x:
-                self.add(value)
-        elif isinstance(x, SerialChain):
-            # The shape of an arm, which may be a function that reads it, is no part of a step.
-            self.add([x.joint_names, x.mounts, x.flange, x.tcp, x.limits, x.ready, x.kinds])
-        elif type(x).__module__.split(".")[0] in ("hrc_learn", "torch") and hasattr(
-            x, "__dict__"
-        ):
-            self.add(x.__getstate__())
-        else:
-            raise UnknownCodeError(f"the code of {type(x).__qualname__} is unknown")
-        self._update("end")
-
-    def _update(self, text: str) -> None:
-        self.digest.update(f"{text}\n".encode())
+def _parts(x: Any) -> Iterable[Any]:
+    """Values that an object consists of."""
+    if isinstance(x, Mapping):
+        return x.items()
+    if isinstance(x, set):
+        return sorted(x, key=repr)
+    if isinstance(x, list | tuple):
+        return x
+    if isinstance(x, SerialChain):
+        # The shape of an arm, which may be a function that reads it, is no part of a step.
+        return x.joint_names, x.mounts, x.flange, x.tcp, x.limits, x.ready, x.kinds
+    if type(x).__module__.split(".")[0] in ("hrc_learn", "torch") and hasattr(x, "__dict__"):
+        return (x.__getstate__(),)
+    raise UnknownCodeError(f"the code of {type(x).__qualname__} is unknown")
 
 
 @cache

@@ -83,6 +83,8 @@ class IOLayout:
         dtype: torch.dtype = torch.float64,
     ):
         self.fields, self.batch, self.dtype = tuple(fields), tuple(batch), dtype
+        # Batch axes of a tensor, and of a vector.
+        self._first, self._last = list(range(len(batch))), list(range(-len(batch), 0))
         edges = np.cumsum([0, *(math.prod(field.shape) for field in fields)]).tolist()
         self.size: int = edges[-1]
         """Number of rows."""
@@ -128,7 +130,16 @@ class IOLayout:
 
     def views(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
         """Views of a vector in the shapes of the fields."""
-        return [self._part(field, vector) for field in self.fields]
+        views = []
+        for field in self.fields:
+            part = vector[self.rows[field.name]].reshape((*field.shape, *self.batch))
+            if field.batched:
+                part = part.movedim(self._last, self._first)
+            else:
+                # A value for the whole batch is repeated for each element: read the first.
+                part = part[(..., *(0 for _ in self.batch))]
+            views.append(part)
+        return views
 
     def shared_rows(self) -> Int[Tensor, " rows"]:
         """Rows of the fields that have one value for the whole batch."""
@@ -141,23 +152,6 @@ class IOLayout:
         """Views of a vector by field name, for reading and writing."""
         views = zip(self.rows, self.views(vector), strict=True)
         return {name: view.numpy() for name, view in views}
-
-    def _part(self, field: Field, vector: Tensor) -> Tensor:
-        part = vector[self.rows[field.name]].reshape((*field.shape, *self.batch))
-        if field.batched:
-            return part.movedim(self._last, self._first)
-        # A value for the whole batch is repeated for each element: read the first.
-        return part[(..., *(0 for _ in self.batch))]
-
-    @property
-    def _first(self) -> list[int]:
-        """Batch axes of a tensor."""
-        return list(range(len(self.batch)))
-
-    @property
-    def _last(self) -> list[int]:
-        """Batch axes of a vector."""
-        return list(range(-len(self.batch), 0))
 
 
 class Vectors(NamedTuple):
@@ -256,8 +250,6 @@ class Package:
     """Layouts of the vectors."""
     first_state: Tensor
     """State vector of an arm at rest in its ready posture."""
-    example: Tensor
-    """Observation vector of the export."""
 
 
 def describe(step: PackedStep, observation: StepObservation) -> dict[str, str]:
@@ -302,24 +294,26 @@ def load(path: Path) -> Package:
             f"{path} was built for {metadata[_BUILT_FOR]}, but this is {machine()}: export the "
             "step on this machine"
         )
-    batch = [int(n) for n in metadata[_BATCH].split()]
-    dtype: torch.dtype = getattr(torch, metadata[_DTYPE])
+    layouts = _layouts(metadata)
+    batch, dtype = layouts.state.batch, layouts.state.dtype
+    if run is None:
+        sizes = int(metadata[LANES]), int(metadata[WORKSPACE])
+        shared = [layout.shared_rows() for layout in layouts[:2]] if batch else []
+        run = NativeStep(path.read_bytes(), *sizes, shared)
+    first = torch.tensor([float(x) for x in metadata[_STATE].split()], dtype=dtype)
+    return Package(run=run, layouts=layouts, first_state=first.reshape((-1, *batch)))
+
+
+def _layouts(metadata: Mapping[str, str]) -> StepLayouts:
+    """Layouts of the vectors that `describe` has described."""
     fields: dict[str, list[Field]] = {vector: [] for vector in StepLayouts._fields}
     for line in metadata[_LAYOUT].splitlines():
         vector, name, kind, batched, *shape = line.split()
         field = Field(name, getattr(torch, kind), batched == "1", tuple(map(int, shape)))
         fields[vector].append(field)
-    layouts = StepLayouts(*(IOLayout(part, batch, dtype) for part in fields.values()))
-    if run is None:
-        sizes = int(metadata[LANES]), int(metadata[WORKSPACE])
-        shared = [layout.shared_rows() for layout in layouts[:2]] if batch else []
-        run = NativeStep(path.read_bytes(), *sizes, shared)
-    return Package(
-        run=run,
-        layouts=layouts,
-        first_state=_vector(metadata[_STATE], batch, dtype),
-        example=_vector(metadata[_OBSERVATION], batch, dtype),
-    )
+    batch = [int(n) for n in metadata[_BATCH].split()]
+    dtype: torch.dtype = getattr(torch, metadata[_DTYPE])
+    return StepLayouts(*(IOLayout(part, batch, dtype) for part in fields.values()))
 
 
 def machine() -> str:
@@ -350,11 +344,6 @@ def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def _vector(text: str, batch: list[int], dtype: torch.dtype) -> Tensor:
-    numbers = torch.tensor([float(x) for x in text.split()], dtype=dtype)
-    return numbers.reshape((-1, *batch))
-
-
 def _metadata(path: Path) -> tuple[dict[str, str], Callable[[list[Tensor]], object] | None]:
     """Metadata of a compiled step, and the function of PyTorch's package."""
     if path.suffix != ".pt2":
@@ -369,21 +358,17 @@ def _metadata(path: Path) -> tuple[dict[str, str], Callable[[list[Tensor]], obje
 def c_header(metadata: Mapping[str, str]) -> str:
     """Header of the machine code for C and C++: its function, and where each field is."""
     dtype = {"float64": "double", "float32": "float"}[metadata[_DTYPE]]
-    batch = [int(n) for n in metadata[_BATCH].split()]
-    sizes = dict.fromkeys(StepLayouts._fields, 0)
+    layouts = _layouts(metadata)
     places = []
-    for line in metadata[_LAYOUT].splitlines():
-        vector, name, _, _, *shape = line.split()
-        rows = math.prod(map(int, shape))
-        word = re.sub(r"\W+", "_", f"{vector}_{name}").upper()
-        places.append(f"#define {word} {sizes[vector]} /* {rows} rows */")
-        sizes[vector] += rows
-    arms = math.prod(batch)
+    for vector, layout in layouts._asdict().items():
+        for name, rows in layout.rows.items():
+            word = re.sub(r"\W+", "_", f"{vector}_{name}").upper()
+            places.append(f"#define {word} {rows.start} /* {rows.stop - rows.start} rows */")
     return "\n".join([
         "/* One control step. Vectors are arrays of rows; a row has a number for each arm. */",
-        f"#define STEP_ARMS {arms}",
+        f"#define STEP_ARMS {math.prod(layouts.state.batch)}",
         f"#define STEP_ARMS_AT_ONCE {metadata[LANES]}",
-        *(f"#define {name.upper()}_ROWS {size}" for name, size in sizes.items()),
+        *(f"#define {name.upper()}_ROWS {x.size}" for name, x in layouts._asdict().items()),
         f"#define WORKSPACE_SIZE {metadata[WORKSPACE]} /* numbers, of any value */",
         *places,
         "/* At rest in the ready posture, and the observation of the export. */",
