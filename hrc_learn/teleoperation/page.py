@@ -23,15 +23,8 @@ from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.teleoperation.devices import OPEN, rumble_strength
-from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate
+from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, messages
 from hrc_learn.teleoperation.gate.admission import RefusedError
-from hrc_learn.teleoperation.gate.messages import (
-    Ask,
-    Hands,
-    Message,
-    Point,
-    TrackedHand,
-)
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.headset import headset_contents, headset_data
 from hrc_learn.teleoperation.page_operator import (
@@ -71,7 +64,11 @@ class PageConfig(AddressConfig):
     """Draw the arm with its meshes; otherwise as capsules, with which a browser without a
     graphics processor draws twice as many frames in AR.
     """
-    touch_points: tuple[Point, ...] = ((0.4, 0.0, 0.0), (0.7, 0.0, 0.0), (0.4, 0.3, 0.0))
+    touch_points: tuple[messages.Point, ...] = (
+        (0.4, 0.0, 0.0),
+        (0.7, 0.0, 0.0),
+        (0.4, 0.3, 0.0),
+    )
     """Points of the real workplace, in the base frame, that a person in a headset touches to
     lay the virtual arm over the real one [m]; three at least, well apart."""
 
@@ -162,15 +159,22 @@ class Page:
         self._wake = Event()
         self._held_gizmos = held = HeldGizmos(self._wake.set, self._links)
         self._hands = HeadsetHands(held, guides=guides)
-        self._server, secret = guarded_viser()
-        self._sockets = PageSockets(
-            control,
-            self._heard,
-            lambda update: self._panel.fits(update.uuid, update.updates),
-            self._told,
-            self._server.get_port(),
-            secret,
+        server, secret = guarded_viser()
+        self._server = server
+        self._scene = PageScene(server, bodies, boxes, held, guides=guides, turns=draws)
+        self._panel = Panel(
+            server,
+            boxes,
+            config.forces,
+            self.human.request,
+            self._scene,
+            held,
+            task,
+            guides=guides,
+            draws=draws,
         )
+        port, fits = server.get_port(), self._panel.fits
+        self._sockets = PageSockets(control, self._heard, fits, self._told, port, secret)
         routes = {"session": self._sockets.session, "view": self._sockets.view}
         contents = {**page_contents(Path(viser.__file__).parent), **headset}
         try:
@@ -181,18 +185,6 @@ class Page:
         self.address = self._gate.address
         self.url, self.watch_url = self.address.link(), self.address.link(watch=True)
         self.headset_url = self.address.link("/xr") if headset else ""
-        self._scene = PageScene(self._server, bodies, boxes, held, guides=guides, turns=draws)
-        self._panel = Panel(
-            self._server,
-            boxes,
-            config.forces,
-            self.human.request,
-            self._scene,
-            held,
-            task,
-            guides=guides,
-            draws=draws,
-        )
         self._poses = (
             np.stack([body.position[0] for body in bodies]),
             np.stack([body.orientation[0] for body in bodies]),
@@ -231,7 +223,7 @@ class Page:
         return self._panel.task
 
     @property
-    def hands(self) -> Mapping[str, TrackedHand]:
+    def hands(self) -> Mapping[str, messages.TrackedHand]:
         """Tracked hands of the controlling client, by "left" and "right", if a headset sees
         them.
         """
@@ -375,14 +367,14 @@ class Page:
         self._held_gizmos.clear()
         self._hands.forget()
 
-    def _heard(self, message: Message) -> None:
+    def _heard(self, message: messages.Message) -> None:
         """Handle a message from the controlling client."""
         match message:
-            case Hands():
+            case messages.Hands():
                 self._hands.hear(message)
                 self._asked = message.sent
                 self._wake.set()
-            case Ask(request=request):
+            case messages.Ask(request=request):
                 self.human.request(request)
             case _:
                 loop = self._server.get_event_loop()

@@ -23,20 +23,9 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from hrc_learn.teleoperation.gate import messages
 from hrc_learn.teleoperation.gate.admission import same_secret
 from hrc_learn.teleoperation.gate.gate import Content, Visitor, first_of, incoming
-from hrc_learn.teleoperation.gate.messages import (
-    Beat,
-    GuiUpdate,
-    Hands,
-    Hello,
-    Lead,
-    Message,
-    MessageError,
-    acts,
-    session_message,
-    view_message,
-)
 
 if TYPE_CHECKING:
     from viser import ViserServer as ViserServer
@@ -258,7 +247,7 @@ class Control:
             self._give(first)
 
 
-Heard = Callable[[Message], None]
+Heard = Callable[[messages.Message], None]
 """Receiver of a message of the controlling client; called in the gate's thread."""
 
 
@@ -273,7 +262,7 @@ class PageSockets:
         self,
         control: Control,
         heard: Heard,
-        fits: Callable[[GuiUpdate], bool],
+        fits: Callable[[messages.GuiUpdate], bool],
         status: Callable[[], Mapping[str, Any]],
         viser_port: int,
         secret: str,
@@ -299,8 +288,8 @@ class PageSockets:
 
         async def listen() -> None:
             nonlocal wants_scene
-            async for _, message in incoming(connection, session_message):
-                if isinstance(message, Hello):
+            async for _, message in incoming(connection, messages.session_message):
+                if isinstance(message, messages.Hello):
                     wants_scene = message.wants == "scene"
                 else:
                     self._hear(visitor.client, message)
@@ -326,17 +315,17 @@ class PageSockets:
         finally:
             self._control.leave(visitor.client)
 
-    def _hear(self, client: str, message: Message) -> None:
+    def _hear(self, client: str, message: messages.Message) -> None:
         match message:
-            case Beat(lag=lag):
+            case messages.Beat(lag=lag):
                 self._control.hear(client, lag)
-            case Lead(wish="ask"):
+            case messages.Lead(wish="ask"):
                 self._control.ask(client)
-            case Lead():
+            case messages.Lead():
                 self._control.hand_over(client)
             case _:
                 # A watching client may have had control when it sent this: no error.
-                idle = isinstance(message, Hands) and not message.grips
+                idle = isinstance(message, messages.Hands) and not message.grips
                 if self._control.act(client, idle=idle):
                     self._heard(message)
 
@@ -357,10 +346,10 @@ class PageSockets:
         ) as viewer:
 
             async def up() -> None:
-                async for raw, message in incoming(connection, view_message):
-                    if isinstance(message, GuiUpdate) and not self._fits(message):
-                        raise MessageError("no value of that control")
-                    if not acts(message) or self._control.act(visitor.client):
+                async for raw, message in incoming(connection, messages.view_message):
+                    if isinstance(message, messages.GuiUpdate) and not self._fits(message):
+                        raise messages.MessageError("no value of that control")
+                    if not messages.acts(message) or self._control.act(visitor.client):
                         await viewer.send(raw)
 
             async def down() -> None:

@@ -15,7 +15,7 @@ from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Feedback, Request
 from hrc_learn.teleoperation.demonstration_recorder import RecorderStatus
 from hrc_learn.teleoperation.devices import DIRECTIONS, OPEN, KeyboardState
-from hrc_learn.teleoperation.gate.messages import Gripper, Message, Region, Target, Task
+from hrc_learn.teleoperation.gate import messages
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.page_operator import HeldGizmos
 from hrc_learn.teleoperation.page_scene import PageScene, ViserServer, in_loop
@@ -194,16 +194,17 @@ class Panel:
         """Description of the task."""
         return "" if self._task is None else self._task.value
 
-    def hear(self, message: Message) -> None:
+    def hear(self, message: messages.Message) -> None:
         """Do what a headset asks, as the panel's own controls would."""
         match message:
-            case Gripper(width=width):
+            case messages.Gripper(width=width):
                 self.gripper = width
-            case Task(task=task) if self._task is not None:
+            case messages.Task(task=task) if self._task is not None:
                 self._task.value = task
-            case Region(centre=centre, half_size=half_size, active=active) if self.editor:
-                self.editor.draw(DrawnRegion(centre=centre, half_size=half_size), active)
-            case Target(point=point) if self.editor:
+            case messages.Region(centre=centre, half_size=half_size) if self.editor:
+                region = DrawnRegion(centre=centre, half_size=half_size)
+                self.editor.draw(region, message.active)
+            case messages.Target(point=point) if self.editor:
                 self.editor.mark(None if point is None else np.array(point))
             case _:
                 pass  # what this page does not offer
@@ -214,17 +215,12 @@ class Panel:
         scale, base = self._strength.value / 100, self._initial_forces
         return replace(base, rate=scale * base.rate, stiffness=scale * base.stiffness)
 
-    def fits(self, uuid: str, updates: Mapping[str, Any]) -> bool:
-        """True if a browser may set a control of the panel to a value.
-
-        Args:
-            uuid: Identifier of the control, assigned by viser.
-            updates: New values of its properties.
-        """
-        handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)
-        if handle is None or set(updates) != {"value"}:
+    def fits(self, update: messages.GuiUpdate) -> bool:
+        """True if a browser may set a control of the panel to a value."""
+        handle: Any = self._gui._gui_input_handle_from_uuid.get(update.uuid)
+        if handle is None or set(update.updates) != {"value"}:
             return False
-        value, now = updates["value"], handle.value
+        value, now = update.updates["value"], handle.value
         if isinstance(now, bool) or isinstance(value, bool):
             return isinstance(value, bool) and isinstance(now, bool)
         if isinstance(now, str):
