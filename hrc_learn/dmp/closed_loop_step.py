@@ -113,7 +113,10 @@ def step(
     # Relative to the equilibrium, at which the spring balances a push.
     rest = target if push is None else target + push / spring.stiffness
     y = torch.stack([state.position - rest, state.rate], dim=-2)
-    offset, velocity = _product_plus(E.to(target), y - before, after).unbind(dim=-2)
+    E, y = E.to(target), y - before
+    # Fused where PyTorch can.
+    y = torch.addmm(after, E, y) if E.ndim == y.ndim == after.ndim == 2 else E @ y + after
+    offset, velocity = y.unbind(dim=-2)
     return DMPState(
         position=offset + rest,
         rate=velocity,
@@ -219,11 +222,6 @@ def _propagators(
         over_step, since_end = spring.propagator(torch.stack([ds, coast]))  # both at once
         return over_step, since_end
     return spring.propagator(ds), spring.propagator(coast) if coast else None
-
-
-def _product_plus(A: Tensor, x: Tensor, b: Tensor) -> Tensor:
-    """A x + b, fused where PyTorch can."""
-    return torch.addmm(b, A, x) if A.ndim == x.ndim == b.ndim == 2 else A @ x + b
 
 
 def _filtered(

@@ -134,7 +134,8 @@ def learn(
     if n_basis is None:
         n_basis = _basis_count(times, linear)
     options = {"smooth": True, **options}
-    fits = [fit(n_basis, approach=b, **options) for b in _given(approach, APPROACHES)]
+    tried = APPROACHES if approach is None else (approach,)
+    fits = [fit(n_basis, approach=b, **options) for b in tried]
     return choose(fits, context, frames)
 
 
@@ -371,10 +372,6 @@ def _basis_count(times: Sequence[Tensor], values: Sequence[Tensor]) -> int:
     if len(possible) < 2:
         return BASIS_COUNTS[0]
     return select_basis_count(list(times), list(values), possible, n_folds=3, smooth=True).count
-
-
-def _given[T](value: T | None, usual: Sequence[T]) -> Sequence[T]:
-    return usual if value is None else (value,)
 
 
 def _coordinates(each: MotionPrimitive) -> Float[Tensor, "n D M"]:

@@ -295,7 +295,7 @@ class LinearPrimitive(nn.Module):
     ) -> Float[Tensor, "*batch D M"]:
         """Coordinates of the motion with this boundary."""
         start, goal, rate = self.resolve_boundary(boundary, duration)
-        weights = self._scaled_weights(start, goal)
+        weights = self._scaled(self.weights.mT, start, goal).mT
         if forcing_gain is not None:
             gain = finite("forcing_gain", self._as_tensor(forcing_gain))
             weights = weights * gain[..., None, None]
@@ -574,11 +574,6 @@ class LinearPrimitive(nn.Module):
     def demonstrated(self) -> Demonstrated:
         """Start, goal and range of the demonstration, as the scaling needs them."""
         return Demonstrated(start=self.start, goal=self.goal, amplitude=self.amplitude)
-
-    def _scaled_weights(self, start: Tensor, goal: Tensor) -> Tensor:
-        if self.scaling == "none":
-            return self.weights
-        return self._scaled(self.weights.mT, start, goal).mT
 
     def _normalised_step(self, dt: Tensor | float, duration: Tensor) -> Tensor | float:
         """Step ds in float64; a plain number if possible, which takes a tenth of the time."""

@@ -133,11 +133,7 @@ class Motions:
             channel: One of `available()`.
             n_basis: Number of basis functions.
             options: Fields of `FitOptions`.
-
-        Raises:
-            ValueError: The demonstrations lack a column of the channel.
         """
-        self.require(channel)
         time, mask = self.demos.time, self.demos.mask
         if channel == "orientation":
             turn = self.column("orientation")
