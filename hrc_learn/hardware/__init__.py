@@ -1,7 +1,6 @@
 """Real arms, grippers and cameras; a driver is imported when its device is opened."""
 
 from hrc_learn.hardware.camera_delay import DelayMotion as DelayMotion
-from hrc_learn.hardware.camera_delay import MeasuredDelay as MeasuredDelay
 from hrc_learn.hardware.camera_delay import measure_delay as measure_delay
 from hrc_learn.hardware.driver_process import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.driver_process import ArmProcess as ArmProcess

@@ -10,6 +10,7 @@ from cakes import KIND, cake, contents, fill
 from hrc_learn.store import (
     MADE_BY,
     MANIFEST,
+    delete_files,
     new_folder,
     replacing,
 )
@@ -153,3 +154,14 @@ def test_results_inside_results_belong_to_them_only_if_written_with_them(tmp_pat
     assert contents(out / "another") == {
         name.removeprefix("x/"): text for name, text in cake("run", "x").items()
     }
+
+
+@pytest.mark.parametrize("foreign", [False, True])
+def test_a_folder_of_temporary_files_is_deleted_with_nothing_else(foreign, tmp_path):
+    folder = tmp_path / "staging"
+    (folder / "data").mkdir(parents=True)
+    (folder / "data" / "part-1").write_text("half")
+    if foreign:
+        (folder / "data" / "notes").write_text("years")
+    assert delete_files(folder, ["data/part-*"]) is not foreign
+    assert contents(tmp_path) == ({"staging/data/notes": "years"} if foreign else {})

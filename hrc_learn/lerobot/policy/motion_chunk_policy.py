@@ -105,18 +105,13 @@ class MotionChunkConfig(MotionPolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("n_basis", "hidden_dim", "n_plans"):
+        least = {"n_basis": 1, "hidden_dim": 1, "n_plans": 1, "chunk_size": 4}
+        for name, bound in (least | {"history": 0, "state_noise": 0}).items():
             value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+            if value is not None and not value >= bound:
+                raise ValueError(f"{name} must be at least {bound}, got {value}")
         if self.blend_time is not None and self.blend_time <= 0:
             raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
-        if self.history < 0:
-            raise ValueError(f"history must be 0 frames or more, got {self.history}")
-        if self.state_noise < 0:
-            raise ValueError(f"state_noise must not be negative, got {self.state_noise}")
-        if self.chunk_size < 4:
-            raise ValueError(f"chunk_size must be at least 4, got {self.chunk_size}")
 
     @property
     def observation_delta_indices(self) -> list[int] | None:
