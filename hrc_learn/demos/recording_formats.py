@@ -163,43 +163,33 @@ def read_hdf5(path: Path) -> list[Recording]:
 
     def visit(group: h5py.Group) -> None:
         _attributes(group.attrs, details)
-        for name, node in _nodes(path, group):
+        for name in group:
+            place = f"{group.name}/{name}".strip("/")
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                raise DatasetError(_LINK, file=path, key=place)
+            node = group[name]
             if isinstance(node, h5py.Group):
                 visit(node)
+            elif node.external or node.is_virtual:
+                text = "is kept in another file: not opened"
+                raise DatasetError(text, file=path, key=place)
             elif node.shape == ():
                 _attributes({name: node[()]}, details)
             elif node.shape and 0 not in node.shape and not node.dtype.names:
-                place = node.name.strip("/")
-                read = partial(_read_hdf5, path, place)
-                if node.dtype.kind != "O":
-                    unit = unit_in_words(_text(node.attrs.get("units", "")))
-                    made = make_field(place, node.shape, node.dtype, read, unit=unit)
-                    fields[place] = made
-                elif h5py.check_string_dtype(node.dtype) or h5py.check_vlen_dtype(node.dtype):
-                    kind = "encoded" if is_encoded(node[0]) else "text"
-                    fields[place] = Field(shape=node.shape[:1], kind=kind, read=read)
+                add(place, node)
+
+    def add(place: str, node: h5py.Dataset) -> None:
+        read = partial(_read_hdf5, path, place)
+        if node.dtype.kind != "O":
+            unit = unit_in_words(_text(node.attrs.get("units", "")))
+            fields[place] = make_field(place, node.shape, node.dtype, read, unit=unit)
+        elif h5py.check_string_dtype(node.dtype) or h5py.check_vlen_dtype(node.dtype):
+            kind = "encoded" if is_encoded(node[0]) else "text"
+            fields[place] = Field(shape=node.shape[:1], kind=kind, read=read)
 
     with h5py.File(path, "r") as file:
         visit(file)
     return split_episodes(path, fields, **details)
-
-
-def _nodes(path: Path, group: Any) -> Iterator[tuple[str, Any]]:
-    """Groups and datasets of a group.
-
-    Raises:
-        DatasetError: One is a link, or its data are in another file.
-    """
-    import h5py
-
-    for name in group:
-        place = f"{group.name}/{name}".strip("/")
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise DatasetError(_LINK, file=path, key=place)
-        node = group[name]
-        if isinstance(node, h5py.Dataset) and (node.external or node.is_virtual):
-            raise DatasetError("is kept in another file: not opened", file=path, key=place)
-        yield name, node
 
 
 def _read_hdf5(path: Path, place: str, start: int, stop: int) -> np.ndarray:
@@ -264,15 +254,14 @@ def read_mat(path: Path) -> list[Recording]:
 
     try:
         content: dict = loadmat(path, simplify_cells=True)
-    except NotImplementedError:  # version 7.3 is HDF5
-        content = _mat_of_hdf5(path)
+    except NotImplementedError:  # version 7.3 is HDF5, which keeps arrays transposed
+        return [_frames_first(one) for one in read_hdf5(path)]
     fields: dict[str, Field] = {}
     details: dict[str, Any] = {}
     content = {k: v for k, v in content.items() if not k.startswith("__")}
     _flatten(content, "", fields)
     _attributes({k: v for k, v in content.items() if np.ndim(v) == 0}, details)
-    episodes = split_episodes(path, fields, **details)
-    return [replace(one, fields=_frames_first(one.fields)) for one in episodes]
+    return [_frames_first(one) for one in split_episodes(path, fields, **details)]
 
 
 def _flatten(value: Any, place: str, fields: dict[str, Field]) -> None:
@@ -288,27 +277,14 @@ def _flatten(value: Any, place: str, fields: dict[str, Field]) -> None:
         fields[place] = array_field(place, value)
 
 
-def _frames_first(fields: Mapping[str, Field]) -> dict[str, Field]:
+def _frames_first(one: Recording) -> Recording:
     """Arrays with their frames, of which most arrays have as many, along the first axis."""
+    fields = one.fields
     lengths = [max(f.shape) for f in fields.values() if len(f.shape) <= 2]
     frames = max(dict.fromkeys(lengths), key=lengths.count, default=0)
     turned = {n: f for n, f in fields.items() if f.shape[1:] == (frames,)}
-    return {**fields, **{n: array_field(n, f.numbers().T) for n, f in turned.items()}}
-
-
-def _mat_of_hdf5(path: Path) -> dict[str, Any]:
-    """Content of a MATLAB file of version 7.3, whose arrays are kept transposed."""
-    import h5py
-
-    def value(node: Any) -> Any:
-        if isinstance(node, h5py.Group):
-            return {n: value(one) for n, one in _nodes(path, node) if not n.startswith("#")}
-        if h5py.check_ref_dtype(node.dtype) is not None:
-            return [value(node.file[ref]) for ref in np.ravel(node[()])]
-        return np.asarray(node[()]).T.squeeze() if node.dtype.kind in "fiub" else None
-
-    with h5py.File(path, "r") as file:
-        return value(file)
+    turned = {n: array_field(n, f.numbers().T) for n, f in turned.items()}
+    return replace(one, fields={**fields, **turned})
 
 
 def read_tfrecord(path: Path) -> list[Recording]:
