@@ -18,7 +18,6 @@ from hrc_learn.demos.issues import Issue as Issue
 from hrc_learn.demos.issues import UnitsWarning as UnitsWarning
 from hrc_learn.demos.issues import ValidationReport as ValidationReport
 from hrc_learn.demos.quality.check import check_dataset as check_dataset
-from hrc_learn.demos.quality.merging import MergeReport as MergeReport
 from hrc_learn.demos.quality.merging import merge_datasets as merge_datasets
 from hrc_learn.demos.quality.ranking import rank_episodes as rank_episodes
 from hrc_learn.demos.quality.repair import RepairOptions as RepairOptions

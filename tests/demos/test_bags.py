@@ -301,6 +301,25 @@ def test_transforms_become_poses_of_the_tool_in_the_base(tmp_path):
         np.testing.assert_allclose(turn.as_matrix(), expected[:3, :3], atol=1e-5)
 
 
+def test_the_only_pose_is_that_of_the_tool_whatever_its_name(tmp_path):
+    messages = ros2()
+    for t in START + STATES:
+        x, y, z = 0.1 * joints(t - START)
+        pose = messages.of(
+            "geometry_msgs/msg/Pose",
+            position=messages.of("geometry_msgs/msg/Point", x=x, y=y, z=z),
+            orientation=messages.of("geometry_msgs/msg/Quaternion", x=0, y=0, z=0, w=1),
+        )
+        header = messages.header(t)
+        messages.add("/tracker/p", t, "geometry_msgs/msg/PoseStamped", header=header, pose=pose)
+        messages.image("/front/color", t, shown(3))
+    (episode,) = plan(write2(tmp_path / "bag", messages)).episodes()
+    demo = episode.demonstration
+    expected = 0.1 * joints(demo.time + demo.start_time - START)
+    np.testing.assert_allclose(demo.position, expected, atol=1e-5)
+    assert [*episode.images] == ["front"]
+
+
 def write_json_mcap(path, finish=True):
     with path.open("wb") as stream:
         writer = McapWriter(stream)
