@@ -193,7 +193,6 @@ def _free_plan(
         workplace.home_joints(),
         placing,
         workplace,
-        space=config.planning,
         dt=dt,
         speed=config.speed,
     ):

@@ -234,23 +234,13 @@ def demonstrated_joints(
     return np.column_stack([np.interp(time, demonstration.time, joint) for joint in columns])
 
 
-def film(recording: RunRecording, render: bool = True) -> Film:
-    """Film of a run.
-
-    Args:
-        recording: Recording of the run.
-        render: Render the pictures, if this machine can; otherwise draw them.
-    """
-    return Film(film_mp4(frames(recording, render), RATE), recording.title)
+def film(recording: RunRecording) -> Film:
+    """Film of a run."""
+    return Film(film_mp4(frames(recording), RATE), recording.title)
 
 
-def frames(recording: RunRecording, render: bool = True) -> Iterator[Picture]:
-    """Pictures of the film.
-
-    Args:
-        recording: Recording of the run.
-        render: Render the pictures, if this machine can; otherwise draw them.
-    """
+def frames(recording: RunRecording) -> Iterator[Picture]:
+    """Pictures of the film, rendered if this machine can, otherwise drawn."""
     camera = CameraModel(
         width=WIDTH,
         height=HEIGHT,
@@ -263,7 +253,7 @@ def frames(recording: RunRecording, render: bool = True) -> Iterator[Picture]:
     inset = None
     if recording.camera is not None and recording.camera.images:
         inset = CameraInset(recording.camera, WIDTH)
-    with _painter(recording, camera, render) as paint:
+    with _painter(recording, camera) as paint:
         for time in np.linspace(begin, end, max(2, round(shown * RATE))):
             step = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
             lines, labels = _drawn_in(recording, step)
@@ -287,17 +277,13 @@ def caption(recording: RunRecording, time: float) -> str:
 
 @contextmanager
 def _painter(
-    recording: RunRecording, camera: CameraModel, render: bool
+    recording: RunRecording, camera: CameraModel
 ) -> Iterator[Callable[[int, list[Line]], Picture]]:
     """Function that makes the picture of a step with lines in it."""
-    renderer, world = None, None
-    if render:
-        try:
-            world = RecordedWorld(recording)
-            renderer = OffscreenRenderer(world, WIDTH, HEIGHT)
-        except RenderingUnavailableError:
-            pass
-    if world is None or renderer is None:
+    world = RecordedWorld(recording)
+    try:
+        renderer = OffscreenRenderer(world, WIDTH, HEIGHT)
+    except RenderingUnavailableError:
         yield lambda step, lines: draw_run(recording, step, camera, lines)
         return
     with closing(renderer):

@@ -80,9 +80,6 @@ class GraspingConfig:
     )
     """Settings of the adaptive controller; the high rate compensates for the drift caused by
     10 ms steps."""
-    approach: bool = True
-    """True: approach the table in joint space, along a checked path; False: use the Cartesian
-    regions from the start, as in the paper."""
     detection_timeout: float = 5.0
     """Give up after an object is undetected for this long [s]."""
     lift: float = 0.20
@@ -214,11 +211,11 @@ class Grasping:
                 "Move the object into the camera's view, and the arm out of it."
             )
         pixel, angle = detected
-        posture = self._posture() if self._config.approach else self._workplace.hover_joints()
+        posture = self._posture()
         return ServoTarget(
             config=self._config.servo,
             above=self._workplace.hover(),
-            posture=posture if self._config.approach else None,
+            posture=posture,
             rest=posture if self._cell.config.after_push == "return" else None,
             visual=self._visual,
             item=pixel,

@@ -33,7 +33,7 @@ from hrc_learn.skills.grasping import (
     raised,
 )
 from hrc_learn.skills.marker_sensor import longest_occlusion
-from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
+from hrc_learn.skills.placing import PlacingSkill, Plan, plan_candidates
 from hrc_learn.skills.receiving import Receipt, Receiving
 from hrc_learn.skills.servo_target import ServoTarget
 from hrc_learn.skills.task_workplace import GraspObject, Workplace
@@ -146,9 +146,6 @@ class PickAndPlaceConfig:
     """Number of first objects at which the person has that time."""
     speed: float = 1.5
     """Speed of the transfer relative to the demonstration."""
-    planning: PlanningSpace = "pose"
-    """Space in which the path to the shelf is planned; the paper's "joint" bends the path into
-    shelves that were not demonstrated."""
     waits: int = 3
     """Number of waits for a blocked path to become free."""
     wait: float = 2.0
@@ -401,7 +398,6 @@ class PickAndPlace:
                 self._cell.joints,
                 self._placing,
                 self._workplace,
-                space=self._config.planning,
                 dt=self._cell.config.dt,
                 speed=self._config.speed,
             )

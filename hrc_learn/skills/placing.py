@@ -274,7 +274,6 @@ def plan_candidates(
     skill: PlacingSkill,
     workplace: Workplace,
     *,
-    space: PlanningSpace,
     dt: float,
     speed: float,
 ) -> Iterator[Plan]:
@@ -289,13 +288,12 @@ def plan_candidates(
         start: Present joint positions [rad].
         skill: Learned motion.
         workplace: Workplace with the home near which the other candidates start.
-        space: Space of the primitive.
         dt: Control step [s].
         speed: Speed relative to the demonstration.
     """
 
     def learned(start: Tensor, goal: Pose = goal) -> Plan:
-        return skill.plan(start, goal, space=space, dt=dt, speed=speed)
+        return skill.plan(start, goal, space="pose", dt=dt, speed=speed)
 
     yield learned(start)
     size = workplace.robot.hand_size

@@ -10,7 +10,18 @@ from sample_runs import sample_run
 from hrc_learn.experiments import run_recorder as film
 from hrc_learn.experiments.run_recorder import caption, frames
 from hrc_learn.log import Event
+from hrc_learn.sim import RenderingUnavailableError
 from hrc_learn.viz import palette
+
+
+@pytest.fixture(autouse=True)
+def no_opengl(monkeypatch):
+    """Pictures are drawn, as on machines that cannot render."""
+
+    def unavailable(*_):
+        raise RenderingUnavailableError("no OpenGL")
+
+    monkeypatch.setattr(film, "OffscreenRenderer", unavailable)
 
 
 def labels(run, step):
@@ -28,14 +39,14 @@ def pushed(steps):
 def test_a_film_is_as_long_as_the_run_up_to_a_bound(duration, shown, monkeypatch):
     monkeypatch.setattr(film, "LONGEST", 2.0)
     time = np.linspace(0.0, duration, len(sample_run().time))
-    with av.open(BytesIO(film.film(sample_run(time=time), render=False).mp4)) as file:
+    with av.open(BytesIO(film.film(sample_run(time=time)).mp4)) as file:
         (stream,) = file.streams.video
         assert sum(1 for _ in file.decode(stream)) == round(shown * film.RATE)
 
 
 def test_the_first_and_the_last_moment_are_in_the_film():
     run = sample_run(time=np.linspace(0.0, 0.5, len(sample_run().time)))
-    pictures = list(frames(run, render=False))
+    pictures = list(frames(run))
     assert pictures[0].shape == (film.HEIGHT, film.WIDTH, 3)
     assert (pictures[0] != pictures[-1]).any()
 

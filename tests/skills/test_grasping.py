@@ -40,7 +40,7 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MissedGraspError, grasping
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.grasping import Grasping, GraspingConfig
+from hrc_learn.skills.grasping import Grasping
 from hrc_learn.skills.placing import check_plan
 from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -307,14 +307,13 @@ def test_a_person_is_told_where_the_arm_cannot_be_led(skill, place, said):
 
 
 @pytest.mark.parametrize("after_push", ["return", "stay"])
-@pytest.mark.parametrize("approach", [True, False])
 def test_the_null_space_goes_back_to_the_posture_above_the_table(
-    skill, monkeypatch, approach, after_push
+    skill, monkeypatch, after_push
 ):
     world = World(WORKPLACE.scene)
     world.reset(WORKPLACE.home_joints().numpy())
     cell = unled_cell(world, after_push=after_push)
-    task = Grasping(cell, WORKPLACE, skill, GraspingConfig(approach=approach))
+    task = Grasping(cell, WORKPLACE, skill)
     monkeypatch.setattr(task, "_detect", lambda item: (np.array([700.0, 500.0]), 0.0))
     target = task.locate(WORKPLACE.scene.objects[0])
     above = panda.forward(WORKPLACE.hover_joints())
@@ -322,10 +321,7 @@ def test_the_null_space_goes_back_to_the_posture_above_the_table(
         assert target.rest is None
     else:
         torch.testing.assert_close(panda.forward(target.rest).position, above.position)
-    if approach:
-        torch.testing.assert_close(panda.forward(target.posture).position, above.position)
-    else:
-        assert target.posture is None
+    torch.testing.assert_close(panda.forward(target.posture).position, above.position)
 
 
 def test_what_was_felt_by_fingers_that_missed_is_not_believed(skill, monkeypatch):

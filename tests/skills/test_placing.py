@@ -277,7 +277,7 @@ def test_an_object_that_sits_low_in_the_gripper_is_released_higher(skill, low, n
             return False
         return True
 
-    candidates = plan_candidates(goal, HOME, skill, WORKPLACE, space="pose", dt=0.05, speed=1.5)
+    candidates = plan_candidates(goal, HOME, skill, WORKPLACE, dt=0.05, speed=1.5)
     which, plan = next(filter(free, enumerate(candidates)))
     assert which == number
     assert 0 <= float(plan.goal.position[2] - goal.position[2]) < 0.01
