@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,10 @@ _ROWS = (
     ("target_error_px", "target in the image, error", 1, "px", None, 0.1),
     ("angle_spread_deg", "angle of object and gripper, spread", 1, "deg", None, 0.0),
     ("approach_spread_deg", "orientation above the object, spread", 1, "deg", None, 0.0),
+    # Found in the video, without markers.
+    ("tool_seen", "images in which the tool was found", 100, "%", None, 0.0),
+    ("tool_pixel_std_px", "pixel of the tool, standard deviation", 1, "px", None, 0.1),
+    ("objects_found", "demonstrations in which the object was found", 1, "", None, 0.0),
 )
 
 
@@ -115,7 +119,6 @@ def _demonstrations(args: FitImageJacobian, console: Console, rank: int) -> _Sea
         refuse_given(args, ["marker"], "is a marker, and --markerless uses none")
         with console.status(f"Searching the video of {len(demos)} demonstrations"):
             unmarked = find_landmarks(demos, args.camera)
-        console.print(str(unmarked), highlight=False)
         return unmarked.demos, unmarked.figures(), unmarked
     if args.marker is None:
         refuse_given(args, ["camera"], "is the camera of --marker")
@@ -185,25 +188,26 @@ def _write(
         record_learning(folder / "fit.rrd", skill, demos, title)
         if unmarked is not None:
             unmarked.save_picture(folder / FOUND)
+    shown = metrics | dict(searched)
     rows = [
         Measurement(
             name=name,
-            value=factor * metrics[key] if unit else round(metrics[key]),
+            value=factor * shown[key] if unit else round(shown[key]),
             unit=unit,
             target=target,
             resolution=resolution,
         )
         for key, name, factor, unit, target, resolution in _ROWS
-        if key in metrics
+        if key in shown
     ]
-    title, more = f"Image Jacobian from {args.dataset}", len(metrics) - len(rows)
+    title, more = f"Image Jacobian from {args.dataset}", len(shown) - len(rows)
     show_measurements(rows, title=title, more=more, elsewhere="metrics.json")
     print(f"Found: {skill.jacobian.camera_fit}.")
     if unmarked is not None:
         print(f"Found in the video: {shlex.quote(str(args.folder / FOUND))}")
     print(f"Model in {shlex.quote(str(args.folder))}")
     print(f"Dashboard: {show_command(args.folder)}")
-    write_values(args.json, metrics | dict(searched))
+    write_values(args.json, shown)
 
 
 FOUND = "found.png"
@@ -218,20 +222,17 @@ def evaluate_image_jacobian(args: Evaluate, model: Path) -> int:
     """Compare an image Jacobian with the simulator's true one."""
     torch.set_num_threads(1)
     figures = _image_jacobian_figures(args, VisualServoSkill.load(model).jacobian)
-    bounded = "upright_relative_error_median"
-    row = replace(_named(bounded, figures[bounded]), target=MOST_ERROR)
-    others = [_named(name, value) for name, value in figures.items() if name != bounded]
-    show_measurements([row, *others], title=f"Image Jacobian {model}", elsewhere="--json FILE")
+    rows = [
+        Measurement(
+            name=name.replace("_", " "),
+            value=value,
+            target=MOST_ERROR if name == "upright_relative_error_median" else None,
+        )
+        for name, value in figures.items()
+    ]
+    show_measurements(rows, title=f"Image Jacobian {model}", elsewhere="--json FILE")
     write_values(args.json, figures)
-    return int(row.ok is False)
-
-
-def _named(name: str, value: float) -> Measurement:
-    """Measured value by its name in JSON, whose last word is the unit if it is one."""
-    stem, _, unit = name.rpartition("_")
-    known = unit in ("px", "mm", "deg", "ms", "s")
-    words = (stem if known else name).replace("_", " ")
-    return Measurement(name=words, value=value, unit=unit if known else "")
+    return int(any(row.ok is False for row in rows))
 
 
 def _image_jacobian_figures(args: Evaluate, network: RBFImageJacobian) -> dict[str, float]:

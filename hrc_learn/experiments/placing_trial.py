@@ -165,9 +165,8 @@ def taught_correction(
     for _ in range(_TEACHING_ITERATIONS):
         joints = world.arm.robot.inverse(measured, near=near).numpy()
         world.reset(joints - errors.encoder_offset)
-        matrix = torch.from_numpy(world.arm.tcp_pose())
         # True pose of the tool, and its error from the guided one.
-        tool = Pose(matrix[:3, 3], quaternion.from_matrix(matrix[:3, :3]))
+        tool = Pose.from_matrix(world.arm.tcp_pose())
         back = quaternion.conjugate(tool.orientation)
         rotation = quaternion.multiply(back, guided.orientation)
         measured = Pose(

@@ -12,8 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
+from hrc_learn.controller.null_space_motion import Clearance
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
 from hrc_learn.hardware.protocol_server import ArmServer, ServedArm, serve_world
 from hrc_learn.kinematics import Arm
@@ -148,8 +148,7 @@ def simulated_cell(
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
     on_step: Callable[[], None] = lambda: None,
     rng: np.random.Generator | None = None,
-    clearance: Callable[[Float[torch.Tensor, "*batch joints"]], Float[torch.Tensor, "*batch"]]
-    | None = None,
+    clearance: Clearance | None = None,
     watch: PersonWatch | None = None,
 ) -> Iterator[tuple[WorkCell, MotionLog]]:
     """Connect a work cell to a world, without gradients, until the block ends.

@@ -75,10 +75,6 @@ class MarkerlessFit:
     """Tool and object, to be found at run time."""
     camera: CameraFit
     """Camera that explains the motion of the tool."""
-    carrier: str
-    """Link whose points were found: the tool, or the link before the last joint."""
-    tracks: int
-    """Tracks that move with it."""
     seen: float
     """Fraction of the searched frames in which the tool was found."""
     deviation: float
@@ -88,27 +84,12 @@ class MarkerlessFit:
 
     def figures(self) -> dict[str, float]:
         """Measured values by name."""
-        objects = [d for d in self.demos if OBJECT_FEATURE in d.extra]
         return {
             "tool_points": len(self.landmarks.tool.points),
             "tool_seen": self.seen,
             "tool_pixel_std_px": self.deviation,
-            "objects_found": len(objects),
+            "objects_found": sum(OBJECT_FEATURE in demo.extra for demo in self.demos),
         }
-
-    def __str__(self) -> str:
-        """Findings in words."""
-        figures = self.figures()
-        item = (
-            f"the object in {figures['objects_found']:.0f} of {len(self.demos)} demonstrations"
-            if self.landmarks.objects
-            else "no object that was moved between the demonstrations"
-        )
-        return (
-            f"found without markers: {self.tracks} tracks that move with the {self.carrier}, "
-            f"the tool in {100 * self.seen:.0f} % of the searched frames, within "
-            f"{self.deviation:.1f} px (one standard deviation), and {item}"
-        )
 
     def save_picture(self, path: Path) -> None:
         """Write the picture, as PNG."""
@@ -119,7 +100,6 @@ class MarkerlessFit:
 class _Link(NamedTuple):
     """Poses of a link in the searched frames, and the line on which the place lies."""
 
-    name: str
     pose: Pose
     axis: tuple[np.ndarray, np.ndarray] | None = None
     """Point on the axis of the last joint, and its direction, in the link's frame [m]."""
@@ -141,7 +121,7 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
     height, width = reader.size(key)
     search = _Search(reader, key, demos, (width, height))
     poses = _poses(demos, search.picked)
-    links = [_Link("tool", poses), *_wrist(source, demos, search.picked)]
+    links = [_Link(poses), *_wrist(source, demos, search.picked)]
     features = search.features()
     tracks = _tracks(features, width)
     best: tuple[int, _Link, CameraFit] | None = None
@@ -177,8 +157,6 @@ def find_landmarks(source: DemonstrationSource, camera: str | None = None) -> Ma
         demos=_described(demos, found, objects),
         landmarks=landmarks,
         camera=fit,
-        carrier=link.name,
-        tracks=best[0],
         seen=len(sure) / max(1, search.followed),
         deviation=float(np.median(sure)),
         picture=search.picture(found, objects),
@@ -403,7 +381,7 @@ def _wrist(
     turn = quaternion.to_matrix(wrist.orientation[0]).mT
     origin = (turn @ (last.position - wrist.position[0])).numpy()
     direction = (turn @ quaternion.to_matrix(last.orientation)[:, 2]).numpy()
-    yield _Link("wrist", wrist, (origin, direction))
+    yield _Link(wrist, (origin, direction))
 
 
 def _pose_of(demo: Demonstration) -> Pose:

@@ -67,12 +67,7 @@ class MarkerAngle:
             angles: Directions of that marker in the image [rad].
             poses: Poses of the end effector right above it, (demos,).
             target: Place of the object in the tool frame.
-
-        Raises:
-            ValueError: There is no demonstration.
         """
-        if not len(angles):
-            raise ValueError("the direction of a marker needs one demonstration or more.")
         differences = []
         for pixel, direction, k in zip(objects, angles, range(len(angles)), strict=True):
             place = poses[k].apply(torch.from_numpy(target.offset))

@@ -23,6 +23,7 @@ from hrc_learn.controller.arm_loop_state import (
     TrackPose,
 )
 from hrc_learn.controller.joint_path import JointPaths, changed_rate, deviation_ratio
+from hrc_learn.controller.null_space_motion import Clearance
 from hrc_learn.controller.task_pace import TaskPace
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import GraspedBox, SerialChain
@@ -139,8 +140,7 @@ class WorkCell:
         config: WorkCellConfig | None = None,
         on_phase: Callable[[str, float], None] = lambda phase, time: None,
         rng: np.random.Generator | None = None,
-        clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]]
-        | None = None,
+        clearance: Clearance | None = None,
         watch: PersonWatch | None = None,
     ):
         """Connect the parts.

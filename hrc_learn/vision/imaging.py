@@ -98,12 +98,7 @@ class Lens:
         """The image of `model` from the image of `pinhole`."""
         import cv2
 
-        expected = (self.pinhole.height, self.pinhole.width)
-        if image.shape[:2] != expected:
-            raise ValueError(
-                f"image must be {expected[1]}x{expected[0]}, as Lens.pinhole says, but is "
-                f"{image.shape[1]}x{image.shape[0]}."
-            )
+        assert image.shape[:2] == (self.pinhole.height, self.pinhole.width)
         out = cv2.remap(image, self._map, None, cv2.INTER_LINEAR)  # pyright: ignore[reportCallIssue, reportArgumentType]
         return np.asarray(out, dtype=np.uint8)
 
