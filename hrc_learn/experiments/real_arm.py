@@ -180,18 +180,15 @@ class ArmRun:
             configuration: Configuration to save with the run.
         """
         log = self.cell.log
-        phases = [{"phase": event.text, "start": event.time} for event in log.events]
+        result = {
+            "failure": self.failure,
+            "duration": float(np.ptp(log["time"])) if len(log) else 0.0,
+            "phases": [{"phase": event.text, "start": event.time} for event in log.events],
+            "remarks": [{"text": said.text, "time": said.time} for said in self.cell.remarks],
+        }
         with new_folder(folder, configuration, overwrite=True) as part:
             log.save(part / "log.npz")
             record_run(part / "run.rrd", record(title, self.cell, self.believed, self.motion))
-            result = {
-                "failure": self.failure,
-                "duration": float(np.ptp(log["time"])) if len(log) else 0.0,
-                "phases": phases,
-                "remarks": [
-                    {"text": said.text, "time": said.time} for said in self.cell.remarks
-                ],
-            }
             write_json(part / "result.json", result)
 
 

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from itertools import product
-from typing import Any
 
 import numpy as np
 import torch
@@ -59,7 +58,8 @@ _ENOUGH = 0.3
 _UNSEEN = 10.0  # loss of quality per fraction of poses without a view of the marker
 # Postures at home that are looked at; of the best, and of those above the table, so many.
 _POSTURES, _TRIED = 16, 6
-_LIFT, _INSIDE = 0.03, 0.3  # of the expert's way over the edge of a board
+# Fraction of the way back to the front at which the expert is over the board.
+_INSIDE = 0.3
 
 # Half the hand's thickness, and what is left under it for errors of base and encoders [m].
 _HAND_HALF, _OVER_BOARD = 0.030, 0.006
@@ -109,21 +109,20 @@ class Workplace:
     """Distance in front of the boards from which the end effector moves straight in [m]."""
 
     @classmethod
-    def of(cls, robot: Arm, **options: Any) -> "Workplace":
+    def of(cls, robot: Arm) -> "Workplace":
         """The same place with another arm in it, laid out for its reach.
 
         Args:
             robot: The arm.
-            options: The remaining fields.
 
         Raises:
             UnreachableError: The arm cannot do the work in any layout.
         """
         if not robot.is_franka:
-            return replace(layout_for(robot).workplace, **options)
+            return layout_for(robot).workplace
         scene = SceneConfig()
         scene = replace(scene, arm=replace(scene.arm, robot=robot))
-        return cls(scene=scene, **options)
+        return cls(scene=scene)
 
     @property
     def robot(self) -> Arm:
@@ -289,11 +288,20 @@ class Workplace:
         spare = (_HAND_HALF + _OVER_BOARD) * self.robot.hand_size
         return max(half_size[1] + self.clearance - spare, 0.0)
 
-    def shelf_front(self, name: str) -> Pose:
-        """End effector in front of a shelf, at the height of the release."""
-        position = self.shelf(name).position.clone()
-        position[1] = self.scene.cabinet.front + self.approach
-        return Pose(position, coarse_orientation(position, self.level_at))
+    def path_to_shelf(self, name: str, lift: float = 0.03) -> Float[Tensor, "4 3"]:
+        """Points of the end effector from home over the edge of a board to its goal [m].
+
+        Args:
+            name: Name of the shelf.
+            lift: Height over the edge, for the Franka hand [m]. The gripper is not quite level
+                there yet: what it carries hangs a little lower.
+        """
+        goal = self.shelf(name).position
+        front = goal.clone()
+        front[1] = self.scene.cabinet.front + self.approach
+        lifted = _vector(0.0, 0.0, self.robot.hand_size * lift)
+        inside = goal + _INSIDE * (front - goal)
+        return torch.stack([self.home().position, front + lifted, inside + lifted, goal])
 
 
 def pose_on_table(
@@ -510,7 +518,7 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
     clearances, level_at = workplace.arm_clearances, workplace.level_at
     to_shelves = torch.ones(len(at_home), dtype=torch.float64)
     for name in workplace.shelf_names():
-        path = _path_to_shelf(workplace, name)
+        path = workplace.path_to_shelf(name)
         quality = path_quality(robot, clearances, path, level_at, at_home)
         to_shelves = torch.minimum(to_shelves, quality)
         if not bool((to_shelves > 0).any()):
@@ -537,13 +545,3 @@ def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
             if clear > 0 and (best is None or min(layout.rank, _ENOUGH) > best.rank):
                 best = layout
     return best
-
-
-def _path_to_shelf(workplace: Workplace, name: str) -> Float[Tensor, "points 3"]:
-    """Path of the end effector from home over the edge of a board, as the expert demonstrates
-    it [m].
-    """
-    goal, front = workplace.shelf(name).position, workplace.shelf_front(name).position
-    lift = _vector(0.0, 0.0, workplace.robot.hand_size * _LIFT)
-    inside = goal + _INSIDE * (front - goal) + lift
-    return torch.stack([workplace.home().position, front + lift, inside, goal])

@@ -139,12 +139,7 @@ class World:
         """Unwanted contacts of the arm since a time [s]: cabinet, table, itself or the worker,
         in words.
         """
-        monitors = (
-            self.cabinet_contacts,
-            self.table_contacts,
-            self.self_contacts,
-            self.worker_contacts,
-        )
+        monitors = (m for m in self._monitors if m is not self.object_contacts)
         met = [
             f"{touch.first} touched {touch.second}"
             for monitor in monitors
@@ -171,11 +166,11 @@ class World:
     def _look_at_contacts(self) -> None:
         """Contacts of one step that a monitor watches; mostly none."""
         geoms = self.data.contact.geom
-        if self._watched[geoms[:, 0], geoms[:, 1]].any():
-            for monitor in self._monitors:
+        watched = self._watched[geoms[:, 0], geoms[:, 1]].any()
+        for monitor in self._monitors:
+            if watched:
                 monitor.update(self.data)
-        else:
-            for monitor in self._monitors:
+            else:
                 monitor.pause()
 
     def hold(self, name: str, joint_position: Float[np.ndarray, " joints"]) -> None:

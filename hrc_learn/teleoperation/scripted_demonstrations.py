@@ -322,21 +322,16 @@ def placing_expert(
         config: Timing and heights.
         rng: Random source of the tremor and of the initial position.
     """
-    goal, front = workplace.shelf(shelf).position, workplace.shelf_front(shelf).position
-    # The gripper is not quite level yet at the edge: what it carries hangs a little lower.
     size = workplace.robot.hand_size
-    lifted = torch.tensor([0.0, 0.0, size * config.lift], dtype=torch.float64)
-    inside = goal + 0.3 * (front - goal)
-    spread = size * config.spread
-    offset = spread * torch.from_numpy(rng.standard_normal(3))
+    offset = size * config.spread * torch.from_numpy(rng.standard_normal(3))
     world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
-    start = workplace.home().position + offset
-    waypoints = torch.stack([start, front + lifted, inside + lifted, goal]).numpy()
+    waypoints = workplace.path_to_shelf(shelf, config.lift)
+    waypoints[0] += offset
     # Whose elbow is where it has to be, once the hand is, cannot be pulled aside.
     pulled = config.pull_elbow and workplace.robot.null_space == "arm angle"
     return ScriptedExpert(
         workplace.robot.chain,
-        GuidedPath(waypoints, config.duration),
+        GuidedPath(waypoints.numpy(), config.duration),
         forces=ELBOW_FORCES if pulled else (),
         tremor=Tremor(size * config.tremor, rng),
         orientation=lambda position, _: coarse_orientation(position, workplace.level_at),

@@ -57,9 +57,9 @@ def test_the_arm_gets_to_all_shelves_and_touches_nothing(robot):
     assert (workplace.scene.cabinet.door_reach > 0) == (robot.null_space != "none")
     share = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
     for name in workplace.shelf_names():
-        front, goal = workplace.shelf_front(name), workplace.shelf(name)
-        to_front = torch.lerp(workplace.home().position, front.position, share)
-        inside = torch.lerp(front.position, goal.position, share)
+        goal, front = workplace.shelf(name), workplace.path_to_shelf(name, lift=0.0)[1]
+        to_front = torch.lerp(workplace.home().position, front, share)
+        inside = torch.lerp(front, goal.position, share)
         position = torch.cat([to_front, inside])
         path = Pose(position, coarse_orientation(position, workplace.level_at))
         q, error = follow_poses(robot.chain, path, start)
