@@ -3,6 +3,7 @@
 import sys
 import webbrowser
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -49,7 +50,8 @@ def check(args: Check) -> int:
         ValueError: Options name what does not exist, there are no columns to store a contract
             of, or no marker to find camera motion by. The findings are written before.
     """
-    _require_dataset(args.dataset)
+    if not args.dataset.is_dir():  # no error of the data
+        raise FileNotFoundError(f"there is no dataset at {args.dataset}")
     report = check_dataset(args.dataset, args.columns(), units=args.units)
     if report.contract is not None:
         print(*report.contract.lines(), "", sep="\n")
@@ -76,11 +78,6 @@ def check(args: Check) -> int:
                     write_json(folder / "contract.json", report.contract)
         write_values(args.json, counts)
     return int(bool(report.errors or (args.strict and (report.warnings or moved))))
-
-
-def _require_dataset(dataset: Path) -> None:
-    if not dataset.is_dir():
-        raise FileNotFoundError(f"there is no dataset at {dataset}")
 
 
 def _store_contract(dataset: Path, contract: Contract | None) -> None:
@@ -114,7 +111,6 @@ def repair(args: Repair) -> None:
     if mended and args.out is None:
         write_values(args.json, {"mended": len(mended)})
         return
-    _require_dataset(args.dataset)
     options = RepairOptions(
         trim="trim" not in args.skip,
         unwrap="unwrap" not in args.skip,
@@ -133,7 +129,7 @@ def repair(args: Repair) -> None:
         options,
         mapping=args.columns(),
         units=args.units,
-        progress=lambda episodes: track(episodes, description="Repairing"),
+        progress=partial(track, description="Repairing"),
     )
     print(report)
     counts = {
@@ -149,8 +145,6 @@ def repair(args: Repair) -> None:
 
 def merge(args: Merge) -> None:
     """Merge the datasets and print their differences."""
-    for dataset in args.datasets:
-        _require_dataset(dataset)
     report = merge_datasets(args.datasets, args.out, fps=args.fps, videos=args.videos)
     print(report)
     counts = {name: getattr(report, name) for name in ("episodes", "frames", "tasks")}
@@ -161,19 +155,16 @@ def curate(args: Curate) -> None:
     """Rank the episodes and decide which of them stay, in the browser or the terminal.
 
     Raises:
-        FileNotFoundError: There is no dataset.
-        ValueError: An episode is named twice or does not exist, or a cut leaves nothing.
+        ValueError: There is no dataset, an episode is named twice or does not exist, or a cut
+            leaves nothing.
     """
     named = Counter([*args.accept, *args.cut, *args.reject])
     if twice := [episode for episode, count in named.items() if count > 1]:
         raise ValueError(
             f"--accept, --cut and --reject name episode {min(twice)} twice: decide on one"
         )
-    _require_dataset(args.dataset)
-    ranking = rank_episodes(
-        args.dataset,
-        progress=lambda episodes: track(episodes, description="Ranking", transient=True),
-    )
+    progress = partial(track, transient=True)
+    ranking = rank_episodes(args.dataset, partial(progress, description="Ranking"))
     decisions = _typed_decisions(args, ranking)
     if args.browser and not args.write:
         decisions = _browser_decisions(args, ranking)
@@ -191,7 +182,7 @@ def curate(args: Curate) -> None:
             args.dataset,
             args.folder,
             decisions,
-            progress=lambda episodes: track(episodes, description="Writing", transient=True),
+            progress=partial(progress, description="Writing"),
         )
         values["frames"] = report.frames
         print(

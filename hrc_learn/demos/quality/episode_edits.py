@@ -128,18 +128,13 @@ def drop_bad_frames(edit: EpisodeEdit, allowed: bool) -> EpisodeEdit:
     Raises:
         DatasetError: There are such frames and `allowed` is False, or too few are left.
     """
-    selections, feature = edit.selections, set()
-    hidden = np.zeros(len(edit), dtype=bool)
-    if {"feature", "feature_visible"} <= selections.keys():
+    faulty = {key: ~np.isfinite(values.astype(float)) for key, values in edit.frames.items()}
+    if {"feature", "feature_visible"} <= edit.selections.keys():
         hidden = ~(edit.quantities["feature_visible"][:, 0] > 0)
-        feature = {*selections["feature"].columns}
-    bad = ~np.isfinite(edit.time)
-    for key, values in edit.frames.items():
-        faulty = ~np.isfinite(values.astype(float))
-        for index in range(values.shape[1]):
-            if (key, index) in feature:
-                faulty[hidden, index] = False
-        bad |= faulty.any(1)
+        for key, index in edit.selections["feature"].columns:
+            faulty[key][hidden, index] = False
+    rows = [~np.isfinite(edit.time), *(mask.any(1) for mask in faulty.values())]
+    bad = np.logical_or.reduce(rows)
     if bad.any() and not allowed:
         raise edit.fault(
             f"holds values that are not finite in {bad.sum()} frames; drop those "
