@@ -108,7 +108,7 @@ class _Source:
     def __init__(self, dataset: OpenedDataset):
         self.dataset, self.folder = dataset, dataset.folder
         self.root, self.features = dataset.folder.root, dataset.folder.features
-        self.units, faults = dataset.decide_units(dataset.sample(32), {})
+        self.units, faults = dataset.decide_units(dataset.folder.episodes, {})
         for fault in faults:
             raise fault
         selections = dataset.columns.selections.items()

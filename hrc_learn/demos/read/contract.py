@@ -177,10 +177,10 @@ class Contract:
         }
 
     def keeping(self, kept: "Contract") -> "Contract":
-        """This contract with the names of an older one, perhaps edited, and its roles.
+        """This contract with the names and roles of an older one, which may have been edited.
 
-        A component that is now read as another quantity has its new role. The older units are
-        those of the quantities already; those of other components are kept as well.
+        A component that is read as another quantity now has its new role. Units of quantities
+        are those of this contract, which obeys the older one; other components keep theirs.
         """
         known, parts = {part.column: part for part in kept.components}, []
         for part in self.components:

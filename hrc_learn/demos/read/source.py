@@ -42,7 +42,7 @@ from hrc_learn.demos.read.units import (
     units_from_episodes,
 )
 
-_SAMPLED_EPISODES = 32
+_SAMPLED = 32
 """Episodes that decide on units."""
 
 
@@ -99,10 +99,6 @@ class OpenedDataset:
         known = {} if self.contract is None else self.contract.units(self.columns.selections)
         return {**self.sidecar.units, **known}
 
-    def sample(self, most: int) -> Sequence[EpisodeEntry]:
-        """Subset of `most` episodes, spread evenly over the dataset."""
-        return _spread(self.folder.episodes, most)
-
     def decide_units(
         self, entries: Sequence[EpisodeEntry], given: Mapping[str, str]
     ) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
@@ -124,7 +120,7 @@ class OpenedDataset:
         known = {*self.declared_units, *given}
         guessed = guessed_from_values(self.columns.selections, known)
         roles = [*guessed, *({"time"} & self.columns.selections.keys() - known)]
-        sample = {entry.index for entry in self.sample(_SAMPLED_EPISODES)}
+        sample = {entry.index for entry in _spread(self.folder.episodes, _SAMPLED)}
         wanted = {entry.index for entry in entries}
         chosen = wanted | sample if guessed else {entries[0].index} if roles else set()
 
