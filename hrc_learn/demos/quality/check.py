@@ -23,7 +23,12 @@ from hrc_learn.demos.read.contract import infer_contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, select_quantities
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar
-from hrc_learn.demos.read.profiles import EpisodeProfile, profile_episode
+from hrc_learn.demos.read.profiles import (
+    EpisodeProfile,
+    FeatureProfiles,
+    feature_profiles,
+    profile_episode,
+)
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES
 from hrc_learn.demos.read.source import DemonstrationSource, OpenedDataset
 from hrc_learn.demos.read.units import Quantities, UnitDecision, unit_factor
@@ -134,7 +139,7 @@ def _check_content(
         report.add_error(fault)
     report.run(_meaning, columns, decisions if profiles else {})
     entries = {entry.index: entry for entry in folder.episodes}
-    features = [*consistency.feature_profiles(folder, entries, profiles)]
+    features = [*feature_profiles(folder, entries, profiles)]
     usual = _usual_motion(columns, decisions, {f.key: f for f in features})
     doubtful = {fault.episode for fault in faults}
     _check_motions(dataset, sound, decisions, report, usual, doubtful)
@@ -151,7 +156,7 @@ def _check_content(
         for check in CONSISTENCY_CHECKS:
             if len(feature.entries) >= consistency.FEWEST:
                 report.run(check, feature)
-    report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
+    report.contract = infer_contract(folder, columns, decisions, features, [*profiles.values()])
     if dataset.contract is not None:
         report.contract = report.contract.keeping(dataset.contract)
 
@@ -189,7 +194,7 @@ def _check_motions(
 def _usual_motion(
     columns: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
-    features: Mapping[str, consistency.FeatureProfiles],
+    features: Mapping[str, FeatureProfiles],
 ) -> UsualMotion:
     """Usual fast step and span of joints and commands in SI units, by role."""
     usual = {}

@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.issues import Issue, warning
 from hrc_learn.demos.read.columns import ColumnMapping
@@ -14,14 +14,14 @@ from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.naming import is_hand, meaning_of_component
 from hrc_learn.demos.read.profiles import (
     FOLLOWS,
+    MOST_NAMED,
     PROMPT,
-    ColumnProfile,
     EpisodeProfile,
+    FeatureProfiles,
     Tracking,
     gain_over,
-    is_discrete,
+    listed,
 )
-from hrc_learn.demos.read.quantities import INDEX_KEYS
 
 FEWEST = 3
 """Fewest episodes among which one can be compared with the others."""
@@ -33,8 +33,6 @@ _FAR_OFF = 3.0
 """Distance from the other episodes, in spreads, above which an episode is examined."""
 _HALF_TURN = 0.9 * np.pi
 """Length of a rotation vector [rad] above which noise of the hand can flip its sign."""
-_MOST_NAMED = 6
-"""Components named in a message."""
 _SATURATED = 0.25
 """Fraction of frames at an end of the range above which a component is reported."""
 _LOST = 0.4
@@ -42,88 +40,6 @@ _LOST = 0.4
 _OFFSET = 0.1
 """Distance between command and state at rest that is reported, relative to the joint's range:
 hobby servos stop within a few degrees under load."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FeatureProfiles:
-    """Profiles of one feature in all episodes that hold it."""
-
-    key: str
-    fps: float
-    """Frame rate [1/s]."""
-    entries: list[EpisodeEntry]
-    profiles: list[ColumnProfile]
-    names: list[str]
-    smooth: np.ndarray
-    """Mask of components that move without switching, in most episodes."""
-
-    def stack(self, name: str) -> Float64[np.ndarray, "episodes ..."]:
-        """One statistic of every profile."""
-        return np.stack([getattr(profile, name) for profile in self.profiles]).astype(float)
-
-    def median(self, name: str) -> Float64[np.ndarray, " components"]:
-        """Usual value of one statistic of each component."""
-        return np.median(self.stack(name), axis=0)
-
-    @cached_property
-    def constant(self) -> Bool[np.ndarray, " components"]:
-        """Mask of components that have one value in all episodes."""
-        return self.stack("low").min(0) == self.stack("high").max(0)
-
-    def named(self, chosen: Bool[np.ndarray, " components"]) -> str:
-        """Names of the chosen components."""
-        if chosen.all() and len(chosen) > 1:
-            return "all components"
-        return _listed(self.names, np.flatnonzero(chosen))
-
-    def issue(
-        self,
-        number: int,
-        text: str,
-        components: Sequence[int],
-        severity: float = 0.0,
-        level: Literal["error", "warning"] = "warning",
-    ) -> Issue:
-        """Issue of components in one of the episodes."""
-        return self.entries[number].fault(
-            text,
-            key=self.key,
-            components=tuple(self.names[i] for i in components),
-            severity=severity,
-            level=level,
-        )
-
-    @property
-    def lengths(self) -> Int64[np.ndarray, " episodes"]:
-        """Number of frames of each episode."""
-        return np.array([entry.length for entry in self.entries])
-
-
-def _listed(names: Sequence[str], places: Sequence[int] | np.ndarray) -> str:
-    """Names of the components at some places, bounded in number."""
-    return ", ".join(names[int(place)] for place in places[:_MOST_NAMED])
-
-
-def feature_profiles(
-    folder: DatasetFolder,
-    entries: Mapping[int, EpisodeEntry],
-    profiles: Mapping[int, EpisodeProfile],
-) -> Iterator[FeatureProfiles]:
-    """Profiles of all episodes, feature by feature."""
-    for key, declared in folder.features.items():
-        known = [p for p in profiles.values() if key in p.columns and key not in INDEX_KEYS]
-        widths = {p.columns[key].start.shape for p in known}
-        if widths != {(declared.width,)}:
-            continue  # reported with the columns
-        discrete = np.mean([is_discrete(p.columns[key], p.length) for p in known], axis=0)
-        yield FeatureProfiles(
-            key=key,
-            fps=folder.fps,
-            entries=[entries[p.index] for p in known],
-            profiles=[p.columns[key] for p in known],
-            names=[declared.component(i) for i in range(declared.width)],
-            smooth=discrete < 0.5,
-        )
 
 
 def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
@@ -143,10 +59,10 @@ def lengths(entries: Sequence[EpisodeEntry]) -> Iterator[Issue]:
 def column_ranges(features: Sequence[FeatureProfiles]) -> Iterator[Issue]:
     """Components that change, and do not stay at an end of their range."""
     still = [feature.key for feature in features if feature.constant.all()]
-    if len(still) > _MOST_NAMED:
-        text = f"{len(still)} features never change: {_listed(still, range(len(still)))}, ..."
+    if len(still) > MOST_NAMED:
+        text = f"{len(still)} features never change: {listed(still, range(len(still)))}, ..."
         yield warning(message=text)
-    said = {*still} if len(still) > _MOST_NAMED else set()
+    said = {*still} if len(still) > MOST_NAMED else set()
     for feature in features:
         low, high, constant = feature.stack("low"), feature.stack("high"), feature.constant
         if constant.any() and feature.key not in said:
@@ -215,7 +131,7 @@ def noise(feature: FeatureProfiles) -> Iterator[Issue]:
     for odd, what in ((noisy, "far noisier"), (coarse, "of far fewer levels")):
         for number in np.flatnonzero(odd.any(1)).tolist():
             places = np.flatnonzero(odd[number]).tolist()
-            names = _listed(feature.names, places)
+            names = listed(feature.names, places)
             text = f"is {what} than in the other episodes: {names}"
             yield feature.issue(number, text, places, float(len(places)))
 
@@ -321,7 +237,7 @@ def _moved(
     negated = np.flatnonzero((off > _FAR_OFF) & (turned < 1.5) & (turned < 0.25 * off))
     if len(negated):
         text = "has the other sign than in the other episodes"
-        return "error", f"{text}: {_listed(names, negated)}"
+        return "error", f"{text}: {listed(names, negated)}"
     # All components together: single ones look alike in both directions.
     back = np.abs(own[[0, 1, 2, 4, 3]] - usual).mean(0) / scale
     if off.mean() > 2 and back.mean() < 0.4 * off.mean():
@@ -330,13 +246,13 @@ def _moved(
     # A moved zero shifts all five figures by the same amount.
     alike = np.ptp(shift, axis=0) < 0.2 * np.abs(shift.mean(0))
     offset = ", ".join(
-        [f"{names[i]} by {shift[1, i]:.3g}" for i in moved if alike[i]][:_MOST_NAMED]
+        [f"{names[i]} by {shift[1, i]:.3g}" for i in moved if alike[i]][:MOST_NAMED]
     )
     if offset:
         text = f"is offset from the other episodes all along: {offset}: its zero was moved?"
         return "warning", text
     if len(moved):
-        return "warning", f"is far from the other episodes: {_listed(names, moved)}"
+        return "warning", f"is far from the other episodes: {listed(names, moved)}"
     return None
 
 
@@ -478,7 +394,7 @@ def velocity_commands(commands: CommandProfiles) -> Iterator[Issue]:
     speeds = (fit > FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
     speeds &= (commands.fit < _LOST) | (prompt & (commands.fit < fit))
     if speeds.sum() > len(speeds) / 2:
-        names = _listed(commands.names, range(len(commands.names)))
+        names = listed(commands.names, range(len(commands.names)))
         text = (
             f"is taken for positions, but follows the velocity of the state with slope "
             f"{float(np.median(slope[speeds])):.2f}: {names}; declare it "
@@ -508,10 +424,10 @@ def _component_tracking(
     against = np.flatnonzero(follows & opposite)
     if len(against):
         text = "the state goes the other way than its command, in this episode alone"
-        yield f"{text}: {_listed(names, against)}", "error"
+        yield f"{text}: {listed(names, against)}", "error"
     elif len(lost):
         text = "the state does not follow its command, as it does in the other episodes"
-        yield f"{text}: {_listed(names, lost)}", "warning"
+        yield f"{text}: {listed(names, lost)}", "warning"
     with np.errstate(all="ignore"):
         ratio = np.abs(slope / np.where(usual_slope, usual_slope, 1))
     # A factor of exp(0.5) = 1.6: payload and contact explain less.
@@ -519,6 +435,6 @@ def _component_tracking(
     if len(size):
         text = (
             f"the state goes {slope[size[0]]:.2g} times as far as its command, in the other "
-            f"episodes {usual_slope[size[0]]:.2g}: {_listed(names, size)}"
+            f"episodes {usual_slope[size[0]]:.2g}: {listed(names, size)}"
         )
         yield text, "warning"

@@ -15,7 +15,6 @@ import numpy as np
 import pyarrow as pa
 
 from hrc_learn.demos.issues import DatasetError, Issue, ValidationReport, plain_text, warning
-from hrc_learn.demos.quality.consistency_checks import FeatureProfiles
 from hrc_learn.demos.read.dataset_files import INFO_PATH, open_parquet, read_json
 from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
@@ -27,6 +26,7 @@ from hrc_learn.demos.read.dataset_folder import (
 )
 from hrc_learn.demos.read.frames import RawFrames, read_each, require_rows
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, read_feature
+from hrc_learn.demos.read.profiles import FeatureProfiles
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.store import MANIFEST, changed_files
 

@@ -21,8 +21,8 @@ from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.dataset_folder import DatasetFolder
 from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json, read_sidecar
 from hrc_learn.demos.read.naming import is_hand, joint_of
-from hrc_learn.demos.read.profiles import EpisodeProfile, is_discrete
-from hrc_learn.demos.read.quantities import INDEX_KEYS, ROLES
+from hrc_learn.demos.read.profiles import EpisodeProfile, FeatureProfiles
+from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.read.unit_evidence import CONFIDENT
 from hrc_learn.demos.read.units import UnitDecision, units_of
 from hrc_learn.store import Count, new_file
@@ -245,6 +245,7 @@ def infer_contract(
     folder: DatasetFolder,
     mapping: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
+    features: Sequence[FeatureProfiles],
     profiles: Sequence[EpisodeProfile],
 ) -> Contract:
     """Infer a contract from the profiles of episodes.
@@ -253,27 +254,25 @@ def infer_contract(
         folder: The dataset.
         mapping: Meaning of its columns by their names.
         decisions: Unit of each quantity.
+        features: Profiles of its features.
         profiles: Profiles of its episodes.
     """
-    known = {
-        key: [(p.columns[key], p.length) for p in profiles if key in p.columns]
-        for key, feature in folder.features.items()
-        if feature.numeric and key not in INDEX_KEYS
-    }
+    smooth = {(f.key, i): bool(moves) for f in features for i, moves in enumerate(f.smooth)}
     unnamed: dict[tuple[str, int], ComponentContract] = {}
-    discrete: dict[str, np.ndarray] = {}
-    for key, own in known.items():
-        if not own:
-            continue
+    for feature in features:
         # Quantiles over episodes, so that a single episode does not set the range.
-        low = np.quantile([p.levels[0] for p, _ in own], 0.05, axis=0).tolist()
-        high = np.quantile([p.levels[-1] for p, _ in own], 0.95, axis=0).tolist()
-        discrete[key] = np.mean([is_discrete(p, length) for p, length in own], axis=0)
-        names = folder.features[key].names or [f"joint_{i + 1}" for i in range(len(low))]
-        for index, (name, least, most) in enumerate(zip(names, low, high, strict=False)):
-            place = {"key": key, "index": index, "name": name}
-            unnamed[key, index] = ComponentContract(
-                **place, role="other", unit="", low=least, high=most
+        levels, names = feature.stack("levels"), folder.features[feature.key].names
+        low = np.quantile(levels[:, 0], 0.05, axis=0).tolist()
+        high = np.quantile(levels[:, -1], 0.95, axis=0).tolist()
+        for index, (least, most) in enumerate(zip(low, high, strict=True)):
+            unnamed[feature.key, index] = ComponentContract(
+                key=feature.key,
+                index=index,
+                name=names[index] if names else f"joint_{index + 1}",
+                role="other",
+                unit="",
+                low=least,
+                high=most,
             )
     # A quantity is read in the order of the contract: x, y, z, w on disk become w, x, y, z.
     parts = [
@@ -282,16 +281,16 @@ def infer_contract(
         for number, column in enumerate(selection.columns)
         if column in unnamed
     ]
-    parts += [_describe_extra(p, float(discrete[p.key][p.index])) for p in unnamed.values()]
+    parts += [_describe_extra(p, smooth[p.column]) for p in unnamed.values()]
     return Contract(components=tuple(parts), fingerprint=fingerprint(folder))
 
 
-def _describe_extra(part: ComponentContract, discrete: float) -> ComponentContract:
+def _describe_extra(part: ComponentContract, smooth: bool) -> ComponentContract:
     """Complete the contract of a component that no quantity uses."""
     if part.low == part.high:
         return replace(part, role="constant", evidence="never changes")
     is_command = part.key.startswith("action") and is_hand(part.name)
-    if discrete > 0.5:
+    if not smooth:
         role = "gripper command" if is_command else "flag"
         return replace(part, role=role, evidence="switches between few levels")
     if is_command:

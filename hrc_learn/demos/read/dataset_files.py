@@ -106,10 +106,7 @@ def read_json(path: Path) -> dict:
     Raises:
         DatasetError: The file holds none.
     """
-    content = _parse(read_text(path), path)
-    if not isinstance(content, dict):
-        raise DatasetError("is no JSON object", file=path)
-    return content
+    return _parse(read_text(path), path)
 
 
 def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[dict]:
@@ -132,8 +129,6 @@ def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[di
         if not line.strip():
             continue
         row = _parse(line, file, f"line {number} ")
-        if not isinstance(row, dict):
-            raise DatasetError(f"line {number} is no JSON object", file=file)
         missing = [key for key in required if key not in row]
         if missing:
             raise DatasetError(f"line {number} lacks {', '.join(missing)}", file=file)
@@ -141,11 +136,14 @@ def read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[di
     return rows
 
 
-def _parse(text: str, file: str | Path, place: str = "") -> Any:
+def _parse(text: str, file: str | Path, place: str = "") -> dict:
     try:
-        return json.loads(text)
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: numbers of too many digits too
         raise DatasetError(f"{place}is no valid JSON: {error}", file=file) from error
+    if not isinstance(content, dict):
+        raise DatasetError(f"{place}is no JSON object", file=file)
+    return content
 
 
 def integer(value: object, name: str, file: str, lowest: int = 0) -> int:

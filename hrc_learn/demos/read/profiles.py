@@ -4,12 +4,16 @@ No statistic depends on a single value: sizes are quantiles, delays and slopes u
 The contract and the consistency checks compare these profiles over episodes.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, Shaped
+from jaxtyping import Bool, Float32, Float64, Int64, Shaped
 
+from hrc_learn.demos.issues import Issue
+from hrc_learn.demos.read.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.units import Quantities
@@ -32,6 +36,8 @@ FOLLOWS = 0.8
 """R squared above which a state follows its command."""
 PROMPT = 0.2
 """Delay within which an arm follows [s]; a slow motion resembles its own rate later."""
+MOST_NAMED = 6
+"""Components named in a message."""
 # Relative variance of a window in which a component rests, up to rounding.
 _RESTING = 1e-10
 
@@ -184,6 +190,88 @@ def is_discrete(profile: ColumnProfile, length: int) -> np.ndarray:
     # Mostly at rest, then a fifth of the range in one step, and not many values.
     switching = (profile.flat > 0.9) & (profile.step > 0.2 * span) & (profile.distinct < 50)
     return few | switching
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureProfiles:
+    """Profiles of one feature in all episodes that hold it."""
+
+    key: str
+    fps: float
+    """Frame rate [1/s]."""
+    entries: list[EpisodeEntry]
+    profiles: list[ColumnProfile]
+    names: list[str]
+    smooth: np.ndarray
+    """Mask of components that move without switching, in most episodes."""
+
+    def stack(self, name: str) -> Float64[np.ndarray, "episodes ..."]:
+        """One statistic of every profile."""
+        return np.stack([getattr(profile, name) for profile in self.profiles]).astype(float)
+
+    def median(self, name: str) -> Float64[np.ndarray, " components"]:
+        """Usual value of one statistic of each component."""
+        return np.median(self.stack(name), axis=0)
+
+    @cached_property
+    def constant(self) -> Bool[np.ndarray, " components"]:
+        """Mask of components that have one value in all episodes."""
+        return self.stack("low").min(0) == self.stack("high").max(0)
+
+    def named(self, chosen: Bool[np.ndarray, " components"]) -> str:
+        """Names of the chosen components."""
+        if chosen.all() and len(chosen) > 1:
+            return "all components"
+        return listed(self.names, np.flatnonzero(chosen))
+
+    def issue(
+        self,
+        number: int,
+        text: str,
+        components: Sequence[int],
+        severity: float = 0.0,
+        level: Literal["error", "warning"] = "warning",
+    ) -> Issue:
+        """Issue of components in one of the episodes."""
+        return self.entries[number].fault(
+            text,
+            key=self.key,
+            components=tuple(self.names[i] for i in components),
+            severity=severity,
+            level=level,
+        )
+
+    @property
+    def lengths(self) -> Int64[np.ndarray, " episodes"]:
+        """Number of frames of each episode."""
+        return np.array([entry.length for entry in self.entries])
+
+
+def listed(names: Sequence[str], places: Sequence[int] | np.ndarray) -> str:
+    """Names of the components at some places, bounded in number."""
+    return ", ".join(names[int(place)] for place in places[:MOST_NAMED])
+
+
+def feature_profiles(
+    folder: DatasetFolder,
+    entries: Mapping[int, EpisodeEntry],
+    profiles: Mapping[int, EpisodeProfile],
+) -> Iterator[FeatureProfiles]:
+    """Profiles of all episodes, feature by feature."""
+    for key, declared in folder.features.items():
+        known = [p for p in profiles.values() if key in p.columns and key not in INDEX_KEYS]
+        widths = {p.columns[key].start.shape for p in known}
+        if widths != {(declared.width,)}:
+            continue  # reported with the columns
+        discrete = np.mean([is_discrete(p.columns[key], p.length) for p in known], axis=0)
+        yield FeatureProfiles(
+            key=key,
+            fps=folder.fps,
+            entries=[entries[p.index] for p in known],
+            profiles=[p.columns[key] for p in known],
+            names=[declared.component(i) for i in range(declared.width)],
+            smooth=discrete < 0.5,
+        )
 
 
 def gain_over(tracking: Tracking, delay: int) -> float:
