@@ -11,7 +11,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -123,24 +123,17 @@ class _ReportFile:
 def write_report(folder: str | os.PathLike[str], report: Report) -> None:
     """Write `report.json`, pictures, `film.mp4` and the self-contained `report.html`.
 
-    Pictures are `figures/*.png`, and `*.svg` beside figures of few lines.
-
     Args:
-        folder: Folder of the run. Each file appears only when complete, `report.json` last.
+        folder: Folder of the run. Each file appears only when complete, `report.json` last;
+            pictures go to `figures/`.
         report: Content of the report.
     """
     folder = Path(folder)
-    report = _drawn(report)
+    drawn = {picture.name: picture.png for picture in report.pictures}
     (folder / FIGURES).mkdir(parents=True, exist_ok=True)
-    for picture in report.pictures:
-        with new_file(folder / FIGURES / f"{picture.name}.png") as part:
-            part.write_bytes(picture.png())
-        vector = folder / FIGURES / f"{picture.name}.svg"
-        if picture.svg is not None:
-            with new_file(vector) as part:
-                part.write_bytes(picture.svg)
-        else:
-            vector.unlink(missing_ok=True)  # of an older report
+    for name, png in drawn.items():
+        with new_file(folder / FIGURES / f"{name}.png") as part:
+            part.write_bytes(png)
     if report.film is not None:
         with new_file(folder / FILM) as part:
             part.write_bytes(report.film.mp4)
@@ -171,15 +164,6 @@ def read_report(folder: str | os.PathLike[str]) -> Report:
     return _from_file(content, folder)
 
 
-def _drawn(report: Report) -> Report:
-    """Report with every figure drawn, so that none is drawn twice."""
-    sections = [
-        replace(section, figures=[p.drawn() for p in section.figures])
-        for section in report.sections
-    ]
-    return replace(report, sections=sections)
-
-
 def _as_file(report: Report) -> dict[str, object]:
     """Content of `report.json`, which fits `_ReportFile`; pictures and film are files."""
     sections = [
@@ -199,9 +183,8 @@ def _as_file(report: Report) -> dict[str, object]:
 
 def _from_file(content: _ReportFile, folder: Path) -> Report:
     def picture(shown: _PictureFile) -> Picture:
-        png, svg = (folder / FIGURES / f"{shown.name}.{kind}" for kind in ("png", "svg"))
-        vector = svg.read_bytes() if svg.is_file() else None
-        return Picture(shown.name, png.read_bytes(), shown.caption, vector)
+        png = (folder / FIGURES / f"{shown.name}.png").read_bytes()
+        return Picture(shown.name, png, shown.caption)
 
     fields = {k: v for k, v in vars(content).items() if k not in ("format", "version")}
     fields["sections"] = [

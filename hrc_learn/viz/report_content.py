@@ -9,6 +9,7 @@ import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 150  # sharp in print, at the width of a page
-_LARGEST_SVG = 400_000  # beyond, curves of thousands of points: a PNG is smaller by far [bytes]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,8 +82,6 @@ class Picture:
     drawing: "Figure | UInt8[np.ndarray, 'height width 3'] | bytes"
     """A matplotlib figure, an image, or a finished PNG file."""
     caption: str
-    svg: bytes | None = None
-    """The picture as vector graphics, which a page prefers; None without them."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w-]+", self.name):
@@ -92,8 +90,9 @@ class Picture:
                 "use letters, digits, hyphens and underscores."
             )
 
+    @cached_property
     def png(self) -> bytes:
-        """The picture as a PNG file."""
+        """The picture as a PNG file, drawn once."""
         if isinstance(self.drawing, bytes):
             return self.drawing
         buffer = BytesIO()
@@ -104,21 +103,6 @@ class Picture:
         else:
             self.drawing.savefig(buffer, format="png", dpi=_DPI)
         return buffer.getvalue()
-
-    def drawn(self) -> "Picture":
-        """Picture as files: a figure as PNG and, unless too large, as SVG."""
-        return replace(self, drawing=self.png(), svg=self.svg or self._vector())
-
-    def _vector(self) -> bytes | None:
-        if isinstance(self.drawing, (bytes, np.ndarray)):
-            return None
-        import matplotlib
-
-        buffer = BytesIO()
-        # The same file from the same figure: without the time, and with fixed names inside.
-        with matplotlib.rc_context({"svg.hashsalt": self.name}):
-            self.drawing.savefig(buffer, format="svg", metadata={"Date": None})
-        return buffer.getvalue() if buffer.tell() <= _LARGEST_SVG else None
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ def test_lines_keep_their_colours_beside_a_photograph(experiments):
     lines = {40: (0, 114, 178), 80: (0, 158, 115), 120: (230, 159, 0)}
     for row, colour in lines.items():
         photograph[row] = colour
-    small = experiments.small(Picture("x", photograph, "").png())
+    small = experiments.small(Picture("x", photograph, "").png)
     shown = np.asarray(Image.open(BytesIO(small)).convert("RGB")).astype(int)
     for row, colour in lines.items():
         assert np.abs(shown[row] - colour).max() < 10

@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -344,8 +343,7 @@ def test_common_values_of_several_runs_are_compared():
 def test_a_folder_holds_page_pictures_and_data(tmp_path):
     write_report(tmp_path, report())
     files = {str(f.relative_to(tmp_path)) for f in tmp_path.rglob("*") if f.is_file()}
-    pictures = {"figures/path.png", "figures/path.svg"}
-    assert files == {"report.html", "report.json", *pictures}
+    assert files == {"report.html", "report.json", "figures/path.png"}
     assert Image.open(tmp_path / "figures/path.png").size == (450, 300)
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert html == reports_page("Grasp", [read_report(tmp_path)])
@@ -386,32 +384,6 @@ def test_a_report_is_read_as_it_was_written(tmp_path):
     assert read.versions == {"numpy": "2.2.6"}
     assert read.command == "python run.py --seed 0"
     assert read.pictures[0].drawing == (tmp_path / "figures/path.png").read_bytes()
-
-
-def test_a_figure_is_shown_as_vector_graphics_that_do_not_change(tmp_path):
-    write_report(tmp_path, report())
-    svg = (tmp_path / "figures/path.svg").read_bytes()
-    assert read_report(tmp_path).pictures[0].svg == svg
-    (source,) = Page((tmp_path / "report.html").read_text(encoding="utf-8")).images
-    kind, data = source.split(",", 1)
-    assert kind == "data:image/svg+xml;base64"
-    assert base64.b64decode(data) == svg
-    root = ElementTree.fromstring(svg)
-    assert root.tag == "{http://www.w3.org/2000/svg}svg"
-    assert Picture("path", figure(), "").drawn().svg == svg
-    # A photograph in its place takes the older vector graphics away.
-    image = np.zeros((4, 6, 3), dtype=np.uint8)
-    sections = [Section(heading="Path", figures=[Picture("path", image, "")])]
-    write_report(tmp_path, report(sections=sections))
-    assert not (tmp_path / "figures/path.svg").exists()
-    assert read_report(tmp_path).pictures[0].svg is None
-
-
-def test_a_figure_of_many_points_stays_a_picture():
-    crowded = Figure()
-    x, y = np.random.default_rng(0).uniform(size=(2, 16_000))
-    crowded.subplots().plot(x, y)
-    assert Picture("crowded", crowded, "").drawn().svg is None
 
 
 def test_a_failed_report_leaves_the_old_one_alone(tmp_path):

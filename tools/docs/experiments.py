@@ -88,7 +88,7 @@ def shown_pictures(kind: str, report: Report, page: str) -> dict[str, bytes]:
             f"the page shows a picture {min(unknown)!r} of {kind}, but the report has "
             f"{', '.join(there)}"
         )
-    return {f"{kind}_{name}.png": small(there[name].png()) for name in wanted}
+    return {f"{kind}_{name}.png": small(there[name].png) for name in wanted}
 
 
 def animation(mp4: bytes) -> bytes:
