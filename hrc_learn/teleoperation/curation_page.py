@@ -7,17 +7,14 @@ import struct
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import msgspec
 import numpy as np
-import torch
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
-from hrc_learn.demos.dataset_arm import arm_of_dataset
 from hrc_learn.demos.images import ImageReader, jpeg, thumbnail_size
 from hrc_learn.demos.issues import plain_text
 from hrc_learn.demos.quality.ranking import MEASURES, Ranking
@@ -30,7 +27,6 @@ from hrc_learn.demos.quality.repair import (
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.read.metadata import Feature
-from hrc_learn.demos.read.source import DemonstrationSource
 from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate.admission import RefusedError
@@ -166,16 +162,14 @@ class CurationPage:
         """All that moves in an episode, over time."""
         source = open_demos(self.ranking.path, [episode], **self._options)
         (demo,) = source
-        frames = _stretches(demo)
         return {
             "time": demo.time,
-            "arm": _arm(source, demo),
             "charts": [
                 {
                     "name": plain_text(name),
                     "unit": unit,
                     "lines": [
-                        {"name": plain_text(label), "points": _points(values, frames)}
+                        {"name": plain_text(label), "points": _points(values)}
                         for label, values in lines.items()
                     ],
                 }
@@ -256,27 +250,6 @@ def _json(content: Any) -> Content:
     return Content(body=_encode(content), kind="application/json")
 
 
-def _arm(source: DemonstrationSource, demo: Demonstration) -> dict[str, Any] | None:
-    """Points along the arm at every few frames; None if the dataset's arm is not known."""
-    try:
-        found = arm_of_dataset(source)
-    except DatasetError:
-        return None
-    if demo.joint_position is None:
-        return None
-    every = 1 + len(demo) // _MOST_POINTS
-    frames = found.arm.link_frames(found.positions(demo.joint_position[::every]))
-    base = frames.new_zeros(len(frames), 1, 3)
-    points = torch.cat([base, frames[..., 3]], dim=1)
-    opening = found.opening(demo)
-    return {
-        "name": found.arm.name,
-        "every": every,
-        "points": np.round(points.numpy(), 4),  # tenths of a millimetre
-        "opening": None if opening is None else np.round(opening[::every], 3),
-    }
-
-
 def _charts(
     demo: Demonstration, features: Mapping[str, Feature], units: Mapping[str, UnitDecision]
 ) -> list[tuple[str, str, dict[str, np.ndarray]]]:
@@ -305,19 +278,14 @@ def _charts(
     return charts
 
 
-def _stretches(demo: Demonstration) -> np.ndarray | None:
-    """Frame numbers that part a long curve into stretches; None if every frame is shown."""
-    if len(demo) <= _MOST_POINTS:
-        return None
-    return np.linspace(0, len(demo), _MOST_POINTS // 2 + 1).astype(int)
-
-
-def _points(values: np.ndarray, edges: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Frames and values of a curve: its extremes within every stretch, so that none is lost."""
-    if edges is None:
-        return np.arange(len(values)), values
-    chosen: list[int] = []
-    for first, last in pairwise(edges.tolist()):
-        part = values[first:last]
-        chosen += sorted({first + int(part.argmin()), first + int(part.argmax())})
-    return np.array(chosen), values[chosen]
+def _points(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frames and values of a curve; of a long one its extremes within every stretch, so that no
+    spike is lost.
+    """
+    frames = np.arange(len(values))
+    if len(values) <= _MOST_POINTS:
+        return frames, values
+    stretches = np.array_split(frames, _MOST_POINTS // 2)
+    ends = [(part[values[part].argmin()], part[values[part].argmax()]) for part in stretches]
+    chosen = np.unique(ends)
+    return chosen, values[chosen]

@@ -270,68 +270,12 @@ function show() {
   }
   document.querySelector("[data-verdict=cut]").textContent = `Cut to ${marks.start} - ${marks.stop}`;
   for (const canvas of document.querySelectorAll("#charts canvas")) drawChart(canvas);
-  drawArm();
   return showImages();
-}
-
-// The arm, as lines between its joints; dragging turns it.
-
-let view = { yaw: 0.6, pitch: 0.35 };
-
-function showArm() {
-  document.getElementById("arm")?.remove();
-  if (!curves.arm) return;
-  const canvas = element("canvas", { width: 480, height: 360 });
-  canvas.onpointermove = (event) => {
-    if (!event.buttons) return;
-    view.yaw -= event.movementX / 150;
-    view.pitch = Math.min(Math.max(view.pitch + event.movementY / 150, -1.5), 1.5);
-    drawArm();
-  };
-  const label = element("figcaption", { textContent: `${curves.arm.name} (drag to turn)` });
-  byId("videos").append(element("figure", { id: "arm" }, canvas, label));
-}
-
-function drawArm() {
-  const canvas = document.querySelector("#arm canvas");
-  if (!canvas || !curves?.arm) return;
-  const [pen, w, h] = canvasOf(canvas);
-  const { points, every, opening } = curves.arm;
-  const reach = Math.max(0.1, ...points.map((p) => Math.hypot(...p.at(-1))));
-  const scale = (0.42 * Math.min(w, h)) / reach;
-  const place = ([x, y, z]) => {
-    const depth = x * Math.cos(view.yaw) + y * Math.sin(view.yaw);
-    const side = y * Math.cos(view.yaw) - x * Math.sin(view.yaw);
-    const up = z * Math.cos(view.pitch) - depth * Math.sin(view.pitch);
-    return [w / 2 + scale * side, 0.7 * h - scale * up];
-  };
-  const line = (corners, style, width) => {
-    pen.beginPath();
-    for (const corner of corners) pen.lineTo(...place(corner));
-    [pen.strokeStyle, pen.lineWidth] = [style, width];
-    [pen.lineCap, pen.lineJoin] = ["round", "round"];
-    pen.stroke();
-  };
-  const floor = reach * 0.6;
-  for (let i = -2; i <= 2; i += 1) {
-    line([[(i * floor) / 2, -floor, 0], [(i * floor) / 2, floor, 0]], colour("--usual"), 0.5);
-    line([[-floor, (i * floor) / 2, 0], [floor, (i * floor) / 2, 0]], colour("--usual"), 0.5);
-  }
-  line(points.map((p) => p.at(-1)), colour("--command"), 1);
-  const now = Math.min(Math.floor(frame / every), points.length - 1);
-  line(points[now], colour("--ink"), Math.max(5, scale * reach * 0.04));
-  line(points[now].slice(-2), colour("--state"), Math.max(3, scale * reach * 0.025));
-  const [x, y] = place(points[now].at(-1));
-  pen.beginPath();
-  pen.arc(x, y, 4 + (opening ? 8 * opening[now] : 0), 0, 7); // as wide as the gripper is open
-  [pen.strokeStyle, pen.lineWidth] = [colour("--state"), 2];
-  pen.stroke();
 }
 
 // Curves.
 
 function charts() {
-  showArm();
   byId("charts").replaceChildren(
     ...curves.charts.map((chart, index) => {
       const canvas = element("canvas");
