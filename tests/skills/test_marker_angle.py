@@ -112,9 +112,3 @@ def test_a_saved_angle_is_read_back(tmp_path):
     path.write_text(json.dumps({"version": 9}))
     with pytest.raises(ValueError, match=r"angle\.json"):
         MarkerAngle.load(path)
-
-
-def test_no_demonstration_teaches_nothing():
-    nothing = Pose(torch.zeros(0, 3).double(), torch.zeros(0, 4).double())
-    with pytest.raises(ValueError, match="one demonstration"):
-        MarkerAngle.fit(camera_vector(camera()), np.zeros((0, 2)), [], nothing, TARGET)

@@ -88,11 +88,6 @@ def test_every_pixel_knows_its_ray():
     np.testing.assert_allclose(pixels, np.stack([u, v], axis=-1), atol=1e-3)
 
 
-def test_lens_refuses_an_image_of_another_size():
-    with pytest.raises(ValueError, match=r"Lens\.pinhole"):
-        Lens(CameraModel(width=320, height=240)).apply(GREY)
-
-
 def test_a_marker_seen_through_the_lens_lies_where_the_model_says():
     model = overhead()
     lens = Lens(model)
