@@ -275,8 +275,6 @@ class MotionSource:
 
     robot: Arm
     fps: float
-    objects: Mapping[str, Pose]
-    """Poses of each object at the start of each demonstration, (n)."""
     start: Pose
     """First pose of the tool in each demonstration, (n)."""
     near: Float[Tensor, "n joints"]
@@ -338,7 +336,6 @@ class MotionSource:
         return cls(
             robot=robot,
             fps=float(demos[0].fps),
-            objects=objects,
             start=stacked([pose[0] for pose in tool]),
             near=posture,
             segments=tuple(segments),

@@ -346,3 +346,8 @@ class TestCode:
         code, _ = self.code(16)
         assert len(code.encode([0] * 30)) == 1
         assert code.encode([3] + [0] * 29)[-1] == 0
+
+    def test_equally_likely_values_take_about_equally_many_tokens(self):
+        """Questions halve what is left: 127 values are told apart by two or three of 15."""
+        code = TokenCode(16, np.full((1, 64), 1 / 64))
+        assert max(len(code.encode([value])) for value in range(-63, 64)) <= 3

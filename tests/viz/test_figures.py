@@ -22,7 +22,6 @@ def jacobian_figure(run):
 
 
 FIGURES = [figures.joints_figure, person_figure, jacobian_figure]
-RESIDUAL = {10: 1e-2, 30: 1e-3, 50: 1e-4}
 
 
 def lines(axes) -> dict[str, np.ndarray]:
