@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.read.columns import ColumnSelection
+from hrc_learn.demos.read.columns import ColumnSelection, feature_key
 from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.naming import (
     is_hand,
@@ -117,7 +117,10 @@ def find_cameras(first: Recording, named: Mapping[str, str] | None) -> dict[str,
     """
     found: dict[str, str] = {}
     if named is not None:
-        found = {camera: first.places(name, camera)[0][0] for camera, name in named.items()}
+        found = {
+            camera: feature_key(camera, name, first.fields, first.file)
+            for camera, name in named.items()
+        }
         for camera, name in found.items():
             if first.fields[name].kind not in ("image", "encoded"):
                 raise first.error(f"{name} holds no images", camera)

@@ -346,6 +346,16 @@ def test_a_wrong_mapping_says_what_exists(tmp_path, mapping, message):
         load_demos(root, mapping=mapping)
 
 
+def test_a_component_of_two_features_needs_the_name_of_one(tmp_path):
+    q = joint_path()
+    episode, names = {STATE: q, "action": 2 * q}, {STATE: panda, "action": panda}
+    root = write_folder(tmp_path / "set", [episode], names)
+    with pytest.raises(DatasetError, match=rf"write one of {STATE}/{panda[0]}, action/"):
+        load_demos(root, mapping={"joint_position": [panda[0]]})
+    read = load_demos(root, mapping={"joint_position": [f"action/{panda[0]}"]})
+    np.testing.assert_allclose(read[0].joint_position, 2 * q[:, :1], atol=1e-6)
+
+
 def test_joints_are_selected_by_name(tmp_path):
     q = joint_path()
     root = write_folder(

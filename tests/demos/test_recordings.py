@@ -540,6 +540,20 @@ def test_rx_ry_rz_may_be_angles(tmp_path):
     assert "euler_xyz" in " ".join(plan(tmp_path / "a.csv").meaning.notes)
 
 
+def test_cameras_are_named_by_the_end_of_their_path_or_left_out(tmp_path):
+    frames = np.zeros((40, 32, 48, 3), np.uint8)
+    write_hdf5(tmp_path / "a.h5", {"q": Q, "t": TIME, "obs/top": frames, "obs/side": frames})
+    made = plan(tmp_path / "a.h5", images={"front": "top"})
+    assert made.meaning.cameras == {"front": "obs/top"}
+    assert "obs/side" in made.meaning.left_out
+    with pytest.raises(
+        DatasetError, match="no column 'back' for front; there are features obs"
+    ):
+        plan(tmp_path / "a.h5", images={"front": "back"})
+    with pytest.raises(DatasetError, match="q holds no images"):
+        plan(tmp_path / "a.h5", images={"front": "q"})
+
+
 def test_a_topic_of_ros_as_a_table(tmp_path):
     head = "%time," + ",".join(
         f"field.{n}{k}" for n in ("position", "velocity") for k in range(3)

@@ -239,19 +239,9 @@ def column_places(
             for index, known in enumerate(feature.names or ())
             if text in (known, f"{name}/{known}")
         ]
-        found = named or [(name, 0) for name in features if name.endswith(f"/{key}")]
-        if len(found) > 1:
-            options = ", ".join(f"{name}/{text}" if named else name for name, _ in found)
-            text = f"{text!r} for {role} is ambiguous: write one of {options}"
-            raise DatasetError(text, file=file, key=role)
-        if named:
+        if len(named) == 1:
             return named
-        if not found:
-            words = [n for feature in features.values() for n in feature.names or ()]
-            known = f"features {', '.join(features)}; components {', '.join(words) or 'none'}"
-            text = f"there is no column {text!r} for {role}; there are {known}"
-            raise DatasetError(text, file=file, key=role)
-        key = found[0][0]
+        key = feature_key(role, key, features, file, [f"{name}/{text}" for name, _ in named])
     width = features[key].width
     first, stop = 0, width
     if match:
@@ -265,6 +255,32 @@ def column_places(
         )
         raise DatasetError(text, file=file, key=key)
     return [(key, index) for index in range(first, stop)]
+
+
+def feature_key(
+    role: str,
+    text: str,
+    features: Mapping[str, HasComponents],
+    file: str | Path,
+    components: Sequence[str] = (),
+) -> str:
+    """Feature of this key, or the only one whose path ends so; arguments as in `column_places`.
+
+    Raises:
+        DatasetError: There is no such feature, or there are several, or several components.
+    """
+    if text in features:
+        return text
+    found = components or [key for key in features if key.endswith(f"/{text}")]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        text = f"{text!r} for {role} is ambiguous: write one of {', '.join(found)}"
+    else:
+        words = [name for feature in features.values() for name in feature.names or ()]
+        known = f"features {', '.join(features)}; components {', '.join(words) or 'none'}"
+        text = f"there is no column {text!r} for {role}; there are {known}"
+    raise DatasetError(text, file=file, key=role)
 
 
 class _Conventions:
