@@ -396,6 +396,17 @@ def test_transforms_are_poses_and_those_of_a_camera_are_not(tmp_path):
     assert "camera_extrinsics" in plan(tmp_path / "a.npz").meaning.left_out
 
 
+@pytest.mark.parametrize(("name", "shape"), [("H", (40, 4, 4)), ("hand_pose", (40, 16))])
+def test_transforms_are_known_by_their_shape_or_by_sixteen_numbers_of_a_pose(
+    tmp_path, name, shape
+):
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, 3] = Q
+    np.savez(tmp_path / "a.npz", **{name: poses.reshape(shape), "t": TIME})
+    (demo,) = read(tmp_path / "a.npz")
+    np.testing.assert_allclose(demo.position, Q)
+
+
 def test_slower_sensors_hold_their_last_value_and_know_no_future(tmp_path):
     time, slow = np.arange(100) / 100, np.arange(12) / 10 - 0.05
     write_hdf5(
