@@ -93,7 +93,7 @@ class _EpisodeList:
         data_files: Number of data files of an earlier dataset.
         episodes: Number of episodes.
         frames: Number of frames.
-        videos: Number of video files of each camera.
+        videos: Number of video files of each camera of an earlier dataset.
     """
 
     def __init__(self, target: Path, link_videos: bool):
@@ -102,7 +102,7 @@ class _EpisodeList:
         self.data_files = self.episodes = self.frames = 0
         self.videos: dict[str, int] = {}
         self._link = link_videos
-        self._placed: dict[tuple[str, Path], int] = {}
+        self._placed: dict[str, dict[Path, int]] = {}
         self._tables: list[pa.Table] = []
         self._rows: list[dict] = []
 
@@ -138,12 +138,12 @@ class _EpisodeList:
 
     def _place_video(self, key: str, segment: VideoSegment) -> dict[str, int | float]:
         """Place the video file of a segment; a file shared by episodes is placed once."""
-        if (key, segment.file) not in self._placed:
-            number = self.videos.get(key, 0)
-            path = self.target / metadata.place(metadata.VIDEO_PATH, number, video_key=key)
-            _put(segment.file, path, link=self._link)
-            self.videos[key], self._placed[key, segment.file] = number + 1, number
-        number = self._placed[key, segment.file]
+        placed = self._placed.setdefault(key, {})
+        if segment.file not in placed:
+            number = placed[segment.file] = self.videos.get(key, 0) + len(placed)
+            path = metadata.place(metadata.VIDEO_PATH, number, video_key=key)
+            _put(segment.file, self.target / path, link=self._link)
+        number = placed[segment.file]
         return {
             f"videos/{key}/chunk_index": number // metadata.CHUNK_SIZE,
             f"videos/{key}/file_index": number % metadata.CHUNK_SIZE,

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
     from huggingface_hub import DatasetCard, HfApi
 
 UPLOADED = ("data/**", "videos/**", "images/**", "meta/**", "LICENSE*", "*.md")
-"""Files that belong to a dataset. `push_dataset` does not upload other files."""
-_OWNED = ("data/*", "videos/*", "images/*", "meta/*")
-"""Files that the upload deletes from the repository if the folder no longer has them; * also
-matches subfolders."""
+"""Files that belong to a dataset. `push_dataset` does not upload other files, and deletes those
+in the four folders from the repository if the dataset no longer has them."""
 _CARD = "README.md"
 _MOST_TASKS = 20
 """Largest number of tasks that the card lists."""
@@ -121,7 +119,7 @@ def _upload(api: "HfApi", root: Path, push: Push) -> None:
         folder_path=root,
         allow_patterns=[*UPLOADED],
         ignore_patterns=[_CARD],
-        delete_patterns=[*_OWNED],
+        delete_patterns=[*UPLOADED[:4]],
         commit_message="Upload the dataset",
         **where,
     )
