@@ -15,14 +15,15 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
+from hrc_learn.demos.charts import demonstration_charts, own_unit
 from hrc_learn.demos.dataset_arm import DatasetArm
 from hrc_learn.demos.images import CameraImages
-from hrc_learn.demos.read.units import UnitDecision, unit_factor
+from hrc_learn.demos.read.units import UnitDecision
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.drawing import arm_bodies
 from hrc_learn.log import JointRanges
 from hrc_learn.viz import palette
-from hrc_learn.viz.panels import Curves, Plot, Tab, limit_curves, several, slug
+from hrc_learn.viz.panels import Plot, Tab, limit_curves, several, slug
 from hrc_learn.viz.rerun_stream import (
     POSE_RATE,
     TIMELINE,
@@ -132,8 +133,9 @@ def send_demonstrations(
         timelines = [f"episode {demo.episode}", *[TIMELINE] * (k == 0)]
         _send_arm(stream, shown, demo, timelines, first=k == 0)
         _send_images(stream, shown.images(demo), timelines)
-        for curves in _episode_curves(shown, demo):
-            send_curves(stream, demo.time, curves, timelines)
+        for plot in _episode_tab(shown, demo).plots:
+            for curves in plot.curves:
+                send_curves(stream, demo.time, curves, timelines)
         task = rr.TextDocument.columns(text=[f"Episode {demo.episode}: {demo.task}"])
         stream.send_columns("task", seconds(demo.time[:1], timelines), task)
         path = _send_path(stream, shown, demo, k)
@@ -182,72 +184,21 @@ def _send_images(
         stream.send_columns(path, index, columns)
 
 
-def _own_unit(shown: ShownDataset, role: str, column: int) -> tuple[str, float]:
-    """Unit of a joint in the dataset, and the factor from it to the unit of the reader."""
-    decision = shown.units.get(role)
-    if decision is None:
-        return "rad", 1.0
-    unit = decision.unit_of(column)
-    return unit, unit_factor(role, unit)
-
-
 def _episode_tab(shown: ShownDataset, demo: Demonstration) -> Tab:
     """All that was recorded in an episode, commands next to what was measured."""
-    plots: dict[str, list[Curves]] = {}
-    for curves in _episode_curves(shown, demo):
-        plots.setdefault(curves.path.removesuffix("/limits"), []).append(curves)
-    drawn = [
-        Plot(
-            title=_title(shown, demo, path),
-            curves=tuple(curves),
-            legend=path in ("episode/position", "episode/feature", "episode/effort"),
-        )
-        for path, curves in plots.items()
-    ]
+    limits, plots = _limits(shown), []
+    for chart in demonstration_charts(demo, shown.units):
+        path, is_joint = f"episode/{chart.key}", chart.key.startswith("joint_")
+        values = np.stack([*chart.lines.values()], axis=1)
+        curves = [several(path, chart.lines, values)]
+        if is_joint and limits is not None:
+            joint = int(chart.key.removeprefix("joint_"))
+            curves.append(limit_curves(f"{path}/limits", limits, joint, len(demo)))
+        title = f"{chart.title} [{chart.unit}]"
+        legend = not is_joint and len(chart.lines) > 1
+        plots.append(Plot(title=title, curves=tuple(curves), legend=legend))
     title = "Episode: measured blue, commanded orange, limits red"
-    return Tab(title=title, plots=tuple(drawn), columns=1 + (len(drawn) > 3))
-
-
-def _title(shown: ShownDataset, demo: Demonstration, path: str) -> str:
-    words = {
-        "episode/position": "Tool centre point [m]",
-        "episode/feature": "Feature in the image [px]",
-        "episode/effort": "Effort of the person [N m]",
-    }
-    if path in words:
-        return words[path]
-    if path == "episode/gripper":
-        decision = shown.units.get("gripper")
-        return f"Gripper [{'m' if decision is None else decision.unit}]"
-    joint = int(path.rpartition("_")[2])
-    unit, _ = _own_unit(shown, "joint_position", joint)
-    return f"{demo.joint_names[joint]} [{unit}]"
-
-
-def _episode_curves(shown: ShownDataset, demo: Demonstration) -> Iterator[Curves]:
-    """Curves of an episode; joints and gripper in the units of the dataset."""
-    for joint, _ in enumerate(demo.joint_names):
-        names, columns = [], []
-        for role, name in (("joint_position", "measured"), ("command_position", "commanded")):
-            if (values := getattr(demo, role)) is not None:
-                _, factor = _own_unit(shown, role, joint)
-                names.append(name)
-                columns.append(values[:, joint] / factor)
-        if names:
-            path = f"episode/joint_{joint}"
-            yield several(path, names, np.stack(columns, axis=1))
-            if (limits := _limits(shown)) is not None:
-                yield limit_curves(f"{path}/limits", limits, joint, len(demo))
-    for name, names, values, role in (
-        ("gripper", ("opening",), demo.gripper, "gripper"),
-        ("position", ("x", "y", "z"), demo.position, ""),
-        ("feature", ("u (right)", "v (down)"), _seen(demo), ""),
-        ("effort", demo.joint_names, demo.human_effort, ""),
-    ):
-        if values is not None:
-            factor = _own_unit(shown, role, 0)[1] if role in shown.units else 1.0
-            columns = values.reshape(len(values), -1) / factor
-            yield several(f"episode/{name}", names, columns)
+    return Tab(title=title, plots=tuple(plots), columns=1 + (len(plots) > 3))
 
 
 def _limits(shown: ShownDataset) -> JointRanges | None:
@@ -257,18 +208,11 @@ def _limits(shown: ShownDataset) -> JointRanges | None:
     count = len(shown.demos[0].joint_names)
     lower, upper = np.full(count, np.nan), np.full(count, np.nan)
     for joint, column in enumerate(shown.arm.columns):
-        unit, factor = _own_unit(shown, "joint_position", column)
+        unit, factor = own_unit(shown.units, "joint_position", column)
         if unit in ("rad", "deg"):  # shares of a range have theirs in their name
             lower[column] = float(shown.arm.arm.limits.lower[joint]) / factor
             upper[column] = float(shown.arm.arm.limits.upper[joint]) / factor
     return JointRanges(lower=lower, upper=upper)
-
-
-def _seen(demo: Demonstration) -> Float[np.ndarray, "frames 2"] | None:
-    """Image feature, NaN where it was not seen."""
-    if demo.feature is None or demo.feature_visible is None:
-        return demo.feature
-    return np.where(demo.feature_visible[:, None], demo.feature, np.nan)
 
 
 def _send_path(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from hrc_learn.demos import DatasetError, Demonstration, open_demos
+from hrc_learn.demos.charts import Chart, demonstration_charts
 from hrc_learn.demos.images import ImageReader, jpeg, thumbnail_size
 from hrc_learn.demos.issues import plain_text
 from hrc_learn.demos.quality.ranking import MEASURES, Ranking
@@ -27,7 +28,6 @@ from hrc_learn.demos.quality.repair import (
 from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.read.metadata import Feature
-from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
 from hrc_learn.teleoperation.gate.admission import RefusedError
 from hrc_learn.teleoperation.gate.gate import Visitor, incoming
@@ -162,18 +162,20 @@ class CurationPage:
         """All that moves in an episode, over time."""
         source = open_demos(self.ranking.path, [episode], **self._options)
         (demo,) = source
+        known = demonstration_charts(demo, source.units)
+        charts = [*known, *_other_charts(demo, self._features)]
         return {
             "time": demo.time,
             "charts": [
                 {
-                    "name": plain_text(name),
-                    "unit": unit,
+                    "name": plain_text(chart.title),
+                    "unit": chart.unit,
                     "lines": [
-                        {"name": plain_text(label), "points": _points(values)}
-                        for label, values in lines.items()
+                        {"name": plain_text(name), "points": _points(values)}
+                        for name, values in chart.lines.items()
                     ],
                 }
-                for name, unit, lines in _charts(demo, self._features, source.units)
+                for chart in charts
             ],
         }
 
@@ -250,32 +252,12 @@ def _json(content: Any) -> Content:
     return Content(body=_encode(content), kind="application/json")
 
 
-def _charts(
-    demo: Demonstration, features: Mapping[str, Feature], units: Mapping[str, UnitDecision]
-) -> list[tuple[str, str, dict[str, np.ndarray]]]:
-    """Name, unit and lines of each chart; columns without a meaning go by their own names."""
-    charts = []
-    moved = {"state": demo.joint_position, "command": demo.command_position}
-    decision = units.get("joint_position")
-    for k, joint in enumerate(demo.joint_names):
-        unit = "rad" if decision is None else decision.unit_of(k)
-        factor = unit_factor("joint_position", unit)
-        lines = {n: values[:, k] / factor for n, values in moved.items() if values is not None}
-        if lines:
-            charts.append((joint, unit, lines))
-    others = (("position", "m", "xyz"), ("feature", "px", "uv"))
-    for name, unit, letters in others:
-        if (values := getattr(demo, name)) is not None:
-            charts.append((name, unit, dict(zip(letters, values.T, strict=False))))
-    if demo.gripper is not None:
-        unit = units["gripper"].unit if "gripper" in units else "1"
-        values = demo.gripper / unit_factor("gripper", unit)
-        charts.append(("gripper", unit.replace("1", ""), {"state": values}))
+def _other_charts(demo: Demonstration, features: Mapping[str, Feature]) -> Iterator[Chart]:
+    """Charts of columns without a meaning, by their own names."""
     for key, values in demo.extra.items():
         if 0 < values.shape[1] <= 12:
             names = [features[key].component(i) for i in range(values.shape[1])]
-            charts.append((key, "", dict(zip(names, values.T, strict=True))))
-    return charts
+            yield Chart(key, key, "", dict(zip(names, values.T, strict=True)))
 
 
 def _points(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

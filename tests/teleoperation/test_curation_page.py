@@ -178,7 +178,7 @@ def test_images_and_curves_are_those_of_the_dataset(unchanged):
     demo = load_demos(root)[2]
     curves = json.loads(client.ask("/data/curves/2")[1])
     joint = curves["charts"][0]
-    assert [line["name"] for line in joint["lines"]] == ["state", "command"]
+    assert [line["name"] for line in joint["lines"]] == ["measured", "commanded"]
     frames, values = joint["lines"][0]["points"]
     np.testing.assert_allclose(values, demo.joint_position[frames, 0])
     np.testing.assert_allclose(curves["time"], demo.time)
