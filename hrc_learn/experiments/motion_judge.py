@@ -10,7 +10,6 @@ from __future__ import annotations
 import multiprocessing
 import pkgutil
 import sys
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -79,7 +78,7 @@ class JudgeConfig:
     processes: int = 2
     """Processes that judge."""
 
-    def open(self, robot: ArmChoice, fps: float, widest: float) -> _Judge:
+    def open(self, robot: ArmChoice, fps: float, widest: float) -> CellJudge | SceneJudge:
         """The judge for an arm.
 
         Args:
@@ -96,47 +95,7 @@ class JudgeConfig:
         return SceneJudge(self, robot, fps, widest)
 
 
-class _Judge(ABC):
-    """A simulated arm that carries out motions."""
-
-    @abstractmethod
-    def begin(self, trial: Trial) -> None:
-        """Put arm and objects where the motion begins."""
-
-    @abstractmethod
-    def read(self) -> tuple[np.ndarray, float, dict[str, np.ndarray]]:
-        """Joint positions, opening of the gripper (NaN: as planned), poses of objects now."""
-
-    @abstractmethod
-    def command(self, joints: np.ndarray, width: float) -> np.ndarray:
-        """Let a frame pass; returns the joint positions that were commanded."""
-
-    @abstractmethod
-    def failure(self) -> str:
-        """Reason for which the task was not done, or empty."""
-
-    def replay(self, trial: Trial) -> Replay:
-        """Carry out a motion."""
-        self.begin(trial)
-        read, sent, failure = [], [], ""
-        ahead = np.concatenate([trial.joints[1:], trial.joints[-1:]])
-        try:
-            for joints, width in zip(ahead, trial.gripper, strict=True):
-                read.append(self.read())
-                sent.append(self.command(joints, float(width)))
-        except PhysicsError as error:
-            failure = f"physics: {error}"
-        gripper = np.array([width for _, width, _ in read])
-        return Replay(
-            joints=np.stack([joints for joints, _, _ in read]),
-            sent=np.stack(sent or [ahead[0]]),
-            gripper=gripper if np.isfinite(gripper).all() else None,
-            objects={n: np.stack([o[n] for _, _, o in read]) for n in trial.objects},
-            failure=failure or self.failure(),
-        )
-
-
-class CellJudge(_Judge):
+class CellJudge:
     """Grasping or placing in our work cell, laid out for the arm."""
 
     def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float):
@@ -175,7 +134,7 @@ class CellJudge(_Judge):
         return touched[0] if touched else done
 
 
-class SceneJudge(_Judge):
+class SceneJudge:
     """An MJCF scene with position actuators, and a success function in Python."""
 
     def __init__(self, config: JudgeConfig, robot: ArmChoice, fps: float, widest: float):
@@ -252,6 +211,27 @@ class SceneJudge(_Judge):
             self.model.body_pos[body.id], self.model.body_quat[body.id] = pose[:3], pose[3:]
 
 
+def replay(judge: CellJudge | SceneJudge, trial: Trial) -> Replay:
+    """Carry out a motion in simulation."""
+    judge.begin(trial)
+    read, sent, failure = [], [], ""
+    ahead = np.concatenate([trial.joints[1:], trial.joints[-1:]])
+    try:
+        for joints, width in zip(ahead, trial.gripper, strict=True):
+            read.append(judge.read())
+            sent.append(judge.command(joints, float(width)))
+    except PhysicsError as error:
+        failure = f"physics: {error}"
+    gripper = np.array([width for _, width, _ in read])
+    return Replay(
+        joints=np.stack([joints for joints, _, _ in read]),
+        sent=np.stack(sent or [ahead[0]]),
+        gripper=gripper if np.isfinite(gripper).all() else None,
+        objects={n: np.stack([o[n] for _, _, o in read]) for n in trial.objects},
+        failure=failure or judge.failure(),
+    )
+
+
 def _function(text: str) -> Callable[[Any, Any], bool]:
     """Function named as MODULE:FUNCTION, from the current folder or an installed package.
 
@@ -269,7 +249,7 @@ def _function(text: str) -> Callable[[Any, Any], bool]:
         sys.path.pop(0)
 
 
-_JUDGE: list[_Judge] = []
+_JUDGE: list[CellJudge | SceneJudge] = []
 """Judge of this process."""
 
 
@@ -280,7 +260,7 @@ def _begin(given: tuple[JudgeConfig, ArmChoice, float, float]) -> None:
 
 
 def _replay(trial: Trial) -> Replay:
-    return _JUDGE[0].replay(trial)
+    return replay(_JUDGE[0], trial)
 
 
 class Judges:
