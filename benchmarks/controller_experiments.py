@@ -29,7 +29,6 @@ from hrc_learn.jacobian import (
     CompositeEstimator,
     FixedEstimator,
     ImageJacobianEstimator,
-    KalmanConfig,
     KalmanEstimator,
     PaperEstimator,
     RBFImageJacobian,
@@ -107,11 +106,6 @@ def _rows_right(network: RBFImageJacobian) -> PrintedEstimator:
     return PrintedEstimator(network, mixed=False)
 
 
-def _knowing_pose_noise(network: RBFImageJacobian) -> KalmanEstimator:
-    # On a lever of 0.8 m encoder noise of 1e-4 rad moves the tool by so much.
-    return KalmanEstimator(network, KalmanConfig(pose_noise=1.5e-4))
-
-
 def _with_gain(gain: float) -> Callable[[RBFImageJacobian], ImageJacobianEstimator]:
     return lambda network: PaperEstimator(network, gain)
 
@@ -181,14 +175,7 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
         "1 % of measurements NaN", suite="estimators", **_imperfect(nan_fraction=0.01)
     ),
     "encoder_noise": _grasp(
-        "encoder noise of 1e-4 rad, which the filter knows",
-        _knowing_pose_noise,
-        suite="estimators",
-        duration=30.0,
-        **_imperfect(encoder_noise=1e-4),
-    ),
-    "encoder_noise_unknown": _grasp(
-        "the same, the noise counted in pixels alone",
+        "encoder noise of 1e-4 rad",
         suite="estimators",
         duration=30.0,
         **_imperfect(encoder_noise=1e-4),

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from torch import Tensor
 from torch.utils import _pytree
 
@@ -80,3 +81,18 @@ def apply_where(
     rows = mask.nonzero(as_tuple=True)
     part = function(_pytree.tree_map(lambda x: x[rows], arguments))
     return _pytree.tree_map(lambda x, new: x.index_put(rows, new), otherwise, part)
+
+
+def chosen(mask: Tensor, one: Any, other: Any) -> Any:
+    """Elements of one batched pytree where a mask holds, elsewhere those of another.
+
+    Args:
+        mask: Elements of the first one, (*batch).
+        one: Pytree of tensors (*batch, ...).
+        other: Pytree of the same structure.
+    """
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(mask[(..., *[None] * (a.dim() - mask.dim()))], a, b)
+
+    return _pytree.tree_map(pick, one, other)

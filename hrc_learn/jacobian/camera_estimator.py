@@ -19,12 +19,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.utils._pytree import tree_map
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import is_number, may_branch
@@ -41,7 +40,7 @@ from hrc_learn.jacobian.perspective import (
     marker_pixels,
     stepped,
 )
-from hrc_learn.pytree import pytree
+from hrc_learn.pytree import chosen, pytree
 
 # Optics and marker: components of the vector with the posterior of the demonstrations.
 _KNOWN = [0, 1, 2, 3, 10, 11, 12]
@@ -195,7 +194,10 @@ class CameraEstimator(ImageJacobianEstimator):
         camera, K = network.camera, len(network.centers)
         known = network.camera_covariance[_KNOWN][:, _KNOWN]
         widened = [0.0] * 4 + [config.marker**2] * 3
-        precision = torch.linalg.inv(known + camera.new_tensor(widened).diag())
+        precision, index = camera.new_zeros(SIZE, SIZE), torch.tensor(_KNOWN)
+        precision[index[:, None], index] = torch.linalg.inv(
+            known + camera.new_tensor(widened).diag()
+        )
         bias, scale = config.residual, component_scale(camera, config.rotation_scale)
         one = weight_covariance(network.centers, bias, bias / 2)
         self.register_buffer("reference", camera, persistent=False)
@@ -211,7 +213,7 @@ class CameraEstimator(ImageJacobianEstimator):
     reference: Tensor
     """Camera of the demonstrations, (13,)."""
     precision: Tensor
-    """Prior precision of optics and marker, (7, 7)."""
+    """Prior precision of optics and marker, zero for the rest, (13, 13)."""
     residual: Tensor
     """Prior covariance of the weights of either image row, (P, P)."""
     scale: Tensor
@@ -255,7 +257,7 @@ class CameraEstimator(ImageJacobianEstimator):
         known = known & is_number(state.pixel).flatten(-2).all(-1)
         if may_branch(known) and bool(known.all()):
             return state
-        return _where(known, state, self.initial_state(*known.shape))
+        return chosen(known, state, self.initial_state(*known.shape))
 
     def update(self, state: CameraState, measurement: Measurement) -> CameraState:
         """State after an image; unchanged without a visible marker."""
@@ -264,7 +266,7 @@ class CameraEstimator(ImageJacobianEstimator):
             return state
         state = self._watched(state, measurement, seen)
         state, kept = self._with_key_frame(state, measurement, seen)
-        return _where(seen & kept, self._searched(state), state)
+        return chosen(seen & kept, self._searched(state), state)
 
     def _rolled(
         self, camera: Float[Tensor, "*batch 13"]
@@ -284,16 +286,10 @@ class CameraEstimator(ImageJacobianEstimator):
         return 0.05 * quaternion.angle(turn, quaternion.exp(self.reference[ROTATION]))
 
     def _prior_covariance(self, *batch: int) -> Float[Tensor, "*batch 13 13"]:
-        zero = self.reference.new_zeros(1, SIZE)
-        _, slope = self._prior_error(self.reference.unsqueeze(0) + zero)
-        gram = slope[0].mT @ slope[0] + self._known_precision()
+        _, slope = self._prior_error(self.reference)
+        gram = slope.mT @ slope + self.precision
         gram = gram + torch.eye(SIZE).to(gram) * 1e-2
         return torch.linalg.inv(gram).expand(*batch, SIZE, SIZE).clone()
-
-    def _known_precision(self) -> Float[Tensor, "13 13"]:
-        whole = self.reference.new_zeros(SIZE, SIZE)
-        index = torch.tensor(_KNOWN, device=whole.device)
-        return whole.index_put((index[:, None], index[None]), self.precision)
 
     def _prior_error(
         self, cameras: Float[Tensor, "*batch 13"]
@@ -344,7 +340,7 @@ class CameraEstimator(ImageJacobianEstimator):
             surprises=torch.zeros_like(surprises),
             moves=state.moves + 1,
         )
-        return _where(moved, fresh, replace(state, surprises=surprises))
+        return chosen(moved, fresh, replace(state, surprises=surprises))
 
     def _with_key_frame(
         self, state: CameraState, now: Measurement, seen: Bool[Tensor, "*batch"]
@@ -376,7 +372,7 @@ class CameraEstimator(ImageJacobianEstimator):
             path=pushed(state.path, path),
             known=torch.cat([state.known[..., 1:], torch.ones_like(first)[..., None]], dim=-1),
         )
-        return _where(add, longer, state), calm
+        return chosen(add, longer, state), calm
 
     def _searched(self, state: CameraState) -> CameraState:
         """State after Gauss-Newton steps, and the residual of the most probable camera."""
@@ -460,13 +456,10 @@ class CameraEstimator(ImageJacobianEstimator):
         towards = (weighted.mT @ error.unsqueeze(-1)).sum(-3).squeeze(-1)
         cost = (error * (information @ error.unsqueeze(-1)).squeeze(-1)).sum((-2, -1))
         prior, by_step = self._prior_error(cameras)
-        gram = gram + by_step.mT @ by_step + self._known_precision()
-        towards = towards - (by_step.mT @ prior.unsqueeze(-1)).squeeze(-1)
-        away = (cameras - self.reference)[..., _KNOWN]
+        gram = gram + by_step.mT @ by_step + self.precision
+        away = cameras - self.reference
         pull = away @ self.precision
-        optics, marker = pull[..., :4], pull[..., 4:]
-        zero = torch.zeros_like(cameras[..., 4:10])
-        towards = towards - torch.cat([optics, zero, marker], dim=-1)
+        towards = towards - (by_step.mT @ prior.unsqueeze(-1)).squeeze(-1) - pull
         cost = cost + prior.square().sum(-1) + (away * pull).sum(-1)
         # Nearly flat directions, the roll before any motion, move little.
         gram = gram + 1e-2 * torch.eye(SIZE).to(gram)
@@ -478,17 +471,3 @@ def _shortened(step: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 13"]:
     turn, move = step[..., ROTATION].norm(dim=-1), step[..., SHIFT].norm(dim=-1)
     factor = torch.maximum(turn / _LONGEST_TURN, move / _LONGEST_MOVE).clamp_min(1.0)
     return step / factor[..., None]
-
-
-def _where(condition: Bool[Tensor, "*batch"], one: Any, other: Any) -> Any:
-    """Elements of one state where the condition holds, else of the other."""
-    if may_branch(condition):
-        if bool(condition.all()):
-            return one
-        if not bool(condition.any()):
-            return other
-
-    def chosen(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(condition[(..., *[None] * (a.dim() - condition.dim()))], a, b)
-
-    return tree_map(chosen, one, other)

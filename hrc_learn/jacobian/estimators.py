@@ -16,13 +16,12 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.utils._pytree import tree_map
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import is_number, matmul
 from hrc_learn.jacobian.fitting import KeyFrameConfig, component_scale, weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.pytree import pytree
+from hrc_learn.pytree import chosen, pytree
 
 
 @pytree
@@ -43,24 +42,6 @@ class Measurement:
     """Vision feedback of the controller."""
     xi_r: Float[Tensor, "*batch 6"]
     """Cartesian feedback of the controller."""
-
-    @staticmethod
-    def seen(pose: Pose, feature: Float[Tensor, " rows"], dt: float = 0.0) -> Measurement:
-        """Measurement of a visible feature, without feedback of a controller.
-
-        Args:
-            pose: Pose of the tool when the image was taken.
-            feature: Image feature [px].
-            dt: Time since the last step [s].
-        """
-        return Measurement(
-            pose=pose,
-            feature=feature,
-            valid=torch.tensor(True),
-            dt=dt,
-            xi_x=torch.zeros_like(feature),
-            xi_r=feature.new_zeros(6),
-        )
 
 
 @pytree
@@ -221,8 +202,8 @@ class MotionSample:
 class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
     """Base of estimators that learn from pairs of key frames."""
 
-    constant_law: ClassVar[str] = ""
-    """Beginning of the message that only normalised neurons serve; empty: others do too."""
+    constant: ClassVar[bool] = False
+    """True if the estimator adds constants to the Jacobian, which takes normalised neurons."""
 
     config: Config
 
@@ -244,10 +225,10 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         """
         super().__init__(network)
         # Equal weights of all normalised neurons give a constant Jacobian.
-        if self.constant_law and not network.normalized:
+        if self.constant and not network.normalized:
             raise ValueError(
-                f"{self.constant_law} a constant Jacobian, which only normalised neurons can "
-                "represent: build the network with normalized=True."
+                f"{type(self).__name__} adds a constant, which only normalised neurons "
+                "can represent: build the network with normalized=True."
             )
         self.config = config
         scale = component_scale(network.centers, config.rotation_scale)
@@ -294,19 +275,10 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
     def restored(self, state: Any) -> Any:
         """The state with weights and key frame reset where they are not finite."""
         state = super().restored(state)
-        key, batch = state.key, state.weight.shape[:-2]
-        pose = key.pose
+        key, pose = state.key, state.key.pose
         numbers = torch.cat([pose.position, pose.orientation, key.feature, key.theta], dim=-1)
-        known = is_number(numbers).all(-1)
-        absent = KeyFrame.absent(self.network, *batch)
-        key = tree_map(
-            lambda x, none: torch.where(
-                known if x.dim() == known.dim() else known[..., None], x, none
-            ),
-            key,
-            absent,
-        )
-        return replace(state, key=key)
+        absent = KeyFrame.absent(self.network, *state.weight.shape[:-2])
+        return replace(state, key=chosen(is_number(numbers).all(-1), key, absent))
 
     def resumed(self, state: Any, pause: float) -> Any:
         """The same weights, and no key frame."""
@@ -329,7 +301,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         config = self.config
         twist = key.pose.twist_to(measurement.pose)
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
-        moved = measurement.valid & key.present & (distance >= config.least_step)
+        moved = measurement.valid & key.present & (distance >= config.min_step)
         valid = moved & (distance <= config.max_step)
         now, before = map(self.network.first_pixel, (measurement.pose, key.pose))
         explained = 0.0 if now is None or before is None else now - before
@@ -467,7 +439,7 @@ class BroydenEstimator(KeyFrameEstimator[BroydenConfig]):
     It applies everywhere at once: equal changes of all normalised neurons add a constant.
     """
 
-    constant_law = "Broyden's update adds"
+    constant = True
 
     def __init__(self, network: RBFImageJacobian, config: BroydenConfig | None = None):
         super().__init__(network, config or BroydenConfig())
@@ -494,32 +466,6 @@ class KalmanConfig(LearningConfig):
     """Prior standard deviation of each neuron's deviation from the mean [px/m]."""
     drift: float = 100.0
     """Random walk of the mean Jacobian [px/m/sqrt(s)]."""
-    watched_drift: float | None = None
-    """Random walk while images arrive, when a motion of the camera would be noticed; `drift`
-    then applies to pauses alone. None: `drift`."""
-
-    def pair_noise(
-        self, weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
-    ) -> float | Float[Tensor, "*batch 1 1"]:
-        """Variance of each coordinate of dx - J_s_hat dr [px^2].
-
-        Both ends of a pair are measured with noise in the image and in the pose, and the
-        Jacobian turns the latter into pixels: the effective variance of an errors-in-variables
-        model.
-
-        Args:
-            weight: Weights of the network [px/m, px/rad].
-            theta: Neurons of the pair.
-        """
-        pixels = 2 * self.pixel_noise**2
-        if self.pose_noise == 0:
-            return pixels
-        rows = evaluate(weight, theta)
-        # Pose noise in radians is scaled to metres.
-        metres = rows / component_scale(rows, self.rotation_scale)
-        # The larger image row, as both have one covariance.
-        square = metres.square().sum(-1).amax(-1)
-        return (pixels + 2 * self.pose_noise**2 * square)[..., None, None]
 
 
 @pytree
@@ -538,7 +484,7 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
     its own, only its covariance. Both image rows have the same regressors and one covariance.
     """
 
-    constant_law = "the filter's drift is"
+    constant = True
 
     first_covariance: Tensor
     """Initial covariance, (P, P)."""
@@ -566,8 +512,6 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
         K = len(network.centers)
         walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
         self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)
-        drift, watched = self.config.drift, self.config.watched_drift
-        self.watched = 1.0 if watched is None else (watched / drift) ** 2
 
     def initial_state(self, *batch: int) -> KalmanState:
         """The network's weights, its posterior or the prior, and no key frame."""
@@ -597,11 +541,10 @@ class KalmanEstimator(KeyFrameEstimator[KalmanConfig]):
         With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
         """
         weight = state.weight
-        covariance = state.covariance + now.dt * self.watched * self.walk
+        covariance = state.covariance + now.dt * self.walk
         phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
         P_phi = matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
-        noise = self.config.pair_noise(weight, pair.theta)
-        spread = (P_phi * phi).sum(-1, keepdim=True) + noise
+        spread = (P_phi * phi).sum(-1, keepdim=True) + 2 * self.config.pixel_noise**2
         change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
         change = change.unflatten(-1, (6, -1)) * self.scale.unsqueeze(-1)  # (*batch, 2, 6, K)
         # The outer product of a vector with itself is exactly symmetric. That of the gain and

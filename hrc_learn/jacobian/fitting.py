@@ -40,22 +40,13 @@ class KeyFrameConfig:
     """Choice of key frames, the frames that are compared."""
 
     min_step: float = 2e-4
-    """Least motion between key frames [m], rotation scaled with `rotation_scale`; larger where
-    `pose_noise` requires it."""
-    pose_noise: float = 0.0
-    """Standard deviation of each component of a measured pose [m], rotation scaled with
-    `rotation_scale`. Pairs closer than ten times that show mostly noise, which would shrink the
-    Jacobian towards zero (regression dilution)."""
+    """Least motion between key frames [m], rotation scaled with `rotation_scale`. Ten times the
+    noise of measured poses or more: noise shrinks the Jacobian towards zero (regression
+    dilution), at ten times by 2 %."""
     max_step: float = 0.05
     """Largest motion of a pair [m]; a larger one spans a gap in visibility and is left out."""
     rotation_scale: float = 0.15
     """Metres per radian, a typical lever arm [m/rad]."""
-
-    @property
-    def least_step(self) -> float:
-        """Least motion between key frames, noise considered [m]."""
-        # The estimate shrinks by the ratio of the variances: at a factor of ten by 2 %.
-        return max(self.min_step, 10.0 * self.pose_noise)
 
 
 @pytree
@@ -193,7 +184,7 @@ def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: KeyFrameConfi
     place = torch.cat([pose.position, turn], dim=-1).detach().cpu().numpy()
     keys: list[int] = []
     for frame in visible.nonzero().flatten().tolist():
-        if not keys or np.linalg.norm(place[frame] - place[keys[-1]]) >= config.least_step:
+        if not keys or np.linalg.norm(place[frame] - place[keys[-1]]) >= config.min_step:
             keys.append(frame)
     return torch.tensor(keys, dtype=torch.long, device=visible.device)
 

@@ -255,7 +255,14 @@ def test_estimators_learn_what_the_camera_leaves():
         state = estimator.initial_state()
         with shapes_unchecked():
             for k in range(len(feature)):
-                now = Measurement.seen(demo.pose[k], feature[k], 0.04)
+                now = Measurement(
+                    pose=demo.pose[k],
+                    feature=feature[k],
+                    valid=torch.tensor(True),
+                    dt=0.04,
+                    xi_x=torch.zeros_like(feature[k]),
+                    xi_r=feature.new_zeros(6),
+                )
                 state = estimator.update(state, now)
         off = estimator.jacobian(state, demo.pose[-1]) - expected
         assert float(off.norm() / expected.norm()) < bound
