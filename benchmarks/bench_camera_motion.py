@@ -30,8 +30,8 @@ from hrc_learn.jacobian import (
     CameraReference,
     CameraWatch,
     ImageDemonstration,
-    MarkerCamera,
 )
+from hrc_learn.jacobian.perspective import marker_pixels, moved
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.imperfections import Imperfections
 
@@ -80,15 +80,10 @@ class _Laboratory:
         rotation = quaternion.to_matrix(quaternion.exp(torch.from_numpy(view))).numpy()
         above = np.array([*rng.normal(0, 0.03, 2), rng.uniform(0.9, 1.3)])
         x, y, z = (above - rotation @ middle).tolist()
-        a, b, c = view.tolist()
-        self.camera = MarkerCamera(
-            focal=float(rng.uniform(1100, 1800)),
-            center=(720 + float(rng.normal(0, 10)), 540 + float(rng.normal(0, 10))),
-            radial=float(rng.uniform(-0.1, 0.0)),
-            rotation=(a, b, c),
-            shift=(x, y, z),
-            marker=_MARKER,
-        )
+        optics = [math.log(rng.uniform(1100, 1800)), 720 + rng.normal(0, 10)]
+        optics += [540 + rng.normal(0, 10), rng.uniform(-0.1, 0.0)]
+        whole = [*optics, *view.tolist(), x, y, z, *_MARKER]
+        self.camera = torch.tensor(whole, dtype=torch.float64)
 
     def motion(self, seconds: float) -> tuple[Pose, Pose, Float[Tensor, " frames"]]:
         """True and measured poses, and which images arrived."""
@@ -103,13 +98,13 @@ class _Laboratory:
         arrived = torch.from_numpy(self._rng.random(len(q)) > self._errors.image_loss)
         return true, panda.forward(q + noise), arrived
 
-    def seen(self, true: Pose, camera: MarkerCamera) -> Float[np.ndarray, "frames 2"]:
-        pixels = camera.project(camera.points(true))
-        return pixels + self._rng.normal(0, _PIXEL_NOISE, pixels.shape)
+    def seen(self, true: Pose, camera: Float[Tensor, "13"]) -> Float[Tensor, "frames 2"]:
+        pixels, _ = marker_pixels(camera, true)
+        return pixels + torch.from_numpy(self._rng.normal(0, _PIXEL_NOISE, pixels.shape))
 
     def demonstration(self) -> ImageDemonstration:
         true, measured, arrived = self.motion(10.0)
-        feature = torch.from_numpy(self.seen(true, self.camera))
+        feature = self.seen(true, self.camera)
         return ImageDemonstration(pose=measured, feature=feature, visible=arrived)
 
 
@@ -149,8 +144,8 @@ def _noticed_after(laboratory: _Laboratory, watch: CameraWatch, twist: np.ndarra
     true, measured, arrived = laboratory.motion(8.0)
     knocked = len(arrived) // 2
     before = laboratory.seen(true[:knocked], laboratory.camera)
-    after = laboratory.seen(true[knocked:], laboratory.camera.moved(twist))
-    pixels = np.concatenate([before, after])
+    after = laboratory.seen(true[knocked:], moved(laboratory.camera, torch.from_numpy(twist)))
+    pixels = torch.cat([before, after])
     for frame in arrived.nonzero()[:, 0].tolist():
         alarm = watch.update(frame / _FPS, measured[frame], pixels[frame])
         if alarm is not None and frame >= knocked:

@@ -6,8 +6,9 @@ that the same code serves both. `ByValue` serves processes that a program starts
 
 import os
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -99,3 +100,21 @@ def differentiable_sum(tensor: Tensor) -> Tensor:
 def data_parallel(module: nn.Module) -> nn.Module:
     """Module with its gradients averaged over processes."""
     return module if count() == 1 else nn.parallel.DistributedDataParallel(module)
+
+
+class LazyMap[S, T](Sequence[T]):
+    """Map of a sequence whose items are computed on access, such as episodes of a dataset."""
+
+    def __init__(self, items: Sequence[S], function: Callable[[S], T]):
+        self._items, self._function = items, function
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return LazyMap(self._items[index], self._function)
+        return self._function(self._items[index])
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self._function, self._items)

@@ -68,7 +68,7 @@ with distributed.processes() as rank:
     few = EvidenceConfig(rounds=2, iterations=3)
     learned = maximize_evidence(demonstrations, around, learning=few)
     network = RBFImageJacobian.fit(
-        demonstrations, learned.neurons, learned.config
+        demonstrations, learned.kept.neurons, learned.kept.config
     )
     result = {
         "processes": torch.tensor(distributed.count()),

@@ -28,7 +28,6 @@ from hrc_learn.jacobian import (
     ImageJacobianFitConfig,
     RBFCenters,
     RBFImageJacobian,
-    paper_grid,
 )
 from hrc_learn.learning.fit_dashboards import record_learning
 from hrc_learn.learning.markerless_fitting import MarkerlessFit, find_landmarks
@@ -89,8 +88,7 @@ def fit_image_jacobian(args: FitImageJacobian) -> None:
                 f"stay as they are (--config learning.hold_out={learning.hold_out})"
             )
         # The paper's grid, or neurons around the demonstrations.
-        on_grid = args.neurons == "grid"
-        neurons = RBFCenters(centers=paper_grid(), width=0.1) if on_grid else None
+        neurons = RBFCenters.paper() if args.neurons == "grid" else None
         with console.status(f"Fitting {len(demos)} demonstrations") as status:
             skill = fit_visual_servo(
                 demos,

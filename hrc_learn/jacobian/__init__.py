@@ -3,14 +3,12 @@
 from hrc_learn.jacobian.camera_estimator import CameraConfig as CameraConfig
 from hrc_learn.jacobian.camera_estimator import CameraEstimator as CameraEstimator
 from hrc_learn.jacobian.camera_estimator import CameraSpread as CameraSpread
-from hrc_learn.jacobian.camera_estimator import CameraState as CameraState
 from hrc_learn.jacobian.camera_motion import CameraCorrection as CameraCorrection
 from hrc_learn.jacobian.camera_motion import CameraMotion as CameraMotion
-from hrc_learn.jacobian.camera_motion import CameraPlacement as CameraPlacement
 from hrc_learn.jacobian.camera_motion import CameraReference as CameraReference
 from hrc_learn.jacobian.camera_motion import CameraWatch as CameraWatch
-from hrc_learn.jacobian.camera_motion import ObjectPlane as ObjectPlane
 from hrc_learn.jacobian.camera_motion import camera_placements as camera_placements
+from hrc_learn.jacobian.camera_motion import object_height as object_height
 from hrc_learn.jacobian.estimators import BroydenConfig as BroydenConfig
 from hrc_learn.jacobian.estimators import BroydenEstimator as BroydenEstimator
 from hrc_learn.jacobian.estimators import CompositeConfig as CompositeConfig
@@ -19,13 +17,10 @@ from hrc_learn.jacobian.estimators import FixedEstimator as FixedEstimator
 from hrc_learn.jacobian.estimators import ImageJacobianEstimator as ImageJacobianEstimator
 from hrc_learn.jacobian.estimators import KalmanConfig as KalmanConfig
 from hrc_learn.jacobian.estimators import KalmanEstimator as KalmanEstimator
-from hrc_learn.jacobian.estimators import KeyFrameEstimator as KeyFrameEstimator
 from hrc_learn.jacobian.estimators import Measurement as Measurement
 from hrc_learn.jacobian.estimators import PaperEstimator as PaperEstimator
 from hrc_learn.jacobian.fitting import ImageDemonstration as ImageDemonstration
 from hrc_learn.jacobian.fitting import ImageJacobianFitConfig as ImageJacobianFitConfig
-from hrc_learn.jacobian.fitting import ImageJacobianFitReport as ImageJacobianFitReport
-from hrc_learn.jacobian.fitting import KeyFrameConfig as KeyFrameConfig
 from hrc_learn.jacobian.fitting import RBFCenters as RBFCenters
 from hrc_learn.jacobian.fitting import grid as grid
 from hrc_learn.jacobian.fitting import paper_grid as paper_grid
@@ -38,6 +33,5 @@ from hrc_learn.jacobian.model_selection import cross_validate as cross_validate
 from hrc_learn.jacobian.model_selection import maximize_evidence as maximize_evidence
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian
 from hrc_learn.jacobian.perspective import CameraFit as CameraFit
-from hrc_learn.jacobian.perspective import MarkerCamera as MarkerCamera
 from hrc_learn.jacobian.perspective import fit_camera as fit_camera
 from hrc_learn.jacobian.perspective import unexplained as unexplained

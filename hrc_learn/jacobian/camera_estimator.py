@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -70,8 +69,6 @@ class CameraConfig:
     and what noise of the encoders adds."""
     hypotheses: int = 8
     """Turns about the optical axis from which the search starts."""
-    steps: int = 1
-    """Gauss-Newton steps an image."""
     tilt: float = 0.15
     """Prior standard deviation of a tilt of the camera since the demonstrations [rad]; its turn
     about the optical axis may be any."""
@@ -88,7 +85,7 @@ class CameraConfig:
     """Images in a row with such an error after which the camera counts as moved."""
 
     def __post_init__(self) -> None:
-        for name in ("frames", "hypotheses", "steps", "surprises"):
+        for name in ("frames", "hypotheses", "surprises"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, but is {getattr(self, name)}.")
         for name in ("min_step", "pixel_noise", "tilt", "place", "marker", "residual", "bump"):
@@ -161,14 +158,6 @@ class CameraSpread:
     """The most probable camera, then the others."""
     weights: Float[Tensor, "*batch others"]
     """Weight of each of the others."""
-
-
-class _Fit(NamedTuple):
-    """Gauss-Newton step of all hypotheses."""
-
-    gram: Tensor
-    towards: Tensor
-    cost: Tensor
 
 
 class CameraEstimator(ImageJacobianEstimator):
@@ -246,8 +235,7 @@ class CameraEstimator(ImageJacobianEstimator):
     ) -> Float[Tensor, "*batch rows 6"]:
         """J_s_hat at a pose: that of the most probable camera, and the residual."""
         pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
-        one = Pose(pose.position.unsqueeze(-2), pose.orientation.unsqueeze(-2))
-        first = camera_jacobian(state.best, one).squeeze(-3)
+        first = camera_jacobian(state.best, pose[..., None]).squeeze(-3)
         return first + evaluate(state.weight, self.network.basis(pose))
 
     def restored(self, state: CameraState) -> CameraState:
@@ -321,8 +309,7 @@ class CameraEstimator(ImageJacobianEstimator):
     ) -> CameraState:
         """State with an empty window where the camera was moved."""
         config = self.config
-        one = Pose(now.pose.position.unsqueeze(-2), now.pose.orientation.unsqueeze(-2))
-        expected, slope = marker_pixels(state.best, one)
+        expected, slope = marker_pixels(state.best, now.pose[..., None])
         error = now.feature - expected.squeeze(-2)
         slope = slope.squeeze(-3)
         spread = slope @ state.covariance @ slope.mT
@@ -375,8 +362,8 @@ class CameraEstimator(ImageJacobianEstimator):
         return chosen(add, longer, state), calm
 
     def _searched(self, state: CameraState) -> CameraState:
-        """State after Gauss-Newton steps, and the residual of the most probable camera."""
-        config, known = self.config, state.known
+        """State after a Gauss-Newton step, and the residual of the most probable camera."""
+        known = state.known
         newest = known.to(state.path).cumsum(-1)
         start = ((newest == 1) & known).to(state.path)
         # Regressors since the first frame of the window.
@@ -387,16 +374,11 @@ class CameraEstimator(ImageJacobianEstimator):
         one = Pose(state.position.unsqueeze(-3), state.orientation.unsqueeze(-3))
         mean = self._flat_weight(self.initial_weight()) @ path.mT
         pixel = state.pixel - mean.mT
-        cameras, cost = state.cameras, state.cost
-        inverse, fit = kernel, None
-        for _ in range(config.steps):
-            inverse = self._information(state, cameras, cost, pixel, kernel)
-            fit = self._fit(cameras, one, pixel, known, inverse)
-            cost = fit.cost
-            cameras = stepped(cameras, _shortened(torch.linalg.solve(fit.gram, fit.towards)))
-        assert fit is not None
+        inverse = self._information(state, pixel, kernel)
+        grams, towards, cost = self._normal_equations(state.cameras, one, pixel, known, inverse)
+        cameras = stepped(state.cameras, _shortened(torch.linalg.solve(grams, towards)))
         index = cost.argmin(-1)[..., None, None, None]
-        gram = fit.gram.gather(-3, index.expand(*index.shape[:-2], SIZE, SIZE)).squeeze(-3)
+        gram = grams.gather(-3, index.expand(*index.shape[:-2], SIZE, SIZE)).squeeze(-3)
         learned = replace(state, cameras=cameras, cost=cost)
         best = learned.best
         poses = Pose(state.position, state.orientation)
@@ -417,14 +399,11 @@ class CameraEstimator(ImageJacobianEstimator):
     def _information(
         self,
         state: CameraState,
-        cameras: Tensor,
-        cost: Tensor,
         pixel: Float[Tensor, "*batch frames 2"],
         kernel: Float[Tensor, "*batch frames frames"],
     ) -> Float[Tensor, "*batch frames frames"]:
         """Inverse covariance of the frames; those off the most probable camera count less."""
-        best = replace(state, cameras=cameras, cost=cost).best
-        seen, _ = marker_pixels(best, Pose(state.position, state.orientation))
+        seen, _ = marker_pixels(state.best, Pose(state.position, state.orientation))
         size = torch.where(state.known, (pixel - seen).norm(dim=-1), 0.0)
         # The median over known frames: unknown ones are first in order.
         count = state.known.sum(-1, keepdim=True)
@@ -435,15 +414,15 @@ class CameraEstimator(ImageJacobianEstimator):
         noise = torch.where(state.known, self.config.pixel_noise**2 * inverse_weight, _UNKNOWN)
         return torch.linalg.inv(kernel + torch.diag_embed(noise))
 
-    def _fit(
+    def _normal_equations(
         self,
         cameras: Float[Tensor, "*batch hypotheses 13"],
         poses: Pose,
         pixel: Float[Tensor, "*batch frames 2"],
         known: Bool[Tensor, "*batch frames"],
         inverse: Float[Tensor, "*batch frames frames"],
-    ) -> _Fit:
-        """Normal equations and cost of each hypothesis."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Matrix, right-hand side and cost of each hypothesis."""
         seen, slope = marker_pixels(cameras, poses)
         use = known[..., None, :, None]
         error = torch.where(use, pixel.unsqueeze(-3) - seen, 0.0)
@@ -463,7 +442,7 @@ class CameraEstimator(ImageJacobianEstimator):
         cost = cost + prior.square().sum(-1) + (away * pull).sum(-1)
         # Nearly flat directions, the roll before any motion, move little.
         gram = gram + 1e-2 * torch.eye(SIZE).to(gram)
-        return _Fit(gram, towards, cost / 2 + self._roll_cost(cameras))
+        return gram, towards, cost / 2 + self._roll_cost(cameras)
 
 
 def _shortened(step: Float[Tensor, "*batch 13"]) -> Float[Tensor, "*batch 13"]:

@@ -1,6 +1,6 @@
 """Detection of camera motion: the robot's own marker is not seen where it should be.
 
-A camera model fitted to demonstrations (`MarkerCamera`) predicts the pixel of the tool's marker
+A camera fitted to demonstrations (`perspective`) predicts the pixel of the tool's marker
 at any tool pose. A camera that turned by w and moved by v sees the marker with the error e = L
 (w, v), to first order, where L is the interaction matrix: the derivative of the pixel by the
 camera twist. Over the last seconds, one such motion is fitted to e. Its explained displacement,
@@ -23,14 +23,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian.fitting import FOLDS, ImageDemonstration
-from hrc_learn.jacobian.perspective import MarkerCamera
+from hrc_learn.jacobian.perspective import (
+    ROTATION,
+    SIZE,
+    fit_camera,
+    from_base,
+    marker_points,
+    motion_jacobian,
+    moved,
+    on_plane,
+    pixels_and_depth,
+)
 
-# Prior standard deviation of a motion [rad, m]: that of a tripod that was knocked. It resolves
-# rotations and translations that look alike in the image.
-_PLAUSIBLE = np.array([0.1] * 3 + [0.1] * 3)
+# Prior standard deviation of each component of a motion [rad, m]: that of a tripod that was
+# knocked. It resolves rotations and translations that look alike in the image.
+_PLAUSIBLE = 0.1
 # Largest motion in these standard deviations: beyond it, the camera would not see the table.
 _FARTHEST = 5.0
 FEWEST_FRAMES = 10
@@ -62,31 +73,31 @@ _PLANE_STEPS = 20
 class CameraMotion:
     """Motion of a camera since the demonstrations."""
 
-    twist: Float[np.ndarray, "6"]
+    twist: Float[Tensor, "6"]
     """Rotation vector about the camera's axes (x right, y down, z along the view) [rad], and
-    translation along them [m], as for `MarkerCamera.moved`."""
+    translation along them [m], as for `perspective.moved`."""
     displacement: float
     """Explained displacement in the image, root mean square over the frames [px]."""
 
     @staticmethod
     def of(
-        twist: Float[np.ndarray, "6"],
-        points: Float[np.ndarray, "frames 3"],
-        camera: MarkerCamera,
+        camera: Float[Tensor, "13"],
+        twist: Float[Tensor, "6"],
+        points: Float[Tensor, "frames 3"],
     ) -> CameraMotion:
         """Motion by a twist, with the displacement of points of the camera frame [m]."""
-        displacement = _root_mean_square(camera.motion_jacobian(points) @ twist)
+        displacement = _root_mean_square(motion_jacobian(camera, points) @ twist)
         return CameraMotion(twist=twist, displacement=displacement)
 
     @property
     def angle(self) -> float:
         """Angle of the rotation [rad]."""
-        return float(np.linalg.norm(self.twist[:3]))
+        return float(self.twist[:3].norm())
 
     @property
     def distance(self) -> float:
         """Length of the translation [m]."""
-        return float(np.linalg.norm(self.twist[3:]))
+        return float(self.twist[3:].norm())
 
     def __str__(self) -> str:
         return (
@@ -99,20 +110,28 @@ class CameraMotion:
 class CameraReference:
     """A camera as seen in demonstrations, and the threshold for its motion."""
 
-    camera: MarkerCamera
-    """Camera fitted to all demonstrations."""
+    camera: tuple[float, ...]
+    """Vector of the camera and its marker (see `perspective`), fitted to all demonstrations."""
     threshold: float
     """Displacement above which the camera has moved [px]."""
-    window: float
-    """Time window of the threshold [s]."""
     lower: tuple[float, float, float]
     """Lower corner of the box of demonstrated marker positions, in the camera frame [m]."""
     upper: tuple[float, float, float]
     """Upper corner of that box [m]."""
 
-    def covers(self, point: Float[np.ndarray, "3"]) -> bool:
+    def __post_init__(self) -> None:
+        if len(self.camera) != SIZE:
+            raise ValueError(f"camera must have {SIZE} numbers, but has {len(self.camera)}")
+
+    @property
+    def vector(self) -> Float[Tensor, "13"]:
+        """The camera as a tensor, in float64."""
+        return torch.tensor(self.camera, dtype=torch.float64)
+
+    def covers(self, point: Float[Tensor, "3"]) -> bool:
         """True if a point of the camera frame is within the box of the demonstrations."""
-        return bool(((point >= self.lower) & (point <= self.upper)).all())
+        lower, upper = point.new_tensor(self.lower), point.new_tensor(self.upper)
+        return bool(((point >= lower) & (point <= upper)).all())
 
     @staticmethod
     def fit(
@@ -139,31 +158,42 @@ class CameraReference:
         largest, folds = 0.0, min(FOLDS, len(demonstrations))
         for fold in range(folds):
             others = [d for i, d in enumerate(demonstrations) if i % folds != fold]
-            watch = CameraWatch(
-                _reference(MarkerCamera.fit(others, image_size), others, np.inf)
-            )
+            watch = CameraWatch(_reference(others, image_size, np.inf))
             for demo in demonstrations[fold::folds]:
                 watch.clear()
                 for k in demo.visible.nonzero()[:, 0].tolist():
-                    watch.update(k / fps, demo.pose[k], demo.feature[k].double().numpy())
+                    watch.update(k / fps, demo.pose[k], demo.feature[k])
                     largest = max(largest, watch.displacement)
         if not largest:
             raise ValueError(
                 f"no demonstration shows the marker {FEWEST_FRAMES} times within {_WINDOW} s: "
                 "record some in which the camera sees the marker."
             )
-        camera = MarkerCamera.fit(demonstrations, image_size)
-        return _reference(camera, demonstrations, _MARGIN * largest)
+        return _reference(demonstrations, image_size, _MARGIN * largest)
 
 
 def _reference(
-    camera: MarkerCamera, demonstrations: Sequence[ImageDemonstration], threshold: float
+    demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int], threshold: float
 ) -> CameraReference:
-    points = np.concatenate([camera.points(demo.seen()[0]) for demo in demonstrations])
-    lower, upper = (tuple(corner.tolist()) for corner in (points.min(0), points.max(0)))
+    camera = fit_camera(demonstrations, image_size).camera
+    points = torch.cat([marker_points(camera, demo.seen()[0]) for demo in demonstrations])
+    lower, upper = (tuple(corner.tolist()) for corner in (points.amin(0), points.amax(0)))
     return CameraReference(
-        camera=camera, threshold=threshold, window=_WINDOW, lower=lower, upper=upper
+        camera=tuple(camera.tolist()),
+        threshold=threshold,
+        lower=lower,
+        upper=upper,
     )
+
+
+type _Frames = deque[tuple[float, Tensor, Tensor]]
+"""Time [s], marker in the camera frame [m] and pixel of each frame [px]."""
+
+
+def _columns(frames: _Frames) -> tuple[Float[Tensor, "frames 3"], Float[Tensor, "frames 2"]]:
+    """Points and pixels of frames."""
+    points, pixels = zip(*((frame[1], frame[2]) for frame in frames), strict=True)
+    return torch.stack(points), torch.stack(pixels)
 
 
 class CameraWatch:
@@ -182,19 +212,17 @@ class CameraWatch:
             fewest: Number of frames needed to report a motion. Below 10, the threshold grows as
                 frames are missing.
         """
-        self.reference = reference
+        self.reference, self._camera = reference, reference.vector
         self.displacement = 0.0
         self._fewest = fewest
-        self._frames: deque[tuple[float, np.ndarray, np.ndarray]] = deque()
+        self._frames: _Frames = deque()
 
     def clear(self) -> None:
         """Forget all frames: before another episode, or after a pause."""
         self.displacement = 0.0
         self._frames.clear()
 
-    def update(
-        self, time: float, pose: Pose, pixel: Float[np.ndarray, "2"]
-    ) -> CameraMotion | None:
+    def update(self, time: float, pose: Pose, pixel: Float[Tensor, "2"]) -> CameraMotion | None:
         """Add one frame in which the marker was found.
 
         Frames outside the region of the demonstrations are ignored.
@@ -210,10 +238,10 @@ class CameraWatch:
         Raises:
             ValueError: Time or pixel are not finite, or time does not increase.
         """
-        if not (np.isfinite(time) and np.isfinite(pixel).all()):
+        if not (np.isfinite(time) and bool(pixel.isfinite().all())):
             raise ValueError(
-                f"time and pixel must be finite, got {time} and {pixel}: leave out frames "
-                "without the marker."
+                f"time and pixel must be finite, got {time} and {pixel.tolist()}: leave out "
+                "frames without the marker."
             )
         frames = self._frames
         if frames and not time > frames[-1][0]:
@@ -221,21 +249,19 @@ class CameraWatch:
                 f"time must increase, but {time} follows {frames[-1][0]}: call clear() "
                 "between episodes."
             )
-        camera = self.reference.camera
-        point = camera.points(pose)
+        camera, point = self._camera, _marker_point(self._camera, pose)
         if self.reference.covers(point):
-            frames.append((time, point, pixel))
-        while frames and frames[0][0] < time - self.reference.window:
+            frames.append((time, point, pixel.double()))
+        while frames and frames[0][0] < time - _WINDOW:
             frames.popleft()
         self.displacement = 0.0
         if len(frames) < self._fewest:
             return None
-        points, pixels = (np.array([frame[i] for frame in frames]) for i in (1, 2))
-        errors, jacobians = pixels - camera.project(points), camera.motion_jacobian(points)
-        twist, self.displacement = _explained(errors, jacobians)
+        points, pixels = _columns(frames)
+        twist, self.displacement = _explained(camera, points, pixels)
         if self.displacement <= self.reference.threshold * max(1, FEWEST_FRAMES / len(frames)):
             return None
-        return CameraMotion.of(refined_twist(camera, points, pixels, twist), points, camera)
+        return CameraMotion.of(camera, refined_twist(camera, points, pixels, twist), points)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -276,15 +302,15 @@ def camera_placements(
         return []
     chosen = [demonstrations[index] for index in seen]
     camera, twists = _camera_of_episodes(chosen, image_size)
-    points = [camera.points(demo.seen()[0]) for demo in chosen]
+    points = [marker_points(camera, demo.seen()[0]) for demo in chosen]
 
     def apart(first: int, second: int) -> float:
         return max(
-            CameraMotion.of(twists[first] - twists[second], points[i], camera).displacement
+            CameraMotion.of(camera, twists[first] - twists[second], points[i]).displacement
             for i in (first, second)
         )
 
-    typical = np.median([apart(i, i + 1) for i in range(len(chosen) - 1)])
+    typical = float(np.median([apart(i, i + 1) for i in range(len(chosen) - 1)]))
     groups: list[list[int]] = []
     for i in range(len(chosen)):
         home = next((g for g in groups if apart(g[0], i) <= _APART * typical), None)
@@ -293,14 +319,14 @@ def camera_placements(
         else:
             home.append(i)
     index = list(seen)
-    first = np.median(twists[groups[0]], axis=0)
+    first = _median(twists[groups[0]])
     return [
         CameraPlacement(
             episodes=tuple(index[i] for i in group),
             motion=CameraMotion.of(
-                np.median(twists[group], axis=0) - first,
-                np.concatenate([points[i] for i in group]),
                 camera,
+                _median(twists[group]) - first,
+                torch.cat([points[i] for i in group]),
             ),
         )
         for group in groups
@@ -309,141 +335,141 @@ def camera_placements(
 
 def _camera_of_episodes(
     demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
-) -> tuple[MarkerCamera, Float[np.ndarray, "episodes 6"]]:
+) -> tuple[Float[Tensor, "13"], Float[Tensor, "episodes 6"]]:
     """Camera of the median episode, and its motion from there in each episode."""
-    camera, twists = MarkerCamera.fit(demonstrations, image_size), np.zeros(0)
+    camera, twists = fit_camera(demonstrations, image_size).camera, torch.zeros(0)
+    still = torch.zeros(6, dtype=torch.float64)
     for _ in range(_REFINEMENTS):
         seen = [demo.seen() for demo in demonstrations]
-        twists = np.array(
+        twists = torch.stack(
             [
-                refined_twist(camera, camera.points(pose), pixel.numpy(), np.zeros(6))
+                refined_twist(camera, marker_points(camera, pose), pixel, still)
                 for pose, pixel in seen
             ]
         )
-        twists -= np.median(twists, axis=0)
+        twists = twists - _median(twists)
         unmoved = []
         for demo, twist in zip(demonstrations, twists, strict=True):
-            shift = torch.from_numpy(_displacement(camera, demo.pose, twist))
-            unmoved.append(replace(demo, feature=demo.feature.double() - shift))
-        camera = MarkerCamera.fit(unmoved, image_size)
+            demo = demo.double()
+            shift = _displacement(camera, marker_points(camera, demo.pose), twist)
+            unmoved.append(replace(demo, feature=demo.feature - shift))
+        camera = fit_camera(unmoved, image_size).camera
     return camera, twists
 
 
-def _explained(
-    errors: Float[np.ndarray, "frames 2"],
-    jacobians: Float[np.ndarray, "frames 2 6"],
-    already: Float[np.ndarray, "6"] | None = None,
-) -> tuple[Float[np.ndarray, "6"], float]:
-    """Most plausible motion for the errors, and the displacement it explains, rms [px].
+def _median(twists: Float[Tensor, "episodes 6"]) -> Float[Tensor, "6"]:
+    """Median of each component; the mean of the two middle ones of an even number."""
+    return twists.quantile(0.5, dim=0)
 
-    `already` is the motion applied so far, which the prior includes.
+
+def _explained(
+    camera: Float[Tensor, "13"],
+    points: Float[Tensor, "frames 3"],
+    pixels: Float[Tensor, "frames 2"],
+    already: Float[Tensor, "6"] | None = None,
+) -> tuple[Float[Tensor, "6"], float]:
+    """Most plausible motion for the pixels of points, and the displacement it explains, rms
+    [px]. `already` is the motion applied so far, which the prior includes.
     """
-    size = np.linalg.norm(errors, axis=-1)
+    errors = pixels - pixels_and_depth(camera, points)[0]
+    size = errors.norm(dim=-1)
     # At least a tenth of a pixel, so that not all frames of exact images are outliers.
-    most = max(_OUTLIER * float(np.median(size)), 0.1)
-    errors = errors * np.minimum(1.0, most / np.maximum(size, most))[:, None]
-    scaled = jacobians * _PLAUSIBLE
-    gram = np.einsum("fij,fik->jk", scaled, scaled) + np.eye(6)
-    towards = np.einsum("fij,fi->j", scaled, errors)
+    most = (_OUTLIER * size.quantile(0.5)).clamp(min=0.1)
+    errors = errors * (most / size.clamp(min=most)).unsqueeze(-1)
+    slope = motion_jacobian(camera, points)
+    scaled = _PLAUSIBLE * slope.flatten(0, 1)
+    gram = scaled.mT @ scaled + torch.eye(6).to(scaled)
+    towards = scaled.mT @ errors.flatten()
     if already is not None:
-        towards -= already / _PLAUSIBLE
-    unit = np.linalg.solve(gram, towards)
-    return _PLAUSIBLE * unit, _root_mean_square(scaled @ unit)
+        towards = towards - already / _PLAUSIBLE
+    twist = _PLAUSIBLE * torch.linalg.solve(gram, towards)
+    return twist, _root_mean_square(slope @ twist)
 
 
 def refined_twist(
-    camera: MarkerCamera,
-    points: Float[np.ndarray, "frames 3"],
-    pixels: Float[np.ndarray, "frames 2"],
-    twist: Float[np.ndarray, "6"],
+    camera: Float[Tensor, "13"],
+    points: Float[Tensor, "frames 3"],
+    pixels: Float[Tensor, "frames 2"],
+    twist: Float[Tensor, "6"],
     steps: int = _REFINEMENTS,
-) -> Float[np.ndarray, "6"]:
+) -> Float[Tensor, "6"]:
     """Camera motion [rad, m] by Gauss-Newton, also for large motions."""
     for _ in range(steps):
-        seen = from_moved(points, twist)
-        errors = pixels - camera.project(seen)
-        step, _ = _explained(errors, camera.motion_jacobian(seen), twist)
+        step, _ = _explained(camera, from_moved(points, twist), pixels, twist)
         # In the frame of the camera as moved so far.
-        turn = quaternion.exp(torch.from_numpy(np.stack([twist[:3], step[:3]])))
-        both = quaternion.log(quaternion.multiply(turn[0], turn[1])).numpy()
-        shift = quaternion.rotate(turn[0], torch.from_numpy(step[3:])).numpy()
-        twist = np.concatenate([both, twist[3:] + shift])
+        turn = quaternion.exp(twist[:3])
+        both = quaternion.log(quaternion.multiply(turn, quaternion.exp(step[:3])))
+        twist = torch.cat([both, twist[3:] + quaternion.rotate(turn, step[3:])])
         # Two contradictory frames would place both points behind the camera.
-        twist = twist * min(1.0, _FARTHEST / float(np.linalg.norm(twist / _PLAUSIBLE)))
+        twist = twist * (_FARTHEST * _PLAUSIBLE / twist.norm()).clamp(max=1.0)
     return twist
 
 
 def from_moved(
-    points: Float[np.ndarray, "*batch 3"], twist: Float[np.ndarray, "6"]
-) -> Float[np.ndarray, "*batch 3"]:
-    """Points [m] in the frame of a camera that turned and moved (see `MarkerCamera.moved`)."""
-    turn = quaternion.exp(torch.from_numpy(twist[:3]))
-    return (points - twist[3:]) @ quaternion.to_matrix(turn).numpy()
+    points: Float[Tensor, "*batch 3"], twist: Float[Tensor, "6"]
+) -> Float[Tensor, "*batch 3"]:
+    """Points [m] in the frame of a camera that turned and moved (see `perspective.moved`)."""
+    return quaternion.rotate(quaternion.exp(-twist[:3]), points - twist[3:])
 
 
 def _displacement(
-    camera: MarkerCamera, pose: Pose, twist: Float[np.ndarray, "6"]
-) -> Float[np.ndarray, "*batch 2"]:
-    """Change of the marker's pixel at poses of the tool by a motion of the camera [px]."""
-    points = camera.points(pose)
-    return camera.project(from_moved(points, twist)) - camera.project(points)
+    camera: Float[Tensor, "13"], points: Float[Tensor, "frames 3"], twist: Float[Tensor, "6"]
+) -> Float[Tensor, "frames 2"]:
+    """Change of the pixels of points by a motion of the camera [px]."""
+    after, _ = pixels_and_depth(camera, from_moved(points, twist))
+    return after - pixels_and_depth(camera, points)[0]
 
 
-def _root_mean_square(pixels: Float[np.ndarray, "frames 2"]) -> float:
-    return float(np.sqrt((pixels**2).sum(-1).mean()))
+def _marker_point(camera: Float[Tensor, "13"], pose: Pose) -> Float[Tensor, "3"]:
+    """The marker in the camera frame [m] at one pose of the tool."""
+    one = Pose(pose.position.double()[None], pose.orientation.double()[None])
+    return marker_points(camera, one)[0]
 
 
-@dataclass(frozen=True, kw_only=True)
-class ObjectPlane:
-    """Horizontal plane on which objects lie, in the base frame of a `MarkerCamera`.
+def _root_mean_square(pixels: Float[Tensor, "frames 2"]) -> float:
+    return float(pixels.square().sum(-1).mean().sqrt())
 
-    That frame differs from the base frame by the part of the marker's position on the tool that
-    the demonstrations do not determine, so a measured height is not this one.
+
+def object_height(
+    reference: CameraReference,
+    places: Float[Tensor, "episodes 3"],
+    pixels: Float[Tensor, "episodes 2"],
+) -> float:
+    """Height of the horizontal plane on which objects lie, in the base frame [m].
+
+    The base frame of a fitted camera differs from the robot's by the part of the marker's
+    position on the tool that the demonstrations do not determine, so a measured height is not
+    this one. All objects have the same offset from the tool when grasped, which is found by
+    least squares on the pixels.
+
+    Args:
+        reference: Camera of the demonstrations.
+        places: Positions of the tool in the base frame at the grasp [m]; four or more different
+            ones.
+        pixels: Pixels of the objects (u, v) before the grasp [px].
+
+    Raises:
+        ValueError: There are too few demonstrations, or pixels and grasps do not agree.
     """
-
-    height: float
-    """Height of the plane [m]."""
-
-    @staticmethod
-    def fit(
-        reference: CameraReference,
-        places: Float[np.ndarray, "episodes 3"],
-        pixels: Float[np.ndarray, "episodes 2"],
-    ) -> ObjectPlane:
-        """Fit the plane to the pixels of objects and the positions of their grasps.
-
-        All objects have the same offset from the tool when grasped, which is found by least
-        squares on the pixels.
-
-        Args:
-            reference: Camera of the demonstrations.
-            places: Positions of the tool in the base frame at the grasp [m]; four or more
-                different ones.
-            pixels: Pixels of the objects (u, v) before the grasp [px].
-
-        Raises:
-            ValueError: There are too few demonstrations, or pixels and grasps do not agree.
-        """
-        if len(places) < 4:
-            raise ValueError(
-                f"the objects' plane needs four or more demonstrations, got {len(places)}."
-            )
-        camera = reference.camera
-        offset, errors = np.zeros(3), pixels
-        for _ in range(_PLANE_STEPS):
-            seen = camera.from_base(places + offset)
-            errors = pixels - camera.project(seen)
-            # Points move opposite to the camera.
-            jacobian = -camera.motion_jacobian(seen)[..., 3:] @ camera.rotation_matrix
-            step, *_ = np.linalg.lstsq(jacobian.reshape(-1, 3), errors.ravel(), rcond=None)
-            offset = offset + step
-        off = float(np.sqrt((errors**2).sum(-1).mean()))
-        if not off <= _AGREEMENT:
-            raise ValueError(
-                f"object pixels and grasp positions disagree by {off:.0f} px: they belong to "
-                "different objects, or the objects were moved in between."
-            )
-        return ObjectPlane(height=float((places + offset)[:, 2].mean()))
+    if len(places) < 4:
+        raise ValueError(
+            f"the objects' plane needs four or more demonstrations, got {len(places)}."
+        )
+    camera = reference.vector
+    turn = quaternion.to_matrix(quaternion.exp(camera[ROTATION]))
+    offset, errors = torch.zeros_like(places[0]), pixels
+    for _ in range(_PLANE_STEPS):
+        pixel, by_point = pixels_and_depth(camera, from_base(camera, places + offset))
+        errors, jacobian = pixels - pixel, (by_point @ turn).flatten(0, 1)
+        # The pseudo-inverse: parallel views leave a direction of the offset open.
+        offset = offset + torch.linalg.pinv(jacobian) @ errors.flatten()
+    off = _root_mean_square(errors)
+    if not off <= _AGREEMENT:
+        raise ValueError(
+            f"object pixels and grasp positions disagree by {off:.0f} px: they belong to "
+            "different objects, or the objects were moved in between."
+        )
+    return float((places + offset)[:, 2].mean())
 
 
 class CameraCorrection:
@@ -455,10 +481,10 @@ class CameraCorrection:
 
     def __init__(self, reference: CameraReference):
         self.motion: CameraMotion | None = None
-        self._reference = reference
+        self._reference, self._camera = reference, reference.vector
         self._watch = CameraWatch(reference, _FEWEST)
-        self._frames: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=_KEPT_FRAMES)
-        self._twist = np.zeros(6)
+        self._frames: _Frames = deque(maxlen=_KEPT_FRAMES)
+        self._twist = torch.zeros(6, dtype=torch.float64)
 
     def clear(self) -> None:
         """Prepare for another episode: the clock restarts, the camera motion is kept."""
@@ -467,17 +493,14 @@ class CameraCorrection:
         # Frames of earlier episodes are older than any window.
         self._frames = deque(((-np.inf, f[1], f[2]) for f in known), maxlen=_KEPT_FRAMES)
 
-    def update(
-        self, time: float, pose: Pose, pixel: Float[np.ndarray, "2"]
-    ) -> CameraMotion | None:
+    def update(self, time: float, pose: Pose, pixel: Float[Tensor, "2"]) -> CameraMotion | None:
         """Add one frame in which the marker was found; arguments as for `CameraWatch.update`.
 
         Returns:
             The camera motion, if it is detected with this frame: the first one, and each
             further one.
         """
-        camera = self._reference.camera
-        point = camera.points(pose)
+        point, pixel = _marker_point(self._camera, pose), pixel.double()
         corrected = self.marker(pose, pixel)
         noticed = self._watch.update(time, pose, corrected)
         if not self._reference.covers(point):
@@ -491,10 +514,10 @@ class CameraCorrection:
             return None
         self._watch.clear()
         if self.motion is not None and len(self._frames) < FEWEST_FRAMES:
-            there = camera.project(point)
-            if np.linalg.norm(pixel - there) < np.linalg.norm(corrected - there):
+            there = pixels_and_depth(self._camera, point[None])[0][0]
+            if (pixel - there).norm() < (corrected - there).norm():
                 # The marker was wrong in the first frames: the camera has not moved.
-                self.motion, self._twist = None, np.zeros(6)
+                self.motion, self._twist = None, torch.zeros_like(self._twist)
                 self._frames.clear()
             else:
                 self._find()
@@ -505,34 +528,36 @@ class CameraCorrection:
         self._find()
         return self.motion
 
-    def marker(self, pose: Pose, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    def marker(self, pose: Pose, pixel: Float[Tensor, "2"]) -> Float[Tensor, "2"]:
         """Pixel of the tool's marker corrected for the camera motion [px]."""
         if self.motion is None:
             return pixel
-        return pixel - _displacement(self._reference.camera, pose, self._twist)
+        point = _marker_point(self._camera, pose)[None]
+        return pixel - _displacement(self._camera, point, self._twist)[0]
 
-    def object(
-        self, plane: ObjectPlane, pixel: Float[np.ndarray, "2"]
-    ) -> Float[np.ndarray, "2"]:
-        """Pixel of a point on a plane corrected for the camera motion [px]."""
+    def object(self, height: float, pixel: Float[Tensor, "2"]) -> Float[Tensor, "2"]:
+        """Pixel of a point on a horizontal plane corrected for the camera motion [px].
+
+        Args:
+            height: Height of the plane, by `object_height` [m].
+            pixel: Pixel of the point [px].
+        """
         if self.motion is None:
             return pixel
-        camera = self._reference.camera
-        place = camera.moved(self._twist).on_plane(pixel, plane.height)
-        return camera.project(camera.from_base(place))
+        place = on_plane(moved(self._camera, self._twist), pixel.double(), height)
+        return pixels_and_depth(self._camera, from_base(self._camera, place[None]))[0][0]
 
     def _forget(self, time: float) -> None:
         """Drop frames older than the time window of the detection."""
-        while self._frames and self._frames[0][0] < time - self._reference.window:
+        while self._frames and self._frames[0][0] < time - _WINDOW:
             self._frames.popleft()
 
     def _find(self, steps: int = 5) -> float:
         """Fit the motion to all frames; returns the error in the last window, rms [px]."""
-        camera = self._reference.camera
-        points, pixels = (np.array([f[i] for f in self._frames]) for i in (1, 2))
+        camera, (points, pixels) = self._camera, _columns(self._frames)
         self._twist = refined_twist(camera, points, pixels, self._twist, steps)
-        self.motion = CameraMotion.of(self._twist, points, camera)
-        now = self._frames[-1][0] - self._reference.window
-        recent = np.array([f[0] >= now for f in self._frames])
-        left = pixels - camera.project(from_moved(points, self._twist))
-        return float(np.sqrt((left[recent] ** 2).sum(-1).mean()))
+        self.motion = CameraMotion.of(camera, self._twist, points)
+        now = self._frames[-1][0] - _WINDOW
+        recent = torch.tensor([f[0] >= now for f in self._frames])
+        left = pixels - pixels_and_depth(camera, from_moved(points, self._twist))[0]
+        return _root_mean_square(left[recent])

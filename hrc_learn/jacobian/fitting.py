@@ -10,7 +10,7 @@ summed statistics.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -145,10 +145,6 @@ class MotionSamples:
         """The pairs of several demonstrations together."""
         return tree_map(lambda *parts: torch.cat(parts), MotionSamples.empty(), *motions)
 
-    def split(self, parts: int) -> list[MotionSamples]:
-        """The pairs in order, in parts of nearly equal size."""
-        return [self[piece] for piece in torch.arange(len(self.dx)).tensor_split(parts)]
-
     def thinned(self, most: int) -> MotionSamples:
         """Evenly chosen pairs, at most `most` of them."""
         pairs = len(self.dx)
@@ -233,27 +229,32 @@ def statistics_by_fold(
         config: Choice of key frames.
 
     Returns:
-        Folds made of whole demonstrations, or fifths of a single one; some may be empty.
+        Every fifth of `recorded_parts`, from each of the first five on; some may be empty.
     """
     folds = [RegressionStatistics.empty(6 * neurons) for _ in range(FOLDS)]
     with torch.no_grad():
-        for fold, motion in samples_by_fold(demonstrations, config):
+        for i, recorded in distributed.local_items(recorded_parts(demonstrations)):
+            motion, fold = recorded.motion(config), i % FOLDS
             part = RegressionStatistics.of(motion.regressors(basis), motion.dx)
             # The first part of a fold sets its device.
             folds[fold] = folds[fold] + part if folds[fold].count else part
     return [fold.over_processes() for fold in folds]
 
 
-def samples_by_fold(
-    demonstrations: Sequence[ImageDemonstration], config: KeyFrameConfig
-) -> Iterator[tuple[int, MotionSamples]]:
-    """Motion between key frames in the demonstrations of this process, with its fold."""
-    for i, demonstration in distributed.local_items(demonstrations):
-        motion = demonstration.motion(config)
-        if len(demonstrations) == 1:
-            yield from enumerate(motion.split(FOLDS))
-        else:
-            yield i % FOLDS, motion
+def recorded_parts(
+    demonstrations: Sequence[ImageDemonstration],
+) -> Sequence[ImageDemonstration]:
+    """The demonstrations, or consecutive fifths of a single one."""
+    if len(demonstrations) != 1:
+        return demonstrations
+    (whole,) = demonstrations
+    pieces = torch.arange(len(whole.visible)).tensor_split(FOLDS)
+    return [
+        ImageDemonstration(
+            pose=whole.pose[piece], feature=whole.feature[piece], visible=whole.visible[piece]
+        )
+        for piece in pieces
+    ]
 
 
 def radial_basis(
@@ -512,14 +513,8 @@ def _held_out_square(
     """Mean squared error over all pairs, each predicted without its own fold."""
     if len(folds) == 1:
         return float("nan")
-    without = weights_without_each(folds, precision, noise)
-    error = sum(fold.squared_error(W) for fold, W in zip(folds, without, strict=True))
+    error = 0.0
+    for i, fold in enumerate(folds):
+        rest = reduce(add, [*folds[:i], *folds[i + 1 :]])
+        error += fold.squared_error(solve(rest, precision, noise)[0])
     return error / sum(fold.count for fold in folds)
-
-
-def weights_without_each(
-    folds: Sequence[RegressionStatistics], precision: Float[Tensor, "P P"], noise: float
-) -> list[Float[Tensor, "P 2"]]:
-    """Posterior means of all folds but one, for each fold left out."""
-    rests = (reduce(add, [*folds[:i], *folds[i + 1 :]]) for i in range(len(folds)))
-    return [solve(rest, precision, noise)[0] for rest in rests]

@@ -22,7 +22,6 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
 from hrc_learn import distributed
-from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import (
     FOLDS,
     ImageDemonstration,
@@ -30,8 +29,8 @@ from hrc_learn.jacobian.fitting import (
     MotionSamples,
     RBFCenters,
     RegressionStatistics,
-    component_scale,
     prior_precision,
+    recorded_parts,
     solve,
     statistics_by_fold,
     weight_covariance,
@@ -85,14 +84,9 @@ class EvidenceResult:
     """Index of the best round."""
 
     @property
-    def neurons(self) -> RBFCenters:
-        """Learned neurons."""
-        return self.rounds[self.best].neurons
-
-    @property
-    def config(self) -> ImageJacobianFitConfig:
-        """Learned noise and prior."""
-        return self.rounds[self.best].config
+    def kept(self) -> EvidenceRound:
+        """The best round, with the learned neurons, noise and prior."""
+        return self.rounds[self.best]
 
 
 def maximize_evidence(
@@ -267,8 +261,6 @@ class HeldOutSamples:
     """Motion of the feature [px]."""
     error: Float[Tensor, "pairs 2"]
     """Motion less its prediction [px]."""
-    uncertainty: Float[Tensor, " pairs"]
-    """Posterior deviation of the Jacobian relative to its size, rotation scaled to metres."""
 
     def by_cell(self, cells: int = 3) -> CellErrors:
         """Errors over a grid on the horizontal plane.
@@ -288,7 +280,6 @@ class HeldOutSamples:
             edges=torch.from_numpy(np.stack(edges, axis=-1)),
             pairs=torch.from_numpy(pairs).long(),
             relative=(error / motion).sqrt(),
-            uncertainty=total(self.uncertainty) / torch.from_numpy(pairs),
         )
 
 
@@ -302,8 +293,6 @@ class CellErrors:
     """Number of pairs in each cell, x first."""
     relative: Float[Tensor, "cells cells"]
     """Root mean square error relative to that of the motion; NaN in an empty cell."""
-    uncertainty: Float[Tensor, "cells cells"]
-    """Mean relative posterior deviation of the Jacobian; NaN in an empty cell."""
 
 
 def cross_validate(
@@ -329,7 +318,7 @@ def cross_validate(
     if report is None:
         raise ValueError("a loaded network has no fit report: pass the network just fitted.")
     network = network.double()
-    parts = _parts(demonstrations)
+    parts = recorded_parts(demonstrations)
     seen = {i % FOLDS for i in range(min(len(parts), FOLDS)) if len(parts[i].motion(config).dx)}
     if len(seen) < 2:
         raise ValueError("held-out errors need pairs in at least two folds of the data.")
@@ -351,20 +340,6 @@ def cross_validate(
     return tree_map(lambda *columns: torch.cat(columns), *pairs)
 
 
-def _parts(demonstrations: Sequence[ImageDemonstration]) -> Sequence[ImageDemonstration]:
-    """The demonstrations, or consecutive parts of a single one."""
-    if len(demonstrations) > 1:
-        return demonstrations
-    (whole,) = demonstrations
-    pieces = torch.arange(len(whole.visible)).tensor_split(FOLDS)
-    return [
-        ImageDemonstration(
-            pose=whole.pose[piece], feature=whole.feature[piece], visible=whole.visible[piece]
-        )
-        for piece in pieces
-    ]
-
-
 @torch.no_grad()
 def _predicted(
     part: ImageDemonstration,
@@ -381,16 +356,4 @@ def _predicted(
         position=(motion.before.position + motion.after.position) / 2,
         motion=motion.dx,
         error=error,
-        uncertainty=relative_uncertainty(network, motion.before, config),
     )
-
-
-def relative_uncertainty(
-    network: RBFImageJacobian, pose: Pose, config: ImageJacobianFitConfig
-) -> Float[Tensor, " pairs"]:
-    """Posterior deviation of the Jacobian relative to its size, rotation scaled to metres."""
-    scale = component_scale(pose.position, config.rotation_scale)
-    size = (network(pose) / scale).flatten(-2).norm(dim=-1)
-    # Both image rows have the same deviation, which makes the norm over both sqrt(2) times it.
-    deviation = network.uncertainty(pose, config.rotation_scale) / scale
-    return 2**0.5 * deviation.norm(dim=-1) / size

@@ -15,14 +15,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice, permutations, product
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.distributed import LazyMap
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import matmul
 from hrc_learn.jacobian.fitting import ImageDemonstration
@@ -90,8 +91,15 @@ def marker_points(
 ) -> Float[Tensor, "*batch frames 3"]:
     """The marker in the camera frame [m] at poses of the tool."""
     lever = quaternion.rotate(pose.orientation, camera[..., None, MARKER])
+    return from_base(camera, pose.position + lever)
+
+
+def from_base(
+    camera: Float[Tensor, "*batch 13"], points: Float[Tensor, "*batch frames 3"]
+) -> Float[Tensor, "*batch frames 3"]:
+    """Points of the base frame in the camera frame [m]."""
     turn = quaternion.exp(camera[..., None, ROTATION])
-    return quaternion.rotate(turn, pose.position + lever) + camera[..., None, SHIFT]
+    return quaternion.rotate(turn, points) + camera[..., None, SHIFT]
 
 
 def marker_pixels(
@@ -176,22 +184,12 @@ def unexplained(
     demonstrations: Sequence[ImageDemonstration], camera: Float[Tensor, "13"]
 ) -> Sequence[ImageDemonstration]:
     """Demonstrations whose feature is what a camera leaves of it, read on access."""
-    return _Unexplained(demonstrations, camera)
+    return LazyMap(demonstrations, partial(_left_by, camera))
 
 
-class _Unexplained(Sequence[ImageDemonstration]):
-    def __init__(self, whole: Sequence[ImageDemonstration], camera: Tensor):
-        self._whole, self._camera = whole, camera
-
-    def __len__(self) -> int:
-        return len(self._whole)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return _Unexplained(self._whole[index], self._camera)
-        demo = self._whole[index].double()
-        seen, _ = marker_pixels(self._camera, demo.pose)
-        return replace(demo, feature=demo.feature - seen)
+def _left_by(camera: Float[Tensor, "13"], demo: ImageDemonstration) -> ImageDemonstration:
+    demo = demo.double()
+    return replace(demo, feature=demo.feature - marker_pixels(camera, demo.pose)[0])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -422,114 +420,32 @@ def _pinhole(
     return u @ torch.diag(torch.stack([*u.new_ones(2), flip])) @ vt, depth
 
 
-@dataclass(frozen=True, kw_only=True)
-class MarkerCamera:
-    """A camera and the position of a marker on the tool, as named numbers."""
+def motion_jacobian(
+    camera: Float[Tensor, "13"], points: Float[Tensor, "frames 3"]
+) -> Float[Tensor, "frames 2 6"]:
+    """Derivative of pixels by a twist of the camera in its own frame [px/rad, px/m].
 
-    focal: float
-    """Focal length [px]."""
-    center: tuple[float, float]
-    """Principal point (u, v) [px]."""
-    radial: float
-    """Brown's k1: a point at xi is seen at xi (1 + k1 |xi|^2)."""
-    rotation: tuple[float, float, float]
-    """Rotation vector from base to camera frame (OpenCV's axes) [rad]."""
-    shift: tuple[float, float, float]
-    """Origin of the base in the camera frame [m]."""
-    marker: tuple[float, float, float]
-    """Position of the marker in the tool frame [m]."""
+    Three columns of rotation, then three of translation: the interaction matrix of Espiau,
+    Chaumette and Rives (1992) for points, times the lens.
 
-    @staticmethod
-    def fit(
-        demonstrations: Sequence[ImageDemonstration], image_size: tuple[int, int]
-    ) -> MarkerCamera:
-        """Camera and marker fitted to demonstrations (see `fit_camera`).
+    Args:
+        camera: Camera.
+        points: Points in the camera frame [m].
+    """
+    _, by_point = pixels_and_depth(camera, points)
+    # For a camera that turns by w and moves by v, points move by p x w - v.
+    turned = torch.linalg.cross(by_point, points[:, None].expand(by_point.shape))
+    return torch.cat([turned, -by_point], dim=-1)
 
-        Args:
-            demonstrations: Demonstrations in which the tool moved, read one by one.
-            image_size: Width and height of the image [px].
-        """
-        return MarkerCamera.of(fit_camera(demonstrations, image_size).camera)
 
-    @staticmethod
-    def of(vector: Float[Tensor, "13"]) -> MarkerCamera:
-        """Camera of a vector."""
-        values = vector.tolist()
-        return MarkerCamera(
-            focal=float(np.exp(values[0])),
-            center=(values[1], values[2]),
-            radial=values[3],
-            rotation=(values[4], values[5], values[6]),
-            shift=(values[7], values[8], values[9]),
-            marker=(values[10], values[11], values[12]),
-        )
-
-    @property
-    def vector(self) -> Float[Tensor, "13"]:
-        """Vector of the camera, in float64."""
-        values = [float(np.log(self.focal)), *self.center, self.radial]
-        values += [*self.rotation, *self.shift, *self.marker]
-        return torch.tensor(values, dtype=torch.float64)
-
-    @property
-    def rotation_matrix(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation from base to camera frame."""
-        return quaternion.to_matrix(quaternion.exp(self.vector[ROTATION])).numpy()
-
-    def points(self, pose: Pose) -> Float[np.ndarray, "*batch 3"]:
-        """The marker in the camera frame [m] at poses of the tool, in float64."""
-        pose = Pose(pose.position.double(), pose.orientation.double())
-        return self.from_base(pose.apply(self.marker).numpy())
-
-    def from_base(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Points of the base frame in the camera frame [m]."""
-        return points @ self.rotation_matrix.T + np.array(self.shift)
-
-    def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of points in the camera frame [px]."""
-        flat = torch.from_numpy(points).reshape(-1, 3)
-        return pixels_and_depth(self.vector, flat)[0].reshape(*points.shape[:-1], 2).numpy()
-
-    def on_plane(
-        self, pixel: Float[np.ndarray, "*batch 2"], height: float
-    ) -> Float[np.ndarray, "*batch 3"]:
-        """Points of a horizontal plane seen at pixels, in the base frame [m].
-
-        Args:
-            pixel: Pixels (u, v) [px].
-            height: Height of the plane in the base frame [m].
-        """
-        camera = self.vector.expand(*pixel.shape[:-1], SIZE)
-        return on_plane(camera, torch.from_numpy(pixel), height).numpy()
-
-    def motion_jacobian(
-        self, points: Float[np.ndarray, "*batch 3"]
-    ) -> Float[np.ndarray, "*batch 2 6"]:
-        """Derivative of pixels by a twist of the camera in its own frame [px/rad, px/m].
-
-        Three columns of rotation, then three of translation: the interaction matrix of
-        Espiau, Chaumette and Rives (1992) for points, times the lens.
-
-        Args:
-            points: Points in the camera frame [m].
-        """
-        flat = torch.from_numpy(points).reshape(-1, 3)
-        _, by_point = pixels_and_depth(self.vector, flat)
-        # For a camera that turns by w and moves by v, points move by p x w - v.
-        turned = torch.linalg.cross(by_point, flat[:, None].expand(by_point.shape))
-        whole = torch.cat([turned, -by_point], dim=-1)
-        return whole.reshape(*points.shape[:-1], 2, 6).numpy()
-
-    def moved(self, twist: Float[np.ndarray, "6"]) -> MarkerCamera:
-        """The camera turned by a rotation vector [rad] about its own axes, then moved along the
-        axes it had before the turn [m].
-        """
-        back, shift = quaternion.exp(-torch.from_numpy(twist[:3])), self.vector[SHIFT]
-        vector = self.vector
-        turn = quaternion.multiply(back, quaternion.exp(vector[ROTATION]))
-        vector[SHIFT] = quaternion.rotate(back, shift - torch.from_numpy(twist[3:]))
-        vector[ROTATION] = quaternion.log(turn)
-        return MarkerCamera.of(vector)
+def moved(camera: Float[Tensor, "13"], twist: Float[Tensor, "6"]) -> Float[Tensor, "13"]:
+    """The camera turned by a rotation vector [rad] about its own axes, then moved along the
+    axes it had before the turn [m].
+    """
+    back = quaternion.exp(-twist[:3])
+    turn = quaternion.log(quaternion.multiply(back, quaternion.exp(camera[ROTATION])))
+    shift = quaternion.rotate(back, camera[SHIFT] - twist[3:])
+    return torch.cat([camera[:4], turn, shift, camera[MARKER]])
 
 
 def _sampled(

@@ -248,16 +248,6 @@ class Arm(SerialChain):
             for mass, guess in zip(given, estimated, strict=True)
         )
 
-    @property
-    def link_masses(self) -> tuple[float, ...]:
-        """Masses of the moving links [kg]."""
-        return self.masses[1 : self.joints + 1]
-
-    @property
-    def meshes(self) -> Mapping[str, tuple[MeshFile, ...]]:
-        """Meshes by the name of their link: link0, link1, ...; without the gripper's."""
-        return self.shape.meshes
-
     # Inverse kinematics
 
     def inverse(
@@ -455,7 +445,7 @@ class Arm(SerialChain):
             name=self.name,
             chain=self.with_tool(tcp, flange),
             shape=ArmShape(
-                meshes=self.meshes,
+                meshes=self.shape.meshes,
                 masses=(*self.masses[:-1], None),
                 inertia=(*self.shape.inertia[:-1], None) if self.shape.inertia else (),
                 shapes=self.shape.shapes,

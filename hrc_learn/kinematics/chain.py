@@ -280,15 +280,6 @@ class SerialChain:
         frames = self._joint_frames(self.joint_positions(q))
         return torch.stack([frame[..., 3] for frame in frames], dim=-2)
 
-    def joint_origin(self, q: ArrayLike, joint: int) -> Float[Tensor, "*batch 3"]:
-        """Origin of the frame of one joint in the base frame [m].
-
-        Args:
-            q: Joint positions [rad].
-            joint: Number of the joint, from 1.
-        """
-        return self._joint_frames(self.joint_positions(q), joint)[-1][..., 3]
-
     def joint_origins_and_jacobian(
         self, q: ArrayLike
     ) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch 6 joints"]]:

@@ -67,7 +67,7 @@ def arm_meshes(robot: Arm, body: str) -> tuple[MeshFile, ...]:
         return tuple(replace(mesh, scale=size) for mesh in panda_meshes(body))
     if robot.is_franka:
         return panda_meshes(body)
-    return tuple(robot.meshes.get(body, ()))
+    return tuple(robot.shape.meshes.get(body, ()))
 
 
 def arm_bodies(

@@ -75,36 +75,11 @@ def task_error_and_jacobian(
     T, J = chain.transform_and_jacobian(q)
     if task in ("pose", "nearest pose"):
         return Pose.from_matrix(T).twist_to(pose), J
-    error = task_error(T, pose, task)
+    error, rows = pose.position - T[..., 3], J[..., :3, :]
     if task == "position":
-        return error[..., :3], J[..., :3, :]
-    sides = pose.matrix()[..., :3, :2].mT
-    turn = (sides @ error[..., 3:, None])[..., 0]
-    return (
-        torch.cat([error[..., :3], turn], dim=-1),
-        torch.cat([J[..., :3, :], sides @ J[..., 3:, :]], dim=-2),
-    )
-
-
-def task_error(
-    T: Float[Tensor, "*batch 3 4"], pose: Pose, task: TaskSpace
-) -> Float[Tensor, "*batch 6"]:
-    """Twist that takes the tool in unit time to what a task wants of a pose [m, rad].
-
-    Of "position+axis" the shortest turn of the tool's axis, of "position" none.
-
-    Args:
-        T: Pose of the tool in the base frame.
-        pose: Wanted.
-        task: Constrained part of the pose.
-    """
-    if task in ("pose", "nearest pose"):
-        return Pose.from_matrix(T).twist_to(pose)
-    linear = pose.position - T[..., 3]
-    if task == "position":
-        return torch.cat([linear, torch.zeros_like(linear)], dim=-1)
+        return error, rows
     R = pose.matrix()[..., :3, :3]
-    wanted, now = R[..., 2], T[..., 2]
+    sides, wanted, now = R[..., :2].mT, R[..., 2], T[..., 2]
     across = torch.linalg.cross(now, wanted)
     sine = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
     cosine = (now * wanted).sum(-1, keepdim=True)
@@ -113,7 +88,8 @@ def task_error(
     small = sine < 1e-9
     axis = torch.where(small, R[..., 0], across / sine.clamp(min=1e-9))
     turn = axis * torch.where(small & (cosine > 0), 0.0, angle)
-    return torch.cat([linear, turn], dim=-1)
+    error = torch.cat([error, (sides @ turn[..., None])[..., 0]], dim=-1)
+    return error, torch.cat([rows, sides @ J[..., 3:, :]], dim=-2)
 
 
 def null_space_dimension(
@@ -254,14 +230,13 @@ def solve_inverse(
         start = (lower + upper) / 2 + (2 * random - 1) * half
         if round_ == 0:
             start[:, 0] = best[missing]
-        row = missing.repeat_interleave(_STARTS)
-        q, reached = _descend(chain, goal[row], start.flatten(0, 1), task, tolerance)
-        q = unwound(chain, q, wish[row])
-        apart = torch.linalg.vector_norm(q - wish[row], dim=-1)
-        apart = torch.where(reached, apart, torch.inf).unflatten(0, (-1, _STARTS))
+        q = solutions_from(chain, goal[missing], start, task=task, tolerance=tolerance)
+        q = unwound(chain, q, wish[missing].unsqueeze(-2))
+        apart = torch.linalg.vector_norm(q - wish[missing].unsqueeze(-2), dim=-1)
+        apart = torch.where(apart.isnan(), torch.inf, apart)
         least = apart.min(-1)
         each = torch.arange(len(missing), device=q.device)
-        chosen = q.unflatten(0, (-1, _STARTS))[each, least.indices]
+        chosen = q[each, least.indices]
         good = least.values.isfinite()
         best[missing[good]], distance[missing[good]] = chosen[good], least.values[good]
     found = distance.isfinite()
@@ -427,40 +402,6 @@ def _drawn_nearer(
 SINGULAR_BELOW = 0.05
 
 
-def pseudo_inverse(
-    J: Float[Tensor, "*batch rows joints"], damping: Float[Tensor, "*#batch"] | float = 0.0
-) -> Float[Tensor, "*batch joints rows"]:
-    """Right pseudo-inverse J^T (J J^T + damping^2 I)^-1.
-
-    Without damping it inverts exactly wherever J has full rank, and fails or overflows where
-    it has not.
-
-    Args:
-        J: Jacobian with at least as many joints as rows.
-        damping: Not negative; bounds the gain by 1 / (2 damping).
-    """
-    gram = J @ J.mT
-    if isinstance(damping, Tensor):
-        damping = damping[..., None, None]
-    if isinstance(damping, Tensor) or damping != 0:
-        gram = gram + damping**2 * torch.eye(J.shape[-2], dtype=J.dtype, device=J.device)
-    return torch.linalg.solve(gram, J).mT
-
-
-def null_space_projector(
-    J: Float[Tensor, "*batch 6 joints"], damping: Float[Tensor, "*#batch"] | float = 0.0
-) -> Float[Tensor, "*batch joints joints"]:
-    """N = I - J^+ J: what is left of a joint velocity when its motion of the tip is removed.
-
-    Args:
-        J: Jacobian with at least as many joints as rows.
-        damping: As in `pseudo_inverse`. With damping N is no longer a projector: near a
-            singularity it lets some motion of the tip through.
-    """
-    eye = torch.eye(J.shape[-1], dtype=J.dtype, device=J.device)
-    return eye - pseudo_inverse(J, damping) @ J
-
-
 _SHOULDER, _ELBOW, _WRIST = 1, 3, 5  # frames of joints 2, 4 and 6
 # Step of the central difference [rad]: rounding and truncation are both near 1e-10 then.
 _STEP = 1e-5
@@ -511,11 +452,7 @@ def arm_angle_and_motion(
         The angle [rad], and joint velocities [rad/s]; these are bounded near configurations
         in which the null space does not move the elbow.
     """
-    N = null_space_projector(jacobian)
-    # The projector has rank one: its longest column spans the null space.
-    longest = N.norm(dim=-2).argmax(dim=-1)
-    column = N.gather(-1, longest[..., None, None].expand(*N.shape[:-1], 1)).squeeze(-1)
-    direction = torch.nn.functional.normalize(column, dim=-1)
+    direction = orthonormal_basis(jacobian)[..., -1]
     step = _STEP * direction
     angle, after, before = arm_angle(chain, torch.stack([q, q + step, q - step]))
     # The shorter difference, should the angle wrap around between both ends.

@@ -1,14 +1,14 @@
 """Fits of datasets larger than memory: from a sample, or streamed."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
+from hrc_learn.distributed import LazyMap
 from hrc_learn.dmp import JointDMP, fit_shared
 from hrc_learn.learning.primitive_fitting import CHANNELS, require_motion
 
@@ -17,24 +17,6 @@ HELD_AT_ONCE = 700_000
 fit and the comparison of models take up to 300 MB."""
 LONGEST = 5_000
 """Largest number of frames of one demonstration, up to 100 basis functions."""
-
-
-class LazyMap[S, T](Sequence[T]):
-    """Lazy map of a sequence: an item is computed when it is accessed."""
-
-    def __init__(self, items: Sequence[S], function: Callable[[S], T]):
-        self._items, self._function = items, function
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return LazyMap(self._items[index], self._function)
-        return self._function(self._items[index])
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    def __iter__(self) -> Iterator[T]:
-        return map(self._function, self._items)
 
 
 def sampled(source: DemonstrationSource) -> DemonstrationSet:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
+from hrc_learn.distributed import LazyMap
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     EvidenceConfig,
@@ -26,7 +27,6 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.learning.large_datasets import LazyMap
 from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import (
     ANGLE_FEATURE,
@@ -75,7 +75,7 @@ def fit_visual_servo(
     if learning is not None and len(demos) >= learning.hold_out:
         left = unexplained(watched, camera.camera)
         learned = maximize_evidence(left, neurons, config, learning, on_round)
-        neurons, config = learned.neurons, learned.config
+        neurons, config = learned.kept.neurons, learned.kept.config
     network = RBFImageJacobian.fit(watched, neurons, config, camera)
     held_out = cross_validate(watched, network, config, image_size)
     assert network.report is not None

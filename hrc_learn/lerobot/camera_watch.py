@@ -29,7 +29,7 @@ from hrc_learn.jacobian import (
     CameraReference,
     CameraWatch,
     ImageDemonstration,
-    ObjectPlane,
+    object_height,
 )
 from hrc_learn.lerobot.arm_values import HAND, MARKER, PIXELS
 from hrc_learn.lerobot.policy.policy_base import read_episodes
@@ -61,7 +61,7 @@ class CameraWatchStep(ProcessorStep):
     object_columns: list[int] | None = None
     """Indices of `PIXELS` in the state, which are corrected too; None: there are none."""
     object_height: float = 0.0
-    """Height of the plane on which the object lies, as in `ObjectPlane` [m]."""
+    """Height of the plane on which the object lies, by `jacobian.object_height` [m]."""
     motion: CameraMotion | None = field(default=None, init=False, repr=False)
     """Latest detection, of this episode unless it is corrected; None: the camera has not moved.
     """
@@ -82,7 +82,6 @@ class CameraWatchStep(ProcessorStep):
         text = json_text(self.reference)
         reference = parse_json(text, CameraReference, "reference of the camera watch")
         self._watch = CameraCorrection(reference) if self.correct else CameraWatch(reference)
-        self._plane = ObjectPlane(height=self.object_height)
         self._calls = 0
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
@@ -103,22 +102,21 @@ class CameraWatchStep(ProcessorStep):
             return transition
         values = values.clone()
         if self.object_columns is not None:
-            pixel = self._watch.object(self._plane, values[self.object_columns].numpy())
-            values[self.object_columns] = torch.from_numpy(pixel)
+            pixel = self._watch.object(self.object_height, values[self.object_columns])
+            values[self.object_columns] = pixel
         if pose is not None:
-            marker[:2] = torch.from_numpy(self._watch.marker(pose, marker[:2].numpy()))
+            marker[:2] = self._watch.marker(pose, marker[:2])
             values[self.marker_columns] = marker
         corrected = {**observation, OBS_STATE: values.to(state).reshape(state.shape)}
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
     def _look(self, state: Float[Tensor, " values"], marker: Float[Tensor, "3"]) -> Pose | None:
         """Position of the tool, if its marker is visible."""
-        u, v, visible = marker.tolist()
         vector = state[self.pose_columns]
-        if visible < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
+        if marker[2] < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
             return None
         pose = Pose(vector[:3], quaternion.exp(vector[3:]))
-        seen = self._watch.update(self._calls / self.fps, pose, torch.tensor([u, v]).numpy())
+        seen = self._watch.update(self._calls / self.fps, pose, marker[:2])
         if seen is not None:
             if self.correct:
                 logging.warning("%s since the demonstrations: what it sees is corrected.", seen)
@@ -192,7 +190,7 @@ def add_camera_watch(
     if correct and object_columns is not None:
         lowest = [x[x[:, pose_columns[2]].argmin(), pose_columns[:3]] for x in states]
         seen = torch.stack([x[0, object_columns] for x in states])
-        height = ObjectPlane.fit(reference, torch.stack(lowest).numpy(), seen.numpy()).height
+        height = object_height(reference, torch.stack(lowest), seen)
     step = CameraWatchStep(
         reference=asdict(reference),
         fps=fps,

@@ -189,7 +189,7 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
         body = _add_body(body, f"link{i + 1}", np.linalg.inv(parent_frame) @ frames[i])
         parent_frame = frames[i]
         _add_joint(spec, body, name, i, config)
-        _add_capsules(body, robot, i + 1, mass=robot.link_masses[i])
+        _add_capsules(body, robot, i + 1, mass=robot.masses[i + 1])
     # The end effector's frame: at the flange, turned as the tool.
     flange, tool = frames[n], frames[n + 1]
     hand_frame = np.linalg.inv(parent_frame) @ tool

@@ -220,10 +220,10 @@ class VisualServoSkill:
                 "camera_place_std_mm": 1e3 * camera.deviation(SHIFT),
             }
         if self.learned is not None:
-            first, best = self.learned.rounds[0], self.learned.rounds[self.learned.best]
+            first, best = self.learned.rounds[0], self.learned.kept
             values |= {
-                "pixel_noise_px": self.learned.config.pixel_noise,
-                "width": float(self.learned.neurons.width),
+                "pixel_noise_px": best.config.pixel_noise,
+                "width": float(best.neurons.width),
                 "learning_rounds": float(self.learned.best),
                 "before_learning_error_px": first.held_out_error,
                 "after_learning_error_px": best.held_out_error,

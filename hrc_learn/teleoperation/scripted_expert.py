@@ -131,7 +131,8 @@ class ScriptedPerturbation(Human):
         q, time = state.joint_position, state.time - self._begin
         for scripted in self.forces:
             if scripted.start < time < scripted.end:
-                origin = self._chain.joint_origin(torch.from_numpy(q), scripted.joint).numpy()
+                origins = self._chain.joint_origins(torch.from_numpy(q))
+                origin = origins[scripted.joint - 1].numpy()
                 d += force_to_nullspace_input(
                     self._chain, q, scripted.joint, scripted.force(time, origin), self._config
                 )

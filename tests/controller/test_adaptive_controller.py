@@ -6,6 +6,7 @@ import pytest
 import sampling
 import torch
 from pinhole_camera import PinholeCamera
+from projections import null_space_projector
 from servoing import (
     CENTRE,
     DOUBLE,
@@ -30,7 +31,7 @@ from hrc_learn.jacobian import (
     KalmanEstimator,
     PaperEstimator,
 )
-from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
+from hrc_learn.kinematics import panda
 
 
 class TestTheLaw:
@@ -62,7 +63,7 @@ class TestTheLaw:
         xi_q = self.controller.joint_region.gradient(self.q)
         s = J_s.mT @ xi_x + xi_r
         null = null_space_projector(J) @ (self.d - xi_q) / 3
-        u = -pseudo_inverse(J) @ s + null
+        u = -torch.linalg.pinv(J) @ s + null
 
         torch.testing.assert_close(command.s, s)
         torch.testing.assert_close(command.twist, -s)

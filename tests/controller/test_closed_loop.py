@@ -39,7 +39,7 @@ from hrc_learn.jacobian import (
     KalmanEstimator,
     PaperEstimator,
 )
-from hrc_learn.kinematics import panda, pseudo_inverse
+from hrc_learn.kinematics import panda
 
 pytestmark = pytest.mark.simulation
 
@@ -364,7 +364,7 @@ def test_table_one_runs_only_because_of_the_safety_filter():
     for _ in range(50):
         before = state.safety.velocity
         command, state = controller.step(state, observe(q, feature_visible=hidden, dt=0.008))
-        speed = pseudo_inverse(panda.jacobian(q)) @ command.twist[..., None]
+        speed = torch.linalg.pinv(panda.jacobian(q)) @ command.twist[..., None]
         wanted = torch.maximum(wanted, (speed[..., 0].abs() / LIMITS.velocity).amax(-1))
         q = q + 0.008 * command.joint_velocity
         assert not violations(q, command.joint_velocity, before, 0.008).any()

@@ -14,7 +14,7 @@ from hrc_learn.controller import (
 )
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import FixedEstimator, PaperEstimator, RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import panda, pseudo_inverse
+from hrc_learn.kinematics import panda
 
 DOUBLE = torch.float64
 GAIN = 3e6
@@ -69,7 +69,7 @@ def run(estimator_of, *, steps: int = 150, dt: float = 2e-3) -> dict[str, Tensor
             history["P"].append(command.potential)
             history["rate"].append(command.potential_rate)
             J = panda.jacobian(q)
-            velocity = (pseudo_inverse(J) @ command.twist[..., None])[..., 0]
+            velocity = (torch.linalg.pinv(J) @ command.twist[..., None])[..., 0]
             x = x + dt * (true(panda.forward(q)) @ command.twist[..., None])[..., 0]
             q = q + dt * velocity
     return {name: torch.stack(values) for name, values in history.items()}

@@ -6,11 +6,12 @@ push through N can change; what drives a joint into its limit in the other six s
 
 import pytest
 import torch
+from projections import null_space_projector
 from torch import Tensor
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyFilter
-from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
+from hrc_learn.kinematics import panda
 from hrc_learn.regions import JointRegion
 
 LIMITS = panda.limits
@@ -28,7 +29,9 @@ def drive(twist: Tensor, stiffness: float, *, filtered: bool) -> Tensor:
     worst = torch.full((len(twist),), -torch.inf, dtype=torch.float64)
     for _ in range(1000):
         J = panda.jacobian(q)
-        task = pseudo_inverse(J, damping=0.05) @ twist[..., None]
+        task = J.mT @ torch.linalg.solve(
+            J @ J.mT + 0.05**2 * torch.eye(6, dtype=J.dtype), twist[..., None]
+        )
         u = (task - null_space_projector(J) @ region.gradient(q)[..., None])[..., 0]
         if filtered:
             u, state, _ = safety.step(state, q, u, DT)

@@ -5,10 +5,11 @@ import math
 import pytest
 import sampling
 import torch
+from projections import null_space_projector
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SeparationConfig
-from hrc_learn.kinematics import null_space_projector, panda
+from hrc_learn.kinematics import panda
 
 pytestmark = pytest.mark.simulation
 

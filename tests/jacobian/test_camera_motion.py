@@ -15,11 +15,25 @@ from hrc_learn.jacobian import (
     CameraReference,
     CameraWatch,
     ImageDemonstration,
-    MarkerCamera,
-    ObjectPlane,
     camera_placements,
+    fit_camera,
+    object_height,
 )
 from hrc_learn.jacobian.camera_motion import from_moved, refined_twist
+from hrc_learn.jacobian.perspective import (
+    FOCAL,
+    RADIAL,
+    marker_pixels,
+    marker_points,
+    motion_jacobian,
+    pixels_and_depth,
+)
+from hrc_learn.jacobian.perspective import (
+    MARKER as MARKER_PART,
+)
+from hrc_learn.jacobian.perspective import (
+    moved as moved_camera,
+)
 from hrc_learn.store import json_text, parse_json
 
 IMAGE, FPS, MARKER = (1440, 1080), 25.0, np.array([0.0, 0.06, 0.03])
@@ -52,7 +66,7 @@ def run(watch, demo, frames=None):
     """What a watch says, frame by frame."""
     watch.clear()
     return [
-        watch.update(frame / FPS, demo.pose[frame], demo.feature[frame].numpy())
+        watch.update(frame / FPS, demo.pose[frame], demo.feature[frame])
         for frame in demo.visible[:frames].nonzero()[:, 0].tolist()
     ]
 
@@ -70,44 +84,38 @@ def reference(demonstrations):
 
 @pytest.fixture(scope="module")
 def camera(demonstrations):
-    return MarkerCamera.fit(demonstrations, IMAGE)
+    return fit_camera(demonstrations, IMAGE).camera
 
 
 def test_the_camera_is_found_with_its_lens(camera):
     rng = np.random.default_rng(5)
     fresh = demonstration(rng, noise=0.0)
-    error = camera.project(camera.points(fresh.pose)) - fresh.feature.numpy()
+    error = (marker_pixels(camera, fresh.pose)[0] - fresh.feature).numpy()
     assert np.nanmax(np.abs(error)) < 0.5
-    assert camera.focal == pytest.approx(1700.0, rel=0.02)
-    assert camera.radial == pytest.approx(-0.06, abs=0.03)
+    assert float(camera[FOCAL].exp()) == pytest.approx(1700.0, rel=0.02)
+    assert float(camera[RADIAL]) == pytest.approx(-0.06, abs=0.03)
     # The marker is at the place that OpenCV put it, not only somewhere that fits.
-    np.testing.assert_allclose(camera.marker, MARKER, atol=2e-3)
+    np.testing.assert_allclose(camera[MARKER_PART], MARKER, atol=2e-3)
 
 
 def test_the_interaction_matrix_is_the_derivative_of_the_moved_camera(camera):
     pose = demonstration(np.random.default_rng(1)).pose[:5]
-    derivative = camera.motion_jacobian(camera.points(pose))
-    for axis, step in enumerate(1e-6 * np.eye(6)):
-        ahead, behind = camera.moved(step), camera.moved(-step)
-        change = ahead.project(ahead.points(pose)) - behind.project(behind.points(pose))
+    derivative = motion_jacobian(camera, marker_points(camera, pose))
+    for axis, step in enumerate(1e-6 * torch.eye(6, dtype=torch.float64)):
+        ahead, behind = moved_camera(camera, step), moved_camera(camera, -step)
+        change = marker_pixels(ahead, pose)[0] - marker_pixels(behind, pose)[0]
         np.testing.assert_allclose(derivative[..., axis], change / 2e-6, rtol=1e-4, atol=1e-3)
 
 
 def test_a_moved_camera_is_that_of_opencv():
     turn, shift = np.array([0.1, -0.2, 0.15]), np.array([0.03, 0.02, -0.05])
-    home = MarkerCamera(
-        focal=1700.0,
-        center=(731.0, 530.0),
-        radial=-0.06,
-        rotation=tuple(ROTATION),
-        shift=tuple(SHIFT),
-        marker=tuple(MARKER),
-    )
-    there = home.moved(np.concatenate([turn, shift]))
+    optics = [np.log(1700.0), 731.0, 530.0, -0.06]
+    home = torch.from_numpy(np.concatenate([optics, ROTATION, SHIFT, MARKER]))
+    there = moved_camera(home, torch.from_numpy(np.concatenate([turn, shift])))
     pose = demonstration(np.random.default_rng(2)).pose
     points = pose.apply(torch.from_numpy(MARKER)).numpy()
     expected = cv2.projectPoints(points, *moved(turn, shift), INTRINSICS, LENS)[0][:, 0]
-    np.testing.assert_allclose(there.project(there.points(pose)), expected, atol=1e-6)
+    np.testing.assert_allclose(marker_pixels(there, pose)[0], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -134,9 +142,9 @@ def test_a_large_motion_is_measured(reference):
     turn, shift = np.deg2rad([4.0, -6.0, 7.0]), np.array([0.05, -0.06, 0.04])
     fresh = demonstration(np.random.default_rng(6), moved(turn, shift))
     motion = run(CameraWatch(reference), fresh)[-1]
-    there = reference.camera.moved(motion.twist)
+    there = moved_camera(reference.vector, motion.twist)
     last = slice(-25, None)
-    error = there.project(there.points(fresh.pose)) - fresh.feature.numpy()
+    error = (marker_pixels(there, fresh.pose)[0] - fresh.feature).numpy()
     # A second of motion tells where the marker is seen, not how much of it was a turn.
     assert np.nanmax(np.abs(error[last])) < 3.0
     assert motion.angle == pytest.approx(np.linalg.norm(turn), rel=0.5)
@@ -157,15 +165,15 @@ def test_frames_where_no_demonstration_went_do_not_count(reference, demonstratio
     watch = CameraWatch(reference)
     assert not any(run(watch, outside))
     assert watch.displacement == 0.0
-    everywhere = np.concatenate(
-        [reference.camera.points(demo.pose[demo.visible]) for demo in demonstrations]
+    everywhere = torch.cat(
+        [marker_points(reference.vector, demo.pose[demo.visible]) for demo in demonstrations]
     )
     assert all(map(reference.covers, everywhere))
-    width = np.subtract(reference.upper, reference.lower)
-    for axis in np.eye(3):
-        for corner, away in ((reference.lower, -1e-6), (reference.upper, 1e-6)):
-            assert reference.covers(np.asarray(corner, float))
-            assert not reference.covers(np.asarray(corner, float) + away * width * axis)
+    lower, upper = (torch.tensor(x).double() for x in (reference.lower, reference.upper))
+    for axis in torch.eye(3):
+        for corner, away in ((lower, -1e-6), (upper, 1e-6)):
+            assert reference.covers(corner)
+            assert not reference.covers(corner + away * (upper - lower) * axis)
 
 
 def test_what_was_seen_before_a_pause_is_forgotten(reference):
@@ -179,11 +187,11 @@ def test_what_was_seen_before_a_pause_is_forgotten(reference):
 
 def test_frames_out_of_order_and_without_numbers_are_refused(reference):
     watch, pose = CameraWatch(reference), demonstration(np.random.default_rng(0)).pose[0]
-    watch.update(1.0, pose, np.array([700.0, 500.0]))
+    watch.update(1.0, pose, torch.tensor([700.0, 500.0]))
     with pytest.raises(ValueError, match="clear"):
-        watch.update(1.0, pose, np.array([700.0, 500.0]))
+        watch.update(1.0, pose, torch.tensor([700.0, 500.0]))
     with pytest.raises(ValueError, match="finite"):
-        watch.update(2.0, pose, np.array([np.nan, 500.0]))
+        watch.update(2.0, pose, torch.tensor([torch.nan, 500.0]))
 
 
 def test_a_reference_survives_json(reference):
@@ -247,7 +255,14 @@ def objects(rng, count=12):
 def plane(reference):
     rng = np.random.default_rng(11)
     there, taken = objects(rng)
-    return ObjectPlane.fit(reference, taken, shown_at(there) + rng.normal(0, 0.1, (12, 2)))
+    pixels = shown_at(there) + rng.normal(0, 0.1, (12, 2))
+    return object_height(reference, torch.from_numpy(taken), torch.from_numpy(pixels))
+
+
+def objects_found(correction, plane, there, place):
+    """Corrected pixels of objects that a moved camera sees."""
+    pixels = torch.from_numpy(shown_at(there, place))
+    return np.stack([correction.object(plane, pixel).numpy() for pixel in pixels])
 
 
 def corrected(correction, demo):
@@ -255,10 +270,10 @@ def corrected(correction, demo):
     pixels, noticed = [], 0
     with shapes_unchecked():
         for frame in demo.visible.nonzero()[:, 0].tolist():
-            pose, pixel = demo.pose[frame], demo.feature[frame].numpy()
+            pose, pixel = demo.pose[frame], demo.feature[frame]
             noticed += correction.update(frame / FPS, pose, pixel) is not None
             pixels.append(correction.marker(pose, pixel))
-    return np.array(pixels), noticed
+    return torch.stack(pixels).numpy(), noticed
 
 
 KNOCKS = [
@@ -286,7 +301,7 @@ def test_a_moved_camera_shows_things_where_it_would_have_seen_them(reference, pl
     points = demo.pose.apply(torch.from_numpy(MARKER)).numpy()[seen]
     assert np.abs(pixels - shown_at(points)).max() < 2.0
     there, _ = objects(rng)
-    found = [correction.object(plane, pixel) for pixel in shown_at(there, place)]
+    found = objects_found(correction, plane, there, place)
     np.testing.assert_allclose(found, shown_at(there), rtol=0, atol=3.0)
     assert np.abs(shown_at(there, place) - shown_at(there)).max() > 50.0
 
@@ -298,8 +313,8 @@ def test_a_camera_that_stands_still_is_not_corrected(reference, plane):
     assert noticed == 0
     assert correction.motion is None
     np.testing.assert_array_equal(pixels, demo.feature.numpy()[demo.visible.numpy()])
-    pixel = np.array([700.0, 500.0])
-    np.testing.assert_array_equal(correction.object(plane, pixel), pixel)
+    pixel = torch.tensor([700.0, 500.0])
+    assert torch.equal(correction.object(plane, pixel), pixel)
 
 
 @pytest.mark.parametrize("place", KNOCKS[:2])
@@ -309,12 +324,12 @@ def test_a_single_frame_tells_most_of_a_large_motion(reference, plane, place):
     correction = CameraCorrection(reference)
     demo = demonstration(rng, place)
     first = int(demo.visible.nonzero()[0])
-    pose, pixel = demo.pose[first], demo.feature[first].double().numpy()
+    pose, pixel = demo.pose[first], demo.feature[first]
     assert correction.update(0.0, pose, pixel) is not None
     marker = shown_at(pose.apply(torch.from_numpy(MARKER)).numpy()[None])[0]
     np.testing.assert_allclose(correction.marker(pose, pixel), marker, rtol=0, atol=2.0)
     there, _ = objects(rng)
-    found = [correction.object(plane, pixel) for pixel in shown_at(there, place)]
+    found = objects_found(correction, plane, there, place)
     left = np.linalg.norm(found - shown_at(there), axis=-1)
     assert np.median(left) < 0.5 * np.median(
         np.linalg.norm(shown_at(there, place) - shown_at(there), axis=-1)
@@ -323,33 +338,32 @@ def test_a_single_frame_tells_most_of_a_large_motion(reference, plane, place):
 
 def test_few_frames_lead_to_the_likeliest_motion_and_never_far(camera):
     """Of errors [px] and a prior spread of 0.1 rad and 0.1 m, the most probable motion."""
-    prior, points = 0.1, np.array([[0.05, -0.1, 0.9], [0.06, -0.1, 0.9]])
-    pixels = camera.project(points) + np.array([100.0, 60.0])
-    twist = refined_twist(camera, points, pixels, np.zeros(6), steps=60)
+    prior, points = 0.1, torch.tensor([[0.05, -0.1, 0.9], [0.06, -0.1, 0.9]]).double()
+    still = torch.zeros(6, dtype=torch.float64)
+    there, _ = pixels_and_depth(camera, points)
+    pixels = there + torch.tensor([100.0, 60.0])
+    twist = refined_twist(camera, points, pixels, still, steps=60)
     seen = from_moved(points, twist)
-    errors, jacobian = pixels - camera.project(seen), camera.motion_jacobian(seen)
-    slope = prior * np.einsum("fij,fi->j", jacobian, errors) - twist / prior
+    errors, jacobian = pixels - pixels_and_depth(camera, seen)[0], motion_jacobian(camera, seen)
+    slope = prior * torch.einsum("fij,fi->j", jacobian, errors) - twist / prior
     # The turn composes, so that the prior is exact to first order only.
-    assert np.linalg.norm(slope) < 0.2 * np.linalg.norm(twist / prior)
+    assert slope.norm() < 0.2 * (twist / prior).norm()
     # Two frames of the same place that contradict each other.
-    pixels = camera.project(points) + np.array([[400.0, 300.0], [-400.0, 100.0]])
-    twist = refined_twist(camera, points, pixels, np.zeros(6), steps=60)
-    assert np.linalg.norm(twist / prior) <= 5.0 + 1e-9
+    pixels = there + torch.tensor([[400.0, 300.0], [-400.0, 100.0]])
+    twist = refined_twist(camera, points, pixels, still, steps=60)
+    assert (twist / prior).norm() <= 5.0 + 1e-9
 
 
 def test_a_wrong_marker_in_one_frame_is_undone_by_those_after_it(reference):
     correction, demo = CameraCorrection(reference), demonstration(np.random.default_rng(18))
     seen = demo.visible.nonzero()[:, 0].tolist()
-    wrong = demo.feature[seen[0]].double().numpy() + np.array([150.0, -80.0])
+    wrong = demo.feature[seen[0]] + torch.tensor([150.0, -80.0])
     assert correction.update(seen[0] / FPS, demo.pose[seen[0]], wrong) is not None
     for k in seen[1:]:
-        correction.update(k / FPS, demo.pose[k], demo.feature[k].double().numpy())
-    pixels = demo.feature[seen[1:]].double().numpy()
-    found = [
-        correction.marker(demo.pose[k], pixel)
-        for k, pixel in zip(seen[1:], pixels, strict=True)
-    ]
-    assert np.abs(np.array(found) - pixels).max() < 2.0
+        correction.update(k / FPS, demo.pose[k], demo.feature[k])
+    for k in seen[1:]:
+        found = correction.marker(demo.pose[k], demo.feature[k])
+        assert (found - demo.feature[k]).abs().max() < 2.0
 
 
 @pytest.mark.parametrize(("frames", "thresholds"), [(1, 10), (4, 2.5), (10, 1), (20, 1)])
@@ -360,8 +374,8 @@ def test_the_fewer_frames_the_more_they_must_show(reference, frames, thresholds)
         correction = CameraCorrection(reference)
         for k in map(int, seen):
             # All pixels are off alike, as when the camera is turned a little.
-            off = np.array([share * thresholds * reference.threshold, 0.0])
-            pixel = demo.feature[k].double().numpy() + off
+            off = torch.tensor([share * thresholds * reference.threshold, 0.0])
+            pixel = demo.feature[k] + off
             correction.update(k / FPS, demo.pose[k], pixel)
         assert (correction.motion is not None) == expected
 
@@ -374,14 +388,14 @@ def test_a_camera_may_be_moved_again_and_put_back(reference, plane):
         correction.clear()
         _, noticed = corrected(correction, demonstration(rng, place))
         assert noticed >= 1
-        found = [correction.object(plane, pixel) for pixel in shown_at(there, place)]
-        assert np.abs(np.array(found) - shown_at(there)).max() < 3.0
+        found = objects_found(correction, plane, there, place)
+        assert np.abs(found - shown_at(there)).max() < 3.0
 
 
 def test_an_objects_plane_says_what_it_takes(reference):
     there, taken = objects(np.random.default_rng(15))
-    pixels = shown_at(there)
+    taken, pixels = torch.from_numpy(taken), torch.from_numpy(shown_at(there))
     with pytest.raises(ValueError, match="four"):
-        ObjectPlane.fit(reference, taken[:3], pixels[:3])
+        object_height(reference, taken[:3], pixels[:3])
     with pytest.raises(ValueError, match="disagree"):
-        ObjectPlane.fit(reference, taken, pixels[::-1])
+        object_height(reference, taken, pixels.flip(0))

@@ -137,8 +137,8 @@ def test_registered_arms_find_poses_they_can_reach(name):
 def test_registered_arms_are_ready_within_limits(name):
     a = installed(name)
     assert a.chain.limits.contain(a.chain.ready)
-    assert a.meshes or a.description is None
-    assert all(mesh.path.is_file() for meshes in a.meshes.values() for mesh in meshes)
+    assert a.shape.meshes or a.description is None
+    assert all(mesh.path.is_file() for meshes in a.shape.meshes.values() for mesh in meshes)
 
 
 @pytest.mark.parametrize("name", ["panda", "fr3"])
@@ -148,7 +148,7 @@ def test_the_links_of_frankas_arms_weigh_what_their_description_says(name):
     robots = next(folder for folder in ur5.parents if folder.name == "robots")
     described = arm(robots / "panda_description/urdf/panda.urdf", tip="panda_link8")
     assert_close(
-        ArmChoice(name).work_arm().link_masses, described.masses[1:8], rtol=0, atol=0.005
+        ArmChoice(name).work_arm().masses[1:8], described.masses[1:8], rtol=0, atol=0.005
     )
     # The description has the fingers apart.
     assert installed(name).masses[-1] == pytest.approx(described.masses[-1], abs=0.05)

@@ -8,9 +8,7 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import (
     arm_angle,
     arm_angle_and_motion,
-    null_space_projector,
     panda,
-    pseudo_inverse,
 )
 
 
@@ -61,47 +59,3 @@ def test_motion_turns_the_arm_and_leaves_the_hand_alone():
     gain = rate / motion.norm(dim=-1)
     assert_close(rate, gain**2 / (gain**2 + 1e-2), rtol=1e-6, atol=1e-6)
     assert float(rate.median()) > 0.9
-
-
-def regular_jacobians(*batch, seed=1):
-    """Jacobians of configurations away from singularities, where identities hold tightly."""
-    q = joint_positions(400, rng=generator(seed))
-    J = panda.jacobian(q)
-    J = J[torch.linalg.svdvals(J)[:, -1] > 0.05]
-    count = torch.Size(batch).numel()
-    return J[:count].reshape(*batch, 6, 7)
-
-
-def singular_jacobian():
-    """Arm stretched straight up: rank below 6."""
-    J = panda.jacobian(torch.zeros(7, dtype=torch.float64))
-    assert int(torch.linalg.matrix_rank(J)) < 6
-    return J
-
-
-@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2), (100,)])
-def test_agrees_with_the_svd(batch):
-    J = regular_jacobians(*batch)
-    assert_close(pseudo_inverse(J), torch.linalg.pinv(J), rtol=0, atol=1e-10)
-
-
-def test_projector_identities():
-    J = regular_jacobians(150)
-    J_plus, N = pseudo_inverse(J), null_space_projector(J)
-    zero = {"rtol": 0, "atol": 1e-12}
-    assert_close(J @ N, torch.zeros_like(J), **zero)
-    assert_close(N @ J_plus, torch.zeros_like(J_plus), **zero)
-    assert_close(N @ N, N, **zero)
-    assert_close(N, N.mT, **zero)
-    rank = N.diagonal(dim1=-2, dim2=-1).sum(-1)
-    assert_close(rank, torch.ones_like(rank), **zero)
-
-
-@pytest.mark.parametrize("damping", [0.02, 0.3])
-def test_damping_filters_singular_values(damping):
-    J = regular_jacobians(20)
-    U, S, Vh = torch.linalg.svd(J, full_matrices=False)
-    expected = Vh.mT @ torch.diag_embed(S / (S**2 + damping**2)) @ U.mT
-    assert_close(pseudo_inverse(J, damping), expected)
-    assert_close(pseudo_inverse(J, torch.full((20,), damping, dtype=J.dtype)), expected)
-    assert_close(null_space_projector(J, damping), torch.eye(7, dtype=J.dtype) - expected @ J)

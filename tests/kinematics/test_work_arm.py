@@ -112,7 +112,7 @@ def test_it_carries_our_hand_in_place_of_its_own():
     assert max(arm.body.links) == 6
     own = [c for c in panda.whole.capsules if c.link == 9]
     assert [c.radius for c in arm.whole.capsules if c.link == 8] == [c.radius for c in own]
-    assert arm.link_masses == (2.0,) * 6
+    assert arm.masses[1:7] == (2.0,) * 6
     assert {(0, 2), (5, 8), (6, 8)} == set(arm.whole.overlapping)
 
 

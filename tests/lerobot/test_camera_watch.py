@@ -11,19 +11,20 @@ from lerobot.processor import ProcessorStepRegistry
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import MarkerCamera
+from hrc_learn.jacobian.perspective import from_base, marker_pixels, moved, pixels_and_depth
 from hrc_learn.lerobot.arm_values import HAND, MARKER
 from hrc_learn.lerobot.camera_watch import CAMERA_WATCH, CameraWatchStep, add_camera_watch
 from hrc_learn.lerobot.smoothing import PREPROCESSOR
 
 FPS = 25
-CAMERA = MarkerCamera(
-    focal=1500.0,
-    center=(720.0, 540.0),
-    radial=0.0,
-    rotation=(np.pi - 0.2, 0.1, 0.05),
-    shift=(-0.4, 0.05, 1.1),
-    marker=(0.0, 0.06, 0.03),
+CAMERA = torch.tensor(
+    [
+        *(np.log(1500.0), 720.0, 540.0, 0.0),  # log of the focal length, centre, lens
+        *(np.pi - 0.2, 0.1, 0.05),  # rotation
+        *(-0.4, 0.05, 1.1),  # shift
+        *(0.0, 0.06, 0.03),  # marker
+    ],
+    dtype=torch.float64,
 )
 
 
@@ -36,7 +37,7 @@ def episode(rng, camera=CAMERA, frames=60):
         torch.from_numpy(np.array([0.45, 0.0, 0.2]) + wave),
         quaternion.exp(torch.from_numpy(turn)),
     )
-    pixels = camera.project(camera.points(pose)) + rng.normal(0, 0.1, (frames, 2))
+    pixels = marker_pixels(camera, pose)[0].numpy() + rng.normal(0, 0.1, (frames, 2))
     return pose, pixels
 
 
@@ -94,23 +95,28 @@ def test_a_camera_that_stands_still_is_left_in_peace(step, caplog):
 def test_a_moved_camera_is_warned_about_once_an_episode(step, caplog):
     caplog.set_level(logging.WARNING)
     rng = np.random.default_rng(2)
-    moved = CAMERA.moved(np.array([0.0, np.deg2rad(0.5), 0.0, 0.004, 0.0, 0.0]))
-    rollout(step, *episode(rng, moved))
+    twist = torch.tensor([0.0, np.deg2rad(0.5), 0.0, 0.004, 0.0, 0.0]).double()
+    there = moved(CAMERA, twist)
+    rollout(step, *episode(rng, there))
     (record,) = caplog.records
     assert "camera moved by" in record.getMessage()
     assert step.motion.displacement > 5
     step.reset()
     assert step.motion is None
-    rollout(step, *episode(rng, moved))
+    rollout(step, *episode(rng, there))
     assert len(caplog.records) == 2
 
 
 OBJECT = np.array([0.5, 0.03, 0.02])
 
 
+def object_pixel(camera):
+    return pixels_and_depth(camera, from_base(camera, torch.from_numpy(OBJECT)[None]))[0][0]
+
+
 def looking(step, pose, pixels, camera):
     """What a policy sees of the marker and of an object, both in its state, at the end."""
-    seen = camera.project(camera.from_base(OBJECT))
+    seen = object_pixel(camera)
     for k, pixel in enumerate(pixels):
         state = torch.tensor([*pose[k].vector(), *pixel, 1.0, *seen]).float()[None]
         before = state.clone()
@@ -128,18 +134,18 @@ def correcting(step):
 
 def test_a_policy_sees_what_it_would_if_the_camera_had_not_been_moved(correcting, caplog):
     rng = np.random.default_rng(4)
-    moved = CAMERA.moved(np.array([0.1, 0.02, 0.05, 0.05, -0.03, 0.02]))
-    unmoved = CAMERA.project(CAMERA.from_base(OBJECT))
+    knocked = moved(CAMERA, torch.tensor([0.1, 0.02, 0.05, 0.05, -0.03, 0.02]).double())
+    unmoved = object_pixel(CAMERA)
     for _ in range(2):
-        pose, pixels = episode(rng, moved)
-        state = looking(correcting, pose, pixels, moved)
+        pose, pixels = episode(rng, knocked)
+        state = looking(correcting, pose, pixels, knocked)
         np.testing.assert_allclose(state[9:], unmoved, atol=4.0)
-        there = CAMERA.project(CAMERA.points(pose[-1:]))[0]
+        there = marker_pixels(CAMERA, pose[-1:])[0][0].numpy()
         np.testing.assert_allclose(state[6:8], there, atol=2.0)
         assert np.abs(pixels[-1] - there).max() > 50.0
         correcting.reset()
         # Known from the first frame on, before the arm has moved.
-        state = looking(correcting, pose[:1], pixels[:1], moved)
+        state = looking(correcting, pose[:1], pixels[:1], knocked)
         np.testing.assert_allclose(state[9:], unmoved, atol=4.0)
     assert len([r for r in caplog.records if "corrected" in r.getMessage()]) == 1
     again = CameraWatchStep(**correcting.get_config())

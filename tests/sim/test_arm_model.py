@@ -78,7 +78,7 @@ def test_its_capsules_are_those_of_the_distances(robot):
     ]
     radii = sorted(float(geom.size[0]) for geom in world_capsules)
     assert radii == pytest.approx(sorted(c.radius for c in robot.body.capsules))
-    total = sum(robot.link_masses)
+    total = sum(robot.masses[1 : robot.joints + 1])
     links = [spec_world.model.body(f"link{i + 1}").mass[0] for i in range(robot.joints)]
     assert sum(links) == pytest.approx(total)
     assert whole_arm(ArmModelConfig(robot=robot)) is robot.whole

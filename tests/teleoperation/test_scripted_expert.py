@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from projections import null_space_projector
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import coarse_orientation, gripper_down, null_space_projector, panda
+from hrc_learn.kinematics import coarse_orientation, gripper_down, panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.teleoperation import (
     GuidedPath,

@@ -159,7 +159,7 @@ def off_path(cell):
     log = cell.log
     on = np.isfinite(log["path_joints"][:, 0])
     q, goal = (torch.from_numpy(log[k][on]) for k in ("joint_position", "path_joints"))
-    elbow = (panda.joint_origin(q, 4) - panda.joint_origin(goal, 4)).norm(dim=-1)
+    elbow = (panda.joint_origins(q) - panda.joint_origins(goal))[:, 3].norm(dim=-1)
     hand = (panda.forward(q).position - panda.forward(goal).position).norm(dim=-1)
     return elbow.numpy(), hand.numpy(), log["time"][on]
 
