@@ -57,8 +57,8 @@ _TINY = 1e-12
 _LENS_STEPS = 20
 # Approximate number of frames fitted to: the noise averages out well before.
 _FRAMES = 2000
-# Rounds of the affine start; rounds of robust weights, and steps in each.
-_AFFINE_ROUNDS, _ROUNDS, _STEPS = 10, 8, 6
+# Rounds of robust weights, and steps in each.
+_ROUNDS, _STEPS = 8, 6
 # The first search: its frames, its rounds of steps, and the cameras that go on from it.
 _FEW_FRAMES, _SEARCHES, _FINALISTS = 100, 5, 3
 # Least depth of all frames at the start of the search [m].
@@ -229,8 +229,8 @@ def fit_camera(
 ) -> CameraFit:
     """Fit camera and marker by robust maximum a posteriori estimation.
 
-    An affine camera in closed form starts a Levenberg-Marquardt search from several focal
-    lengths. Neighbouring frames share errors of calibration; their number counts accordingly.
+    A Levenberg-Marquardt search starts from several orientations and focal lengths.
+    Neighbouring frames share errors of calibration; their number counts accordingly.
 
     Args:
         demonstrations: Demonstrations in which the tool moved, read one by one.
@@ -349,33 +349,15 @@ def _inflation(
 def _starts(
     pose: Pose, pixel: Float[Tensor, "frames 2"], prior: Float[Tensor, "13"], width: int
 ) -> Float[Tensor, "starts 13"]:
-    """Cameras in closed form, from an affine camera x = A (p + T m) + b and its marker."""
-    turn, marker = quaternion.to_matrix(pose.orientation), pixel.new_zeros(3)
-    middle, seen = pose.position.mean(0), pixel.mean(0)
-    rows = pixel.new_zeros(2, 3)
-    for _ in range(_AFFINE_ROUNDS):
-        point = pose.position - middle + turn @ marker
-        point = point - point.mean(0)
-        # The ridge leaves directions without motion at zero: a millimetre in all frames.
-        ridge = 1e-6 * len(point) * torch.eye(3, dtype=pixel.dtype)
-        rows = torch.linalg.solve(point.mT @ point + ridge, point.mT @ (pixel - seen)).mT
-        lever = rows @ (turn - turn.mean(0))
-        left = pixel - seen - (pose.position - middle) @ rows.mT
-        ridge = (width / 100 / _MARKER_SPREAD) ** 2 * torch.eye(3, dtype=pixel.dtype)
-        gram = torch.einsum("fij,fik->jk", lever, lever) + ridge
-        marker = torch.linalg.solve(gram, torch.einsum("fij,fi->j", lever, left))
-    # An affine camera of little motion is wrong: the axes of a cube are candidates, too.
-    xi = (seen - prior[CENTER]) / width
-    matrix, _ = _pinhole(rows / width, xi)
-    candidates = torch.cat([matrix[None], _cube_rotations().to(matrix)])
+    """Cameras in all orientations, each at the best place for the marker at the tool."""
+    rotations = _cube_rotations().to(pixel)
+    turned, marker = quaternion.log(quaternion.from_matrix(rotations)), pixel.new_zeros(24, 3)
     starts = []
     for factor in _FOCAL_STARTS:
-        point = (pose.position + turn @ marker) @ candidates.mT
+        point = pose.position @ rotations.mT
         shift = _shifts(point, (pixel - prior[CENTER]) / (factor * width))
         optics = torch.cat([prior[:1] + float(np.log(factor)), prior[1:4]])
-        rotation = quaternion.log(quaternion.from_matrix(candidates))
-        known = [optics.expand(len(shift), 4), rotation, shift, marker.expand(len(shift), 3)]
-        starts.append(torch.cat(known, dim=-1))
+        starts.append(torch.cat([optics.expand(24, 4), turned, shift, marker], dim=-1))
     return torch.cat(starts)
 
 
@@ -403,21 +385,6 @@ def _cube_rotations() -> Float[Tensor, "24 3 3"]:
         for signs in product((1.0, -1.0), repeat=3)
     ]
     return torch.stack([matrix for matrix in signed if torch.linalg.det(matrix) > 0])
-
-
-def _pinhole(
-    jacobian: Float[Tensor, "2 3"], xi: Float[Tensor, "2"]
-) -> tuple[Float[Tensor, "3 3"], Float[Tensor, ""]]:
-    """Rotation and depth of a pinhole of focal length 1 with J = (r_12 - xi r_3^T) / z."""
-    square = 1 + xi.square().sum()
-    # trace(J J^T) z^2 = 2 + |xi|^2
-    depth = ((1 + square) / jacobian.square().sum().clamp_min(_TINY)).sqrt()
-    rows = depth * jacobian
-    # The cross product of the rows is along the ray, r_3 + xi_1 r_1 + xi_2 r_2.
-    axis = (torch.linalg.cross(rows[0], rows[1]) - xi @ rows) / square
-    u, _, vt = torch.linalg.svd(torch.stack([*(rows + xi[:, None] * axis), axis]))
-    flip = torch.ones_like(depth) * torch.linalg.det(u @ vt)
-    return u @ torch.diag(torch.stack([*u.new_ones(2), flip])) @ vt, depth
 
 
 def motion_jacobian(

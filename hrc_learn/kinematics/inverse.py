@@ -11,6 +11,7 @@ wanted configuration is kept, and moved further towards it in the null space.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -42,6 +43,8 @@ _LEVER = 0.3
 _RANK, _LED = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular where the task has more rows than n
 _STARTS, _ROUNDS, _ITERATIONS = 12, 6, 40
+# Largest error of a solution's position [m] and orientation [rad].
+_TOLERANCE = 1e-6
 # Rotation by which a nearest pose may miss the wanted one [rad]: an arm that turns away further
 # does another task.
 _MISSED_TURN = 0.6
@@ -192,8 +195,6 @@ def solve_inverse(
     near: Float[Tensor, "*#batch joints"] | None = None,
     *,
     task: TaskSpace = "pose",
-    tolerance: float = 1e-6,
-    seed: int = 0,
 ) -> InverseSolution:
     """Joint positions that bring the tool centre point to poses, within limits.
 
@@ -202,20 +203,14 @@ def solve_inverse(
         pose: Poses of the tool centre point in the base frame.
         near: Configuration to stay close to [rad, m]; the ready posture if None.
         task: Constrained part of the pose.
-        tolerance: Largest error of the position [m] and the orientation [rad].
-        seed: Seed of the random starts.
     """
-    batch = pose.position.shape[:-1]
     joints = len(chain.joint_names)
     near = chain.ready if near is None else near
-    batch = torch.broadcast_shapes(batch, near.shape[:-1])
-    goal = Pose(
-        pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
-        pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
-    )
+    batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
+    goal = _in_rows(pose, batch)
     wish = near.detach().to(goal.position).expand(*batch, joints).reshape(-1, joints)
     lower, upper = _limits(chain, wish)
-    rng = torch.Generator().manual_seed(seed)
+    rng = torch.Generator().manual_seed(0)
     best = wish.clone().clamp(lower, upper)
     distance = wish.new_full((len(wish),), torch.inf)
     for round_ in range(_ROUNDS):
@@ -230,7 +225,7 @@ def solve_inverse(
         start = (lower + upper) / 2 + (2 * random - 1) * half
         if round_ == 0:
             start[:, 0] = best[missing]
-        q = solutions_from(chain, goal[missing], start, task=task, tolerance=tolerance)
+        q = solutions_from(chain, goal[missing], start, task=task, tolerance=_TOLERANCE)
         q = unwound(chain, q, wish[missing].unsqueeze(-2))
         apart = torch.linalg.vector_norm(q - wish[missing].unsqueeze(-2), dim=-1)
         apart = torch.where(apart.isnan(), torch.inf, apart)
@@ -241,9 +236,7 @@ def solve_inverse(
         best[missing[good]], distance[missing[good]] = chosen[good], least.values[good]
     found = distance.isfinite()
     if found.any() and joints > TASK_ROWS[task]:
-        best[found] = _drawn_nearer(
-            chain, goal[found], best[found], wish[found], task, tolerance
-        )
+        best[found] = _drawn_nearer(chain, goal[found], best[found], wish[found], task)
     return InverseSolution(best.reshape(*batch, joints).to(near), found.reshape(batch))
 
 
@@ -269,10 +262,7 @@ def solutions_from(
     """
     count, joints = starts.shape[-2:]
     batch = torch.broadcast_shapes(pose.position.shape[:-1], starts.shape[:-2])
-    goal = Pose(
-        pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
-        pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
-    )
+    goal = _in_rows(pose, batch)
     row = torch.arange(len(goal.position), device=starts.device).repeat_interleave(count)
     start = starts.detach().double().expand(*batch, count, joints).reshape(-1, joints)
     start = start.clamp(*_limits(chain, start))
@@ -306,10 +296,7 @@ def follow_poses(
     q, positions, errors = start.reshape(-1, start.shape[-1]), [], []
     rows = start.shape[:-1]
     for k in range(len(path.position)):
-        goal = Pose(
-            path.position[k].expand(*rows, 3).reshape(-1, 3),
-            path.orientation[k].expand(*rows, 4).reshape(-1, 4),
-        )
+        goal = _in_rows(path[k], rows)
         near = None if wish is None else wish[k].reshape(q.shape)
         for _ in range(_CORRECTIONS):
             q, _ = _step(chain, goal, q, task, near)
@@ -317,6 +304,14 @@ def follow_poses(
         positions.append(q.reshape(start.shape))
         errors.append(left.unflatten(-1, (2, 3)).norm(dim=-1).amax(-1).reshape(rows))
     return torch.stack(positions), torch.stack(errors)
+
+
+def _in_rows(pose: Pose, batch: Sequence[int]) -> Pose:
+    """Poses broadcast to a batch, in one axis and in float64, without gradients."""
+    return Pose(
+        pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
+        pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
+    )
 
 
 def _step(
@@ -379,13 +374,13 @@ def unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
 
 
 def _drawn_nearer(
-    chain: SerialChain, goal: Pose, q: Tensor, wish: Tensor, task: TaskSpace, tolerance: float
+    chain: SerialChain, goal: Pose, q: Tensor, wish: Tensor, task: TaskSpace
 ) -> Tensor:
     """Moved in the null space towards a wish, as long as the pose is reached and it helps."""
     moved = q
     for _ in range(15):  # each removes most of what the null space can
         moved, _ = _step(chain, goal, moved, task, wish)
-    moved, reached = _descend(chain, goal, moved, task, tolerance)
+    moved, reached = _descend(chain, goal, moved, task, _TOLERANCE)
     nearer = torch.linalg.vector_norm(moved - wish, dim=-1) < torch.linalg.vector_norm(
         q - wish, dim=-1
     )

@@ -160,15 +160,14 @@ class Approach:
         )
 
 
-def tangent(position: Float[Tensor, "time 3"], near: float = NEAR) -> Float[Tensor, "3"]:
+def tangent(position: Float[Tensor, "time 3"]) -> Float[Tensor, "3"]:
     """Direction of the last stretch of a path, of unit length; 0 where it does not move.
 
     Args:
         position: Along the path [m].
-        near: Length of the stretch [m].
     """
     way = position[-1] - position
-    before = (way.norm(dim=-1) > near).nonzero()[:, 0]
+    before = (way.norm(dim=-1) > NEAR).nonzero()[:, 0]
     chord = way[int(before[-1])] if len(before) else way[0]
     return chord / chord.norm().clamp(min=_SHORTEST)
 

@@ -105,8 +105,7 @@ class CameraWatchStep(ProcessorStep):
             pixel = self._watch.object(self.object_height, values[self.object_columns])
             values[self.object_columns] = pixel
         if pose is not None:
-            marker[:2] = self._watch.marker(pose, marker[:2])
-            values[self.marker_columns] = marker
+            values[self.marker_columns[:2]] = self._watch.marker(pose, marker[:2])
         corrected = {**observation, OBS_STATE: values.to(state).reshape(state.shape)}
         return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 

@@ -169,7 +169,7 @@ def test_frames_where_no_demonstration_went_do_not_count(reference, demonstratio
         [marker_points(reference.vector, demo.pose[demo.visible]) for demo in demonstrations]
     )
     assert all(map(reference.covers, everywhere))
-    lower, upper = (torch.tensor(x).double() for x in (reference.lower, reference.upper))
+    lower, upper = (torch.from_numpy(np.array(x)) for x in (reference.lower, reference.upper))
     for axis in torch.eye(3):
         for corner, away in ((lower, -1e-6), (upper, 1e-6)):
             assert reference.covers(corner)

@@ -156,7 +156,7 @@ def test_a_policy_sees_what_there_is_while_the_camera_stands_still(correcting):
     pose, pixels = episode(np.random.default_rng(5))
     state = looking(correcting, pose, pixels, CAMERA)
     np.testing.assert_allclose(state[6:8], pixels[-1], rtol=1e-6)
-    np.testing.assert_allclose(state[9:], CAMERA.project(CAMERA.from_base(OBJECT)), rtol=1e-6)
+    np.testing.assert_allclose(state[9:], object_pixel(CAMERA), rtol=1e-6)
 
 
 def test_an_unseen_marker_and_missing_observations_are_passed_over(step):
