@@ -20,19 +20,12 @@ from hrc_learn.demos import check_dataset, load_demos
 from hrc_learn.dmp import JointDMP
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import arm
-from hrc_learn.kinematics.described_arm import LimitsTable
+from hrc_learn.kinematics.limits import read_limits
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.learning.model_choice import CHOICE, best_models
 from hrc_learn.skills.servo_target import VisualTarget
 from hrc_learn.skills.visual_skill import MarkerAngle
-from hrc_learn.store import (
-    MANIFEST,
-    changed_files,
-    new_folder,
-    read_made_by,
-    read_toml,
-    write_json,
-)
+from hrc_learn.store import MANIFEST, changed_files, new_folder, read_made_by, write_json
 from hrc_learn.viz.report import Measurement, Report, read_report, write_report
 
 PATIENCE = 20.0
@@ -123,7 +116,7 @@ TARGETS = {
     "limits": Target(
         "limits.toml",
         lambda f: (f / "limits.toml").write_text("[default]\nacceleration = 5.0\n"),
-        lambda f: read_toml(f / "limits.toml", LimitsTable),
+        lambda f: read_limits(f / "limits.toml"),
     ),
     "config": Target(
         "model/config.json",

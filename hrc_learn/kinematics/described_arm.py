@@ -28,16 +28,12 @@ from hrc_learn.kinematics.description import (
     motion,
     turn_to,
 )
-from hrc_learn.kinematics.limits import JointLimits, complete_limits
+from hrc_learn.kinematics.limits import JointLimits, complete_limits, read_limits
 from hrc_learn.kinematics.mjcf import read_mjcf
 from hrc_learn.kinematics.urdf import read_urdf
-from hrc_learn.store import read_toml
 
 type LimitsGiven = Mapping[str, Mapping[str, float]] | Path | None
 """Limits that replace or complete those of a description, see `complete_limits`, or a file."""
-
-LimitsTable = dict[str, dict[str, float]]
-"""A file of limits: a table for each joint; `default` applies to all of them."""
 
 type FittedBody = tuple[Sequence[LinkCapsule], Sequence[tuple[int, int]]]
 """Capsules of an arm, and pairs of links that overlap by design, besides neighbours."""
@@ -118,7 +114,7 @@ def arm_from_file(
             for j in moving
         ],
         source=str(path),
-        overrides=read_toml(limits, LimitsTable) if isinstance(limits, Path) else limits,
+        overrides=read_limits(limits) if isinstance(limits, Path) else limits,
     )
     posture = _ready(description, names, chain_limits, ready)
     chain = SerialChain(

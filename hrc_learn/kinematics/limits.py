@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hrc_learn.store import read_toml
+
 
 @dataclass(frozen=True, kw_only=True)
 class MotionLimits:
@@ -211,3 +213,22 @@ def complete_limits(
             table[column].append(float(full[column]))
     columns = {name: torch.tensor(row, dtype=torch.float64) for name, row in table.items()}
     return JointLimits(vintage=source, **columns)
+
+
+def read_limits(path: Path) -> dict[str, dict[str, float]]:
+    """Read limits from a TOML file with one table per joint; `default` applies to all joints.
+
+        [default]
+        acceleration = 5.0
+        [elbow_joint]
+        velocity = 2.0
+
+    Raises:
+        ValueError: The file is not valid TOML, or a table holds values other than numbers.
+    """
+    limits = {}
+    for name, row in read_toml(path).items():
+        if not isinstance(row, dict) or not all(type(x) in (int, float) for x in row.values()):
+            raise ValueError(f"{path}: [{name}] must be a table of numbers")
+        limits[name] = {key: float(value) for key, value in row.items()}
+    return limits
