@@ -201,3 +201,17 @@ def test_version_2_with_the_folder_named_as_in_version_3(tmp_path):
     info["data_path"] = "data/chunk-{chunk_index:03d}/episode_{episode_index:06d}.parquet"
     write_info(root, info)
     assert not check_dataset(root).errors
+
+
+@pytest.mark.parametrize(("frames", "frozen"), [(25, True), (23, False)])
+def test_a_hold_counts_above_five_usual_ones_and_two_per_cent(tmp_path, frames, frozen):
+    """Holds of 4 in 200 frames are usual here: more than 24 are none."""
+
+    def episode(seed, held):
+        way = np.linspace(0, 2, 200)[:, None] + 0.1 * seed
+        q = np.sin(way * np.linspace(0.6, 1.1, len(JOINTS)))
+        q[80 : 80 + held] = q[80]
+        return {STATE: q}
+
+    episodes = [episode(k, 4) for k in range(4)] + [episode(4, frames)]
+    assert bool(found(tmp_path / "set", episodes, "encoder froze")) == frozen

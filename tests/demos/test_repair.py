@@ -284,6 +284,18 @@ def test_trimmed_episodes_keep_the_part_of_their_video(tmp_path):
     ]
 
 
+def test_statistics_of_images_stay_where_no_frame_goes(tmp_path):
+    root = with_videos(tmp_path / "old")
+    repair_dataset(root, tmp_path / "new", RepairOptions(trim=False))
+    old, new = (
+        pq.read_table(made / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+        for made in (root, tmp_path / "new")
+    )
+    for name in ("count", "mean"):
+        key = f"stats/observation.images.front/{name}"
+        assert [row[key] for row in new] == [row[key] for row in old]
+
+
 @pytest.mark.parametrize("options", [RepairOptions(trim=False, fps=25)])
 def test_videos_that_would_need_new_frames_are_refused_or_left_out(tmp_path, options):
     root = with_videos(tmp_path / "old")

@@ -13,12 +13,7 @@ from hrc_learn.demos.quality import episode_checks, structure_checks
 from hrc_learn.demos.quality.episode_checks import UsualMotion, motion_sketch
 from hrc_learn.demos.quality.structure_checks import read_metadata, read_sound_episodes
 from hrc_learn.demos.quality.video_checks import check_videos
-from hrc_learn.demos.read.columns import (
-    ColumnMapping,
-    MappingSpec,
-    map_columns,
-    parse_mapping,
-)
+from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
 from hrc_learn.demos.read.contract import infer_contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, select_quantities
@@ -87,11 +82,10 @@ def check_dataset(
         return report
     for check in METADATA_CHECKS:
         report.run(check, folder)
-    parse_mapping(mapping or {}, folder.features)
+    # A wrong mapping is no fault of the data; without a sound sidecar, names have to do.
+    columns = map_columns(folder.features, Sidecar(), mapping)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
-    if dataset is None:  # a damaged sidecar
-        columns = map_columns(folder.features, Sidecar(), mapping)
-        dataset = OpenedDataset(folder=folder, columns=columns)
+    dataset = dataset or OpenedDataset(folder=folder, columns=columns)
     report.attempt(lambda: check_videos(folder, report))
     report.attempt(lambda: _check_content(dataset, report, units or {}))
     return report
