@@ -209,7 +209,7 @@ def smooth(args: Smooth) -> None:
         ends = zip(panda.limits.lower.tolist(), panda.limits.upper.tolist(), strict=True)
         limits = limits.within(dict(zip(ArmValues(panda).joints, ends, strict=True)))
     if args.checkpoint is not None:
-        add_smoothing(args.checkpoint, limits, args.dataset)
+        add_smoothing(args.checkpoint, limits)
     if args.limits is not None:
         limits.save(args.limits)
     values = asdict(limits)

@@ -69,16 +69,6 @@ class CameraWatchStep(ProcessorStep):
     def __post_init__(self) -> None:
         if not self.fps > 0:
             raise ValueError(f"fps must be positive, got {self.fps}.")
-        for name, wanted in (
-            ("pose_columns", HAND),
-            ("marker_columns", MARKER),
-            ("object_columns", PIXELS),
-        ):
-            columns = getattr(self, name)
-            if columns is not None and len(columns) != len(wanted):
-                raise ValueError(
-                    f"{name} must be those of {', '.join(wanted)}, got {len(columns)} of them."
-                )
         text = json_text(self.reference)
         reference = parse_json(text, CameraReference, "reference of the camera watch")
         self._watch = CameraCorrection(reference) if self.correct else CameraWatch(reference)

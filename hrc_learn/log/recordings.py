@@ -138,33 +138,26 @@ class RunRecording:
     """Messages to the person near the arm."""
 
     def __post_init__(self) -> None:
-        series = {
-            name: value
-            for name, value in vars(self).items()
-            if isinstance(value, np.ndarray) and name not in _PATHS
-        }
-        series |= {f"potentials[{name!r}]": value for name, value in self.potentials.items()}
-        for field_name in ("safety", "worker_distance", "hindered"):
-            named = getattr(self, field_name)
-            series |= {f"{field_name}[{name!r}]": value for name, value in named.items()}
+        series: dict[str, np.ndarray] = {}
+        for field_name, value in vars(self).items():
+            if isinstance(value, Mapping):
+                series |= {f"{field_name}[{name!r}]": one for name, one in value.items()}
+            elif isinstance(value, np.ndarray) and field_name not in _PATHS:
+                series[field_name] = value
         for body in self.bodies:
             series[f"bodies: {body.name}.position"] = body.position
             series[f"bodies: {body.name}.orientation"] = body.orientation
         if self.camera is not None:
             series["camera.feature"] = self.camera.feature
             series["camera.target"] = self.camera.target
-        check_samples(self.time, series)
+        wrong = {n: len(v) for n, v in series.items() if len(v) != len(self.time)}
+        if wrong:
+            raise ValueError(
+                f"time has {len(self.time)} samples, but "
+                + ", ".join(f"{name} has {n}" for name, n in wrong.items())
+                + ". Log every field at every control step, with NaN where it has no value."
+            )
 
 
 _PATHS = ("demo_path", "plan_path")
 """Arrays without a sample for each control step."""
-
-
-def check_samples(time: Float[np.ndarray, " time"], series: Mapping[str, np.ndarray]) -> None:
-    wrong = {n: len(v) for n, v in series.items() if len(v) != len(time)}
-    if wrong:
-        raise ValueError(
-            f"time has {len(time)} samples, but "
-            + ", ".join(f"{name} has {n}" for name, n in wrong.items())
-            + ". Log every field at every control step, with NaN where it has no value."
-        )

@@ -174,14 +174,8 @@ def test_several_environments_at_once_are_refused(step):
 
 
 def test_settings_that_make_no_sense_are_refused(step):
-    for change, word in (
-        ({"fps": 0.0}, "fps"),
-        ({"pose_columns": [1]}, "ee.x"),
-        ({"marker_columns": [1]}, "marker.u"),
-        ({"object_columns": [1]}, "object.u"),
-    ):
-        with pytest.raises(ValueError, match=word):
-            CameraWatchStep(**step.get_config() | change)
+    with pytest.raises(ValueError, match="fps must be positive"):
+        CameraWatchStep(**step.get_config() | {"fps": 0.0})
 
 
 def test_what_is_missing_is_named(dataset, tmp_path):

@@ -92,37 +92,6 @@ def test_steps_are_put_at_both_ends_and_taken_out_again(checkpoint):
     assert names(POSTPROCESSOR) == ["to_batch_processor"]
 
 
-@pytest.mark.parametrize(
-    ("mean", "std", "message"),
-    [
-        ([0.1, 2.0], [0.3, 0.5], None),
-        ([0.2, 1.9], [0.25, 0.6], None),  # trained on a part of the episodes
-        ([9.0, 0.1], [0.5, 0.3], "a.pos of .* is 9 .*another robot, unit or order"),
-        ([5.7, 114.6], [17.0, 28.6], "another robot, unit or order"),
-    ],
-)
-def test_limits_of_other_actions_are_refused(checkpoint, mean, std, message):
-    from safetensors.numpy import save_file
-
-    file = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
-    trained = {"action.mean": [0.1, 2.0], "action.std": [0.3, 0.5]}
-    save_file({k: np.array(v, np.float32) for k, v in trained.items()}, checkpoint / file)
-    pipeline = json.loads((checkpoint / POSTPROCESSOR).read_text())
-    step = {"registry_name": "unnormalizer_processor", "config": {}, "state_file": file}
-    pipeline["steps"].insert(0, step)
-    (checkpoint / POSTPROCESSOR).write_text(json.dumps(pipeline))
-    (checkpoint / "set/meta").mkdir(parents=True)
-    stats = {"action": {"mean": mean, "std": std}}
-    (checkpoint / "set/meta/stats.json").write_text(json.dumps(stats))
-    before = (checkpoint / POSTPROCESSOR).read_text()
-    if message is None:
-        add_smoothing(checkpoint, LIMITS, checkpoint / "set")
-    else:
-        with pytest.raises(ValueError, match=message):
-            add_smoothing(checkpoint, LIMITS, checkpoint / "set")
-        assert (checkpoint / POSTPROCESSOR).read_text() == before
-
-
 def test_limits_of_another_width_are_refused(checkpoint):
     config = {"output_features": {"action": {"type": "ACTION", "shape": [7]}}}
     (checkpoint / "config.json").write_text(json.dumps(config))

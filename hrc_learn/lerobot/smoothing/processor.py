@@ -34,10 +34,6 @@ _JUMP = 5.0
 """A robot that moves this many times faster than its limit was put there: an episode began."""
 _SAME = 1e-6
 """Changes below this are rounding."""
-_CLOSE = 1e-3
-"""Relative difference of statistics of the same actions: float32, and quantised episodes."""
-_FAR = 5.0
-"""Deviations between means, and ratio of deviations, of actions of another robot."""
 
 _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
@@ -276,7 +272,7 @@ ProcessorStepRegistry.register(WATCH)(WatchStateStep)
 ProcessorStepRegistry.register(SMOOTH)(SmoothActionsStep)
 
 
-def add_smoothing(checkpoint: Path, limits: ActionLimits, dataset: Path | None = None) -> None:
+def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
     """Add smoothing of the actions to a trained policy's checkpoint.
 
     Steps from an earlier call are replaced. Weights and all other steps stay as they are.
@@ -284,16 +280,12 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits, dataset: Path | None =
     Args:
         checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
         limits: Limits of its actions.
-        dataset: Dataset that the limits are from; its actions are compared with those that the
-            policy was trained on.
 
     Raises:
         FileNotFoundError: The folder holds no processors.
         ValueError: They cannot be read, or the limits are not those of the policy's actions.
     """
     _require_width(checkpoint, limits)
-    if dataset is not None:
-        _require_same_actions(checkpoint, dataset, limits.names)
     before, after = (read_pipeline(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
     watch = {"registry_name": WATCH, "config": {}}
     smooth = {"registry_name": SMOOTH, "config": asdict(limits)}
@@ -314,45 +306,6 @@ def _require_width(checkpoint: Path, limits: ActionLimits) -> None:
             f"the policy of {checkpoint} has {width} values in an action, but the limits are "
             f"those of {', '.join(limits.names)}: give the dataset that it was trained on"
         )
-
-
-def _require_same_actions(checkpoint: Path, dataset: Path, names: list[str]) -> None:
-    """Compare the statistics of actions that both keep.
-
-    Raises:
-        ValueError: Those of the dataset are far from those of the policy.
-    """
-    trained, path = _trained_statistics(checkpoint), dataset / "meta" / "stats.json"
-    shown = (read_json(path) if path.is_file() else {}).get(ACTION) or {}
-    if not {"mean", "std"} <= shown.keys() or trained.shape != (2, len(names)):
-        return
-    found = np.array([shown["mean"], shown["std"]], dtype=np.float64).reshape(2, -1)
-    if found.shape != trained.shape or np.allclose(found, trained, rtol=_CLOSE, atol=_SAME):
-        return
-    (mean, std), trained_std = found, trained[1]
-    wide = np.maximum(std, trained_std)
-    ratio = np.abs(np.log(np.maximum(std, _SAME) / np.maximum(trained_std, _SAME)))
-    far = (np.abs(mean - trained[0]) > _FAR * wide) | (ratio > np.log(_FAR))
-    if far.any():
-        i = int(far.argmax())
-        raise ValueError(
-            f"{names[i]} of {dataset} is {mean[i]:.3g} +- {std[i]:.3g}, but the policy of "
-            f"{checkpoint} was trained on {trained[0, i]:.3g} +- {trained_std[i]:.3g}: that is "
-            f"another robot, unit or order; give the dataset that it was trained on"
-        )
-
-
-def _trained_statistics(checkpoint: Path) -> np.ndarray:
-    """Mean and deviation of the actions that the policy was trained on; empty if not kept."""
-    from safetensors.numpy import load_file
-
-    for step in read_pipeline(checkpoint / POSTPROCESSOR)["steps"]:
-        file = checkpoint / str(step.get("state_file"))
-        if step.get("state_file") and file.is_file():
-            kept = load_file(file)
-            if {f"{ACTION}.mean", f"{ACTION}.std"} <= kept.keys():
-                return np.stack([kept[f"{ACTION}.{n}"].astype(float) for n in ("mean", "std")])
-    return np.empty(0)
 
 
 def remove_smoothing(checkpoint: Path) -> None:
