@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import binomtest
 
 from hrc_learn.experiments.metric_table import (
+    Metric,
     Summary,
     column,
     median,
@@ -86,3 +87,12 @@ def test_a_trial_that_was_given_up_spoils_no_quantile():
     assert p95("error")(given_up) == 3
     assert success_rate(given_up) == 0.8
     assert median("nothing")(trials) is None
+
+
+@pytest.mark.parametrize("bound", [{"at_most": 1.0}, {"at_least": 1.0}])
+def test_a_metric_has_one_bound(bound):
+    measured = Metric("error", lambda run: run, **bound).measure(2.0)
+    assert measured is not None
+    assert measured.ok == ("at_least" in bound)
+    with pytest.raises(ValueError, match="'error' has two bounds"):
+        Metric("error", lambda run: run, at_most=1.0, at_least=0.0)

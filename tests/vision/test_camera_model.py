@@ -53,6 +53,15 @@ def test_points_behind_the_camera_have_no_pixel():
     assert not model.in_view(behind)
 
 
+@pytest.mark.parametrize("x", [-0.5, 0.0, 0.5])
+@pytest.mark.parametrize("y", [-0.25, 0.0, 0.25])
+def test_the_image_reaches_to_the_outer_edges_of_its_pixels(x, y):
+    """All numbers are exact in binary: 128 x 64 pixels, 128 px of focal length."""
+    model = CameraModel(width=128, height=64, focal=(128.0, 128.0), principal=(63.5, 31.5))
+    assert model.in_view(np.array([x, y, 1.0]))
+    assert not model.in_view(np.array([1.01 * x or 0.51, 1.01 * y, 1.0]))
+
+
 def test_a_lens_that_folds_over_brings_nothing_into_view():
     # x (1 - 0.15 x^2) comes back to zero at x = 2.58, far outside the field of view.
     model = CameraModel(distortion=(-0.15, 0.0, 0.0, 0.0, 0.0))
