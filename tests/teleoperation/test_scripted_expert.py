@@ -155,3 +155,23 @@ def test_a_person_without_spells_leaves_the_arm_alone():
     asked = ScriptedPerturbation(panda, []).read(state)
     assert not asked.nullspace_input.any()
     assert not asked.twist.any()
+
+
+def test_a_script_counts_from_zero_or_from_when_it_begins():
+    pull = ScriptedForce(start=0.1, duration=1.0, towards=(0.5, 0.3, 0.6))
+
+    def effort(person, time):
+        q = panda.ready.numpy()
+        state = ArmState(time=time, joint_position=q, joint_velocity=0 * q, gripper_width=0.08)
+        return person.read(state).effort(7)
+
+    person = ScriptedPerturbation(panda, [pull])
+    pulled = effort(person, 0.6)
+    assert pulled.any()
+    assert not effort(person, 0.05).any()
+    assert not effort(person, 1.2).any()
+    waiting = ScriptedPerturbation(panda, [pull], begin=None)
+    assert not effort(waiting, 0.6).any()
+    waiting.begin(2.0)
+    assert not effort(waiting, 2.05).any()
+    np.testing.assert_array_equal(effort(waiting, 2.6), pulled)
