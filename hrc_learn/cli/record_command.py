@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from rich.progress import Progress, track
 
-from hrc_learn.cli._run import configuration, refuse_existing, with_settings, write_values
+from hrc_learn.cli._run import configuration, with_settings, write_values
 from hrc_learn.cli.arguments import Record
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
@@ -245,7 +245,6 @@ def _record_leader(args: Record, episodes: int, seed: int) -> None:
     frames = round(config.duration * config.fps)
     if frames < 2 or config.pause < 0:
         raise ValueError("demonstration.duration must be positive, and pause not negative.")
-    refuse_existing(args.out, False)
     site = replace(settings.site, driver="lerobot")
     robot = ArmChoice(args.robot).arm()
     names = robot.chain.joint_names

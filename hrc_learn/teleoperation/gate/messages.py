@@ -235,9 +235,8 @@ class _TurnStart(_Message, tag="TransformControlsDragStartMessage"):
     owner: str = ""
 
 
-class _TurnEnd(_Message, tag="TransformControlsDragEndMessage"):
-    name: str
-    owner: str = ""
+class _TurnEnd(_TurnStart, tag="TransformControlsDragEndMessage"):
+    pass
 
 
 class _Command(_Message, tag="CommandTriggerMessage"):
