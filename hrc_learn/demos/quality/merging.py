@@ -100,7 +100,9 @@ class _Source:
 
     Attributes:
         folder: Its metadata.
+        decisions: Unit of each quantity.
         meanings: Quantity and joint of each component that has one.
+        units: Unit of each of these components.
         places: Component of this dataset for each component of a feature of the first one.
         factors: Factor to the unit of the first dataset for each of them.
     """
@@ -108,26 +110,18 @@ class _Source:
     def __init__(self, dataset: OpenedDataset):
         self.dataset, self.folder = dataset, dataset.folder
         self.root, self.features = dataset.folder.root, dataset.folder.features
-        self.units, faults = dataset.decide_units(dataset.folder.episodes, {})
+        self.decisions, faults = dataset.decide_units(dataset.folder.episodes, {})
         for fault in faults:
             raise fault
-        selections = dataset.columns.selections.items()
-        self.meanings: dict[_Column, tuple[str, str]] = {
-            column: (role, label.removesuffix(".pos"))
-            for role, selection in selections
-            for column, label in zip(selection.columns, selection.labels, strict=True)
-        }
+        self.meanings: dict[_Column, tuple[str, str]] = {}
+        self.units: dict[_Column, UnitDecision] = {}
+        for role, selection in dataset.columns.selections.items():
+            decision = self.decisions[role]
+            for number, column in enumerate(selection.columns):
+                self.meanings[column] = role, selection.labels[number].removesuffix(".pos")
+                self.units[column] = replace(decision, unit=decision.unit_of(number), units=())
         self.places: dict[str, list[int]] = {}
         self.factors: dict[str, np.ndarray] = {}
-
-    def unit(self, column: _Column) -> UnitDecision | None:
-        """Decision on one component, in its own unit; None without a meaning."""
-        if column not in self.meanings:
-            return None
-        role = self.meanings[column][0]
-        number = self.dataset.columns.selections[role].columns.index(column)
-        decision = self.units[role]
-        return replace(decision, unit=decision.unit_of(number), units=())
 
     def fault(self, message: str, key: str) -> DatasetError:
         """Error about a feature of this dataset."""
@@ -233,7 +227,7 @@ class _Merge:
         )
 
     def _factor(self, source: _Source, key: str, index: int, place: int) -> float:
-        own, other = self.first.unit((key, index)), source.unit((key, place))
+        own, other = self.first.units.get((key, index)), source.units.get((key, place))
         if own is None or other is None or own.unit == other.unit:
             return 1.0
         for asked, decision in ((self.first, own), (source, other)):
@@ -309,7 +303,7 @@ class _Merge:
             yield EpisodeEdit(
                 entry=entry,
                 columns=source.dataset.columns,
-                units=source.units,
+                units=source.decisions,
                 frames=source.converted(frames, features),
                 time=np.arange(entry.length) / fps,
                 kept=np.arange(entry.length),
