@@ -61,6 +61,20 @@ def pytree[T](cls: type[T]) -> type[T]:
     return cls
 
 
+def zero_where[T](mask: Tensor, tree: T) -> T:
+    """A pytree with zeros, or False, in the elements of the batch where a mask holds.
+
+    Args:
+        mask: Elements to clear, (*batch).
+        tree: Tensors whose batch dimensions lead.
+    """
+
+    def cleared(x: Tensor) -> Tensor:
+        return x.masked_fill(mask[(..., *[None] * (x.dim() - mask.dim()))], 0)
+
+    return _pytree.tree_map(cleared, tree)
+
+
 def apply_where(
     mask: Tensor, function: Callable[[Any], Any], arguments: Any, otherwise: Any
 ) -> Any:

@@ -83,8 +83,8 @@ def controller(device: str):
 
 def constraint_layer(device: str):
     state = constraint_states.of_panda(200)
-    found = constrained_velocity(*to(device, state.arguments))
-    return found.joint_velocity, found.slowed
+    velocity, report = constrained_velocity(*to(device, state.arguments))
+    return velocity, report.slowed
 
 
 def motion_head(device: str):

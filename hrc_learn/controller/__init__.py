@@ -6,9 +6,6 @@ from hrc_learn.controller.adaptive_controller import ControllerState as Controll
 from hrc_learn.controller.arm_loop import ArmLoop as ArmLoop
 from hrc_learn.controller.arm_loop_state import ArmLoopConfig as ArmLoopConfig
 from hrc_learn.controller.arm_loop_state import ArmReading as ArmReading
-from hrc_learn.controller.constraint_layer import (
-    ConstrainedVelocity as ConstrainedVelocity,
-)
 from hrc_learn.controller.constraint_layer import ConstraintConfig as ConstraintConfig
 from hrc_learn.controller.constraint_layer import Distances as Distances
 from hrc_learn.controller.constraint_layer import SeparationConfig as SeparationConfig

@@ -44,6 +44,7 @@ from hrc_learn.controller.resolved_rate import (
     validated_step,
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.controller.task_pace import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.numerics import ArrayLike, is_number
@@ -95,21 +96,13 @@ class ControllerConfig:
     """Safety filter."""
 
     def __post_init__(self):
-        for name in (
-            "linear_speed",
-            "angular_speed",
-            "vision_rate",
-            "approach_linear_speed",
-            "approach_angular_speed",
-            "null_damping",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
-        if not self.drift_compensation_rate >= 0:
-            raise ValueError(
-                "drift_compensation_rate must not be negative, but is "
-                f"{self.drift_compensation_rate}"
-            )
+        speeds = "linear_speed", "angular_speed"
+        approach = "approach_linear_speed", "approach_angular_speed"
+        check_settings(
+            self,
+            positive=(*speeds, *approach, "vision_rate", "null_damping"),
+            not_negative=["drift_compensation_rate"],
+        )
 
     @classmethod
     def paper(cls) -> ControllerConfig:

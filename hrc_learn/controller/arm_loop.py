@@ -38,6 +38,7 @@ from hrc_learn.controller.arm_loop_state import (
 from hrc_learn.controller.interface import Command, SafetyReport
 from hrc_learn.controller.null_space_motion import (
     Clearance,
+    EasedVelocity,
     eased_null_velocity,
     fraction_in_null_space,
     fraction_kept,
@@ -50,7 +51,6 @@ from hrc_learn.controller.task_pace import (
     TaskPace,
     capped_scale,
     closes_in,
-    fraction_of_motion,
     people_bind,
     way_making_velocity,
 )
@@ -61,6 +61,8 @@ from hrc_learn.pytree import apply_where
 
 # Null-space input below which one that has ended is over [N m].
 _LEAST_INPUT = 0.05
+# Twist below which the task counts as resting (metres and radians mixed) [1/s].
+_AT_REST = 1e-3
 
 
 @final
@@ -199,33 +201,25 @@ class ArmLoop:
         q, J = reading.joint_position, reading.jacobian
         config, bounds = self.config, self._tracking.task_margin.velocity_bounds(q)
 
-        def eased(part: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-            q, J, previous, requested, lower, upper = part
-            return tuple(
-                eased_null_velocity(
-                    self.chain, q, J, previous, requested, (lower, upper), config.dt, config
-                )
-            )
-
         one = torch.ones_like(q[..., 0])
-        velocity, projected, slowdown, fade, unbounded, bounded = apply_where(
+        eased = apply_where(
             acts,
-            eased,
-            (q, J, state.null_velocity, requested, *bounds),
-            (requested, requested, one, one, requested, requested),
+            lambda part: eased_null_velocity(self.chain, *part, config.dt, config),
+            (q, J, state.null_velocity, requested, bounds),
+            EasedVelocity(requested, requested, one, one, requested, requested),
         )
-        small = config.damping * velocity.abs().amax(-1) < _LEAST_INPUT
-        velocity = velocity.masked_fill((~asked & small).unsqueeze(-1), 0.0)
+        small = config.damping * eased.velocity.abs().amax(-1) < _LEAST_INPUT
+        velocity = eased.velocity.masked_fill((~asked & small).unsqueeze(-1), 0.0)
         if not reading.explain:
             return velocity, ()
         return velocity, (
-            Limitation("task", fraction_in_null_space(requested, projected)),
-            Limitation("speed", slowdown),
-            Limitation("singularity", fade),
+            Limitation("task", fraction_in_null_space(requested, eased.projected)),
+            Limitation("speed", eased.slowdown),
+            Limitation("singularity", eased.fade),
             Limitation(
                 "joint_limit",
-                fraction_kept(unbounded, bounded),
-                joint=limiting_joint(unbounded, *bounds),
+                fraction_kept(eased.unbounded, eased.bounded),
+                joint=limiting_joint(eased.unbounded, *bounds),
             ),
         )
 
@@ -282,7 +276,7 @@ class ArmLoop:
             stop=reading.stop,
         )
         slowed = self._slowed_by_people(reading, sent, filtered)
-        left = fraction_of_motion(twist_of(J, velocity), twist_of(J, sent))
+        left = fraction_kept(twist_of(J, velocity), twist_of(J, sent), _AT_REST)
         pace = state.pace.limited(torch.where(slowed, left, 1.0), self.config.dt)
         report = ArmReport(filtered, *wanted[1:])
         if reading.explain:
@@ -295,7 +289,7 @@ class ArmLoop:
         """Send a command of the adaptive controller, at the pace of the task."""
         J, q = reading.jacobian, reading.joint_position
         slowed = self._slowed_by_people(reading, command.joint_velocity, command.safety)
-        left = fraction_of_motion(command.twist, twist_of(J, command.joint_velocity))
+        left = fraction_kept(command.twist, twist_of(J, command.joint_velocity), _AT_REST)
         velocity = state.pace.speed_override.unsqueeze(-1) * command.joint_velocity
         pace = state.pace.limited(torch.where(slowed, left, 1.0), self.config.dt)
         change = (velocity - state.safety.velocity) / self.config.dt

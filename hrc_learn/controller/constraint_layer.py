@@ -14,16 +14,18 @@ do not depend on the data, so they compile and export.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.utils import _pytree
 
 from hrc_learn.controller.contact_limits import ContactConfig, PersonMode
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry.numerics import is_number, matmul, may_branch, orthonormal_basis
-from hrc_learn.pytree import pytree
+from hrc_learn.pytree import pytree, zero_where
 
 # Violations of a limit up to this are rounding.
 _TOLERANCE = 1e-10
@@ -214,11 +216,8 @@ class ConstraintConfig:
     more than 24 in 0.1 %. Each takes about 3 % of a compiled control step."""
 
     def __post_init__(self):
-        if not self.clearance >= 0:
-            raise ValueError(f"clearance must not be negative, but is {self.clearance}")
-        for name in ("rate", "task_weight", "path_weight", "distance_weight"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        positive = "rate", "task_weight", "path_weight", "distance_weight"
+        check_settings(self, positive=positive, not_negative=["clearance"])
         if self.steps < 1:
             raise ValueError(f"steps must be at least 1, but is {self.steps}")
 
@@ -262,11 +261,8 @@ class SeparationConfig:
     def __post_init__(self):
         if self.mode not in (modes := get_args(PersonMode)):
             raise ValueError(f"mode must be {' or '.join(modes)}, but is {self.mode!r}")
-        for name in ("human_speed", "reaction_time", "clearance"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, but is {getattr(self, name)}")
-        if not self.deceleration > 0:
-            raise ValueError(f"deceleration must be positive, but is {self.deceleration}")
+        terms = "human_speed", "reaction_time", "clearance"
+        check_settings(self, positive=["deceleration"], not_negative=terms)
 
     def protective_distance(
         self,
@@ -378,24 +374,11 @@ class Distances:
 
     def double(self) -> Distances:
         """The distances in float64."""
-        return Distances(
-            distance=self.distance.double(),
-            gradient=self.gradient.double(),
-            approach_speed=self.approach_speed.double(),
-            person=self.person,
-            contact_speed=None if self.contact_speed is None else self.contact_speed.double(),
-        )
+        return _pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, self)
 
     def where(self, known: Bool[Tensor, "*batch"]) -> Distances:
         """The distances where `known`, zeros elsewhere."""
-        unknown, contact = ~known.unsqueeze(-1), self.contact_speed
-        return Distances(
-            distance=self.distance.masked_fill(unknown, 0),
-            gradient=self.gradient.masked_fill(unknown.unsqueeze(-1), 0),
-            approach_speed=self.approach_speed.masked_fill(unknown, 0),
-            person=self.person,
-            contact_speed=None if contact is None else contact.masked_fill(unknown, 0),
-        )
+        return replace(zero_where(~known, self), person=self.person)
 
     def closing_speed(
         self, config: ConstraintConfig, separation: SeparationConfig
@@ -412,11 +395,11 @@ class Distances:
         return torch.where(self.person, towards_person, towards_object)
 
 
-class ConstrainedVelocity(NamedTuple):
-    """A joint velocity within all limits, and the effect of the limits."""
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class ConstraintReport:
+    """Effect of the limits on a joint velocity."""
 
-    joint_velocity: Float[Tensor, "*batch n"]
-    """Joint velocities [rad/s]."""
     slowed: Float[Tensor, "*batch"]
     """Fraction of the task velocity given up, 0 to 1."""
     violation: Float[Tensor, "*batch"]
@@ -436,7 +419,7 @@ def constrained_velocity(
     config: ConstraintConfig | None = None,
     task_fraction: Float[Tensor, "*batch"] | None = None,
     separation: SeparationConfig | None = None,
-) -> ConstrainedVelocity:
+) -> tuple[Float[Tensor, "*batch n"], ConstraintReport]:
     """The joint velocity nearest to a wanted one that keeps all limits, the task first.
 
     With the task's velocity t, an orthonormal basis N of the null space of J, and P of the
@@ -475,6 +458,9 @@ def constrained_velocity(
         task_fraction: Fraction of the task contained in the wanted velocity, 0 to 1, below 1
             while the arm accelerates; None: 1.
         separation: Protective distance from people; default: the recommended settings.
+
+    Returns:
+        Joint velocities [rad/s], and the effect of the limits.
     """
     config = config or ConstraintConfig()
     dtype, m = wanted.dtype, jacobian.shape[-2]
@@ -498,7 +484,8 @@ def constrained_velocity(
     if may_branch(wanted) and bool(none_binds(least, most).all()):
         solved = torch.ones_like(zero, dtype=torch.bool)
         within = wanted.clamp(lower, upper).to(dtype)
-        return ConstrainedVelocity(within, zero.to(dtype), zero.to(dtype), solved)
+        zero = zero.to(dtype)
+        return within, ConstraintReport(slowed=zero, violation=zero, solved=solved)
 
     basis = _unit_cost_directions(J, task, config)
     rows = _limit_rows(basis, gradient, m, config)
@@ -509,7 +496,10 @@ def constrained_velocity(
     u = torch.where(solved.unsqueeze(-1), u, 0.0).clamp(lower, upper)
     slowed = torch.where(solved, -y[..., m] / config.task_weight, fraction)
     violation = torch.where(solved, y[..., -1] / config.slack_cost, 0.0)
-    return ConstrainedVelocity(u.to(dtype), slowed.to(dtype), violation.to(dtype), solved)
+    report = ConstraintReport(
+        slowed=slowed.to(dtype), violation=violation.to(dtype), solved=solved
+    )
+    return u.to(dtype), report
 
 
 def _unit_cost_directions(

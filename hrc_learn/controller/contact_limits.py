@@ -26,6 +26,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry import Box
 from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics import Separation
@@ -91,14 +92,10 @@ class ContactConfig:
     """Mass of an object in the gripper, at the tool centre point [kg]."""
 
     def __post_init__(self) -> None:
-        for name in ("area", "padding", "used"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        masses = "rotor_inertia", "load"
+        check_settings(self, positive=("area", "padding", "used"), not_negative=masses)
         if self.used > 1:
             raise ValueError(f"used must be at most 1, but is {self.used}")
-        for name in ("rotor_inertia", "load"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} must not be negative, but is {getattr(self, name)}")
 
 
 def region_numbers(names: Sequence[str]) -> Int[Tensor, " parts"]:

@@ -12,7 +12,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from hrc_learn.controller.constraint_layer import ConstraintConfig, Distances, SeparationConfig
+from hrc_learn.controller.constraint_layer import (
+    ConstraintConfig,
+    ConstraintReport,
+    Distances,
+    SeparationConfig,
+)
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.kinematics import TaskSpace
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import (
@@ -67,17 +73,14 @@ class SafetyConfig:
     the task; None: each joint brakes by itself before its limits, and no distance is kept."""
 
     def __post_init__(self):
-        for name in ("rate", "tcp_speed"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
-        for name in ("margin", "delay"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, but is {getattr(self, name)}")
+        check_settings(
+            self,
+            positive=("rate", "tcp_speed"),
+            not_negative=("margin", "delay"),
+            below_one=("velocity_margin", "jitter"),
+        )
         if not 0 < self.braking <= 1:
             raise ValueError(f"braking must be in (0, 1], but is {self.braking}")
-        for name in ("velocity_margin", "jitter"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ValueError(f"{name} must be in [0, 1), but is {getattr(self, name)}")
 
     @property
     def longest_step(self) -> float:
@@ -112,19 +115,6 @@ class SafetyState:
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class ConstraintReport:
-    """Effect of the quadratic program in one step (`ConstrainedVelocity`)."""
-
-    slowed: Float[Tensor, "*batch"]
-    """Fraction of the task velocity given up, 0 to 1."""
-    violation: Float[Tensor, "*batch"]
-    """Excess of the fastest closing speed over the allowed one [m/s]."""
-    solved: Bool[Tensor, "*batch"]
-    """False: the arm brakes, because the solver needed more steps."""
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
 class SafetyReport:
     """Interventions of the filter in one step."""
 
@@ -136,7 +126,7 @@ class SafetyReport:
     speed_excess_time: Float[Tensor, "*batch"]
     """Time for which the cap has been exceeded, up to the end of this step [s]."""
     constraints: ConstraintReport | None = None
-    """Effect of the constraints, where the filter has them."""
+    """Effect of the constraints, where the filter has them; none on an arm that brakes."""
 
     def acted(self, kind: str) -> Bool[Tensor, "*batch"]:
         """True where one kind of intervention changed the command."""
@@ -244,10 +234,6 @@ class Goals:
         return replace(
             self, position=replace(self.position, centre=centre, half_size=half_size)
         )
-
-    def aimed_at(self, target: Float[Tensor, "*#batch rows"]) -> Goals:
-        """The goals with another target in the image [px]."""
-        return replace(self, vision=replace(self.vision, target=target))
 
     def approached_by(self, posture: Float[Tensor, "*#batch n"] | None) -> Goals:
         """The goals, first approached in joint space towards a posture [rad].

@@ -20,6 +20,7 @@ from hrc_learn.controller.null_space_motion import (
     YieldingConfig,
     smallest_singular_value,
 )
+from hrc_learn.geometry import minimum_jerk
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree
 
@@ -318,17 +319,10 @@ class DirectReturn:
     @classmethod
     def none(cls, joint_position: Float[Tensor, "*batch n"]) -> DirectReturn:
         """No return under way."""
-        zero = torch.zeros_like(joint_position[..., 0])
+        q, zero = joint_position, torch.zeros_like(joint_position[..., 0])
+        clocks = {"progress": zero, "duration": zero, "time": zero}
         never = torch.zeros_like(zero, dtype=torch.bool)
-        return cls(
-            start=joint_position,
-            goal=joint_position,
-            progress=zero,
-            duration=zero,
-            time=zero,
-            active=never,
-            blocked=never,
-        )
+        return cls(start=q, goal=q, **clocks, active=never, blocked=never)
 
     @classmethod
     def planned(
@@ -381,8 +375,7 @@ class DirectReturn:
 
     def joint_position(self) -> Float[Tensor, "*batch n"]:
         """Joint positions to track now [rad]."""
-        s = (self.time / self.duration.clamp(min=1e-9)).clamp(0, 1)
-        s = s**3 * (10 - 15 * s + 6 * s**2)
+        s, _ = minimum_jerk(self.time / self.duration.clamp(min=1e-9))
         return torch.lerp(self.start, self.goal, s.unsqueeze(-1))
 
 

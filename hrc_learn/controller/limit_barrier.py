@@ -50,8 +50,7 @@ class LimitBarrier(nn.Module):
     a long ramp time A/j.
 
     *Starts outside.* A joint may start at rest nearer to a limit than this, or beyond it. Such
-    a joint never moves outwards. With `rests_outside=False` the barrier drives it inwards. With
-    `rests_outside=True` it may also stay at rest; the set is then
+    a joint never moves outwards, and may stay at rest; the set is then
     v_hat <= max(h(delta), A^2/(2 j)). A joint that comes to rest within its margin then stops
     at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. This set is also
     invariant, because braking lowers v_hat.
@@ -100,7 +99,6 @@ class LimitBarrier(nn.Module):
         *,
         margin: float,
         rate: float,
-        rests_outside: bool = False,
         delay: float = 0.0,
         jitter: float = 0.0,
     ):
@@ -111,12 +109,10 @@ class LimitBarrier(nn.Module):
             margin: Distance kept from every position limit [rad]; wider where
                 position-dependent velocity limits require it.
             rate: Fastest decay of the remaining distance [1/s].
-            rests_outside: True if a joint outside its limits may rest there.
             delay: Time until the joints follow a command [s].
             jitter: Largest relative excess of a step over its dt.
         """
         super().__init__()
-        self.rests_outside = rests_outside
         A, j = limits.acceleration, limits.jerk
         reserve = A**2 / (2 * j)
         slowest, decay_time = A / (1 + jitter), torch.full_like(A, 1 / rate)
@@ -167,9 +163,8 @@ class LimitBarrier(nn.Module):
         # it may approach the wall from the same distance inside. |delta| keeps the root real.
         square = torch.addcmul(self.knee_square, self.twice_acceleration, delta.abs())
         speed = torch.copysign(square.sqrt() - self.knee, delta)
-        speed = speed - self.reserve  # v_hat = v + A^2/(2 j) at a = 0
-        if self.rests_outside:
-            speed = speed.clamp(min=0)
+        # v_hat = v + A^2/(2 j) at a = 0; outside, a joint may rest.
+        speed = (speed - self.reserve).clamp(min=0)
         most = (1 - 2 * _ROUNDING * torch.finfo(self.velocity.dtype).eps) * self.velocity
         bounds = speed.clamp(-most, most) * -self.sides
         lower, upper = bounds.unbind(-2)

@@ -311,11 +311,17 @@ def kept_clear(
 
 
 def fraction_kept(
-    before: Float[Tensor, "*batch n"], after: Float[Tensor, "*batch n"]
+    before: Float[Tensor, "*batch n"], after: Float[Tensor, "*batch n"], rest: float = 1e-6
 ) -> Float[Tensor, "*batch"]:
-    """Fraction of a velocity that is left along its direction, 0 to 1; 1 for no velocity."""
+    """Fraction of a velocity that is left along its direction, 0 to 1; 1 at rest.
+
+    Args:
+        before: Velocity of the joints [rad/s], or a twist.
+        after: What is left of it.
+        rest: Length below which a velocity counts as rest.
+    """
     square = torch.linalg.vecdot(before, before)
-    moving = square >= 1e-12  # a microradian a second
+    moving = square >= rest**2
     along = torch.linalg.vecdot(before, after) / torch.where(moving, square, 1.0)
     return torch.where(moving, along, 1.0).clamp(0.0, 1.0)
 

@@ -130,14 +130,8 @@ class PathLaw:
         ratio = torch.where(path.blocked | stops, torch.inf, ratio)
         rate = changed_rate(path.rate, 2.0 - ratio, dt, torch.where(backs, -1, 1))
         progress = (path.progress + rate * state.pace.scale).clamp(min=0)
-        return replace(
-            path,
-            progress=torch.where(moves, progress, path.progress),
-            rate=torch.where(moves, rate, path.rate),
-            waited=torch.where(moves, waited, path.waited),
-            nearest=torch.where(moves, nearest, path.nearest),
-            held=torch.where(moves, held, path.held),
-        )
+        then = {"progress": progress, "rate": rate, "waited": waited, "nearest": nearest}
+        return _changed_where(moves, path, **then, held=held)
 
     def follow(
         self, state: ArmLoopState, reading: ArmReading, request: FollowPath
@@ -265,35 +259,26 @@ class PathLaw:
         direct, dt = path.direct_return, self.config.dt
         arrived = direct.active & (direct.time > direct.duration + dt)
         if bool(arrived.any()):
-            path = replace(
-                path,
-                progress=torch.where(arrived, direct.progress, path.progress),
-                waited=torch.where(arrived, 0.0, path.waited),
-                nearest=torch.where(arrived, torch.inf, path.nearest),
-                held=torch.where(arrived, 0.0, path.held),
-                direct_return=replace(direct, active=direct.active & ~arrived),
-            )
-            direct = path.direct_return
+            there = {"progress": direct.progress, "waited": 0.0, "nearest": torch.inf}
+            path = _changed_where(arrived, path, **there, held=0.0)
+            direct = replace(direct, active=direct.active & ~arrived)
         begins = path.waited > self.config.direct_return_after
         begins = begins & ~direct.active & ~direct.blocked
         if bool(begins.any()):
             direct = apply_where(
                 begins,
-                lambda part: self._direct_return(request, *part),
+                lambda part: DirectReturn.planned(
+                    request.paths, *part, self.config, self._tracking.clearance
+                ),
                 (request.path, path.progress, joint_position),
                 direct,
             )
-            path = replace(path, direct_return=direct)
-        return path
+        return replace(path, direct_return=direct)
 
-    def _direct_return(
-        self, request: FollowPath, which: Tensor, progress: Tensor, joint_position: Tensor
-    ) -> DirectReturn:
-        return DirectReturn.planned(
-            request.paths,
-            which,
-            progress,
-            joint_position,
-            self.config,
-            self._tracking.clearance,
-        )
+
+def _changed_where(mask: Tensor, path: PathState, **values: Tensor | float) -> PathState:
+    """The path with other values of some fields where a mask holds."""
+    changed = {
+        name: torch.where(mask, value, getattr(path, name)) for name, value in values.items()
+    }
+    return replace(path, **changed)

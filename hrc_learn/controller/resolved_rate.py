@@ -31,7 +31,7 @@ from hrc_learn.geometry.numerics import (
     solve_positive,
 )
 from hrc_learn.kinematics.inverse import SINGULAR_BELOW, position_first
-from hrc_learn.pytree import pytree
+from hrc_learn.pytree import pytree, zero_where
 from hrc_learn.regions import PostureRegion
 
 # Keeps the Cholesky factorisation possible at a singularity. It serves to judge how near that
@@ -271,14 +271,7 @@ def restored_drift(drift: PoseDrift) -> PoseDrift:
     """The drift, reset where a field is not a number."""
     numbers = (drift.drift, drift.joint_position, drift.planned, drift.jacobian.flatten(-2))
     known = is_number(torch.cat(numbers, dim=-1)).all(-1)
-    unknown = ~known.unsqueeze(-1)
-    return PoseDrift(
-        drift=drift.drift.masked_fill(unknown, 0),
-        joint_position=drift.joint_position.masked_fill(unknown, 0),
-        jacobian=drift.jacobian.masked_fill(unknown.unsqueeze(-1), 0),
-        planned=drift.planned.masked_fill(unknown, 0),
-        active=drift.active & known,
-    )
+    return zero_where(~known, drift)
 
 
 def measure_drift(
@@ -405,11 +398,8 @@ class VisionBlending(nn.Module):
         """The state, reset where it is not finite."""
         known = is_number(state.level) & is_number(state.feature).all(-1)
         fresh = self.initial_state(state.level.unsqueeze(-1), state.feature.shape[-1] // 2)
-        return BlendingState(
-            active=state.active & known,
-            level=torch.where(known, state.level, fresh.level),
-            feature=torch.where(known.unsqueeze(-1), state.feature, fresh.feature),
-        )
+        feature = torch.where(known.unsqueeze(-1), state.feature, fresh.feature)
+        return replace(zero_where(~known, state), feature=feature)
 
     def late(self, age: Float[Tensor, "*batch"]) -> Bool[Tensor, "*batch"]:
         """True where a measurement of an age [s] is too old."""
@@ -636,4 +626,4 @@ def effective_goals(
         return goals, True
     known = is_number(target).all(-1)
     target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
-    return goals.aimed_at(target), known
+    return replace(goals, vision=replace(goals.vision, target=target)), known

@@ -14,10 +14,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hrc_learn.controller.constraint_layer import Distances, constrained_velocity
+from hrc_learn.controller.constraint_layer import (
+    ConstraintReport,
+    Distances,
+    constrained_velocity,
+)
 from hrc_learn.controller.interface import (
     INTERVENTIONS,
-    ConstraintReport,
     SafetyConfig,
     SafetyReport,
     SafetyState,
@@ -25,6 +28,7 @@ from hrc_learn.controller.interface import (
 from hrc_learn.controller.limit_barrier import LimitBarrier, SpeedBarrier
 from hrc_learn.geometry.numerics import ArrayLike, as_tensor, is_number, may_branch
 from hrc_learn.kinematics import MotionLimits, SerialChain
+from hrc_learn.pytree import zero_where
 
 # Smallest relative excess, or change of a joint velocity [rad/s], reported as an intervention.
 # Smaller ones are rounding, also in float32: a command along a limit would be flagged at
@@ -114,7 +118,6 @@ class SafetyFilter(nn.Module):
             rate=config.rate,
             delay=config.delay,
             jitter=config.jitter,
-            rests_outside=True,
         )
         self.speed_barrier = SpeedBarrier(
             self.barrier, config.tcp_speed, delay=config.delay, jitter=config.jitter
@@ -427,22 +430,14 @@ class SafetyFilter(nn.Module):
         excess = _excess(change, acceleration)
         # a = change/s with the root s of a dt + a^2/(2 j) = change dt, which fades out in time.
         fading = (1 + torch.sqrt(1 + 2 * _excess(change, jerk * dt))) / 2
-        v, excess_j = self._accelerated(given, change / torch.maximum(excess, fading), bounds)
-        return v, _acts(excess), _acts(excess_j)
-
-    def _accelerated(
-        self, given: _Inputs, wanted: Tensor, bounds: tuple[Tensor, Tensor] | None
-    ) -> tuple[Tensor, Tensor]:
-        """The velocity after a wanted acceleration, and by how much it exceeds the jerk."""
-        barrier, state, dt = self.barrier, given.state, given.dt
-        change = wanted - state.acceleration
-        excess = _excess(change, barrier.usable(dt)[1] * dt)
-        acceleration = torch.addcdiv(state.acceleration, change, excess.clamp(min=1))
+        jump = change / torch.maximum(excess, fading) - state.acceleration
+        jerky = _excess(jump, jerk * dt)
+        wanted = torch.addcdiv(state.acceleration, jump, jerky.clamp(min=1))
         if bounds is not None:
-            acceleration = barrier.nearest_acceleration(
-                acceleration, state.acceleration, state.velocity, bounds, dt
+            wanted = barrier.nearest_acceleration(
+                wanted, state.acceleration, state.velocity, bounds, dt
             )
-        return state.velocity + acceleration * dt, excess
+        return state.velocity + wanted * dt, _acts(excess), _acts(jerky)
 
     def _stopping(self, given: _Inputs) -> Tensor:
         """The velocity with which the arm brakes to rest, as hard as it can [rad/s]."""
@@ -467,7 +462,7 @@ class SafetyFilter(nn.Module):
         square = torch.linalg.vecdot(command, command)
         along = torch.linalg.vecdot(command, v)
         fraction = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
-        kept = constrained_velocity(
+        v, report = constrained_velocity(
             v,
             command,
             given.jacobian,
@@ -480,18 +475,12 @@ class SafetyFilter(nn.Module):
             self.config.separation,
         )
         # The solver's rounding is a motion where a velocity limit is zero.
-        v = kept.joint_velocity
         v = torch.where(v.abs() < _REST, 0, v)
         braking = given.invalid | given.stopped
         if not may_branch(v) or bool(braking.any()):
             v = torch.where(braking, self._stopping(given), v)
         idle = braking.squeeze(-1)
-        report = ConstraintReport(
-            slowed=kept.slowed.masked_fill(idle, 0),
-            violation=kept.violation.masked_fill(idle, 0),
-            solved=kept.solved | idle,
-        )
-        return v, report
+        return v, replace(zero_where(idle, report), solved=report.solved | idle)
 
     def _keep_speed(
         self, given: _Inputs, v: Tensor, cap: Tensor | float

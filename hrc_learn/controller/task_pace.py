@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller.constraint_layer import Distances
-from hrc_learn.controller.interface import ConstraintReport, SafetyConfig
+from hrc_learn.controller.constraint_layer import ConstraintReport, Distances
+from hrc_learn.controller.interface import SafetyConfig
 from hrc_learn.controller.joint_path import CHANGE_OF_RATE, changed_rate
+from hrc_learn.controller.setting_checks import check_settings
 from hrc_learn.geometry.numerics import safe_norm
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree, static
 
-# Twist below which a fraction of it is not computed (metres and radians mixed) [1/s].
-_AT_REST = 1e-3
 # Step of a difference quotient along a motion [s].
 _STEP = 1e-4
 # Fraction of the task given up by the constraint layer that exceeds rounding.
@@ -93,20 +92,6 @@ class TaskPace:
         return replace(self, speed_override=rate.clamp(max=self.full_speed))
 
 
-def fraction_of_motion(
-    requested: Float[Tensor, "*batch 6"], done: Float[Tensor, "*batch 6"]
-) -> Float[Tensor, "*batch"]:
-    """Fraction of a requested motion that is done, 0 to 1; 1 at rest.
-
-    Args:
-        requested: Twist of the end effector (linear [m/s], angular [rad/s]).
-        done: Twist that is left of it.
-    """
-    square, along = (requested * requested).sum(-1), (requested * done).sum(-1)
-    moves = square > _AT_REST**2
-    return torch.where(moves, along / torch.where(moves, square, 1.0), 1.0).clamp(0, 1)
-
-
 def capped_scale(
     chain: SerialChain,
     q: Float[Tensor, "*batch n"],
@@ -168,11 +153,14 @@ def closes_in(
     return (allowed + opening <= _BINDING).any(-1)
 
 
+WayMaking = Literal["none", "expert", "automatic", "both"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class WayMakingConfig:
     """Source of null-space motion, and the repulsion from nearby bodies."""
 
-    mode: Literal["none", "expert", "automatic", "both"] = "both"
+    mode: WayMaking = "both"
     """Source of null-space motion: none, the null-space input of a person, the repulsion from
     nearby bodies, or the sum of both."""
     far: float = 0.3
@@ -187,15 +175,11 @@ class WayMakingConfig:
     would jump where another pair becomes the nearest."""
 
     def __post_init__(self):
-        if self.mode not in ("none", "expert", "automatic", "both"):
-            raise ValueError(
-                f"mode must be 'none', 'expert', 'automatic' or 'both', but is {self.mode!r}"
-            )
+        if self.mode not in (modes := get_args(WayMaking)):
+            raise ValueError(f"mode must be {' or '.join(modes)}, but is {self.mode!r}")
         if not self.near < self.far:
             raise ValueError(f"near must be below far, but they are {self.near} and {self.far}")
-        for name in ("speed", "smoothing"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        check_settings(self, positive=("speed", "smoothing"))
 
     @property
     def automatic(self) -> bool:

@@ -30,27 +30,7 @@ _PRODUCT_SIGN = Constant(
 _CONJUGATE_SIGN = Constant(torch.tensor([1, -1, -1, -1], dtype=torch.float64))
 # The sum of the signs with these weights has the sign of the first non-zero component.
 _LEXICOGRAPHIC = Constant(torch.tensor([8, 4, 2, 1], dtype=torch.float64))
-# 4 q q^T = I + sum over three entries of R (row-major) with these signs.
-_OUTER_INDEX = Constant(
-    torch.tensor(
-        [
-            [0, 7, 2, 3, 7, 0, 1, 2, 2, 1, 0, 5, 3, 2, 5, 0],
-            [4, 5, 6, 1, 5, 4, 3, 6, 6, 3, 4, 7, 1, 6, 7, 4],
-            [8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8],
-        ]
-    )
-)
-_OUTER_SIGN = Constant(
-    torch.tensor(
-        [
-            [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, -1, 1, 1, 1, 1, -1],
-            [1, -1, -1, -1, -1, -1, 1, 1, -1, 1, 1, 1, -1, 1, 1, -1],
-            [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
-        ],
-        dtype=torch.float64,
-    )
-)
-_OUTER_OFFSET = Constant(torch.eye(4, dtype=torch.float64))
+_EYE = Constant(torch.eye(3, dtype=torch.float64))
 # Below this angle [rad] an axis of rotation is rounding noise.
 _AXIS_THRESHOLD = 1e-6
 
@@ -126,8 +106,13 @@ def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """
     if torch.compiler.is_compiling():
         return _written_out_from_matrix(R)
-    entries = R.flatten(-2)[..., _OUTER_INDEX.like(R)] * _OUTER_SIGN.like(R)
-    outer = entries.sum(-2).unflatten(-1, (4, 4)) + _OUTER_OFFSET.like(R)
+    # 4 w^2 = 1 + tr R, 4 w v = vee(R - R^T), 4 v v^T = R + R^T + (1 - tr R) I.
+    trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    turned = R - R.mT
+    wv = torch.stack([turned[..., 2, 1], turned[..., 0, 2], turned[..., 1, 0]], dim=-1)
+    upper = torch.cat([1 + trace, wv[..., None, :]], dim=-1)
+    lower = torch.cat([wv[..., None], R + R.mT + (1 - trace) * _EYE.like(R)], dim=-1)
+    outer = torch.cat([upper, lower], dim=-2)
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
     # Not take_along_dim: exporting it fixes the batch size.
     row = outer.gather(-2, largest[..., None, None].expand(*outer.shape[:-2], 1, 4))

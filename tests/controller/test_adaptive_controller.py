@@ -166,7 +166,7 @@ def test_a_batch_is_a_loop(kind: int):
     assert (whole - q).norm(dim=-1).min() > 0.05
     for i in (0, 3):
         one_camera = _pytree.tree_map(lambda t, i=i: t[i] if t.dim() > 1 else t, camera)
-        one_goals = goals.aimed_at(target[i])
+        one_goals = replace(goals, vision=replace(goals.vision, target=target[i]))
         vision = replace(one_goals.vision, half_size=goals.vision.half_size[i])
         one_goals = replace(one_goals, vision=vision)
         with shapes_unchecked():  # for speed

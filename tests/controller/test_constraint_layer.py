@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import replace
+from typing import NamedTuple
 
 import constraint_states
 import numpy as np
@@ -13,7 +14,6 @@ from torch import Tensor
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import (
-    ConstrainedVelocity,
     ConstraintConfig,
     Distances,
     SafetyConfig,
@@ -33,18 +33,30 @@ ENOUGH = ConstraintConfig(steps=40)
 BOXES = {"6 of 6": (6, 6), "8, 6 rows": (8, 6), "7, 3 rows": (7, 3), "6, 3 rows": (6, 3)}
 
 
+class Found(NamedTuple):
+    joint_velocity: Tensor
+    slowed: Tensor
+    violation: Tensor
+    solved: Tensor
+
+
+def constrained(*arguments, **options) -> Found:
+    velocity, report = constrained_velocity(*arguments, **options)
+    return Found(velocity, report.slowed, report.violation, report.solved)
+
+
 def moved(J: Tensor, u: Tensor) -> Tensor:
     return (J @ u.unsqueeze(-1)).squeeze(-1)
 
 
-def off_path(state: State, found: ConstrainedVelocity) -> Tensor:
+def off_path(state: State, found: Found) -> Tensor:
     """Motion of the tool besides that of the task [m/s, rad/s]."""
     task = (1 - found.slowed).unsqueeze(-1) * state.task
     return moved(state.jacobian, found.joint_velocity - task)
 
 
 def assert_optimal(state: State, config: ConstraintConfig) -> None:
-    found = constrained_velocity(*state.arguments, config, separation=state.separation)
+    found = constrained(*state.arguments, config, separation=state.separation)
     assert found.solved.all()
     off = off_path(state, found).norm(dim=-1).numpy()
     weights = config.task_weight * np.array(
@@ -87,11 +99,11 @@ def test_a_step_that_ends_early_equals_one_of_all_steps():
     wide = state.lower - room[:, None], state.upper + room[:, None]
     arguments = (*state.arguments[:3], *wide, near)
     with shapes_unchecked():  # vmap takes all steps
-        every = torch.vmap(lambda *x: constrained_velocity(*x, ENOUGH))(*arguments)
+        every = torch.vmap(lambda *x: constrained(*x, ENOUGH))(*arguments)
     free = 0
     for k in range(20):
         one = torch.utils._pytree.tree_map(lambda x: x[k], arguments)  # noqa: B023
-        few = constrained_velocity(*one, ENOUGH)
+        few = constrained(*one, ENOUGH)
         for theirs, ours in zip(every, few, strict=True):
             torch.testing.assert_close(ours, theirs[k], atol=1e-12, rtol=0)
         free += torch.equal(few.joint_velocity, one[0])
@@ -101,7 +113,7 @@ def test_a_step_that_ends_early_equals_one_of_all_steps():
 def test_the_order_is_strict_to_the_weight_of_the_task():
     """Linear programming knows no weights: whether the path can be kept, and at which speed."""
     state = constraint_states.of_panda(150, seed=2, pairs=3)
-    found = constrained_velocity(*state.arguments, ENOUGH)
+    found = constrained(*state.arguments, ENOUGH)
     null = null_projection(state.jacobian, found.joint_velocity) - state.null
     kept = 0
     for k in range(150):
@@ -134,7 +146,7 @@ def test_where_nothing_binds_it_is_task_and_null_space():
     state = constraint_states.of_panda(200)
     far = replace(state.distances, distance=state.distances.distance + 100)
     wide = replace(state, lower=state.lower - 100, upper=state.upper + 100, distances=far)
-    found = constrained_velocity(*wide.arguments)
+    found = constrained(*wide.arguments)
     torch.testing.assert_close(
         found.joint_velocity, state.task + state.null, rtol=0, atol=1e-12
     )
@@ -145,7 +157,7 @@ def test_where_nothing_binds_it_is_task_and_null_space():
 @pytest.mark.parametrize("steps", [2, 40])
 def test_hard_limits_hold_whether_solved_or_not(steps: int):
     state = constraint_states.of_panda(500, seed=3)
-    found = constrained_velocity(*state.arguments, ConstraintConfig(steps=steps))
+    found = constrained(*state.arguments, ConstraintConfig(steps=steps))
     assert (found.joint_velocity >= state.lower).all()
     assert (found.joint_velocity <= state.upper).all()
     braking = torch.zeros_like(state.lower).clamp(state.lower, state.upper)
@@ -156,7 +168,7 @@ def test_hard_limits_hold_whether_solved_or_not(steps: int):
 
 def test_distances_hold_to_the_violation_that_is_told():
     state = constraint_states.of_panda(500, seed=4)
-    found = constrained_velocity(*state.arguments, ENOUGH)
+    found = constrained(*state.arguments, ENOUGH)
     nearing = -moved(state.distances.gradient, found.joint_velocity)
     excess = (nearing - constraint_states.allowed(state, ENOUGH)).amax(-1)
     assert (excess <= found.violation + 1e-9).all()
@@ -169,7 +181,7 @@ def test_a_person_who_comes_faster_than_the_arm_can_recede():
     """Nothing but the violation is left: the arm recedes with all its acceleration allows."""
     limit = torch.full((7,), 0.02, dtype=DOUBLE)
     gradient = torch.tensor([[0.3, -0.2, 0.1, 0.05, 0.0, 0.0, 0.0]], dtype=DOUBLE)
-    found = constrained_velocity(
+    found = constrained(
         torch.zeros(7, dtype=DOUBLE),
         torch.zeros(7, dtype=DOUBLE),
         panda.jacobian(panda.ready),
@@ -197,12 +209,12 @@ def test_the_null_space_yields_first_and_then_the_task_on_its_path():
     joint = int(null.abs().argmax())
     limit = wide.clone()
     limit[joint] = 0.2 * null[joint].abs() + task[joint].abs()
-    found = constrained_velocity(task + null, task, J, -limit, limit)
+    found = constrained(task + null, task, J, -limit, limit)
     torch.testing.assert_close(J @ found.joint_velocity, twist, rtol=0, atol=1e-4)
     assert abs(float(found.joint_velocity[joint])) == pytest.approx(float(limit[joint]))
     # A task of which every joint may do a third: where the null space cannot help all of them.
     narrow = task.abs() / 3 + 1e-9
-    found = constrained_velocity(task, task, J, -narrow, narrow)
+    found = constrained(task, task, J, -narrow, narrow)
     assert found.slowed == pytest.approx(2 / 3, abs=1e-3)
     done = J @ found.joint_velocity
     torch.testing.assert_close(done, (1 - found.slowed) * twist, rtol=0, atol=1e-6)
@@ -213,7 +225,7 @@ def test_a_task_that_is_under_way_is_given_up_by_no_more_than_its_share():
     task = torch.linalg.pinv(J)[:, 0] * 0.2
     stop = torch.zeros(7, dtype=DOUBLE)
     share = torch.tensor(0.25, dtype=DOUBLE)
-    found = constrained_velocity(0.25 * task, task, J, stop, stop, task_fraction=share)
+    found = constrained(0.25 * task, task, J, stop, stop, task_fraction=share)
     assert found.slowed == pytest.approx(0.25, abs=1e-6)
     assert not found.joint_velocity.any()
     # Nor does it run backwards before a person who comes towards it.
@@ -223,7 +235,7 @@ def test_a_task_that_is_under_way_is_given_up_by_no_more_than_its_share():
         approach_speed=torch.tensor([0.1], dtype=DOUBLE),
     )
     wide = torch.full((7,), 9.0, dtype=DOUBLE)
-    found = constrained_velocity(0.25 * task, task, J, -wide, wide, ahead, task_fraction=share)
+    found = constrained(0.25 * task, task, J, -wide, wide, ahead, task_fraction=share)
     assert found.slowed == pytest.approx(0.25, abs=1e-9)
     assert found.violation < 1e-3
     assert (ahead.gradient @ found.joint_velocity).item() == pytest.approx(0.1, abs=1e-3)
@@ -237,7 +249,7 @@ def test_single_precision_is_computed_in_double():
         else x.float()
         for x in state.arguments
     ]
-    found, exact = (constrained_velocity(*x, ENOUGH) for x in (single, state.arguments))
+    found, exact = (constrained(*x, ENOUGH) for x in (single, state.arguments))
     assert found.joint_velocity.dtype == torch.float32
     error = (found.joint_velocity - exact.joint_velocity).abs().amax(-1)
     assert error.median() < 1e-5
@@ -253,7 +265,7 @@ def test_the_exported_layer_is_the_eager_one():
     class Layer(torch.nn.Module):
         def forward(self, wanted, task, J, lower, upper, *near):
             distances = Distances(**dict(zip(names, near, strict=True)))
-            return tuple(constrained_velocity(wanted, task, J, lower, upper, distances, config))
+            return tuple(constrained(wanted, task, J, lower, upper, distances, config))
 
     with shapes_unchecked():
         program = torch.export.export(Layer(), (*arguments, *near), strict=False)
