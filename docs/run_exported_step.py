@@ -1,4 +1,4 @@
-"""Run a control step of `export_torch_package` without the library that made it.
+"""Run a control step of `export_torch_package.py` without the library that made it.
 
     python docs/run_exported_step.py step.pt2
 

@@ -1,7 +1,6 @@
 """The control step for real-time loops: compiled ahead of time, NumPy in and out."""
 
 from hrc_learn.deploy.export import export_step as export_step
-from hrc_learn.deploy.export import export_torch_package as export_torch_package
 from hrc_learn.deploy.runner import EagerRunner as EagerRunner
 from hrc_learn.deploy.runner import PackageRunner as PackageRunner
 from hrc_learn.deploy.runner import Rate as Rate

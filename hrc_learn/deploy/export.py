@@ -30,7 +30,7 @@ from hrc_learn.deploy.package import (
 )
 from hrc_learn.deploy.scalar_program import UnknownOperationError, scalar_program
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.store import EXPORT, Claim, new_file, replacing, write_json, write_text
+from hrc_learn.store import EXPORT, Claim, replacing, write_json, write_text
 
 
 def export_step(
@@ -118,37 +118,6 @@ def _few_arms(
         ):
             return smaller, few
     raise UnknownOperationError("the fields of a batch cannot be told from those of one arm")
-
-
-def export_torch_package(
-    controller: Steppable, observation: StepObservation, package: Path
-) -> Path:
-    """Compile the step of a controller with PyTorch's AOTInductor, for programs with libtorch.
-
-    It takes a C++ compiler and a minute or two, and is slower than `export_step`.
-
-    Args:
-        controller: Controller with the step.
-        observation: An example, as for `export_step`.
-        package: File to write; its name ends with `.pt2`.
-
-    Returns:
-        `package`.
-    """
-    step = PackedStep(controller, observation)
-    program = trace(step, observation)
-    for node in program.graph.nodes:
-        # The inductor of torch 2.11 cannot raise a constant to a power.
-        if node.target is torch.ops.aten.square.default:
-            node.target, node.args = torch.ops.aten.mul.Tensor, (node.args[0], node.args[0])
-    with torch.no_grad(), new_file(package) as part:
-        built = torch._inductor.aoti_compile_and_package(
-            program,
-            package_path=str(part.with_suffix(".pt2")),
-            inductor_configs={"aot_inductor.metadata": describe(step, observation)},
-        )
-        Path(built).rename(part)
-    return package
 
 
 def trace(step: PackedStep, observation: StepObservation) -> torch.export.ExportedProgram:

@@ -276,7 +276,7 @@ def describe(step: PackedStep, observation: StepObservation) -> dict[str, str]:
 
 
 def load(path: Path) -> Package:
-    """Load a compiled step: the machine code of `export_step`, or PyTorch's package.
+    """Load the machine code of `export_step`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -286,7 +286,7 @@ def load(path: Path) -> Package:
     if not path.is_file():
         raise FileNotFoundError(f"no compiled step {path}")
     require_unchanged(path.parent)
-    metadata, run = _metadata(path)
+    metadata = read_json(path.with_name(DESCRIPTION), dict[str, str], "export it again")
     if _LAYOUT not in metadata:
         raise ValueError(f"{path} was not written by export_step: it has no layout")
     if metadata[_BUILT_FOR] != machine():
@@ -296,10 +296,9 @@ def load(path: Path) -> Package:
         )
     layouts = _layouts(metadata)
     batch, dtype = layouts.state.batch, layouts.state.dtype
-    if run is None:
-        sizes = int(metadata[LANES]), int(metadata[WORKSPACE])
-        shared = [layout.shared_rows() for layout in layouts[:2]] if batch else []
-        run = NativeStep(path.read_bytes(), *sizes, shared)
+    sizes = int(metadata[LANES]), int(metadata[WORKSPACE])
+    shared = [layout.shared_rows() for layout in layouts[:2]] if batch else []
+    run = NativeStep(path.read_bytes(), *sizes, shared)
     first = torch.tensor([float(x) for x in metadata[_STATE].split()], dtype=dtype)
     return Package(run=run, layouts=layouts, first_state=first.reshape((-1, *batch)))
 
@@ -342,17 +341,6 @@ def _text(vector: Tensor) -> str:
 
 def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
-
-
-def _metadata(path: Path) -> tuple[dict[str, str], Callable[[list[Tensor]], object] | None]:
-    """Metadata of a compiled step, and the function of PyTorch's package."""
-    if path.suffix != ".pt2":
-        return read_json(path.with_name(DESCRIPTION), dict[str, str], "export it again"), None
-    try:
-        package = torch._inductor.aoti_load_package(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{path} is no package of export_torch_package: {error}") from error
-    return package.get_metadata(), lambda vectors: package(*vectors)
 
 
 def c_header(metadata: Mapping[str, str]) -> str:

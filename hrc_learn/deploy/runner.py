@@ -132,7 +132,7 @@ class PackageRunner(StepRunner):
     """A step compiled ahead of time; a step allocates nothing."""
 
     def __init__(self, package: Path):
-        """Load machine code written by `export_step`, in milliseconds, or PyTorch's package.
+        """Load machine code written by `export_step`, in milliseconds.
 
         Raises:
             FileNotFoundError: There is no such file.

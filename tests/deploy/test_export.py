@@ -1,6 +1,7 @@
 """The exported step against the eager one, and the arrays around it."""
 
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -27,15 +28,14 @@ from hrc_learn.deploy import (
     EagerRunner,
     PackageRunner,
     export_step,
-    export_torch_package,
     open_step,
 )
 from hrc_learn.deploy import package as package_module
-from hrc_learn.deploy.package import PackedStep, Vectors, load
+from hrc_learn.deploy.package import LANES, WORKSPACE, PackedStep, Vectors, load
 from hrc_learn.kinematics import panda
-from hrc_learn.store import EXPORT, replacing
+from hrc_learn.store import EXPORT, replacing, write_json
 
-ROOT = Path(__file__).parents[2]
+DOCS = Path(__file__).parents[2] / "docs"
 DOUBLE = torch.float64
 
 
@@ -146,7 +146,7 @@ class TestCompiled:
         if shutil.which("cc") is None:
             pytest.skip("needs a C compiler")
         program = tmp_path / "run_exported_step"
-        source = ROOT / "docs" / "run_exported_step.c"
+        source = DOCS / "run_exported_step.c"
         command = ["cc", "-Wall", "-Werror", "-O1", source, compiled, f"-I{compiled.parent}"]
         subprocess.run([*command, "-lm", "-o", program], check=True)
         done = subprocess.run([program], capture_output=True, text=True, check=True)
@@ -256,26 +256,18 @@ def test_a_step_that_cannot_be_compiled_runs_eagerly_and_says_so(tmp_path):
     assert not list(tmp_path.glob("step-*"))
 
 
-@pytest.mark.parametrize("content", [b"", b"no archive"])
-def test_a_foreign_file_is_refused(tmp_path, content):
-    path = tmp_path / "step.pt2"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"step.pt2 is no package of export_torch_package"):
-        PackageRunner(path)
-
-
 def test_a_damaged_package_is_refused(tmp_path):
     with replacing(tmp_path / "step", EXPORT) as new:
         new.mkdir()
-        (new / "step.pt2").write_bytes(b"compiled")
-    (tmp_path / "step" / "step.pt2").write_bytes(b"compileD")
-    with pytest.raises(ValueError, match=r"step.pt2 has changed since it was written"):
-        PackageRunner(tmp_path / "step" / "step.pt2")
+        (new / "step.o").write_bytes(b"compiled")
+    (tmp_path / "step" / "step.o").write_bytes(b"compileD")
+    with pytest.raises(ValueError, match=r"step.o has changed since it was written"):
+        PackageRunner(tmp_path / "step" / "step.o")
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no compiled step .*step.pt2"):
-        PackageRunner(tmp_path / "step.pt2")
+    with pytest.raises(FileNotFoundError, match=r"no compiled step .*step.o"):
+        PackageRunner(tmp_path / "step.o")
 
 
 @pytest.mark.parametrize("dtype", [DOUBLE, torch.float32])
@@ -289,9 +281,10 @@ def test_a_package_tells_all_it_takes_to_call_it(monkeypatch, tmp_path, dtype, b
         dt=0.002,
     )
     step = PackedStep(controller.to(dtype), observation)
-    (path := tmp_path / "step.pt2").touch()
+    (path := tmp_path / "step.o").touch()
     says = package_module.describe(step, observation)
-    monkeypatch.setattr(package_module, "_metadata", lambda path: (says, step))
+    write_json(path.with_name("step.json"), says | {LANES: "1", WORKSPACE: "1"})
+    monkeypatch.setattr(package_module, "NativeStep", lambda *_: step)
     kept = load(path)
     for ours, theirs in zip(step.layouts, kept.layouts, strict=True):
         assert (theirs.fields, theirs.batch) == (ours.fields, batch)
@@ -307,14 +300,18 @@ def test_ten_thousand_steps_equal_the_eager_ones(observed, compiled):
 @pytest.mark.slow
 def test_a_torch_package_runs_without_this_library(observed, compiled, tmp_path):
     """Built in a minute or two."""
-    package = export_torch_package(*observed, tmp_path / "step.pt2")
-    assert_equal_steps(*observed, load(package).run, 100)
+    package = tmp_path / "step.pt2"
+    runpy.run_path(str(DOCS / "export_torch_package.py"))["export_torch_package"](
+        *observed, package
+    )
+    run = torch._inductor.aoti_load_package(str(package))
+    assert_equal_steps(*observed, lambda vectors: run(*vectors), 100)
     blocked = (
         "import sys, runpy; sys.modules['hrc_learn'] = None; "
         "del sys.argv[0]; "
         "runpy.run_path(sys.argv[0], run_name='__main__')"
     )
-    program = ROOT / "docs" / "run_exported_step.py"
+    program = DOCS / "run_exported_step.py"
     done = subprocess.run(
         [sys.executable, "-c", blocked, program, package],
         capture_output=True,
