@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
+from hrc_learn.controller import resolved_rate as law
 from hrc_learn.controller.interface import (
     Command,
     Goals,
@@ -26,22 +27,6 @@ from hrc_learn.controller.resolved_rate import (
     Feedback,
     PoseDrift,
     VisionBlending,
-    approach_velocity,
-    effective_goals,
-    excess_speed,
-    measure_drift,
-    next_task_level,
-    planned_motion,
-    potential_rate,
-    regional_feedback,
-    resolved_rate,
-    restored_drift,
-    saturate_in_null_space,
-    scale_null_space,
-    scale_task,
-    task_descent,
-    validated_position,
-    validated_step,
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.controller.setting_checks import check_settings
@@ -134,6 +119,17 @@ class ControllerState:
     """State of the safety filter, with its counts of interventions."""
     estimator: Any
     """State of the image-Jacobian estimator."""
+
+
+class _Given(NamedTuple):
+    """Values that a step computes with, valid or replaced."""
+
+    observation: Observation
+    goals: Goals
+    dt: float | Tensor
+    q: Tensor
+    pose: Pose
+    J: Tensor
 
 
 class _Motion(NamedTuple):
@@ -299,12 +295,15 @@ class AdaptiveController(nn.Module):
                 more than the arm has joints for.
         """
         state = self._restored(state)
-        goals, known = self._checked_goals(observation)
-        dt, timed = validated_step(observation.dt, self.config.safety.longest_step)
-        q, stale = validated_position(observation, state.safety.position)
+        self.safety.joint_vector(observation.joint_position, "joint_position")
+        goals, known = law.effective_goals(observation, self.goals)
+        self._check_task(goals)
+        dt, timed = law.validated_step(observation.dt, self.config.safety.longest_step)
+        q, stale = law.validated_position(observation, state.safety.position)
         pose, J = self.chain.forward_and_jacobian(q)
+        given = _Given(observation, goals, dt, q, pose, J)
         blend_time = self.config.blending.blend_time
-        task_level = next_task_level(
+        task_level = law.next_task_level(
             state.task_level, goals.posture, q, state.blending.active, dt, blend_time
         )
         usable = visible = observation.feature_visible & goals.vision_enabled & known
@@ -314,12 +313,11 @@ class AdaptiveController(nn.Module):
             state.blending, observation.feature, usable, dt, age=observation.feature_age
         )
         J_s = self.estimator.jacobian(state.estimator, pose)
-        feedback = regional_feedback(goals, pose, blending, J_s, self.config.vision_rate)
-        motion = self._motion(state, observation, goals, q, pose, J, task_level, feedback.s)
-        sound = timed & _all_finite(motion.joint_velocity, feedback.xi_x, feedback.xi_r)
-        v, safety, report = self._filtered(
-            state.safety, observation, q, motion, pose, J, stop, stale | ~sound
-        )
+        feedback = law.regional_feedback(goals, pose, blending, J_s, self.config.vision_rate)
+        motion = self._motion(state, given, task_level, feedback.s)
+        numbers = (motion.joint_velocity, feedback.xi_x, feedback.xi_r)
+        sound = timed & is_number(torch.cat(numbers, dim=-1)).all(-1)
+        v, safety, report = self._filtered(state.safety, given, motion, stop, stale | ~sound)
         pose_drift = self._next_drift(state.pose_drift, motion, v, dt, sound, safety)
         command = Command(
             joint_velocity=v,
@@ -333,7 +331,7 @@ class AdaptiveController(nn.Module):
             weight_norm=torch.linalg.vector_norm(state.estimator.weight, dim=(-2, -1)),
             vision_level=blending.level,
             potential=feedback.potential,
-            potential_rate=potential_rate(feedback.s, J, v),
+            potential_rate=law.potential_rate(feedback.s, J, v),
             safety=report,
         )
         if goals.posture is not None:
@@ -344,7 +342,7 @@ class AdaptiveController(nn.Module):
             taught = torch.where(seen.unsqueeze(-1), observation.feature, blending.feature)
             blending = replace(blending, feature=taught)
         seen = seen & ~stale & sound
-        estimator = self._adapted(state, observation, pose, dt, seen, blending, feedback, sound)
+        estimator = self._adapted(state, given, seen, blending, feedback, sound)
         return command, ControllerState(
             blending=blending,
             task_level=task_level,
@@ -353,25 +351,16 @@ class AdaptiveController(nn.Module):
             estimator=estimator,
         )
 
-    def _checked_goals(self, observation: Observation) -> tuple[Goals, Tensor | bool]:
-        """Goals of this step, and True where the target is known; checks both inputs."""
-        self.safety.joint_vector(observation.joint_position, "joint_position")
-        goals, known = effective_goals(observation, self.goals)
-        self._check_task(goals)
-        return goals, known
-
     def _filtered(
         self,
         state: SafetyState,
-        observation: Observation,
-        q: Tensor,
+        given: _Given,
         motion: _Motion,
-        pose: Pose,
-        J: Tensor,
         stop: Tensor | None,
         unknown: Tensor,
     ) -> tuple[Tensor, SafetyState, SafetyReport]:
         """Step of the safety filter, which brakes where something is unknown."""
+        observation = given.observation
         if observation.stop is not None:
             stop = observation.stop if stop is None else stop | observation.stop
         distances = observation.distances
@@ -380,11 +369,11 @@ class AdaptiveController(nn.Module):
         load = observation.load
         return self.safety.step(
             state,
-            q,
+            given.q,
             motion.joint_velocity.masked_fill(unknown.unsqueeze(-1), math.nan),
             observation.dt,
-            jacobian=J,
-            load=None if load is None else quaternion.rotate(pose.orientation, load),
+            jacobian=given.J,
+            load=None if load is None else quaternion.rotate(given.pose.orientation, load),
             joint_velocity=observation.joint_velocity,
             human_distance=observation.human_distance,
             stop=stop,
@@ -396,23 +385,16 @@ class AdaptiveController(nn.Module):
         return ControllerState(
             blending=self.blending.restored(state.blending),
             task_level=state.task_level.masked_fill(~is_number(state.task_level), 0),
-            pose_drift=restored_drift(state.pose_drift),
+            pose_drift=law.restored_drift(state.pose_drift),
             safety=self.safety.restored(state.safety),
             estimator=self.estimator.restored(state.estimator),
         )
 
     def _motion(
-        self,
-        state: ControllerState,
-        observation: Observation,
-        goals: Goals,
-        q: Tensor,
-        pose: Pose,
-        J: Tensor,
-        task_level: Tensor,
-        s: Tensor,
+        self, state: ControllerState, given: _Given, task_level: Tensor, s: Tensor
     ) -> _Motion:
         """Joint velocity of the law, with drift compensation while a person acts."""
+        observation, goals, _, q, pose, J = given
         descent = s
         d, rate = self._nullspace_input(observation), self.config.drift_compensation_rate
         xi_q = self.joint_region.gradient(q)
@@ -424,13 +406,13 @@ class AdaptiveController(nn.Module):
         basis, controlled = self._basis(goals, pose, J), J
         if basis is not None:
             controlled = basis.mT @ (basis @ J)
-            descent = task_descent(J, basis, descent)
-        twist = task_twist = -descent / excess_speed(descent, self.caps[0])
+            descent = law.task_descent(J, basis, descent)
+        twist = task_twist = -descent / law.excess_speed(descent, self.caps[0])
         pose_drift = None
         if d is not None and rate > 0:
             # A joint-space approach plans no tool path, so there is no drift.
             active = (d != 0).any(-1) & ((task_level == 1) | (goals.posture is None))
-            pose_drift = measure_drift(state.pose_drift, q, controlled, active)
+            pose_drift = law.measure_drift(state.pose_drift, q, controlled, active)
             twist = torch.add(task_twist, pose_drift.drift, alpha=rate)
 
         delay = self.config.command_delay
@@ -438,38 +420,36 @@ class AdaptiveController(nn.Module):
             # Null space at the predicted joints.
             pose, J = self.chain.forward_and_jacobian(q + delay * state.safety.velocity)
             basis = self._basis(goals, pose, J)
-        bounds = self.safety.velocity_bounds(q)
-        task, null = self._resolved(goals, q, J, basis, twist, null, task_level, bounds)
+        task, null = self._resolved(given, J, basis, twist, null, task_level)
         return _Motion(task + null, null, twist, task_twist, xi_q, pose_drift, controlled)
 
     def _resolved(
         self,
-        goals: Goals,
-        q: Tensor,
+        given: _Given,
         J: Tensor,
         basis: Tensor | None,
         twist: Tensor,
         null: Tensor,
         task_level: Tensor,
-        bounds: tuple[Tensor, Tensor],
     ) -> tuple[Tensor, Tensor]:
         """Joint velocities of the task and of the null space, which yields near limits."""
-        config = self.config
+        config, q, posture = self.config, given.q, given.goals.posture
+        bounds = self.safety.velocity_bounds(q)
         J_task, rows = J, twist
         if basis is not None:
             J_task, rows = basis @ J, (basis @ twist.unsqueeze(-1)).squeeze(-1)
-        task, null = resolved_rate(J_task, rows, null)
+        task, null = law.resolved_rate(J_task, rows, null)
         # Constraints resolve the conflict of task and null space themselves.
         scaled = config.safety.constraints is None
         if scaled and config.null_space_saturation:
-            task = saturate_in_null_space(task, J_task, rows, *bounds)
+            task = law.saturate_in_null_space(task, J_task, rows, *bounds)
         if scaled and config.task_slows:
-            task = scale_task(task, J, *bounds, self.caps[0])
-        if goals.posture is not None:
-            approach = approach_velocity(goals.posture, q, J, self.caps[1])
+            task = law.scale_task(task, J, *bounds, self.caps[0])
+        if posture is not None:
+            approach = law.approach_velocity(posture, q, J, self.caps[1])
             task = torch.lerp(approach, task, task_level.unsqueeze(-1))
         if scaled and config.null_space_yields:
-            null = scale_null_space(task, null, *bounds)
+            null = law.scale_null_space(task, null, *bounds)
         return task, null
 
     def _next_drift(
@@ -491,7 +471,7 @@ class AdaptiveController(nn.Module):
                 before, active=torch.zeros_like(motion.twist[..., 0], dtype=torch.bool)
             )
         J = motion.jacobian
-        planned = planned_motion(motion.task_twist, motion.twist, J, joint_velocity, dt)
+        planned = law.planned_motion(motion.task_twist, motion.twist, J, joint_velocity, dt)
         # An arm that only brakes does not drift.
         braking = torch.linalg.vecdot(J, joint_velocity.unsqueeze(-2))
         braking = safety.dt.unsqueeze(-1) * braking
@@ -520,15 +500,14 @@ class AdaptiveController(nn.Module):
     def _adapted(
         self,
         state: ControllerState,
-        observation: Observation,
-        pose: Pose,
-        dt: float | Tensor,
+        given: _Given,
         seen: Tensor,
         blending: BlendingState,
         feedback: Feedback,
         sound: Tensor,
     ) -> Any:
         """State of the estimator after the measurement of the camera."""
+        observation, pose = given.observation, given.pose
         q = observation.image_joint_position
         if q is not None:
             # Estimators compute with the pose even where they must not learn from it.
@@ -543,13 +522,8 @@ class AdaptiveController(nn.Module):
             pose=pose,
             feature=blending.feature,
             valid=seen,
-            dt=dt,
+            dt=given.dt,
             xi_x=feedback.xi_x.masked_fill(~sound.unsqueeze(-1), 0),
             xi_r=feedback.xi_r.masked_fill(~sound.unsqueeze(-1), 0),
         )
         return self.estimator.update(state.estimator, measurement)
-
-
-def _all_finite(*vectors: Tensor) -> Bool[Tensor, "*batch"]:
-    """True where all components of all vectors are finite."""
-    return is_number(torch.cat(vectors, dim=-1)).all(-1)
