@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ctypes
 import heapq
-import struct
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -18,9 +17,10 @@ from typing import Any, final
 import numpy as np
 import torch
 from jaxtyping import Int
+from llvmlite import ir
 from torch import Tensor
 
-from hrc_learn.deploy.scalar_program import Instruction, ScalarProgram, operands
+from hrc_learn.deploy.scalar_program import ScalarProgram, operands
 
 # Instructions of one function: with more the register allocation of LLVM slows down, with fewer
 # the workspace is read and written more often.
@@ -28,17 +28,16 @@ _LENGTH = 1000
 
 # Products and sums are not fused: one more digit would let tests for zero turn out otherwise
 # than in PyTorch.
-_BINARY = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "and": "and", "or": "or"}
-_COMPARISONS = {
-    "gt": "ogt", "lt": "olt", "ge": "oge", "le": "ole", "eq": "oeq", "ne": "une",
-    "not gt": "ule", "not lt": "uge", "not ge": "ult", "not le": "ugt",
+_BUILT = {
+    "add": ir.IRBuilder.fadd, "sub": ir.IRBuilder.fsub, "mul": ir.IRBuilder.fmul,
+    "div": ir.IRBuilder.fdiv, "neg": ir.IRBuilder.fneg, "and": ir.IRBuilder.and_,
+    "or": ir.IRBuilder.or_, "not": ir.IRBuilder.not_, "select": ir.IRBuilder.select,
 }  # fmt: skip
-_INTRINSICS = {
-    "abs": "fabs", "sqrt": "sqrt", "trunc": "trunc", "floor": "floor", "ceil": "ceil",
-    "round": "roundeven", "sin": "sin", "cos": "cos", "exp": "exp", "log": "log",
-    "tanh": "tanh", "asin": "asin", "acos": "acos", "atan": "atan", "atan2": "atan2",
-    "pow": "pow", "copysign": "copysign",
-}  # fmt: skip
+_ORDERED = {"gt": ">", "lt": "<", "ge": ">=", "le": "<=", "eq": "=="}
+# True as well if a number is NaN.
+_UNORDERED = {"ne": "!=", "not gt": "<=", "not lt": ">=", "not ge": "<", "not le": ">"}
+# Names of LLVM's intrinsic functions, where they differ from ours.
+_INTRINSICS = {"abs": "fabs", "round": "roundeven"}
 
 ENTRY = "control_step"
 """Name of the function `control_step(state, observation, command, workspace, stride, count)`.
@@ -54,7 +53,7 @@ class NativeCode:
     Attributes:
         text: The module.
         lanes: Number of arms at once.
-        slots: Size of the workspace in vectors of `lanes` numbers.
+        workspace: Size of the workspace in numbers.
     """
 
     def __init__(self, program: ScalarProgram, vectors: Sequence[str], lanes: int):
@@ -66,186 +65,137 @@ class NativeCode:
             lanes: Number of arms at once.
         """
         self._program, self._vectors, self.lanes = program, tuple(vectors), lanes
-        scalar = {8: "double", 4: "float"}[np.dtype(program.number).itemsize]
-        self._scalar = scalar
-        self._number = scalar if lanes == 1 else f"<{lanes} x {scalar}>"
-        self._truth = "i1" if lanes == 1 else f"<{lanes} x i1>"
-        self._declared: set[str] = set()
+        self._size = np.dtype(program.number).itemsize
+        self._scalar = {8: ir.DoubleType(), 4: ir.FloatType()}[self._size]
+        self._number, self._truth, self._flag = (
+            kind if lanes == 1 else ir.VectorType(kind, lanes)
+            for kind in (self._scalar, ir.IntType(1), ir.IntType(8))
+        )
+        self._module = ir.Module()
         order = _depth_first(program)
         chunks = [order[k : k + _LENGTH] for k in range(0, len(order), _LENGTH)]
-        self._slot, self.slots = _allocate(program, chunks)
-        functions = [self._function(k, chunk) for k, chunk in enumerate(chunks)]
-        functions.append(self._store(len(chunks)))
-        functions.append(self._entry(len(functions)))
-        self.text = "\n".join([*functions, *sorted(self._declared), ""])
+        self._slot, slots = _allocate(program, chunks)
+        self.workspace = slots * lanes
+        parts = [self._part(k, chunk) for k, chunk in enumerate(chunks)]
+        self._entry([*parts, self._store()])
+        self.text = str(self._module)
 
-    @property
-    def _parameters(self) -> str:
-        pointers = [f"ptr noalias %{name}" for name in (*self._vectors, "workspace")]
-        return ", ".join([*pointers, "i64 %stride"])
+    def _begun(self, name: str, *more: ir.Type) -> ir.IRBuilder:
+        """Builder of a function of the vectors, the workspace and the stride."""
+        pointers = [ir.PointerType()] * (len(self._vectors) + 1)
+        kind = ir.FunctionType(ir.VoidType(), [*pointers, ir.IntType(64), *more])
+        function = ir.Function(self._module, kind, name)
+        for pointer in function.args[: len(pointers)]:
+            pointer.add_attribute("noalias")
+        return ir.IRBuilder(function.append_basic_block("entry"))
 
-    def _entry(self, functions: int) -> str:
+    def _entry(self, parts: Sequence[ir.Function]) -> None:
         """Loop over the arms, `lanes` at a time."""
-        vectors = [f"%{name}" for name in self._vectors]
-        arguments = ", ".join(
-            [*(f"ptr {name}.i" for name in vectors), "ptr %workspace", "i64 %stride"]
-        )
-        return "\n".join([
-            f"define void @{ENTRY}({self._parameters}, i64 %count) {{",
-            "entry:",
-            "  br label %loop",
-            "loop:",
-            "  %i = phi i64 [ 0, %entry ], [ %next, %step ]",
-            f"  %next = add i64 %i, {self.lanes}",
-            "  %goes = icmp sle i64 %next, %count",
-            "  br i1 %goes, label %step, label %end",
-            "step:",
-            *(f"  {x}.i = getelementptr {self._scalar}, ptr {x}, i64 %i" for x in vectors),
-            *(f"  call void @part{k}({arguments})" for k in range(functions)),
-            "  br label %loop",
-            "end:",
-            "  ret void",
-            "}",
-        ])  # fmt: skip
+        builder = self._begun(ENTRY, ir.IntType(64))
+        *vectors, workspace, stride, count = builder.function.args
+        entry = builder.block
+        loop, step, end = (builder.append_basic_block(name) for name in ("loop", "step", "end"))
+        builder.branch(loop)
+        builder.position_at_end(loop)
+        i = builder.phi(ir.IntType(64))
+        i.add_incoming(ir.IntType(64)(0), entry)
+        following = builder.add(i, ir.IntType(64)(self.lanes))
+        i.add_incoming(following, step)
+        builder.cbranch(builder.icmp_signed("<=", following, count), step, end)
+        builder.position_at_end(step)
+        arms = [builder.gep(x, [i], source_etype=self._scalar) for x in vectors]
+        for part in parts:
+            builder.call(part, [*arms, workspace, stride])
+        builder.branch(loop)
+        builder.position_at_end(end)
+        builder.ret_void()
 
-    @property
-    def workspace(self) -> int:
-        """Size of the workspace in numbers."""
-        return self.slots * self.lanes
-
-    def _function(self, index: int, chunk: Sequence[int]) -> str:
+    def _part(self, index: int, chunk: Sequence[int]) -> ir.Function:
         """Function of some instructions, with what it reads and leaves behind."""
-        inside, lines = set(chunk), []
+        builder, values = self._begun_part(f"part{index}"), {}
         read = {x for v in chunk for x in operands(self._program.instructions[v])}
-        for x in sorted(read - inside):
-            lines += self._fetch(x)
+        for x in sorted(read - set(chunk)):
+            values[x] = self._fetched(builder, x)
         for v in chunk:
-            lines += self._calculate(v, self._program.instructions[v])
+            name, *parts = self._program.instructions[v]
+            values[v] = self._calculated(builder, name, [values[x] for x in parts])
             if v in self._slot:
-                lines += self._keep(v)
-        return self._defined(index, lines)
+                self._keep(builder, v, values[v])
+        builder.ret_void()
+        return builder.function
 
-    def _store(self, index: int) -> str:
+    def _store(self) -> ir.Function:
         """Function that writes the results, once all inputs have been read."""
-        loads, stores, known = [], [], set()
-        for vector, rows in self._program.results.items():
+        builder = self._begun_part("store")
+        results = self._program.results
+        values = {x: self._fetched(builder, x) for rows in results.values() for x in rows}
+        for vector, rows in results.items():
             for row, x in enumerate(rows):
-                if x not in known:
-                    known.add(x)
-                    loads += self._fetch(x)
-                place = f"%{vector}.{row}"
-                stores += [
-                    *self._row(place, vector, row),
-                    f"  store {self._number} {self._name(x)}, ptr {place}, align {self._size}",
-                ]
-        return self._defined(index, loads + stores)
+                builder.store(values[x], self._row(builder, vector, row), align=self._size)
+        builder.ret_void()
+        return builder.function
 
-    def _defined(self, index: int, lines: Sequence[str]) -> str:
-        head = f"define private void @part{index}({self._parameters}) noinline {{"
-        return "\n".join([head, *lines, "  ret void", "}"])
+    def _begun_part(self, name: str) -> ir.IRBuilder:
+        builder = self._begun(name)
+        builder.function.linkage = "private"
+        builder.function.attributes.add("noinline")
+        return builder
 
-    @property
-    def _size(self) -> int:
-        return np.dtype(self._program.number).itemsize
-
-    def _row(self, name: str, vector: str, row: int) -> list[str]:
+    def _row(self, builder: ir.IRBuilder, vector: str, row: int) -> ir.Value:
         """Address of a row."""
-        return [
-            f"  {name}.o = mul i64 %stride, {row}",
-            f"  {name} = getelementptr {self._scalar}, ptr %{vector}, i64 {name}.o",
-        ]
+        *_, stride = builder.function.args
+        first = builder.function.args[self._vectors.index(vector)]
+        offset = builder.mul(stride, ir.IntType(64)(row))
+        return builder.gep(first, [offset], source_etype=self._scalar)
 
-    def _fetch(self, x: int) -> list[str]:
-        """A value of an earlier function, or an input."""
+    def _place(self, builder: ir.IRBuilder, x: int) -> ir.Value:
+        """Address of a value's slot in the workspace."""
+        offset = ir.IntType(64)(self._slot[x] * self.lanes)
+        return builder.gep(builder.function.args[-2], [offset], source_etype=self._scalar)
+
+    def _fetched(self, builder: ir.IRBuilder, x: int) -> ir.Value:
+        """A constant, an input, or a value of an earlier function."""
         kind, *where = self._program.instructions[x]
+        boolean = self._program.boolean[x]
         if kind == "constant":
-            return []
+            return (self._truth if boolean else self._number)(self._program.value(x))
         if kind == "input":
-            vector, row, _ = where
-            place = f"%in.{vector}.{row}"
-            return [
-                *self._row(place, vector, row),
-                f"  %v{x} = load {self._number}, ptr {place}, align {self._size}",
-            ]
-        place = [f"  %at{x} = {self._slot_address(x)}"]
-        if not self._program.boolean[x]:
-            return [*place, f"  %v{x} = load {self._number}, ptr %at{x}, align {self._size}"]
-        wide = self._truth.replace("i1", "i8")
-        return [
-            *place,
-            f"  %w{x} = load {wide}, ptr %at{x}, align 1",
-            f"  %v{x} = trunc {wide} %w{x} to {self._truth}",
-        ]
-
-    def _keep(self, x: int) -> list[str]:
-        place = [f"  %at{x} = {self._slot_address(x)}"]
-        if not self._program.boolean[x]:
-            return [*place, f"  store {self._number} %v{x}, ptr %at{x}, align {self._size}"]
-        wide = self._truth.replace("i1", "i8")
-        return [
-            *place,
-            f"  %w{x} = zext {self._truth} %v{x} to {wide}",
-            f"  store {wide} %w{x}, ptr %at{x}, align 1",
-        ]
-
-    def _slot_address(self, x: int) -> str:
-        offset = self._slot[x] * self.lanes
-        return f"getelementptr {self._scalar}, ptr %workspace, i64 {offset}"
-
-    def _calculate(self, v: int, instruction: Instruction) -> list[str]:
-        """Text of one instruction."""
-        name, *parts = instruction
-        kind = self._truth if parts and self._program.boolean[parts[-1]] else self._number
-        a, *more = (self._name(x) for x in parts)
-        if name in _BINARY:
-            return [f"  %v{v} = {_BINARY[name]} {kind} {a}, {more[0]}"]
-        if name in _COMPARISONS:
-            return [f"  %v{v} = fcmp {_COMPARISONS[name]} {kind} {a}, {more[0]}"]
-        if name == "neg":
-            return [f"  %v{v} = fneg {kind} {a}"]
-        if name == "not":
-            return [f"  %v{v} = xor {kind} {a}, {self._literal(True, kind)}"]
-        if name == "select":
-            return [f"  %v{v} = select {self._truth} {a}, {kind} {more[0]}, {kind} {more[1]}"]
-        if name in ("max", "min"):
-            return self._extreme(v, name, kind, a, more[0])
-        function = f"@llvm.{_INTRINSICS[name]}.{self._suffix}"
-        kinds = ", ".join([self._number] * len(parts))
-        self._declared.add(f"declare {self._number} {function}({kinds})")
-        arguments = ", ".join(f"{self._number} {self._name(x)}" for x in parts)
-        return [f"  %v{v} = call {self._number} {function}({arguments})"]
-
-    def _extreme(self, v: int, name: str, kind: str, a: str, b: str) -> list[str]:
-        """Larger or smaller of two numbers; NaN if one is NaN, as in PyTorch."""
-        ordered = "ogt" if name == "max" else "olt"
-        return [
-            f"  %c{v} = fcmp {ordered} {kind} {a}, {b}",
-            f"  %s{v} = select {self._truth} %c{v}, {kind} {a}, {kind} {b}",
-            f"  %n{v} = fcmp uno {kind} {a}, {a}",
-            f"  %v{v} = select {self._truth} %n{v}, {kind} {a}, {kind} %s{v}",
-        ]
-
-    @property
-    def _suffix(self) -> str:
-        width = f"f{8 * self._size}"
-        return width if self.lanes == 1 else f"v{self.lanes}{width}"
-
-    def _name(self, x: int) -> str:
-        """Text of an operand."""
-        instruction = self._program.instructions[x]
-        if instruction[0] != "constant":
-            return f"%v{x}"
-        kind = self._truth if self._program.boolean[x] else self._number
-        return self._literal(self._program.value(x), kind)
-
-    def _literal(self, value: float | bool, kind: str) -> str:
-        if "i1" in kind:
-            text, scalar = str(int(value)), "i1"
+            place = self._row(builder, where[0], where[1])
         else:
-            # LLVM writes numbers of any size by the bits of the equal double.
-            (bits,) = struct.unpack("<Q", struct.pack("<d", float(value)))
-            text, scalar = f"0x{bits:016X}", self._scalar
-        return text if kind == scalar else f"splat ({scalar} {text})"
+            place = self._place(builder, x)
+        if not boolean:
+            return builder.load(place, align=self._size, typ=self._number)
+        return builder.trunc(builder.load(place, align=1, typ=self._flag), self._truth)
+
+    def _keep(self, builder: ir.IRBuilder, x: int, value: ir.Value) -> None:
+        """Leave a value to later functions."""
+        place, align = self._place(builder, x), self._size
+        if self._program.boolean[x]:
+            value, align = builder.zext(value, self._flag), 1
+        builder.store(value, place, align=align)
+
+    def _calculated(self, builder: ir.IRBuilder, name: str, parts: list[Any]) -> ir.Value:
+        """Result of one instruction."""
+        if name in _BUILT:
+            return _BUILT[name](builder, *parts)
+        if name in _ORDERED:
+            return builder.fcmp_ordered(_ORDERED[name], *parts)
+        if name in _UNORDERED:
+            return builder.fcmp_unordered(_UNORDERED[name], *parts)
+        if name in ("max", "min"):
+            # NaN if one is NaN, as in PyTorch.
+            a, b = parts
+            better = builder.fcmp_ordered(">" if name == "max" else "<", a, b)
+            return builder.select(
+                builder.fcmp_unordered("uno", a, a), a, builder.select(better, a, b)
+            )
+        width = f"f{8 * self._size}" if self.lanes == 1 else f"v{self.lanes}f{8 * self._size}"
+        intrinsic = f"llvm.{_INTRINSICS.get(name, name)}.{width}"
+        function = self._module.globals.get(intrinsic)
+        if function is None:
+            kind = ir.FunctionType(self._number, [self._number] * len(parts))
+            function = ir.Function(self._module, kind, intrinsic)
+        return builder.call(function, parts)
 
 
 def _depth_first(program: ScalarProgram) -> list[int]:
