@@ -223,17 +223,9 @@ class Goals:
             vision_enabled=torch.tensor(enabled, device=centre.device),
         )
 
-    def moved_to(
-        self,
-        centre: Float[Tensor, "*#batch 3"],
-        half_size: Float[Tensor, "*#batch 3"] | None = None,
-    ) -> Goals:
-        """The goals with another centre and, if given, another half size of the box [m]."""
-        if half_size is None:
-            half_size = self.position.half_size
-        return replace(
-            self, position=replace(self.position, centre=centre, half_size=half_size)
-        )
+    def moved_to(self, centre: Float[Tensor, "*#batch 3"]) -> Goals:
+        """The goals with another centre of the box [m]."""
+        return replace(self, position=replace(self.position, centre=centre))
 
     def approached_by(self, posture: Float[Tensor, "*#batch n"] | None) -> Goals:
         """The goals, first approached in joint space towards a posture [rad].

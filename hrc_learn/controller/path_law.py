@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.controller import joint_path
 from hrc_learn.controller.arm_loop_state import (
     ArmLoopState,
     ArmReading,
@@ -17,19 +18,7 @@ from hrc_learn.controller.arm_loop_state import (
     PathState,
     WantedMotion,
 )
-from hrc_learn.controller.joint_path import (
-    DirectReturn,
-    begins_aside,
-    changed_rate,
-    deviation_ratio,
-    eased_return,
-    may_not_return,
-    nears_singularity,
-    push_fraction,
-    return_alignment,
-    stays_aside,
-    waiting_time,
-)
+from hrc_learn.controller.joint_path import DirectReturn
 from hrc_learn.controller.null_space_motion import fraction_kept
 from hrc_learn.controller.pose_tracking import PoseTracking, twist_of
 from hrc_learn.geometry import Pose
@@ -92,7 +81,7 @@ class PathLaw:
         path = PathState.none(joint_position, state.path.pose)
         goal, last = paths.position[which, 0], paths.last[which].to(path.last)
         path = replace(path, goal=goal, last=last)
-        return replace(state, aside=begins_aside(goal - joint_position), path=path)
+        return replace(state, aside=joint_path.begins_aside(goal - joint_position), path=path)
 
     def go_on(self, state: ArmLoopState, reading: ArmReading) -> PathState:
         """Progress along the path, one step later."""
@@ -101,7 +90,7 @@ class PathLaw:
         if not bool(moves.any()):
             return path
         pushed, zero = state.pushed, torch.zeros_like(path.rate)
-        waited, nearest = waiting_time(
+        waited, nearest = joint_path.waiting_time(
             path.waited,
             path.nearest,
             (path.goal - q).norm(dim=-1),
@@ -116,19 +105,19 @@ class PathLaw:
         backs = (waited > self.config.back_after) & (path.progress > 0)
         ratio = apply_where(
             state.aside,
-            lambda part: deviation_ratio(part[0].twist_to(part[1]), part[2]),
+            lambda part: joint_path.deviation_ratio(part[0].twist_to(part[1]), part[2]),
             (reading.pose, path.pose, path.twist),
             zero,
         )
         singular = apply_where(
             state.aside,
-            lambda part: nears_singularity(self.chain, *part),
+            lambda part: joint_path.nears_singularity(self.chain, *part),
             (q, state.safety.velocity),
             torch.zeros_like(state.aside),
         )
         stops = ~backs & state.aside & (state.lost | path.narrow_ahead | singular)
         ratio = torch.where(path.blocked | stops, torch.inf, ratio)
-        rate = changed_rate(path.rate, 2.0 - ratio, dt, torch.where(backs, -1, 1))
+        rate = joint_path.changed_rate(path.rate, 2.0 - ratio, dt, torch.where(backs, -1, 1))
         progress = (path.progress + rate * state.pace.scale).clamp(min=0)
         then = {"progress": progress, "rate": rate, "waited": waited, "nearest": nearest}
         return _changed_where(moves, path, **then, held=held)
@@ -207,7 +196,7 @@ class PathLaw:
         config, error = self.config, target.goal - reading.joint_position
         direct = path.direct_return.active
         pushed, aside = state.pushed & ~direct, state.aside & ~direct
-        aside = (~target.narrow | aside) & stays_aside(pushed, aside, error)
+        aside = (~target.narrow | aside) & joint_path.stays_aside(pushed, aside, error)
         null_error = null_projection(reading.jacobian, error)
         null_error = null_error.masked_fill(~aside.unsqueeze(-1), 0.0)
         lost = torch.zeros_like(aside)
@@ -215,13 +204,13 @@ class PathLaw:
         # Joints return where the path waits for them, and once they are let go.
         returns = path.rate <= 0
         if config.after_push == "return":
-            alignment = return_alignment(null_error, error)
-            lost = aside & may_not_return(error, alignment, state.lost & ~pushed)
-            kept = push_fraction(state.null_velocity, null_error, alignment)
+            alignment = joint_path.return_alignment(null_error, error)
+            lost = aside & joint_path.may_not_return(error, alignment, state.lost & ~pushed)
+            kept = joint_path.push_fraction(state.null_velocity, null_error, alignment)
             fraction = torch.where(aside, kept, 1.0)
             returns = returns | ~pushed
         null_error = null_error.masked_fill(~returns.unsqueeze(-1), 0.0)
-        back = eased_return(state.return_velocity, null_error, config.dt, config)
+        back = joint_path.eased_return(state.return_velocity, null_error, config.dt, config)
         return OffPath(
             aside=aside,
             lost=lost,

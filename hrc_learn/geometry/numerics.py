@@ -11,6 +11,8 @@ argument, because a NaN there would reach the gradient as 0 * NaN.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from operator import add
 
 import numpy as np
 import torch
@@ -191,14 +193,14 @@ def inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
     M: list[list[Tensor]] = [[] for _ in range(n)]
     for i in range(n):
         for j in range(i):
-            M[i].append(-_sum([L[i][j], *(L[i][k] * M[k][j] for k in range(j + 1, i))]))
+            M[i].append(-reduce(add, [L[i][j], *(L[i][k] * M[k][j] for k in range(j + 1, i))]))
         M[i].append(torch.ones_like(inverse_d[i]))
     square = []
     for i in range(n):
         for j in range(i + 1):
-            entry = _sum([M[k][i] * M[k][j] * inverse_d[k] for k in range(i, n)])
+            entry = reduce(add, [M[k][i] * M[k][j] * inverse_d[k] for k in range(i, n)])
             square.append(entry * entry * (1 if i == j else 2))
-    return _sum(square).sqrt()
+    return reduce(add, square).sqrt()
 
 
 def solve_positive(
@@ -308,10 +310,3 @@ def _factors(A: Tensor) -> tuple[list[list[Tensor]], list[Tensor]]:
             d = d - scaled[k] * L[i][k]
         inverse_d.append(1 / d)
     return L, inverse_d
-
-
-def _sum(terms: list[Tensor]) -> Tensor:
-    total = terms[0]
-    for term in terms[1:]:
-        total = total + term
-    return total

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import sampling
@@ -172,10 +173,9 @@ def test_phases_share_one_module_and_one_state():
     controller, camera = grasping(rng=rng)
     q, state = POSTURE, controller.initial_state(POSTURE)
     goals = controller.goals
-    lower = goals.moved_to(
-        CENTRE - torch.tensor([0, 0, 0.1], dtype=DOUBLE),
-        torch.tensor([0.01, 0.01, 0.005], dtype=DOUBLE),
-    ).with_vision(False)
+    lower = goals.moved_to(CENTRE - torch.tensor([0, 0, 0.1], dtype=DOUBLE)).with_vision(False)
+    half_size = torch.tensor([0.01, 0.01, 0.005], dtype=DOUBLE)
+    lower = replace(lower, position=replace(lower.position, half_size=half_size))
     phases = [goals.approached_by(POSTURE), goals, lower]
     for phase in phases:
         for _ in range(150):
