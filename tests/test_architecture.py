@@ -100,6 +100,7 @@ LIBRARIES: dict[str, set[str]] = {
         "PIL",
     },
     "sim": {"torch", "jaxtyping", "numpy", "mujoco"},
+    "deploy": {"torch", "jaxtyping", "numpy", "llvmlite"},
     "skills": {"torch", "jaxtyping", "numpy"},
     "learning": {"torch", "jaxtyping", "numpy", "rerun", "matplotlib"},
     # Of franky-sim one module makes a robot, imported when one is served.
@@ -121,7 +122,6 @@ ROS2 = {
 """Packages of ROS 2, from the registry or the system."""
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
-    "deploy": {"llvmlite"},
     "geometry": {"trimesh", "collada"},
     "kinematics": {"frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
