@@ -296,16 +296,12 @@ class Separation:
     arm_point: Float[Tensor, "*batch C H 3"]
     """Nearest point on the axis of the arm's capsule, or on the held box, in the base frame
     [m]."""
-    person_point: Float[Tensor, "*batch C H 3"]
-    """Nearest point on the axis of the person's capsule [m]."""
     arm_radius: Float[Tensor, " C"]
     """Radii of the arm's capsules; zero for the held box [m]."""
-    person_radius: Float[Tensor, "*#batch H"]
-    """[m]"""
     joint_axes: Float[Tensor, "*#batch joints 3"]
-    """Nearest points of the arm, in the base frame."""
+    """Axes of the joints in the base frame."""
     joint_origins: Float[Tensor, "*#batch joints 3"]
-    """[m]"""
+    """Points on these axes [m]."""
     moved: Bool[Tensor, "C joints"]
     """Mask of the joints that move each of the arm's capsules."""
 
@@ -313,11 +309,6 @@ class Separation:
     def on_arm(self) -> Float[Tensor, "*batch C H 3"]:
         """Nearest point on the arm's surface, in the base frame [m]."""
         return self.arm_point + self.arm_radius[:, None, None] * self.direction
-
-    @property
-    def on_person(self) -> Float[Tensor, "*batch C H 3"]:
-        """Nearest point on the person's surface [m]."""
-        return self.person_point - self.person_radius[..., None, :, None] * self.direction
 
     @cached_property
     def gradient(self) -> Float[Tensor, "*batch C H joints"]:
@@ -420,9 +411,7 @@ def separation(
         direction=gap / torch.where(apart, length, 1.0).unsqueeze(-1),
         fraction=t,
         arm_point=arm_point,
-        person_point=person_point,
         arm_radius=arm_radius,
-        person_radius=radius,
         joint_axes=frames[..., :joints, :, 2],
         joint_origins=frames[..., :joints, :, 3],
         moved=_moved(links, joints).to(q.device),
