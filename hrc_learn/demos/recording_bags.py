@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -52,7 +53,7 @@ def read_bag(path: Path) -> list[Recording]:
         DatasetError: The bag is damaged, or holds no topic that is understood.
     """
     types, messages = _opened_mcap(path) if path.suffix == ".mcap" else _opened_bag(path)
-    topics = _gathered(types, messages)
+    topics, order = _gathered(types, messages)
     if not topics:
         kinds = ", ".join(f"{topic} ({kind})" for topic, kind in types.items())
         raise DatasetError(f"no topic holds joints, poses or images: {kinds}", file=path)
@@ -61,7 +62,7 @@ def read_bag(path: Path) -> list[Recording]:
     for name, one in topics.items():
         time, places = np.unique(times[name], return_index=True)
         if one.values[0].size:
-            made = _numbers(name, one, places, notes)
+            made = _numbers(name, one, places, order, notes)
         else:
             made = image_field(name, one, messages, notes)
             if len(places) < len(one.received) or (np.diff(places) < 0).any():
@@ -139,16 +140,24 @@ def _opened_mcap(path: Path) -> tuple[dict[str, str], Messages]:
     return names, messages
 
 
-def _gathered(types: Mapping[str, str], messages: Messages) -> dict[str, Topic]:
-    """Topics by field."""
+def _gathered(
+    types: Mapping[str, str], messages: Messages
+) -> tuple[dict[str, Topic], list[str]]:
+    """Topics by field, and joints in the order of the robot's description, if it is there.
+
+    Drivers publish joints in any order, often that of the alphabet.
+    """
     sets: dict[str, dict[frozenset[str], Topic]] = {}
     edges: dict[tuple[str, str], list[tuple[float, float, np.ndarray]]] = {}
+    order: list[str] = []
     for topic, received, message in messages([*types]):
-        stamp = stamp_of(message)
+        stamp, data = stamp_of(message), getattr(message, "data", None)
         for one in getattr(message, "transforms", ()):
             edge = (one.header.frame_id.strip("/"), one.child_frame_id.strip("/"))
             pose = matrix_of(one.transform.translation, one.transform.rotation)
             edges.setdefault(edge, []).append((received * 1e-9, stamp_of(one), pose))
+        if isinstance(data, str) and topic.endswith("robot_description") and not order:
+            order = [j.get("name", "") for j in ElementTree.fromstring(data).iter("joint")]
         for name, names, value in parts_of(topic.strip("/"), message):
             group = sets.setdefault(name, {})
             one = group.setdefault(frozenset(names or ()), Topic(names))
@@ -161,7 +170,7 @@ def _gathered(types: Mapping[str, str], messages: Messages) -> dict[str, Topic]:
         for one in ranked[1:]:  # a gripper's driver may publish to the same topic
             parent, _, last = name.rpartition("/")
             topics["/".join(filter(None, (parent, (one.names or "?")[0], last)))] = one
-    return topics | poses_of_frames(edges)
+    return topics | poses_of_frames(edges), order
 
 
 def _times(
@@ -187,6 +196,7 @@ def _numbers(
     name: str,
     one: Topic,
     places: Int64[np.ndarray, " _frames"],
+    order: Sequence[str],
     notes: list[str],
 ) -> Field | None:
     """Field of a topic of numbers; None if it cannot be used, which a note says.
@@ -195,18 +205,22 @@ def _numbers(
         name: Name of the field.
         one: Messages of the topic.
         places: Messages in the order of their times, each time once.
+        order: Joints in the order of the robot's description.
         notes: Receives what is left out.
     """
     if len({value.shape for value in one.values}) > 1:
         notes.append(f"{name} is left out: its messages differ in size")
         return None
-    values = np.stack(one.values)
+    values, names = np.stack(one.values), one.names
     if not np.isfinite(values).all() and not name.endswith("joint_positions"):
         notes.append(f"{name} is left out: it holds NaN")
         return None
     if len(places) < len(values):
         notes.append(f"{name}: {len(values) - len(places)} messages with repeated stamps")
-    made = array_field(name, values[places], names=one.names)
+    if names and {*names} <= {*order}:
+        columns = [names.index(name) for name in order if name in names]
+        values, names = values[:, columns], tuple(names[i] for i in columns)
+    made = array_field(name, values[places], names=names)
     is_pose = values.shape[1:] == (4, 4) and not TOOL.search(name)
     return replace(made, kind="pose") if is_pose else made
 

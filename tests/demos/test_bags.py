@@ -241,6 +241,21 @@ def test_a_gripper_on_the_topic_of_the_arm_is_kept_apart(tmp_path):
     np.testing.assert_allclose(demo.gripper, 0.04 * now, atol=5e-4)
 
 
+def test_joints_keep_the_order_of_the_robot_description(tmp_path):
+    messages = ros2()
+    links = "".join(f'<joint name="{name}" type="revolute"/>' for name in UR)
+    text = f'<robot name="ur">{links}</robot>'
+    messages.add("/robot_description", START, "std_msgs/msg/String", data=text)
+    for t in START + STATES:
+        values = [position_of(name, t - START) for name in SORTED]
+        messages.state("/joint_states", t, SORTED, values)
+    (episode,) = plan(write2(tmp_path / "bag", messages)).episodes()
+    demo = episode.demonstration
+    assert demo.joint_names == UR
+    expected = joints(demo.time + demo.start_time - START)
+    np.testing.assert_allclose(demo.joint_position, expected, atol=1e-5)
+
+
 def test_commands_of_a_trajectory_are_put_in_the_order_of_the_joints(tmp_path):
     messages, empty = ros2(), np.zeros(0)
     for t in START + STATES:
