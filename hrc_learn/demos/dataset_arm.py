@@ -60,7 +60,7 @@ class DatasetArm:
         if self.gripper.unit in ("%", "1"):
             return np.clip(demo.gripper, 0.0, 1.0)
         travel = sum(
-            abs(f.opened - f.closed) for f in self.arm.gripper if f.kind == "prismatic"
+            abs(f.opened - f.closed) for f in self.arm.shape.gripper if f.kind == "prismatic"
         )
         width = _FRANKA_WIDTH if self.arm.is_franka else travel
         return np.clip(demo.gripper / (width or max(demo.gripper.max(), 1e-9)), 0.0, 1.0)

@@ -198,11 +198,6 @@ class Arm(SerialChain):
 
     # Shape
 
-    @property
-    def gripper(self) -> tuple[FingerJoint, ...]:
-        """Joints of the gripper in the description; empty if it ends at the flange."""
-        return self.shape.gripper
-
     @cached_property
     def whole(self) -> CapsuleArm:
         """Capsules that contain all links and the gripper, with the pairs that may touch.

@@ -132,9 +132,9 @@ def _franka_fingers(tool: Pose, opening: Float[np.ndarray, " time"]) -> Iterator
 
 def _fingers(robot: Arm, tool: Pose, opening: Float[np.ndarray, " time"]) -> Iterator[Body]:
     """Fingers of a gripper from a description; those that follow others move with them."""
-    fingers = {finger.name: finger for finger in robot.gripper}
+    fingers = {finger.name: finger for finger in robot.shape.gripper}
     places: dict[str, Pose] = {}
-    for finger in robot.gripper:  # carriers come before what they carry
+    for finger in robot.shape.gripper:  # carriers come before what they carry
         carrier = tool if finger.carrier is None else places[finger.carrier]
         moved = _moved(finger, torch.from_numpy(_positions(finger, fingers, opening)))
         places[finger.name] = carrier @ Pose.from_matrix(finger.mount) @ moved

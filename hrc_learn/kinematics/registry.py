@@ -8,10 +8,8 @@ import math
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
@@ -148,7 +146,8 @@ def arm(
         return arm_from_file(found[0], name=name, **choice)
     raise ValueError(
         f"no arm {name!r}: there are {', '.join(registered_arms())}, descriptions in installed "
-        f"packages, and files in URDF (.urdf) and MJCF (.xml, .mjcf){_fetched_with(name)}"
+        "packages, and files in URDF (.urdf) and MJCF (.xml, .mjcf); mujoco_menagerie and "
+        "robot_descriptions fetch many more"
     )
 
 
@@ -193,24 +192,6 @@ def _description_folders() -> Iterator[Path]:
     yield Path(os.environ.get("MENAGERIE_ROOT") or Path(menagerie) / "models")
     fetched = os.environ.get("ROBOT_DESCRIPTIONS_CACHE") or "~/.cache/robot_descriptions"
     yield Path(fetched).expanduser()
-
-
-_ENDS = ("_description", "_mj_description")
-
-
-def _fetched_with(name: str) -> str:
-    """Command that fetches a description, if an installed package knows the robot."""
-    wanted = _plain(name)
-    with suppress(ModuleNotFoundError):
-        for robot in import_module("mujoco_menagerie").names():
-            if _plain(robot).endswith(wanted):
-                return f"; mujoco_menagerie.prefetch([{robot!r}]) fetches {robot}"
-    with suppress(ModuleNotFoundError):
-        # The list alone: the import of a description downloads it.
-        for module in import_module("robot_descriptions._descriptions").DESCRIPTIONS:
-            if wanted in (_plain(module.removesuffix(end)) for end in _ENDS):
-                return f"; `import robot_descriptions.{module}` fetches it"
-    return ""
 
 
 @cache

@@ -163,7 +163,7 @@ def test_any_axis_and_sliding_joints(tmp_path):
     a = odd(tmp_path)
     assert a.chain.kinds == ("continuous", "prismatic", "revolute")
     assert_moves_like(a, mujoco_model(a), "base", "tip", 50)
-    assert [(j.name, j.closed, j.opened) for j in a.gripper] == [("grip", 0.0, 0.04)]
+    assert [(j.name, j.closed, j.opened) for j in a.shape.gripper] == [("grip", 0.0, 0.04)]
 
 
 def test_written_out_kinematics_slide_too(tmp_path):
@@ -186,7 +186,7 @@ def test_fingers_are_where_mujoco_has_them_from_closed_to_open(tmp_path):
             a = odd(tmp_path, gripping.replace('<joint name="grip" type="prismatic">', joint))
             model = mujoco_model(a)
             data = mujoco.MjData(model)
-            (finger,) = a.gripper
+            (finger,) = a.shape.gripper
             assert {finger.closed, finger.opened} == {lower, upper}
             assert abs(finger.opened) > abs(finger.closed)
             values = np.linspace(finger.closed, finger.opened, 5)

@@ -274,9 +274,9 @@ def test_joints_of_a_gripper_are_not_the_arms(tmp_path, kind):
     assert described.joints == 6
     assert described.tip == tip
     named = {element.get("name") for element in ElementTree.fromstring(robot(content))}
-    assert {finger.name for finger in described.gripper} <= named
-    assert (len(described.gripper) > 0) == (kind != "camera beside")
-    assert any(described.gripper[0].name in str(note.message) for note in notes) or (
+    assert {finger.name for finger in described.shape.gripper} <= named
+    assert (len(described.shape.gripper) > 0) == (kind != "camera beside")
+    assert any(described.shape.gripper[0].name in str(note.message) for note in notes) or (
         kind == "camera beside" and not notes
     )
 

@@ -96,7 +96,7 @@ def test_the_jaw_of_an_so101_opens(tmp_path):
     (tmp_path / "robot.urdf").write_text(bare)
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.urdf"))
     data = mujoco.MjData(model)
-    for row, value in ((0, so101.gripper[0].closed), (1, so101.gripper[0].opened)):
+    for row, value in ((0, so101.shape.gripper[0].closed), (1, so101.shape.gripper[0].opened)):
         for name, position in zip(
             [*so101.joint_names, "gripper"], [*q[row], value], strict=True
         ):
