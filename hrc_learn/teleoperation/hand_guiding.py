@@ -70,14 +70,6 @@ class InteractionForceConfig:
 
     __post_init__ = check_positive
 
-    def velocity(self, force: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-        """Velocity that a gizmo asks for where it would be a spring of this force [m/s].
-
-        Args:
-            force: [N]
-        """
-        return capped(self.rate / self.stiffness * force, self.speed)
-
 
 # The floor only keeps a division by zero out; it is far below any length that matters.
 TINY = 1e-12
@@ -132,7 +124,8 @@ def force_to_nullspace_input(
         return (J.mT @ torch.as_tensor(force, dtype=torch.float64)).numpy()
     # The first joints of an arm cannot move their own origin in all directions.
     inverse = torch.linalg.pinv(J, rtol=1e-6).numpy()
-    return config.damping * inverse @ config.velocity(force)
+    velocity = capped(config.rate / config.stiffness * force, config.speed)
+    return config.damping * inverse @ velocity
 
 
 def gizmo_nullspace_input(
@@ -382,13 +375,7 @@ class CombinedInput(Human):
     """
 
     def __init__(self, *sources: Human):
-        """Join them.
-
-        Raises:
-            ValueError: There are none.
-        """
-        if not sources:
-            raise ValueError("a combined input needs at least one source.")
+        """Join them."""
         self._sources = sources
 
     def read(self, state: ArmState) -> HumanInput:

@@ -148,19 +148,11 @@ class GuidedPath:
         """Fix the path.
 
         Args:
-            waypoints: Positions to pass [m].
+            waypoints: Positions to pass, no two the same in a row [m].
             duration: Time from the first to the last [s].
             start: Time at the first [s].
-
-        Raises:
-            ValueError: If way points repeat or the duration is not positive.
         """
         chords = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-        if len(chords) < 1 or chords.min() < 1e-6 or duration <= 0:
-            raise ValueError(
-                "a guided path needs at least two different way points, no two the same in a "
-                f"row, and a positive duration; got {len(waypoints)} in {duration} s."
-            )
         from scipy.interpolate import PchipInterpolator  # a quarter of a second
 
         length = np.concatenate([[0.0], np.cumsum(chords)])

@@ -39,11 +39,8 @@ def film_mp4(pictures: Iterable[Picture], rate: float) -> bytes:
     """An MP4 file (H.264) that browsers play.
 
     Args:
-        pictures: RGB, all of the same even size.
+        pictures: RGB, one at least, all of the same even size.
         rate: Pictures per second [1/s].
-
-    Raises:
-        ValueError: If there is no picture, or one has an odd size.
     """
     # In a file, which the index can be moved to the front of, so that it plays while it loads.
     with TemporaryDirectory(prefix="hrc_film_") as folder:
@@ -60,18 +57,14 @@ def _encode(path: Path, pictures: Iterable[Picture], rate: float) -> None:
         for picture in pictures:
             if stream is None:
                 height, width = picture.shape[:2]
-                if height % 2 or width % 2:
-                    raise ValueError(
-                        f"pictures of a film need even sizes, not {width} x {height} px."
-                    )
+                assert height % 2 == width % 2 == 0, "chroma is halved"
                 stream: Any = container.add_stream(
                     "libx264", rate=Fraction(rate).limit_denominator(1001), options=_CODEC
                 )
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
             container.mux(stream.encode(frame))
-        if stream is None:
-            raise ValueError("a film needs at least one picture.")
+        assert stream is not None, "a film needs a picture"
         container.mux(stream.encode())
 
 

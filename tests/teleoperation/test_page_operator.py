@@ -214,11 +214,6 @@ def test_both_hands_act_at_once():
     assert asked.requests == ("start", "stop")
 
 
-def test_a_person_without_hands_is_refused():
-    with pytest.raises(ValueError, match="at least one source"):
-        CombinedInput()
-
-
 def test_a_region_has_a_size():
     with pytest.raises(ValueError, match="half_size must be positive"):
         DrawnRegion(centre=(0.0, 0.0, 0.0), half_size=(0.1, 0.0, 0.1))

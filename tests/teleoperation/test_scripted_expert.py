@@ -54,15 +54,6 @@ def test_a_guided_path_passes_its_waypoints_from_rest_to_rest():
         np.testing.assert_allclose(path.velocity(time), numeric, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("waypoints", "duration"),
-    [(WAYPOINTS[:1], 5.0), (WAYPOINTS[[0, 0, 1]], 5.0), (WAYPOINTS, 0.0)],
-)
-def test_a_path_that_leads_nowhere_is_refused(waypoints, duration):
-    with pytest.raises(ValueError, match="way points"):
-        GuidedPath(waypoints, duration)
-
-
 def test_tremor_is_a_small_motion_about_the_path():
     tremor = Tremor(5e-4, np.random.default_rng(0))
     dt = 1e-3

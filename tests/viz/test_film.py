@@ -47,15 +47,6 @@ def test_a_film_is_decoded_with_its_rate_size_and_order():
     np.testing.assert_allclose([image.mean() for image in shown], levels, atol=6)
 
 
-@pytest.mark.parametrize(
-    ("pictures", "complaint"),
-    [([], "at least one picture"), ([np.zeros((48, 63, 3), np.uint8)], "not 63 x 48 px")],
-)
-def test_pictures_that_make_no_film_are_refused(pictures, complaint):
-    with pytest.raises(ValueError, match=complaint):
-        film_mp4(pictures, 15.0)
-
-
 def test_the_caption_is_below_the_inset():
     plain = np.full((300, 400, 3), 200, np.uint8)
     inset = np.full((40, 60, 3), 90, np.uint8)
