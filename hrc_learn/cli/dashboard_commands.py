@@ -33,6 +33,8 @@ def show(args: Show) -> int:
         return _open(recordings, args.web)
     if args.out is not None:
         return _record(args, args.out)
+    if args.web or not has_screen():
+        return _stream(args)
     with tempfile.TemporaryDirectory(prefix="hrc_show_") as folder:
         recording = Path(folder) / "demonstrations.rrd"
         return _record(args, recording) or _open([recording], args.web)
@@ -81,6 +83,26 @@ def _record(args: Show, out: Path) -> int:
     seconds = record_demonstrations(out, shown)
     print(out)
     write_values(args.json, {"episodes": len(shown.demos), "seconds": seconds})
+    return 0
+
+
+def _stream(args: Show) -> int:
+    """Serve a dataset to the browser, from its first episode on, until Ctrl-C."""
+    from hrc_learn.learning.demonstration_dashboard import (
+        demonstration_layout,
+        send_demonstrations,
+    )
+    from hrc_learn.teleoperation.dashboard_page import serve_stream
+
+    shown = _shown(args)
+    with contextlib.suppress(KeyboardInterrupt), serve_stream(None) as (stream, url):
+        stream.send_blueprint(demonstration_layout(shown))
+        print(f"Dashboard at {url} (Ctrl-C ends it)", flush=True)
+        if has_screen():
+            webbrowser.open(url)
+        seconds = sum(demo.duration for demo in send_demonstrations(stream, shown))
+        write_values(args.json, {"episodes": len(shown.demos), "seconds": seconds})
+        threading.Event().wait()
     return 0
 
 
