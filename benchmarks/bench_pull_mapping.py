@@ -25,13 +25,8 @@ from hrc_learn.experiments.collaboration_trial import NULL_SPACE_FORCES
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.teleoperation import (
-    ForceMapping,
-    InteractionForceConfig,
-    ScriptedForce,
-    random_pulls,
-)
-from hrc_learn.teleoperation.hand_guiding import force_to_nullspace_input
+from hrc_learn.teleoperation import InteractionForceConfig, ScriptedForce, random_pulls
+from hrc_learn.teleoperation.hand_guiding import ForceMapping, force_to_nullspace_input
 from hrc_learn.teleoperation.scripted_demonstrations import ELBOW_FORCES
 
 _MAPPINGS: tuple[ForceMapping, ...] = get_args(ForceMapping)

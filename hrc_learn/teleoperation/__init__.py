@@ -5,24 +5,16 @@ scripted demonstrations, which need the simulator, in modules of their own.
 """
 
 from hrc_learn.teleoperation.hand_guiding import CombinedInput as CombinedInput
-from hrc_learn.teleoperation.hand_guiding import ForceMapping as ForceMapping
 from hrc_learn.teleoperation.hand_guiding import HandGuidedArm as HandGuidedArm
-from hrc_learn.teleoperation.hand_guiding import HandGuidingConfig as HandGuidingConfig
-from hrc_learn.teleoperation.hand_guiding import InputFilter as InputFilter
-from hrc_learn.teleoperation.hand_guiding import InputFilterConfig as InputFilterConfig
 from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig as InteractionForceConfig,
 )
 from hrc_learn.teleoperation.hand_guiding import (
     force_to_nullspace_input as force_to_nullspace_input,
 )
-from hrc_learn.teleoperation.hand_guiding import gizmo_nullspace_input as gizmo_nullspace_input
-from hrc_learn.teleoperation.hand_guiding import guiding_twist as guiding_twist
-from hrc_learn.teleoperation.scripted_expert import GuidedPath as GuidedPath
 from hrc_learn.teleoperation.scripted_expert import ScriptedExpert as ScriptedExpert
 from hrc_learn.teleoperation.scripted_expert import ScriptedForce as ScriptedForce
 from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation as ScriptedPerturbation
-from hrc_learn.teleoperation.scripted_expert import Tremor as Tremor
 from hrc_learn.teleoperation.scripted_expert import random_pulls as random_pulls
 from hrc_learn.teleoperation.touch import Touch as Touch
 from hrc_learn.teleoperation.touch import TouchConfig as TouchConfig

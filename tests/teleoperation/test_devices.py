@@ -10,7 +10,7 @@ import torch
 
 from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
-from hrc_learn.teleoperation import InputFilter, InputFilterConfig, InteractionForceConfig
+from hrc_learn.teleoperation import InteractionForceConfig
 from hrc_learn.teleoperation.devices import (
     DIRECTIONS,
     Gamepad,
@@ -19,7 +19,12 @@ from hrc_learn.teleoperation.devices import (
     deflection,
     rumble_strength,
 )
-from hrc_learn.teleoperation.hand_guiding import CombinedInput, LinkGuide
+from hrc_learn.teleoperation.hand_guiding import (
+    CombinedInput,
+    InputFilter,
+    InputFilterConfig,
+    LinkGuide,
+)
 
 Q = panda.ready.numpy()
 STATE = ArmState(time=0.0, joint_position=Q, joint_velocity=0 * Q, gripper_width=0.08)

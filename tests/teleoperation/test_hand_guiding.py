@@ -8,12 +8,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.teleoperation import (
-    InteractionForceConfig,
-    force_to_nullspace_input,
-    gizmo_nullspace_input,
-    guiding_twist,
-)
+from hrc_learn.teleoperation import InteractionForceConfig, force_to_nullspace_input
 from hrc_learn.teleoperation.hand_guiding import (
     ATTRACTION,
     RETURN_SPEED,
@@ -21,6 +16,8 @@ from hrc_learn.teleoperation.hand_guiding import (
     HandGuidingConfig,
     bounded,
     capped,
+    gizmo_nullspace_input,
+    guiding_twist,
 )
 
 pytestmark = pytest.mark.simulation

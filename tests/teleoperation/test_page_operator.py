@@ -9,7 +9,8 @@ import torch
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
-from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig, gizmo_nullspace_input
+from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig
+from hrc_learn.teleoperation.hand_guiding import gizmo_nullspace_input
 from hrc_learn.teleoperation.page import PageHuman
 from hrc_learn.teleoperation.page_operator import (
     HeldGizmo,
