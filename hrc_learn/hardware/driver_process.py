@@ -247,7 +247,6 @@ def ending_at_rest(stop: Callable[[], object], *, patience: float = 5.0) -> Iter
         raise SystemExit(128 + number)
 
     before = _handled_by(end)
-    stopped = False
     try:
         try:
             yield
