@@ -367,7 +367,7 @@ def time_to_rest(page: Page, asked) -> float:
         leader = Leader(page)
         leading = asyncio.create_task(leader.run())
         await asyncio.wait_for(leader.leads.wait(), 20)
-        while not asked().nullspace_input.any():
+        while not asked().effort(7).any():
             await asyncio.sleep(0.002)
         # Its network is gone: nothing is closed, nothing comes any more.
         leader.silent, gone = True, time.monotonic()
@@ -380,7 +380,7 @@ def time_to_rest(page: Page, asked) -> float:
 
 
 def _until_rest(asked, gone: float) -> float:
-    while asked().nullspace_input.any():
+    while asked().effort(7).any():
         if time.monotonic() - gone > 10:
             raise AssertionError("the effort stays")
         time.sleep(0.001)

@@ -73,7 +73,7 @@ def asked_by_wire(grips, region):
             def asked():
                 socket.send(wire.BEAT)
                 now = page.human.read(state)
-                return now.region and now.twist.any() and now.nullspace_input.any()
+                return now.region and now.twist.any() and now.effort(7).any()
 
             wait_until(asked, "the scripted person is heard", timeout=10)
             return page.human.read(state)
@@ -131,7 +131,7 @@ def test_both_hands_and_a_region_arrive_as_a_scripted_person_says_them(still, wo
         assert now.joint == grip["joint"]
         np.testing.assert_allclose(now.pointer, grip["pointer"], atol=2 * GEOMETRY)
     # A busy machine may not be heard for a moment, which lets go.
-    asks = lambda now: now.nullspace_input.any() and now.twist.any()  # noqa: E731
+    asks = lambda now: now.effort(7).any() and now.twist.any()  # noqa: E731
     settled(lambda: asks(page.human.read(state)), "both are asked for")
     both = page.human.read(state)
 
@@ -162,11 +162,9 @@ def test_both_hands_and_a_region_arrive_as_a_scripted_person_says_them(still, wo
 
     box = {"centre": [*(corner + opposite) / 2], "half_size": [*half]}
     scripted = asked_by_wire(grips, box)
-    d, twist = both.nullspace_input, both.twist
+    d, twist = both.effort(7), both.twist
     # J of a point within a metre of its axes has singular values below 2.
-    np.testing.assert_allclose(
-        d, scripted.nullspace_input, atol=2 * GEOMETRY * STIFFNESS * 2, rtol=0
-    )
+    np.testing.assert_allclose(d, scripted.effort(7), atol=2 * GEOMETRY * STIFFNESS * 2, rtol=0)
     np.testing.assert_allclose(twist, scripted.twist, atol=2 * GEOMETRY * RATE, rtol=0)
     np.testing.assert_allclose(
         scripted.region.half_size, region.half_size, atol=GEOMETRY, rtol=0

@@ -69,12 +69,12 @@ def besieged(session, kinds, seed=0):
     assert not any(asked.requests for asked in seen)
     assert all(asked.gripper is None and asked.region is None for asked in seen)
     assert not any(asked.twist.any() for asked in seen)
-    pulled = [asked for asked in seen if asked.nullspace_input.any()]
+    pulled = [asked for asked in seen if asked.effort(7).any()]
     # The leader pulls the elbow up: joint 5 and later are not concerned.
     assert len(pulled) > len(seen) // 2
-    assert all(not asked.nullspace_input[4:].any() for asked in pulled)
+    assert all(not asked.effort(7)[4:].any() for asked in pulled)
     wait_until(lambda: session.page.control.people == 0, "everybody gone")
-    wait_until(lambda: not session.asked.nullspace_input.any(), "rest")
+    wait_until(lambda: not session.asked.effort(7).any(), "rest")
 
 
 def test_one_of_each_kind_changes_nothing(session):
@@ -337,17 +337,15 @@ def test_a_grip_that_was_held_before_the_hand_over_moves_nothing(session):
         for _ in range(10):
             await second.send(hands(pointer=(0.3, 0.4, 0.5)))
             await asyncio.sleep(0.03)
-        assert not session.asked.nullspace_input.any()
+        assert not session.asked.effort(7).any()
         await second.send(json.dumps({"type": "hands", "grips": []}))
         await second.send(hands(pointer=(0.3, 0.4, 0.5)))
-        await asyncio.to_thread(
-            wait_until, lambda: session.asked.nullspace_input.any(), "an effort"
-        )
+        await asyncio.to_thread(wait_until, lambda: session.asked.effort(7).any(), "an effort")
         await first.close()
         await second.close()
 
     asyncio.run(go())
-    wait_until(lambda: not session.asked.nullspace_input.any(), "rest")
+    wait_until(lambda: not session.asked.effort(7).any(), "rest")
 
 
 def test_a_client_that_draws_the_scene_itself_is_told_where_everything_is(session):
