@@ -51,10 +51,10 @@ def main(args: Args) -> None:
         demos = open_demos(folder)
         figures["frames"] = float(demos.frames)
         before = _peak_memory()
-        took, (fits, _) = _timed(lambda: fit_streamed(demos, args.n_basis))
+        took, (_, values) = _timed(lambda: fit_streamed(demos, args.n_basis))
         figures["dmp_fit_s"] = took
         figures["dmp_fit_peak_growth_mb"] = _peak_memory() - before
-        figures["dmp_rmse_rad"] = float(fits["joint"].rmse.square().mean().sqrt())
+        figures["dmp_rmse_rad"] = values["mean_joint_rmse"]
         camera = feature_trajectories(demos)
         config = ImageJacobianFitConfig(pixel_noise=0.1)
         took, network = _timed(

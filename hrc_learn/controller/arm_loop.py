@@ -204,7 +204,7 @@ class ArmLoop:
         one = torch.ones_like(q[..., 0])
         eased = apply_where(
             acts,
-            lambda part: eased_null_velocity(self.chain, *part, config.dt, config),
+            lambda part: eased_null_velocity(self.chain, *part, dt=config.dt, config=config),
             (q, J, state.null_velocity, requested, bounds),
             EasedVelocity(requested, requested, one, one, requested, requested),
         )

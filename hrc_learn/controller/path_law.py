@@ -257,7 +257,7 @@ class PathLaw:
             direct = apply_where(
                 begins,
                 lambda part: DirectReturn.planned(
-                    request.paths, *part, self.config, self._tracking.clearance
+                    request.paths, *part, config=self.config, clearance=self._tracking.clearance
                 ),
                 (request.path, path.progress, joint_position),
                 direct,

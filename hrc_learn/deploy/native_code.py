@@ -153,7 +153,7 @@ class NativeCode:
         offset = ir.IntType(64)(self._slot[x] * self.lanes)
         return builder.gep(builder.function.args[-2], [offset], source_etype=self._scalar)
 
-    def _fetched(self, builder: ir.IRBuilder, x: int) -> ir.Value:
+    def _fetched(self, builder: ir.IRBuilder, x: int) -> Any:
         """A constant, an input, or a value of an earlier function."""
         kind, *where = self._program.instructions[x]
         boolean = self._program.boolean[x]
@@ -167,7 +167,7 @@ class NativeCode:
             return builder.load(place, align=self._size, typ=self._number)
         return builder.trunc(builder.load(place, align=1, typ=self._flag), self._truth)
 
-    def _keep(self, builder: ir.IRBuilder, x: int, value: ir.Value) -> None:
+    def _keep(self, builder: ir.IRBuilder, x: int, value: Any) -> None:
         """Leave a value to later functions."""
         place, align = self._place(builder, x), self._size
         if self._program.boolean[x]:

@@ -262,7 +262,7 @@ def column(trials: Sequence[Trial], key: str) -> Float[np.ndarray, " trials"]:
 
 def never[Run](
     name: str,
-    of: Callable[[Run], int | None],
+    of: Callable[[Run], float | int | None],
     claim: str = "",
     detail: Callable[[Run], str] = lambda run: "",
 ) -> Metric[Run]:
