@@ -84,7 +84,7 @@ class Figures:
 
 
 BUDGET: dict[str, float] = {
-    "code": 45_950,
+    "code": 45_000,
     "modules": 235,
     "long_functions": 20,
     "shared_file_names": 0,
@@ -93,14 +93,8 @@ BUDGET: dict[str, float] = {
     "idiom": 0.3,
     "docs_words": 35_000,
 }
-"""Largest allowed figures. They are lowered towards `AIM` as code goes; nothing raises them but
-the rows that CONTRIBUTING.md lists for code and modules."""
-
-AIM: dict[str, float] = BUDGET | {
-    "code": 45_000,
-    "docs_words": 35_000,
-}
-"""Figures to reach. For scale: BoTorch has 34.7k lines of code in 172 modules."""
+"""Largest allowed figures. Nothing raises them but the rows that CONTRIBUTING.md lists for code
+and modules. For scale: BoTorch has 34.7k lines of code in 172 modules."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -350,10 +344,10 @@ def budget_table(values: dict[str, float], limits: dict[str, float]) -> str:
         "code": round(values["code"], -2),
         "docs_words": 500 * round(values["docs_words"] / 500),
     }
-    lines = ["| figure | now | at most | aim |", "|---|---|---|---|"]
+    lines = ["| figure | now | at most | without raises |", "|---|---|---|---|"]
     lines += [
         f"| {words} | {shape.format(rounded[key])} | {shape.format(limits[key])} | "
-        f"{shape.format(AIM[key])} |"
+        f"{shape.format(BUDGET[key])} |"
         for key, (words, shape) in ROWS.items()
     ]
     return "\n".join(lines) + "\n"
