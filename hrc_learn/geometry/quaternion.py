@@ -20,10 +20,37 @@ from hrc_learn.geometry.numerics import (
     safe_norm,
 )
 
+# Row i of the matrix P with p * q = P q, as components of p and their signs.
+_PRODUCT_INDEX = Constant(torch.tensor([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0]))
+_PRODUCT_SIGN = Constant(
+    torch.tensor(
+        [[1, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]], dtype=torch.float64
+    )
+)
 _CONJUGATE_SIGN = Constant(torch.tensor([1, -1, -1, -1], dtype=torch.float64))
 # The sum of the signs with these weights has the sign of the first non-zero component.
 _LEXICOGRAPHIC = Constant(torch.tensor([8, 4, 2, 1], dtype=torch.float64))
-_DIAGONAL = Constant(torch.eye(3, dtype=torch.bool))
+# 4 q q^T = I + sum over three entries of R (row-major) with these signs.
+_OUTER_INDEX = Constant(
+    torch.tensor(
+        [
+            [0, 7, 2, 3, 7, 0, 1, 2, 2, 1, 0, 5, 3, 2, 5, 0],
+            [4, 5, 6, 1, 5, 4, 3, 6, 6, 3, 4, 7, 1, 6, 7, 4],
+            [8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8],
+        ]
+    )
+)
+_OUTER_SIGN = Constant(
+    torch.tensor(
+        [
+            [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, -1, 1, 1, 1, 1, -1],
+            [1, -1, -1, -1, -1, -1, 1, 1, -1, 1, 1, 1, -1, 1, 1, -1],
+            [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
+        ],
+        dtype=torch.float64,
+    )
+)
+_OUTER_OFFSET = Constant(torch.eye(4, dtype=torch.float64))
 # Below this angle [rad] an axis of rotation is rounding noise.
 _AXIS_THRESHOLD = 1e-6
 
@@ -32,11 +59,11 @@ def multiply(
     p: Float[Tensor, "*#batch 4"], q: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
     """Hamilton product: rotate by q, then by p."""
+    if torch.compiler.is_compiling():
+        return _written_out_product(p, q)
     # Sums instead of a matmul: TF32 tensor cores would round the product to three digits.
-    a, b = p[..., :1], q[..., :1]
-    u, v = torch.broadcast_tensors(p[..., 1:], q[..., 1:])
-    scalar = a * b - (u * v).sum(-1, keepdim=True)
-    return torch.cat([scalar, a * v + b * u + torch.linalg.cross(u, v)], dim=-1)
+    left = p[..., _PRODUCT_INDEX.like(p)].unflatten(-1, (4, 4)) * _PRODUCT_SIGN.like(p)
+    return (left * q[..., None, :]).sum(-1)
 
 
 def conjugate(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -97,19 +124,14 @@ def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     (Markley 2008, "Unit quaternion from rotation matrix"): accurate at every angle, and a
     unit quaternion even if R is a rotation only up to rounding.
     """
-    # 4 w^2 = 1 + tr R, 4 w v = vee(R - R^T), 4 v v^T = R + R^T + (1 - tr R) I.
-    trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    turned, both = R - R.mT, R + R.mT
-    wv = torch.stack([turned[..., 2, 1], turned[..., 0, 2], turned[..., 1, 0]], dim=-1)
-    vv = torch.where(_DIAGONAL.like(R), both + (1 - trace), both)
-    row = torch.cat([1 + trace, wv[..., None, :]], dim=-1).squeeze(-2)
-    largest = row[..., :1]
-    # Not gather: inductor of torch 2.11 generates C++ for it that does not compile for a batch.
-    for k, other in enumerate(torch.cat([wv[..., None], vv], dim=-1).unbind(-2), start=1):
-        larger = other[..., k : k + 1] > largest
-        row = torch.where(larger, other, row)
-        largest = torch.where(larger, other[..., k : k + 1], largest)
-    return normalize(row)
+    if torch.compiler.is_compiling():
+        return _written_out_from_matrix(R)
+    entries = R.flatten(-2)[..., _OUTER_INDEX.like(R)] * _OUTER_SIGN.like(R)
+    outer = entries.sum(-2).unflatten(-1, (4, 4)) + _OUTER_OFFSET.like(R)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    # Not take_along_dim: exporting it fixes the batch size.
+    row = outer.gather(-2, largest[..., None, None].expand(*outer.shape[:-2], 1, 4))
+    return normalize(row.squeeze(-2))
 
 
 def angle(
@@ -276,3 +298,38 @@ def _k(square: Tensor) -> Tensor:
         square.clamp_max(_SMALL), (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)
     )
     return torch.where(square < _SMALL, series, (1 - sinc) / far)
+
+
+# Compilers turn the functions below into one loop over the batch; the indexing above costs a
+# lookup per number. Also, inductor of torch 2.11 generates C++ for the `gather` in
+# `from_matrix` that does not compile for a batch.
+
+
+def _written_out_product(p: Tensor, q: Tensor) -> Tensor:
+    """`multiply` component by component."""
+    (a, b, c, d), (w, x, y, z) = p.unbind(-1), q.unbind(-1)
+    parts = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    return torch.stack(parts, dim=-1)
+
+
+def _written_out_from_matrix(R: Tensor) -> Tensor:
+    """`from_matrix` component by component."""
+    a, b, c, d, e, f, g, h, i = R.flatten(-2).unbind(-1)
+    wx, wy, wz, xy, xz, yz = h - f, c - g, d - b, b + d, c + g, f + h
+    row, *others = [
+        [a + e + i + 1, wx, wy, wz],
+        [wx, a - e - i + 1, xy, xz],
+        [wy, xy, e - a - i + 1, yz],
+        [wz, xz, yz, i - a - e + 1],
+    ]
+    largest = row[0]
+    for k, other in enumerate(others, start=1):
+        larger = other[k] > largest
+        row = [torch.where(larger, new, old) for new, old in zip(other, row, strict=True)]
+        largest = torch.where(larger, other[k], largest)
+    return normalize(torch.stack(row, dim=-1))
