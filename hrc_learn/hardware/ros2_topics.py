@@ -23,6 +23,10 @@ _STARTUP = 10.0
 """Longest wait for a description of the robot, and for the guard [s]."""
 
 
+_FAREWELL = 1.0
+"""Time for which the guard sends zeros after its process has died [s]."""
+
+
 def ros2_origin() -> str:
     """One line that says which ROS 2 is used."""
     import rclpy
@@ -156,7 +160,7 @@ def start_guard(topic: str, joints: int, timeout: float) -> subprocess.Popen:
 def guard_velocities(topic: str, joints: int, timeout: float) -> None:
     """Send zeros once a velocity was the last command for too long.
 
-    It ends with the process that started it, but not before the arm is at rest.
+    It outlives the process that started it by a second of zeros.
     """
     from std_msgs.msg import Float64MultiArray
 
@@ -175,10 +179,17 @@ def guard_velocities(topic: str, joints: int, timeout: float) -> None:
             sys.exit(f"neither controller nor commands on {topic} for {_STARTUP:g} s")
         time.sleep(0.02)
     print("ready", flush=True)
-    while os.getppid() == parent or newest["moving"]:
+    rest = Float64MultiArray(data=[0.0] * joints)
+    while os.getppid() == parent:
         time.sleep(timeout / 5)
         if newest["moving"] and time.monotonic() - newest["time"] > timeout:
-            zeros.publish(Float64MultiArray(data=[0.0] * joints))
+            zeros.publish(rest)
+    # This process hears its own zeros at once. A controller that has not taken them yet loses
+    # them when the publisher leaves the graph.
+    end = time.monotonic() + _FAREWELL
+    while time.monotonic() < end:
+        zeros.publish(rest)
+        time.sleep(timeout / 5)
     session.close()
 
 
