@@ -12,7 +12,7 @@ from typing import Any
 import beartype
 import jaxtyping
 
-_MOST = 2000
+_MOST = 500
 _calls = 0
 
 
