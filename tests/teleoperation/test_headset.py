@@ -79,6 +79,7 @@ def asked_by_wire(grips, region):
             return page.human.read(state)
 
 
+@pytest.mark.slow
 def test_both_hands_and_a_region_arrive_as_a_scripted_person_says_them(still, worn):
     page, state = still
     links = panda.link_poses(torch.from_numpy(state.joint_position))
