@@ -125,7 +125,8 @@ class Ros2Arm:
             self._await_controllers()
             if kind == "velocity":
                 longest = 1.5 * config.timeout
-                self._guard = start_guard(config.command, len(self._names), longest)
+                heard = self._commands.get_subscription_count()
+                self._guard = start_guard(config.command, len(self._names), longest, heard)
         except BaseException:
             self.session.close()
             raise

@@ -138,18 +138,20 @@ def stamp_of(message: Any) -> float:
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
-def start_guard(topic: str, joints: int, timeout: float) -> subprocess.Popen:
+def start_guard(topic: str, joints: int, timeout: float, controllers: int) -> subprocess.Popen:
     """The process of `guard_velocities`, once it hears the commands and is heard.
 
     Args:
         topic: Topic of the velocity controller.
         joints: Number of its joints.
         timeout: Longest silence after a velocity [s].
+        controllers: Number of subscriptions that the commands reach.
 
     Raises:
         ConnectionError: It does not start.
     """
-    words = [sys.executable, str(Path(__file__)), topic, str(joints), str(timeout)]
+    numbers = map(str, (joints, timeout, controllers))
+    words = [sys.executable, str(Path(__file__)), topic, *numbers]
     process = subprocess.Popen(words, stdout=subprocess.PIPE)
     assert process.stdout is not None
     if not process.stdout.readline():
@@ -157,7 +159,7 @@ def start_guard(topic: str, joints: int, timeout: float) -> subprocess.Popen:
     return process
 
 
-def guard_velocities(topic: str, joints: int, timeout: float) -> None:
+def guard_velocities(topic: str, joints: int, timeout: float, controllers: int) -> None:
     """Send zeros once a velocity was the last command for too long.
 
     It outlives the process that started it by a second of zeros.
@@ -173,10 +175,14 @@ def guard_velocities(topic: str, joints: int, timeout: float) -> None:
     session.node.create_subscription(Float64MultiArray, topic, take, quality(reliable=True))
     zeros = session.node.create_publisher(Float64MultiArray, topic, quality(reliable=True))
     end = time.monotonic() + _STARTUP
-    # Each time itself and another: the controller, and the process that commands it.
-    while zeros.get_subscription_count() < 2 or session.node.count_publishers(topic) < 2:
+    # Each time itself and others: all controllers, and the process that commands them.
+    while (
+        zeros.get_subscription_count() < controllers + 1
+        or session.node.count_publishers(topic) < 2
+    ):
         if time.monotonic() > end or os.getppid() != parent:
-            sys.exit(f"neither controller nor commands on {topic} for {_STARTUP:g} s")
+            found = zeros.get_subscription_count() - 1
+            sys.exit(f"{topic}: {found} of {controllers} controllers found in {_STARTUP:g} s")
         time.sleep(0.02)
     print("ready", flush=True)
     rest = Float64MultiArray(data=[0.0] * joints)
@@ -195,4 +201,5 @@ def guard_velocities(topic: str, joints: int, timeout: float) -> None:
 
 if __name__ == "__main__":
     with suppress(KeyboardInterrupt):
-        guard_velocities(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]))
+        joints, timeout, controllers = sys.argv[2:]
+        guard_velocities(sys.argv[1], int(joints), float(timeout), int(controllers))
