@@ -190,7 +190,8 @@ def decode(
     try:
         with av.open(str(segment.file)) as container:
             stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
+            if len(numbers) > 1:  # threads read ahead, which a single image has to wait for
+                stream.thread_type = "AUTO"
             for number, run in enumerate(np.split(numbers, gaps + 1)):
                 wanted, start = {*run.tolist()}, segment.start + run[0] / fps
                 if (start > 0 or number) and stream.time_base is not None:
