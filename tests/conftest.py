@@ -7,6 +7,9 @@ import os
 # environment for the programs that tests start.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import random
+
+import numpy as np
 import pytest
 import torch
 from shape_checks import first_calls_checked
@@ -34,7 +37,13 @@ def ordinary_priority():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    """Simulations, with their fixtures, cost twice as much with shape checks and autograd."""
+    """Random numbers repeat, and simulations run without shape checks and autograd.
+
+    Simulations, with their fixtures, would cost twice as much.
+    """
+    random.seed(0)
+    np.random.seed(0)
+    torch.manual_seed(0)
     if item.get_closest_marker("simulation") is None:
         with first_calls_checked():
             return (yield)

@@ -90,7 +90,7 @@ def test_given_start_and_goal_it_does_not_lose_to_the_mean():
         motion = ProbabilisticDMP.fit(each[rest])
         at_ends = motion.at(way[i, 0], way[i, -1])
         pair = at_ends.mean_primitive(), motion.mean_primitive()
-        sampled = at_ends.sample(3).rollout(time=[0.0, 1.0]).position
+        sampled = at_ends.sample(3, rng).rollout(time=[0.0, 1.0]).position
         torch.testing.assert_close(sampled, way[i, [0, -1]].expand(3, 2, 2), rtol=0, atol=2e-3)
         errors.append(
             [

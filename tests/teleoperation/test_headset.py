@@ -56,6 +56,20 @@ def worn(still, tmp_path_factory):
         yield person
 
 
+@pytest.fixture(scope="module")
+def placing(still, worn):
+    """Yaw [rad] and position [m] of the arm in the room, placed by three touched points."""
+    marks, yaw = np.array(still[0]._config.touch_points), -1.1
+    stands = np.array([0.3, 0.7, -0.9])
+    worn.press("Place the arm")
+    # Fingers close on each point from a hand's breadth above.
+    for mark in placed(marks, yaw, stands):
+        worn.reach("right", mark)
+        with worn.pinching("right"):
+            closed = worn.hand("right") - mark
+    return yaw, stands + closed  # all three are off alike, and so is the arm
+
+
 def asked_by_wire(grips, region):
     """What a page beside the same arm asks for when a scripted person says the same."""
     with still_page() as (page, state):
@@ -79,24 +93,20 @@ def asked_by_wire(grips, region):
             return page.human.read(state)
 
 
-@pytest.mark.slow
-def test_both_hands_and_a_region_arrive_as_a_scripted_person_says_them(still, worn):
-    page, state = still
-    links = panda.link_poses(torch.from_numpy(state.joint_position))
-    marks, yaw, stands = np.array(page._config.touch_points), -1.1, np.array([0.3, 0.7, -0.9])
-    room = lambda point: placed(np.atleast_2d(point), yaw, stands)[0]  # noqa: E731
-
-    # Three touched points place the arm. Fingers close on each from a hand's breadth above.
-    worn.press("Place the arm")
-    for mark in placed(marks, yaw, stands):
-        worn.reach("right", mark)
-        with worn.pinching("right"):
-            closed = worn.hand("right") - mark
-    stands = stands + closed  # all three are off alike, and so is the arm
+def test_three_touched_points_place_the_arm(worn, placing):
+    yaw, stands = placing
     kept = json.loads(worn.tab.evaluate("localStorage['hrc-placing']"))["arm"]
     np.testing.assert_allclose(kept["position"], stands, atol=GEOMETRY)
     assert kept["yaw"] == pytest.approx(yaw, abs=GEOMETRY)
     assert "the points miss by 0 mm" in worn.tab.locator("#words").text_content()
+
+
+@pytest.mark.slow
+def test_both_hands_and_a_region_arrive_as_a_scripted_person_says_them(still, worn, placing):
+    page, state = still
+    links = panda.link_poses(torch.from_numpy(state.joint_position))
+    yaw, stands = placing
+    room = lambda point: placed(np.atleast_2d(point), yaw, stands)[0]  # noqa: E731
 
     # One hand pinches link 4 of the arm, the other leads the end effector from aside.
     base = lambda hand: unplaced(worn.hand(hand), yaw, stands)  # noqa: E731
@@ -172,10 +182,9 @@ def test_both_hands_and_a_region_arrive_as_a_scripted_person_says_them(still, wo
     )
 
 
-def test_the_region_is_moved_and_sized(still, worn):
+def test_the_region_is_moved_and_sized(still, worn, placing):
     page, _ = still
-    arm = json.loads(worn.tab.evaluate("localStorage['hrc-placing']"))["arm"]
-    yaw, stands = arm["yaw"], np.array(arm["position"])
+    yaw, stands = placing
     before = page._panel.editor.drawn
     closed = _closing(worn, "right")
     worn.press("Draw region")
@@ -214,9 +223,9 @@ def _closing(worn, hand) -> np.ndarray:
         return worn.hand(hand) - start
 
 
-def test_the_hand_turns_the_end_effector_by_its_own_turn(still, worn):
+def test_the_hand_turns_the_end_effector_by_its_own_turn(still, worn, placing):
     page, state = still
-    yaw = json.loads(worn.tab.evaluate("localStorage['hrc-placing']"))["arm"]["yaw"]
+    yaw, _ = placing
 
     def take_back():
         # What the hand said before it opened may come late, and turns on.
@@ -323,7 +332,7 @@ def test_a_controller_shakes_with_what_the_arm_meets(still, worn):
     worn.frames(2)
 
 
-def test_the_place_is_kept_for_the_next_session(still, worn):
+def test_the_place_is_kept_for_the_next_session(still, worn, placing):
     kept = worn.tab.evaluate("localStorage['hrc-placing']")
     worn.tab.reload()
     worn.button("Enter AR").wait_for()
