@@ -9,7 +9,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import random
 
-import numpy as np
 import pytest
 import torch
 from shape_checks import first_calls_checked
@@ -42,7 +41,6 @@ def pytest_runtest_protocol(item):
     Simulations, with their fixtures, would cost twice as much.
     """
     random.seed(0)
-    np.random.seed(0)
     torch.manual_seed(0)
     if item.get_closest_marker("simulation") is None:
         with first_calls_checked():
