@@ -189,9 +189,9 @@ def decode(
     gaps = np.flatnonzero(np.diff(numbers) > max(1, round(_SKIP_SECONDS * fps)))
     try:
         with av.open(str(segment.file)) as container:
+            # PyAV's own threads stay within an image: threads that read ahead may log while the
+            # container closes, and both then wait for Python's lock.
             stream = container.streams.video[0]
-            if len(numbers) > 1:  # threads read ahead, which a single image has to wait for
-                stream.thread_type = "AUTO"
             for number, run in enumerate(np.split(numbers, gaps + 1)):
                 wanted, start = {*run.tolist()}, segment.start + run[0] / fps
                 if (start > 0 or number) and stream.time_base is not None:

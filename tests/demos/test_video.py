@@ -1,5 +1,7 @@
 """Camera images recorded as video: LeRobot decodes them, frame for frame."""
 
+import multiprocessing
+
 import numpy as np
 import pytest
 from clean_sets import SETS, write_set
@@ -7,7 +9,7 @@ from lerobot_folders import read_info, write_info
 from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, recover_dataset
-from hrc_learn.demos.videos import video_path
+from hrc_learn.demos.videos import VideoSegment, decode, video_path
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation
@@ -113,3 +115,29 @@ def test_a_version_without_its_letter_is_the_same_version(tmp_path):
     after = check_dataset(root)
     assert after.ok
     assert list(map(str, after.warnings)) == list(map(str, before.warnings))
+
+
+def read_beginnings(file) -> None:
+    """Begin to read a video again and again, while FFmpeg logs through Python."""
+    import av
+
+    av.logging.set_level(av.logging.DEBUG)
+    for _ in range(100):
+        assert next(decode(VideoSegment(file=file, start=0, stop=2), 20))[0] == 0
+
+
+def test_a_reader_that_ends_early_does_not_wait_for_threads_that_log(tmp_path):
+    import av
+
+    file = tmp_path / "video.mp4"
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("libx264", rate=20, options={"g": "2"})
+        stream.width, stream.height = SIZE[::-1]
+        for frame in (*(av.VideoFrame.from_ndarray(image(k)) for k in range(40)), None):
+            container.mux(stream.encode(frame))
+    reader = multiprocessing.get_context("fork").Process(target=read_beginnings, args=(file,))
+    reader.start()
+    reader.join(30)
+    hangs = reader.is_alive()
+    reader.kill()
+    assert not hangs and reader.exitcode == 0
