@@ -140,4 +140,5 @@ def test_a_reader_that_ends_early_does_not_wait_for_threads_that_log(tmp_path):
     reader.join(30)
     hangs = reader.is_alive()
     reader.kill()
-    assert not hangs and reader.exitcode == 0
+    assert not hangs
+    assert reader.exitcode == 0
