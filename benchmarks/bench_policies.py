@@ -28,6 +28,7 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
+from sample_windows import SampleWindows
 from torch import Tensor
 
 from hrc_learn import cli
@@ -259,8 +260,6 @@ class Nearest:
     def __init__(
         self, shown: Sequence[Episode], stats: dict[str, dict[str, Tensor]], chunk: int
     ):
-        from hrc_learn.lerobot.policy.policy_base import SampleWindows
-
         windows = SampleWindows(shown, {STATE: None, ACTION: range(chunk)}, 1)
         everything = windows.batch(torch.arange(len(windows)))
         spread = stats[STATE]["std"]
@@ -352,8 +351,6 @@ def train(
 
     The learning rate falls along a cosine over that time.
     """
-    from hrc_learn.lerobot.policy.policy_base import SampleWindows
-
     config = policy.config
     seen = config.observation_delta_indices
     deltas = {key: seen if key != ACTION else config.action_delta_indices for key in shown[0]}

@@ -27,6 +27,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from sample_windows import SampleWindows
 from torch import Tensor
 from torch.optim.lr_scheduler import CosineAnnealingLR
 
@@ -228,7 +229,7 @@ def _config(name: str, width: int) -> Any:
 
 def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> dict[str, float]:
     """As lerobot-train does it, with batches from memory; mean losses of some tenths of it."""
-    from hrc_learn.lerobot.policy.policy_base import SampleWindows, read_episodes
+    from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     config = policy.config
     episodes = [e | _observation(e[STATE]) for e in read_episodes(dataset, (STATE, ACTION))]

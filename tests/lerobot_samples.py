@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from programs_as_modules import load_program
 from torch import Tensor
 
 from hrc_learn.demos import DatasetWriter
@@ -13,8 +14,8 @@ from hrc_learn.geometry import minimum_jerk
 from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 from hrc_learn.lerobot.policy.dmp_policy import DMPPolicy
 from hrc_learn.lerobot.policy.motion_chunk_policy import MotionChunkPolicy
-from hrc_learn.lerobot.policy.policy_base import SampleWindows
 
+SampleWindows = load_program("benchmarks/sample_windows.py").SampleWindows
 FPS = 20.0
 NAMES = ["a.pos", "b.pos"]
 STATE = "observation.state"
@@ -146,7 +147,7 @@ def shaken(policy: DMPPolicy, seed: int = 0) -> DMPPolicy:
     return policy
 
 
-def windows(policy: DMPPolicy | MotionChunkPolicy, episodes: list[Episode]) -> SampleWindows:
+def windows(policy: DMPPolicy | MotionChunkPolicy, episodes: list[Episode]):
     seen = policy.config.observation_delta_indices
     deltas = {key: seen for key in episodes[0] if key != "action"}
     deltas["action"] = policy.config.action_delta_indices

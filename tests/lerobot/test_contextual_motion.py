@@ -4,12 +4,11 @@ import math
 
 import pytest
 import torch
-from lerobot_samples import reaching, write_dataset
+from lerobot_samples import SampleWindows, reaching, write_dataset
 
-from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
+from hrc_learn.dmp import GaussianBasis, SpringDamper, continue_motion, response_of
 from hrc_learn.lerobot.policy import policy_base
 from hrc_learn.lerobot.policy.contextual_motion import ContextualMotion, fit_closed_form
-from hrc_learn.lerobot.policy.policy_base import SampleWindows
 
 EPISODES = reaching(3)
 DELTAS = {"observation.state": [-1000, 0], "action": [-2, 0, 5], "observation.goal": None}
@@ -63,8 +62,15 @@ def traced(motion, x):
     motion.base.data.copy_(x)  # durations count from it
     p = motion.primitives(x[None])
     time = p.duration[:, None] * torch.linspace(0, 1, 100, dtype=torch.float64)
-    path, _ = motion.continued(
-        p, p.start, p.start_velocity, elapsed=torch.zeros(1).double(), time=time
+    path, _ = continue_motion(
+        motion.response,
+        p.weights,
+        p.goal,
+        p.start,
+        p.start_velocity,
+        duration=p.duration,
+        elapsed=torch.zeros(1).double(),
+        time=time,
     )
     return path[0].detach(), p.duration.log().detach()
 

@@ -33,7 +33,7 @@ from hrc_learn.lerobot.policy.motion_chunks import (
     Plans,
 )
 from hrc_learn.lerobot.policy.observation_encoder import Observation, divisors
-from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig, SampleWindows
+from hrc_learn.lerobot.policy.policy_base import MotionPolicy, MotionPolicyConfig
 
 __all__ = ["MotionChunkConfig", "MotionChunkPolicy", "make_motion_chunk_pre_post_processors"]
 
@@ -454,15 +454,16 @@ class MotionChunkPolicy(MotionPolicy):
             moved = torch.cat([x.diff(dim=0) for x in turned]) / self._step
             rates = (moved / self.encoder.std[: moved.shape[1]]).square().mean(0).sqrt()
             self.velocity_spread.copy_(divisors(rates, SLOWEST))
-        deltas: dict[str, Any] = dict.fromkeys(self.encoder.widths)
-        samples = self.config.chunk_size + 1
-        windows = SampleWindows(episodes, {**deltas, ACTION: range(samples)}, 1 / self._step)
-        every = -(-len(windows) // MOST_CHUNKS)
-        batch = windows.batch(torch.arange(0, len(windows), every))
-        chunks = batch[ACTION][..., self._smooth]
+        columns = {key: torch.cat([e[key] for e in episodes]) for key in episodes[0]}
+        lengths = torch.tensor([len(e[ACTION]) for e in episodes])
+        last = (lengths.cumsum(0) - 1).repeat_interleave(lengths)
+        shown = torch.arange(0, len(last), -(-len(last) // MOST_CHUNKS))
+        ahead = shown[:, None] + torch.arange(self.decoder.samples)
+        chunks = columns[ACTION][torch.minimum(ahead, last[shown, None])][..., self._smooth]
         numbers = chunks.new_zeros(len(chunks), 0)
         if self.encoder.widths:
-            numbers = self.encoder.numbers(self._turned(batch))
+            seen = {key: columns[key][shown] for key in self.encoder.widths}
+            numbers = self.encoder.numbers(self._turned(seen))
         self.network.fit(numbers, self.decoder.project(chunks))
         linear = self.network.linear(numbers).unflatten(-1, self.network.mean.shape)
         planned = self.decoder.positions(linear * self.network.spread + self.network.mean)
