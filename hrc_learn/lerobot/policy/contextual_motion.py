@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
-from hrc_learn.dmp import JointDMP, Response, continue_motion, fit_ridge
+from hrc_learn.dmp import JointDMP, Response, fit_ridge
 
 HARMONICS = 4
 """Sines and cosines of the phase that the network sees."""
@@ -111,27 +111,6 @@ class ContextualMotion(nn.Module):
             start=per_coordinate[..., -2],
             goal=per_coordinate[..., -1],
             duration=duration,
-        )
-
-    def continued(
-        self,
-        primitives: Primitives,
-        position: Float[Tensor, "B A"],
-        velocity: Float[Tensor, "B A"],
-        *,
-        elapsed: Float[Tensor, "B"],
-        time: Float[Tensor, "B T"],
-    ) -> tuple[Float[Tensor, "B T A"], Float[Tensor, "B T A"]]:
-        """Motion of the primitives from here on; see `continue_motion`."""
-        return continue_motion(
-            self.response,
-            primitives.weights,
-            primitives.goal,
-            position,
-            velocity,
-            duration=primitives.duration,
-            elapsed=elapsed,
-            time=time,
         )
 
     def _duration(self, x: Tensor) -> Tensor:
