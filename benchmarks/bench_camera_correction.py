@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import torch
 from lerobot.utils.constants import OBS_STATE
 from rich.console import Console
@@ -92,7 +93,7 @@ def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[
 
     from hrc_learn.demos.read.dataset_folder import read_info
     from hrc_learn.lerobot.camera_watch import add_camera_watch
-    from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
+    from hrc_learn.lerobot.envs import ArmEnvConfig
     from hrc_learn.lerobot.mujoco_arm import MovedCameraConfig
 
     if correct:
@@ -107,7 +108,7 @@ def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[
         scene = ArmEnvConfig(
             task="grasping", fps=fps, pixels=True, marker=True, hand=True, moved_camera=camera
         )
-        env, grasped_now = ArmEnv(**scene.gym_kwargs), []
+        env, grasped_now = gym.make(scene.gym_id, **scene.gym_kwargs), []
         for k in range(args.episodes):
             for part in (before, policy, after):
                 part.reset()

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import gymnasium as gym
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -255,9 +256,7 @@ def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> d
 def _do(
     act: Callable[[Tensor | None], Any], config: ArmEnvConfig, count: int, title: str
 ) -> list[Done]:
-    from hrc_learn.lerobot.envs import ArmEnv
-
-    env, done = ArmEnv(**config.gym_kwargs), []
+    env, done = gym.make(config.gym_id, **config.gym_kwargs), []
     for seed in track(range(HELD_OUT, HELD_OUT + count), title):
         act(None)
         seen, _ = env.reset(seed=seed)

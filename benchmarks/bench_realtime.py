@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from bench_policies import ACTION, STATE, config_of, statistics, train
@@ -72,7 +73,7 @@ type Stepper = Callable[[dict[str, Any]], tuple[np.ndarray, bool]]
 
 
 def main(args: Args) -> None:
-    from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
+    from hrc_learn.lerobot.envs import ArmEnvConfig
     from hrc_learn.lerobot.policy.policy_base import read_episodes
 
     torch.set_num_threads(1)
@@ -82,7 +83,7 @@ def main(args: Args) -> None:
     config = ArmEnvConfig(task=args.scenario, fps=round(_fps(args.data)))
     policy, steps, seconds = _learn(shown, config.fps, args)
     Console().print(f"motion_chunk: {steps} steps of training, {seconds:.0f} s of CPU")
-    env = ArmEnv(**config.gym_kwargs)
+    env = gym.make(config.gym_id, **config.gym_kwargs)
     late = round(args.delay * config.fps)
     ways: dict[str, Callable[[], Stepper]] = {
         **{f"every {n}": lambda n=n: _selecting(policy, n) for n in args.periods},

@@ -30,9 +30,9 @@ class Grasping:
         config = ArmEnvConfig(task="grasping", pixels=True, fps=round(self.fps))
         settings = config.gym_kwargs
         settings["config"].id = f"{next(_COUNT)}"
-        self._env = ArmEnv(**settings)
+        self._env = ArmEnv(settings["config"])
         self.expert: Expert = _Expert(settings["config"].id)
-        self.longest = self._env._max_episode_steps
+        self.longest = settings["max_episode_steps"]
         self.n_actions = config.features[ACTION].shape[0]
 
     def begin(self, seed: int) -> Observation:

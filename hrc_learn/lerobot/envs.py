@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from jaxtyping import Float, UInt8
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
@@ -23,6 +21,7 @@ from hrc_learn.lerobot.mujoco_arm import (
 )
 from hrc_learn.teleoperation.scenarios import ScenarioView, make_scenario
 
+_GYM_ID = "hrc_learn/mujoco_arm"
 _MORE_TIME = 1.25
 """Time limit of a policy, in durations of a demonstration."""
 
@@ -68,6 +67,10 @@ class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
         )
 
     @property
+    def gym_id(self) -> str:
+        return _GYM_ID
+
+    @property
     def gym_kwargs(self) -> dict[str, Any]:
         return {"config": self.robot_config(), "max_episode_steps": self._length()}
 
@@ -77,20 +80,6 @@ class ArmEnvConfig(WorkplaceConfig, ValuesConfig, EnvConfig):
         robot = self.robot_config()
         duration = make_scenario(robot.scenario, robot.shelf, robot.work_arm()).duration
         return round(_MORE_TIME * duration * self.fps)
-
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One vector of environments that differ by their seeds."""
-        makers = [partial(ArmEnv, **self.gym_kwargs)] * n_envs
-        mode = AutoresetMode.SAME_STEP
-        if use_async_envs and n_envs > 1:
-            vector = gym.vector.AsyncVectorEnv(
-                makers, autoreset_mode=mode, context="forkserver"
-            )
-        else:
-            vector = gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
-        return {self.type: {0: vector}}
 
 
 _PICTURE = (240, 180)
@@ -105,19 +94,17 @@ class ArmEnv(gym.Env):
     The same seed and actions lead to the same end.
     """
 
-    def __init__(self, config: MujocoArmRobotConfig, max_episode_steps: int):
+    def __init__(self, config: MujocoArmRobotConfig):
         """Set up.
 
         Args:
             config: Configuration of the robot, with the scenario.
-            max_episode_steps: Actions after which an episode has failed.
         """
         self._robot = MujocoArmRobot(config)
         self._robot.judged = False
         self._robot.connect()
         self._actions = tuple(self._robot.action_features)
-        self._max_episode_steps = max_episode_steps
-        self._steps = self._done = 0
+        self._done = 0
         self._view: ScenarioView | None = None
         self.task = config.scenario
         self.task_description = self._robot.run.scenario.task
@@ -140,7 +127,7 @@ class ArmEnv(gym.Env):
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         self._robot.begin(seed)
-        self._steps = self._done = 0
+        self._done = 0
         return self._observation(), {"is_success": False}
 
     def step(
@@ -150,11 +137,9 @@ class ArmEnv(gym.Env):
         self._robot.send_action(
             dict(zip(self._actions, np.asarray(action).tolist(), strict=True))
         )
-        self._steps += 1
         self._done = self._done + 1 if self._robot.run.succeeded() else 0
         success = self._done * self._robot.dt >= _STEADY
-        late = self._steps >= self._max_episode_steps and not success
-        return self._observation(), float(success), success, late, {"is_success": success}
+        return self._observation(), float(success), success, False, {"is_success": success}
 
     def render(self) -> UInt8[np.ndarray, "height width 3"]:
         """A picture of the workplace."""
@@ -174,6 +159,9 @@ class ArmEnv(gym.Env):
         if CAMERA in values:
             observation["pixels"] = {CAMERA: values[CAMERA]}
         return observation
+
+
+gym.register(_GYM_ID, ArmEnv)
 
 
 def _unbounded(size: int) -> gym.spaces.Box:

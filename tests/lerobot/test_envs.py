@@ -66,7 +66,7 @@ def test_an_episode_ends_when_its_time_is_up():
 
 def environment(**settings):
     config = ArmEnvConfig(task="grasping", fps=FPS, **settings)
-    return config, ArmEnv(**config.gym_kwargs)
+    return config, ArmEnv(config.robot_config())
 
 
 def held(env):
@@ -145,9 +145,9 @@ def test_a_vector_has_environments_of_its_own():
     assert isinstance(vector, SyncVectorEnv)
     state, _ = vector.reset(seed=[1, 2])
     assert state["agent_pos"].shape[0] == 2
-    assert [env._robot.run.seed for env in vector.envs] == [1, 2]
+    assert [env.unwrapped._robot.run.seed for env in vector.envs] == [1, 2]
     vector.close()
     (one,) = ArmEnvConfig(task=None).create_envs(1, use_async_envs=True)["mujoco_arm"].values()
     assert isinstance(one, SyncVectorEnv)
-    assert one.envs[0].task == "placing"
+    assert one.get_attr("task") == ("placing",)
     one.close()
