@@ -202,7 +202,7 @@ class Multiplication:
         if self.judge.scene:
             widest = max(widths, default=1.0)
             physics = Judges(self.judge, self.choice, self.source.fps, widest)
-        with writer, physics as judges, Progress(transient=True) as progress:
+        with writer.claimed(), physics as judges, Progress(transient=True) as progress:
             bar, done = progress.add_task("Multiplying", total=wanted), len(writer.provenance)
             first = 1 + writer.provenance[-1]["attempt"] if done else 0
             failed: dict[int, str] = {}

@@ -6,7 +6,8 @@ provenance in the list of episodes, so that an interrupted job goes on where it 
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from hrc_learn.demos import DemonstrationSource
 from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.dataset_arm import DatasetArm
 from hrc_learn.demos.dataset_assembly import begin, discard, finish
+from hrc_learn.demos.read.columns import column_places
 from hrc_learn.demos.read.dataset_folder import staging_folder
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.metadata import INDEX_FEATURES, Sidecar, read_sidecar
@@ -80,16 +82,11 @@ class MultipliedColumns:
         self._old = {key: f for key, f in known.items() if key not in (*INDEX_KEYS, *lost)}
         read = read_frames(source.folder, source.entries, [*self._old])
         self._frames: list[RawFrames] = [frames for _, frames in read]
-        found = self._object_columns(objects)
-        self._places |= {f"object {name}": places for name, places in found.items()}
-        self.objects = {
-            name: pose_of(
-                torch.from_numpy(
-                    np.stack([self._first(places, main) for main in range(len(source))])
-                )
-            )
-            for name, places in found.items()
-        }
+        self.objects: dict[str, Pose] = {}
+        for name, places in self._object_columns(objects).items():
+            self._places[f"object {name}"] = places
+            first = np.stack([self._first(places, main) for main in range(len(source))])
+            self.objects[name] = pose_of(torch.from_numpy(first))
         # A command of the tool is its next pose, as LeRobot's robots take it.
         shown = {
             self._old[k].component(i): (r, n)
@@ -105,16 +102,12 @@ class MultipliedColumns:
         names = {k: np.array([f.names or [""] * f.width], object) for k, f in self._old.items()}
         if not self._same:
             self._rename(names)
-        self.features = {
-            key: {
-                "dtype": feature.dtype,
-                "shape": [names[key].shape[1]]
-                if names[key].shape[1] != feature.width
-                else list(feature.shape),
-                "names": feature.names and names[key][0].tolist(),
-            }
-            for key, feature in self._old.items()
-        }
+        self.features = {}
+        for key, feature in self._old.items():
+            width, named = names[key].shape[1], names[key][0].tolist()
+            shape = list(feature.shape) if width == feature.width else [width]
+            content = {"dtype": feature.dtype, "shape": shape, "names": feature.names and named}
+            self.features[key] = content
 
     def _object_columns(self, given: Mapping[str, str]) -> dict[str, list[Place]]:
         """Components of the pose of each object."""
@@ -131,14 +124,10 @@ class MultipliedColumns:
             if {"x", "y", "z"} <= axes.keys() and len(axes) in (3, 6, 7)
         }
         for name, text in given.items():
-            match = re.fullmatch(r"(.+)\[(\d+):(\d+)\]", text)
-            numbers = range(int(match[2]), int(match[3])) if match else range(0)
-            if not match or match[1] not in self._old or len(numbers) not in (3, 6, 7):
-                raise ValueError(
-                    f"objects.{name}.columns={text!r} must be FEATURE[FIRST:LAST] of 3, 6 or 7 "
-                    f"columns; features are {', '.join(self._old)}"
-                )
-            places[name] = [(match[1], i) for i in numbers]
+            option, root = f"objects.{name}.columns", self._source.folder.root
+            places[name] = column_places(option, text, self._old, root)
+            if len(places[name]) not in (3, 6, 7):
+                raise ValueError(f"{option}={text!r} must be of 3, 6 or 7 columns")
         return places
 
     def _first(self, places: Sequence[Place], main: int) -> Float[np.ndarray, " numbers"]:
@@ -163,12 +152,9 @@ class MultipliedColumns:
             key, columns = self._places[role][0][0], [i for _, i in self._places[role]]
             if self._same:
                 made[key][:, columns] = values[role]
-            else:
-                rest, at = (
-                    np.delete(made[key], columns, 1),
-                    [min(columns)] * values[role].shape[1],
-                )
-                made[key] = np.insert(rest, at, values[role], axis=1)
+                continue
+            at = [min(columns)] * values[role].shape[1]
+            made[key] = np.insert(np.delete(made[key], columns, 1), at, values[role], axis=1)
 
     def gripper(self, main: int, phase: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
         """Commanded opening of the gripper, or the measured one if none was commanded."""
@@ -233,9 +219,7 @@ class MultipliedColumns:
             made[key][:, i] = np.append(new[role][1:, number], new[role][-1, number])
         rates = [np.gradient(q, 1 / self._source.fps, axis=0) for q in (joints, sent)]
         moved = dict(zip(_JOINTS, (joints, rates[0], sent, rates[1]), strict=True))
-        moved = {
-            role: self._on_disk(role, x) for role, x in moved.items() if role in self._places
-        }
+        moved = {r: self._on_disk(r, x) for r, x in moved.items() if r in self._places}
         self._put_joints(made, moved)
         return made
 
@@ -291,7 +275,7 @@ class MultipliedWriter:
         source: DemonstrationSource,
         made_by: Mapping[str, Any],
     ):
-        """Describe the dataset; entering the context claims its folder.
+        """Describe the dataset; `claimed` begins to write it.
 
         Args:
             root: Folder of the dataset.
@@ -320,24 +304,27 @@ class MultipliedWriter:
         self.root, self.provenance, self._frames = root, [], 0
         self._staging, self._tasks = staging_folder(root), {}
 
-    def __enter__(self) -> "MultipliedWriter":
-        """Claim the folder, and continue an interrupted recording.
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Claim the folder, continue an interrupted recording, and make the dataset at the end.
 
         Raises:
             BusyError: Another process writes there.
             FileExistsError: There is something else.
         """
         self.root.parent.mkdir(parents=True, exist_ok=True)
-        self._claim = Claim(self.root)
-        try:
+        with Claim(self.root) as claim:
             if any(self._staging.glob("episode_*.parquet")) and not self.root.exists():
                 self._continue()
             else:
                 begin(self.root, None)
-        except BaseException:
-            self._claim.release()
-            raise
-        return self
+            try:
+                yield
+            except BaseException:
+                if not self.provenance:
+                    discard(self._staging)
+                raise
+            finish(self.root, claim)
 
     def _continue(self) -> None:
         for path in recorded.staged_paths(self._staging):
@@ -366,10 +353,3 @@ class MultipliedWriter:
             path, self.header, values, ([task], index), self._frames, provenance=origin
         )
         self._add(origin, task, frames)
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        with self._claim:
-            if kind is None:
-                finish(self.root, self._claim)
-            elif not self.provenance:
-                discard(self._staging)
