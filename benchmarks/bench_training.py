@@ -19,7 +19,7 @@ from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter, Demonstration, open_demos
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianFitConfig, RBFCenters, RBFImageJacobian
-from hrc_learn.learning.large_datasets import fit_streamed
+from hrc_learn.learning.primitive_fitting import fit_streamed
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 
 JOINTS = tuple(f"joint{i + 1}" for i in range(7))

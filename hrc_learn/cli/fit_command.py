@@ -16,9 +16,13 @@ from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.source import open_dataset
 from hrc_learn.learning.fit_dashboards import fit_report, record_fit, shown_fit
-from hrc_learn.learning.large_datasets import fit_streamed, sampled
 from hrc_learn.learning.model_choice import best_models, keep_best
-from hrc_learn.learning.primitive_fitting import CHANNELS, FittedPrimitives
+from hrc_learn.learning.primitive_fitting import (
+    CHANNELS,
+    FittedPrimitives,
+    fit_streamed,
+    sampled,
+)
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz.report import (

@@ -16,9 +16,8 @@ from hrc_learn.cli.arguments import Evaluate, FitPrimitives, Smooth, columns
 from hrc_learn.cli.fit_command import fit_silently
 from hrc_learn.demos import DemonstrationSet, open_demos
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.large_datasets import sampled
 from hrc_learn.learning.model_choice import best_models, predict
-from hrc_learn.learning.primitive_fitting import CHANNELS, Motions
+from hrc_learn.learning.primitive_fitting import CHANNELS, Motions, sampled
 from hrc_learn.learning.reproduction_error import ReproductionError
 from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure

@@ -9,14 +9,14 @@ import torch
 from hrc_learn.demos import DatasetWriter, Demonstration, DemonstrationSet, open_demos
 from hrc_learn.dmp import JointDMP, LearnedMotion, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
-from hrc_learn.learning import large_datasets
-from hrc_learn.learning.large_datasets import sampled
+from hrc_learn.learning import primitive_fitting
 from hrc_learn.learning.model_choice import contexts, keep_best
 from hrc_learn.learning.primitive_fitting import (
     EACH,
     Motions,
     fit_primitives,
     load_primitive,
+    sampled,
 )
 from hrc_learn.learning.reproduction_error import Reproduction
 
@@ -137,7 +137,7 @@ def test_errors_of_a_known_offset(demos):
 
 def big_set(root, monkeypatch, episodes=11):
     """Poses on disk, of several lengths, of which three and no more fit into memory."""
-    monkeypatch.setattr(large_datasets, "HELD_AT_ONCE", 3 * 110 * 7)
+    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 3 * 110 * 7)
     with DatasetWriter(root, fps=60, robot_type="hand", joint_names=[]) as writer:
         for episode in range(episodes):
             demo = demonstration(episode, 90 + 10 * (episode % 3))
@@ -162,9 +162,9 @@ def test_a_sample_stands_for_more_than_fit_into_memory(tmp_path, monkeypatch):
 
 
 def test_of_demonstrations_too_long_to_hold_some_frames_are_fitted(tmp_path, monkeypatch):
-    monkeypatch.setattr(large_datasets, "LONGEST", 60)
+    monkeypatch.setattr(primitive_fitting, "LONGEST", 60)
     source = big_set(tmp_path / "set", monkeypatch, episodes=2)
-    monkeypatch.setattr(large_datasets, "HELD_AT_ONCE", 60 * 7)
+    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 60 * 7)
     (demo,) = sampled(source)
     whole = source[0]
     assert len(demo) == 60
@@ -179,6 +179,6 @@ def test_of_demonstrations_too_long_to_hold_some_frames_are_fitted(tmp_path, mon
 
 def test_few_are_loaded_as_they_are(tmp_path, monkeypatch):
     source = big_set(tmp_path / "set", monkeypatch)
-    monkeypatch.setattr(large_datasets, "HELD_AT_ONCE", 11 * 110 * 7)
+    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 11 * 110 * 7)
     assert len(sampled(source)) == 11
     assert sampled(source).notes == source.notes
