@@ -22,6 +22,7 @@ UPLOADED = ("data/**", "videos/**", "images/**", "meta/**", "LICENSE*", "*.md")
 """Files that belong to a dataset. `push_dataset` does not upload other files, and deletes those
 in the four folders from the repository if the dataset no longer has them."""
 _CARD = "README.md"
+_TEMPLATE = Path(__file__).with_name("dataset_card.md")
 _MOST_TASKS = 20
 """Largest number of tasks that the card lists."""
 
@@ -152,14 +153,26 @@ def dataset_card(
         license: Identifier of the licence.
         tags: Tags besides "LeRobot" and the robot's name.
     """
-    from huggingface_hub import DatasetCard
+    from huggingface_hub import DatasetCard, DatasetCardData
 
     own = folder.root / _CARD
     if own.is_file():
         card = DatasetCard(own.read_text(encoding="utf-8"), ignore_metadata_errors=True)
     else:
-        body = "\n".join(_body(folder, report, repo))
-        card = DatasetCard(f"---\n{{}}\n---\n\n{body}\n")
+        shown = Counter(task for entry in folder.episodes for task in entry.tasks)
+        *findings, _ = report.lines()
+        card = DatasetCard.from_template(
+            DatasetCardData(),
+            template_path=str(_TEMPLATE),
+            repo=repo,
+            folder=folder,
+            frames=sum(entry.length for entry in folder.episodes),
+            tasks=shown.most_common(_MOST_TASKS),
+            cameras=[feature for feature in folder.features.values() if feature.is_picture],
+            report=report,
+            findings=findings,
+            cell=_cell,
+        )
     head: Any = card.data
     if license is not None:
         head.license = license
@@ -174,37 +187,6 @@ def dataset_card(
     return card
 
 
-def _body(folder: DatasetFolder, report: ValidationReport, repo: str) -> Iterator[str]:
-    frames = sum(entry.length for entry in folder.episodes)
-    robot = plain_text(folder.robot_type or "unknown robot")
-    yield (
-        f"# {repo.split('/')[1]}\n\n{len(folder.episodes)} demonstrations by {robot}, {frames} "
-        f"frames at {folder.fps:g} Hz ({frames / folder.fps / 60:.1f} min), in the LeRobot "
-        f"format {folder.version}.\n"
-    )
-    shown = Counter(task for entry in folder.episodes for task in entry.tasks)
-    for task, count in shown.most_common(_MOST_TASKS):
-        yield f"- {_cell(task)} ({count} episodes)"
-    for feature in filter(lambda feature: feature.is_picture, folder.features.values()):
-        size = " x ".join(map(str, feature.shape))
-        yield f"- camera `{_cell(feature.key)}`: {size}, stored as {feature.dtype}"
-    if report.contract is not None:
-        header, *rows = report.contract.rows()
-        yield (
-            "\n## Columns\n\nLeRobot datasets declare no units. These units were declared by "
-            f"the author or inferred from the values.\n\n| {' | '.join(header)} |"
-        )
-        yield f"|{' --- |' * len(header)}"
-        yield from (f"| {' | '.join(map(_cell, row))} |" for row in rows)
-    counts = f"{len(report.errors)} errors, {len(report.warnings)} warnings"
-    yield f"\n## Check\n\n`hrc check`: {counts}.\n"
-    *findings, _ = report.lines()
-    yield from (f"- {_cell(line)}" for line in findings)
-    yield (
-        "\n## Use\n\n```python\nfrom lerobot.datasets.lerobot_dataset import LeRobotDataset\n\n"
-        f'dataset = LeRobotDataset("{repo}")\n```'
-    )
-
-
 def _cell(text: str) -> str:
+    """Text from a dataset, safe in a table of the card."""
     return plain_text(text).replace("|", "\\|").replace("<", "&lt;")
