@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 from hrc_learn import store
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read import metadata
+from hrc_learn.demos.read.contract import Sidecar, read_sidecar
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
 from hrc_learn.demos.read.dataset_folder import (
     episode_lists,
@@ -70,7 +71,7 @@ def assemble(
     if earlier is not None:
         _carry_over(earlier, listed, cameras)
         # The longer dataset keeps the details and the contract of the earlier one.
-        before = metadata.read_sidecar(earlier)
+        before = read_sidecar(earlier)
         details = before.details | sidecar.details
         sidecar = replace(sidecar, details=details, contract=before.contract)
     listed.tasks |= dict.fromkeys(tasks)
@@ -212,7 +213,7 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _write_metadata(
-    target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: metadata.Sidecar
+    target: Path, header: RecordingHeader, listed: _EpisodeList, sidecar: Sidecar
 ) -> None:
     table, tasks = listed.table(), list(listed.tasks)
     metadata.write_tasks(target / "meta/tasks.parquet", tasks)
@@ -234,7 +235,7 @@ def _write_metadata(
             key, _, statistic = name.removeprefix("stats/").rpartition("/")
             stacked.setdefault(key, {})[statistic] = np.array(column.to_pylist())
     metadata.dump_json(target / "meta/stats.json", metadata.combined_statistics(stacked))
-    if sidecar != metadata.Sidecar():
+    if sidecar != Sidecar():
         metadata.dump_json(target / metadata.SIDECAR_PATH, sidecar)
 
 

@@ -10,18 +10,14 @@ from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.dataset_assembly import begin, discard, finish
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.contract import Sidecar, SidecarColumn, read_sidecar
 from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
     open_folder,
     recovery_advice,
     staging_folder,
 )
-from hrc_learn.demos.read.metadata import (
-    INDEX_FEATURES,
-    Sidecar,
-    SidecarColumn,
-    read_sidecar,
-)
+from hrc_learn.demos.read.metadata import INDEX_FEATURES
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.videos import CameraRecorder, Image, video_features
 from hrc_learn.store import DATASET, Claim

@@ -12,8 +12,9 @@ from jaxtyping import Float64, Int64, Shaped
 
 from hrc_learn.demos.demonstration import float_array
 from hrc_learn.demos.issues import DatasetError
+from hrc_learn.demos.read.contract import Sidecar
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table, write_parquet
-from hrc_learn.demos.read.metadata import Sidecar, Statistics, episode_statistics
+from hrc_learn.demos.read.metadata import Statistics, episode_statistics
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file, parse_json

@@ -14,7 +14,6 @@ from jaxtyping import Float64
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.read.columns import ColumnSelection, map_columns, replaced_roles
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
-from hrc_learn.demos.read.metadata import Sidecar
 from hrc_learn.demos.read.naming import joint_of
 from hrc_learn.demos.read.profiles import track
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, ROLES
@@ -139,7 +138,7 @@ def _by_name(
             if one.kind == "number" and name not in given and not is_time(name, one)
         }
     )
-    found = map_columns(search.features, Sidecar())
+    found = map_columns(search.features)
     taken = replaced_roles(dict.fromkeys(explicit))
     meaning = Meaning(
         selections={

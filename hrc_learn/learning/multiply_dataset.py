@@ -20,9 +20,10 @@ from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.dataset_arm import DatasetArm
 from hrc_learn.demos.dataset_assembly import begin, discard, finish
 from hrc_learn.demos.read.columns import column_places
+from hrc_learn.demos.read.contract import Sidecar, read_sidecar
 from hrc_learn.demos.read.dataset_folder import staging_folder
 from hrc_learn.demos.read.frames import RawFrames, read_frames
-from hrc_learn.demos.read.metadata import INDEX_FEATURES, Sidecar, read_sidecar
+from hrc_learn.demos.read.metadata import INDEX_FEATURES
 from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import Arm

@@ -19,7 +19,7 @@ from hrc_learn.demos import (
     load_demos,
     recover_all,
 )
-from hrc_learn.demos.read.metadata import read_sidecar
+from hrc_learn.demos.read.contract import read_sidecar
 
 # Whole datasets are written and read; shapes are checked in the other tests of this folder.
 pytestmark = pytest.mark.simulation

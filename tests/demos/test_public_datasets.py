@@ -13,7 +13,7 @@ import pytest
 
 from hrc_learn.demos.read.columns import map_columns
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
-from hrc_learn.demos.read.metadata import Sidecar, read_features
+from hrc_learn.demos.read.metadata import read_features
 from hrc_learn.demos.read.units import units_from_episodes
 
 SO101 = [f"{j}.pos" for j in ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex")] + [
@@ -383,7 +383,7 @@ def decide(robot_type, vectors):
             for key, v in vectors.items()
         }
     }
-    columns = map_columns(read_features(info), Sidecar())
+    columns = map_columns(read_features(info))
     way = np.clip(1.2 * np.sin(np.linspace(0, 3, 300)) - 0.1, 0, 1)[:, None]
     values = {k: np.array(v.low) + way * np.subtract(v.high, v.low) for k, v in vectors.items()}
     for key, v in vectors.items():

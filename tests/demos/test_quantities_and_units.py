@@ -7,7 +7,7 @@ import pytest
 
 from hrc_learn.demos.read.columns import ColumnSelection, map_columns
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
-from hrc_learn.demos.read.metadata import Feature, Sidecar
+from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.naming import (
     ComponentMeaning,
     is_hand,
@@ -293,7 +293,7 @@ def mapped(state, action):
         key: Feature(key=key, dtype="float32", shape=(len(names),), names=tuple(names))
         for key, names in (("observation.state", state), ("action", action))
     }
-    columns = map_columns(features, Sidecar())
+    columns = map_columns(features)
     return columns.joint_names, " ".join(columns.notes)
 
 

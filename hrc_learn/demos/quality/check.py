@@ -17,7 +17,7 @@ from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
 from hrc_learn.demos.read.contract import infer_contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry
 from hrc_learn.demos.read.frames import RawFrames, select_quantities
-from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar
+from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.profiles import (
     EpisodeProfile,
     FeatureProfiles,
@@ -83,7 +83,7 @@ def check_dataset(
     for check in METADATA_CHECKS:
         report.run(check, folder)
     # A wrong mapping is no fault of the data; without a sound sidecar, names have to do.
-    columns = map_columns(folder.features, Sidecar(), mapping)
+    columns = map_columns(folder.features, mapping)
     dataset = report.attempt(lambda: OpenedDataset.of(folder, mapping))
     dataset = dataset or OpenedDataset(folder=folder, columns=columns)
     report.attempt(lambda: check_videos(folder, report))

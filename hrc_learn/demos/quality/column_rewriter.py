@@ -12,13 +12,17 @@ from hrc_learn.demos import recorded_episode as recorded
 from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.episode_edits import EpisodeEdit
-from hrc_learn.demos.read.contract import Contract, fingerprint, keep_contract
+from hrc_learn.demos.read.contract import (
+    Contract,
+    SidecarColumn,
+    fingerprint,
+    keep_contract,
+)
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, open_folder, recorded_statistics
 from hrc_learn.demos.read.metadata import (
     INDEX_FEATURES,
     NUMERIC,
-    SidecarColumn,
     image_statistics,
 )
 from hrc_learn.demos.read.quantities import INDEX_KEYS

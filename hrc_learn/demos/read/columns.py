@@ -14,7 +14,7 @@ from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read import naming
 from hrc_learn.demos.read.dataset_files import INFO_PATH
-from hrc_learn.demos.read.metadata import Feature, Sidecar
+from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.demos.read.naming import ComponentMeaning
 from hrc_learn.demos.read.quantities import INDEX_KEYS, ORIENTATION_ROLES, ROLES
 
@@ -84,33 +84,22 @@ class ColumnMapping:
 
 def map_columns(
     features: Mapping[str, Feature],
-    sidecar: Sidecar,
     mapping: MappingSpec | None = None,
-    kept: Mapping[str, ColumnSelection] | None = None,
+    declared: Mapping[str, ColumnSelection] | None = None,
 ) -> ColumnMapping:
     """Find the quantities among the features.
 
     Args:
         features: Features declared by the dataset.
-        sidecar: Declaration of our own writer; its columns make guesses unnecessary.
         mapping: Role -> columns, as in `load_demos`; None as columns leaves a role out.
-        kept: Columns of a contract kept with the dataset; replaces all guesses.
+        declared: Columns of quantities that the dataset declares; replaces all guesses.
 
     Raises:
-        DatasetError: The mapping or the sidecar names a role or column that does not exist.
+        DatasetError: The mapping names a role or column that does not exist.
     """
     usable = {k: f for k, f in features.items() if f.numeric and k not in INDEX_KEYS}
     notes: list[str] = []
-    if kept is not None:
-        found = dict(kept)
-    elif sidecar.columns:
-        declared = {
-            role: [f"{column.key}/{name}" for name in column.names]
-            for role, column in sidecar.columns.items()
-        }
-        found = parse_mapping(declared, usable)
-    else:
-        found = _Conventions(notes).find(usable)
+    found = _Conventions(notes).find(usable) if declared is None else dict(declared)
     replaced = replaced_roles(mapping or {})
     found = {role: selection for role, selection in found.items() if role not in replaced}
     found |= parse_mapping(mapping or {}, usable)

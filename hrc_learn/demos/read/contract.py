@@ -1,7 +1,8 @@
 """Contract of a dataset: the meaning of every column, inferred once and kept with the data.
 
-LeRobot declares neither units nor meanings. A contract states role, unit, range, sign and delay
-of each component, with the evidence and a confidence. It is kept in `meta/hrc_learn.json`, may
+LeRobot declares neither units, meanings nor reference frames, and drops unknown fields from its
+own files. A sidecar, `meta/hrc_learn.json`, holds what the writer declared, and the contract:
+role, unit, range, sign and delay of each component, with the evidence and a confidence. It may
 be edited there, and every reader of the dataset obeys it.
 """
 
@@ -9,7 +10,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Literal
@@ -17,15 +18,15 @@ from typing import Literal
 import numpy as np
 
 from hrc_learn.demos.issues import DatasetError, aligned, plain_text
-from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection
+from hrc_learn.demos.read.columns import ColumnMapping, ColumnSelection, parse_mapping
 from hrc_learn.demos.read.dataset_folder import DatasetFolder
-from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json, read_sidecar
+from hrc_learn.demos.read.metadata import SIDECAR_PATH, Feature, dump_json
 from hrc_learn.demos.read.naming import is_hand, joint_of
 from hrc_learn.demos.read.profiles import EpisodeProfile, FeatureProfiles
 from hrc_learn.demos.read.quantities import ROLES
 from hrc_learn.demos.read.unit_evidence import CONFIDENT
 from hrc_learn.demos.read.units import UnitDecision, units_of
-from hrc_learn.store import Count, new_file
+from hrc_learn.store import Count, new_file, read_json
 
 _QUANTITIES = {
     "arm": "joint_position",
@@ -203,25 +204,68 @@ def _faulty(message: str) -> DatasetError:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ContractPart:
-    """The part of the sidecar that holds the contract."""
+class SidecarColumn:
+    """Columns that hold one quantity."""
 
+    key: str
+    """Feature."""
+    names: tuple[str, ...]
+    """Its components."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sidecar:
+    """Units and meaning of columns, declared by the writer or kept after a check."""
+
+    format: Literal[1] = 1
+    units: dict[str, str] = field(default_factory=dict)
+    """Unit on disk of each role."""
+    columns: dict[str, SidecarColumn] = field(default_factory=dict)
+    """Columns of each role."""
+    joint_names: tuple[str, ...] = ()
+    frames: dict[str, str] = field(default_factory=dict)
+    """Reference frames of the poses: "base" and "ee"."""
+    details: dict = field(default_factory=dict)
+    """Further values given to the writer."""
     contract: Contract = Contract()
+    """Meaning of each component; takes precedence over `units` and `columns`."""
+
+    def selections(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection] | None:
+        """Columns of each quantity; None if nothing is declared.
+
+        Raises:
+            DatasetError: A declared column does not exist, or a quantity has too many or too
+                few.
+        """
+        if self.contract.components:
+            return self.contract.selections(features)
+        declared = {
+            role: [f"{column.key}/{name}" for name in column.names]
+            for role, column in self.columns.items()
+        }
+        return parse_mapping(declared, features) if declared else None
 
 
-def read_contract(root: Path) -> Contract | None:
-    """Contract kept with a dataset, or None.
+def read_sidecar(root: Path) -> Sidecar:
+    """The dataset's sidecar, empty if there is no file.
 
     Raises:
-        DatasetError: The contract is damaged, or names a role that does not exist.
+        DatasetError: The file is damaged, was edited wrongly, or names a role that does not
+            exist; names the field.
     """
-    contract = read_sidecar(root, _ContractPart).contract
-    return contract if contract.components else None
+    path = root / SIDECAR_PATH
+    if not path.exists():
+        return Sidecar()
+    try:
+        return read_json(path, Sidecar, "edit it, or delete it to have units guessed")
+    except ValueError as error:
+        message = str(error).removeprefix(f"{path}: ")
+        raise DatasetError(message, file=SIDECAR_PATH) from error
 
 
 def keep_contract(root: Path, contract: Contract) -> None:
     """Write the contract into the sidecar, keeping the rest of its content."""
-    sidecar = replace(read_sidecar(root), contract=asdict(contract))
+    sidecar = replace(read_sidecar(root), contract=contract)
     with new_file(root / SIDECAR_PATH) as part:
         dump_json(part, sidecar)
 

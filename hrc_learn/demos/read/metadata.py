@@ -1,23 +1,19 @@
-"""Metadata of a dataset: declared features, our sidecar, and the layout of version 3.0.
+"""Metadata of a dataset: declared features, and the layout of version 3.0.
 
-    data/chunk-000/file-000.parquet            frames, one row group per episode
-    meta/info.json                             features, frame rate, counts
-    meta/stats.json                            statistics of every feature
-    meta/tasks.parquet                         task texts by index
-    meta/episodes/chunk-000/file-000.parquet   place and statistics of each episode
-    meta/hrc_learn.json                        sidecar: units, frames, meaning of columns
-
-LeRobot declares neither units nor reference frames, and drops unknown fields from its own
-files; the sidecar holds them.
+data/chunk-000/file-000.parquet            frames, one row group per episode
+meta/info.json                             features, frame rate, counts
+meta/stats.json                            statistics of every feature
+meta/tasks.parquet                         task texts by index
+meta/episodes/chunk-000/file-000.parquet   place and statistics of each episode
+meta/hrc_learn.json                        sidecar (`read.contract`)
 """
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from functools import partial
 from math import prod
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +21,6 @@ from jaxtyping import Shaped, UInt8
 
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.read.dataset_files import INFO_PATH, write_parquet
-from hrc_learn.store import read_json
 
 NUMERIC = ("float", "int", "uint", "bool")
 """Prefixes of the dtypes of numbers."""
@@ -105,54 +100,6 @@ def flatten_names(names: object) -> tuple[str, ...] | None:
     if not isinstance(names, list | tuple):
         return (str(names),)
     return tuple(name for item in names for name in flatten_names(item) or ())
-
-
-@dataclass(frozen=True, kw_only=True)
-class SidecarColumn:
-    """Columns that hold one quantity."""
-
-    key: str
-    """Feature."""
-    names: tuple[str, ...]
-    """Its components."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sidecar:
-    """Units and meaning of a dataset's columns, as declared by its writer."""
-
-    format: Literal[1] = 1
-    units: dict[str, str] = field(default_factory=dict)
-    """Unit on disk of each role."""
-    columns: dict[str, SidecarColumn] = field(default_factory=dict)
-    """Columns of each role."""
-    joint_names: tuple[str, ...] = ()
-    frames: dict[str, str] = field(default_factory=dict)
-    """Reference frames of the poses: "base" and "ee"."""
-    details: dict = field(default_factory=dict)
-    """Further values given to the writer."""
-    contract: dict = field(default_factory=dict)
-    """Meaning of each component, as in `read.contract`; {} if none is kept."""
-
-
-def read_sidecar[T](root: Path, schema: type[T] = Sidecar) -> T:
-    """The dataset's sidecar, empty if there is no file.
-
-    Args:
-        root: Folder of the dataset.
-        schema: Dataclass of the wanted part of its content, with a default for each field.
-
-    Raises:
-        DatasetError: The file is damaged, or was edited wrongly; names the field.
-    """
-    path = root / SIDECAR_PATH
-    if not path.exists():
-        return schema()
-    try:
-        return read_json(path, schema, "edit it, or delete it to have units guessed")
-    except ValueError as error:
-        message = str(error).removeprefix(f"{path}: ")
-        raise DatasetError(message, file=SIDECAR_PATH) from error
 
 
 VERSION = "v3.0"

@@ -18,7 +18,7 @@ from hrc_learn.demos.demonstration import (
 from hrc_learn.demos.image_features import extracted_features
 from hrc_learn.demos.issues import DatasetError, UnitsWarning
 from hrc_learn.demos.read.columns import ColumnMapping, MappingSpec, map_columns
-from hrc_learn.demos.read.contract import Contract, fingerprint, read_contract
+from hrc_learn.demos.read.contract import Contract, Sidecar, fingerprint, read_sidecar
 from hrc_learn.demos.read.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
@@ -33,7 +33,7 @@ from hrc_learn.demos.read.frames import (
     raising,
     read_quantities,
 )
-from hrc_learn.demos.read.metadata import SIDECAR_PATH, Sidecar, read_sidecar
+from hrc_learn.demos.read.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.quantities import ORIENTATION_ROLES, to_quaternion, transforms
 from hrc_learn.demos.read.units import (
     Quantities,
@@ -53,8 +53,6 @@ class OpenedDataset:
     folder: DatasetFolder
     columns: ColumnMapping
     sidecar: Sidecar = field(default_factory=Sidecar)
-    contract: Contract | None = None
-    """Contract kept with the dataset."""
     own_feature: bool = False
     """True if the image feature is a column of the dataset, or left out by the caller."""
 
@@ -72,16 +70,19 @@ class OpenedDataset:
                 damaged.
         """
         sidecar = read_sidecar(folder.root)
-        contract = read_contract(folder.root)
-        kept = None if contract is None else contract.selections(folder.features)
-        columns = map_columns(folder.features, sidecar, mapping, kept)
+        declared = sidecar.selections(folder.features)
+        columns = map_columns(folder.features, mapping, declared)
         return cls(
             folder=folder,
             sidecar=sidecar,
-            contract=contract,
             columns=columns,
             own_feature="feature" in columns.selections or "feature" in (mapping or {}),
         )
+
+    @property
+    def contract(self) -> Contract | None:
+        """Contract kept with the dataset."""
+        return self.sidecar.contract if self.sidecar.contract.components else None
 
     @cached_property
     def contract_note(self) -> str | None:
@@ -96,7 +97,7 @@ class OpenedDataset:
     @cached_property
     def declared_units(self) -> Mapping[str, str | Sequence[str]]:
         """Units by role from the sidecar, or of each component from the contract."""
-        known = {} if self.contract is None else self.contract.units(self.columns.selections)
+        known = self.sidecar.contract.units(self.columns.selections)
         return {**self.sidecar.units, **known}
 
     def decide_units(
