@@ -25,7 +25,6 @@ from hrc_learn.demos.quality.repair import (
     read_decisions,
     write_curated,
 )
-from hrc_learn.demos.read.columns import MappingSpec
 from hrc_learn.demos.read.dataset_folder import open_folder
 from hrc_learn.demos.read.metadata import Feature
 from hrc_learn.teleoperation.gate import AddressConfig, Content, Gate, folder_contents
@@ -60,9 +59,6 @@ class CurationPage:
         ranking: Ranking,
         out: Path,
         address: AddressConfig | None = None,
-        *,
-        mapping: MappingSpec | None = None,
-        units: Mapping[str, str] | None = None,
     ):
         """Read the decisions made so far and bind the server to its port.
 
@@ -70,8 +66,6 @@ class CurationPage:
             ranking: Ranking of the dataset's episodes.
             out: Folder that receives the cleaned dataset.
             address: Host, port and certificate of the page.
-            mapping: Columns of quantities that are not found by name, as in `load_demos`.
-            units: Units on disk by role, as in `load_demos`.
 
         Raises:
             DatasetError: The saved decisions belong to another dataset.
@@ -80,7 +74,6 @@ class CurationPage:
         config = address or AddressConfig()
         self.ranking, self.out = ranking, out
         self.decisions = read_decisions(ranking.path)
-        self._options: dict[str, Any] = {"mapping": mapping, "units": units}
         self._lengths = {q.episode: q.length for q in ranking.episodes}
         self._images = ImageReader(ranking.path)
         self._features = open_folder(ranking.path).features
@@ -160,7 +153,7 @@ class CurationPage:
 
     def curves(self, episode: int) -> dict[str, Any]:
         """All that moves in an episode, over time."""
-        source = open_demos(self.ranking.path, [episode], **self._options)
+        source = open_demos(self.ranking.path, [episode])
         (demo,) = source
         known = demonstration_charts(demo, source.units)
         charts = [*known, *_other_charts(demo, self._features)]
@@ -237,7 +230,7 @@ class CurationPage:
         self.decisions = decisions
 
     def _write(self, decisions: dict[int, Decision]) -> str:
-        report = write_curated(self.ranking.path, self.out, decisions, **self._options)
+        report = write_curated(self.ranking.path, self.out, decisions)
         return (
             f"{len(report.changes)} episodes with {report.frames} of {report.frames_before} "
             f"frames are in {self.out}"

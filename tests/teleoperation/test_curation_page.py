@@ -214,10 +214,7 @@ def test_curves_are_in_the_units_of_the_dataset(tmp_path):
     names = [f"{name}_deg.pos" for name in panda.joint_names]
     columns = {"observation.state": names}
     root = write_folder(tmp_path / "set", [{"observation.state": degrees}], columns)
-    units = {"joint_position": "deg"}
-    with CurationPage(
-        rank_episodes(root), tmp_path / "out", AddressConfig(port=0), units=units
-    ) as page:
+    with CurationPage(rank_episodes(root), tmp_path / "out", AddressConfig(port=0)) as page:
         curves = json.loads(Client(page).ask("/data/curves/0")[1])
     assert curves["charts"][0]["unit"] == "deg"
     np.testing.assert_allclose(

@@ -1,7 +1,7 @@
 """Copies of a dataset with other frames: features, statistics, tasks and videos."""
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,10 +13,10 @@ from hrc_learn.demos.dataset_assembly import assemble
 from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality.episode_edits import EpisodeEdit
 from hrc_learn.demos.read.contract import (
-    Contract,
     SidecarColumn,
     fingerprint,
     keep_contract,
+    read_sidecar,
 )
 from hrc_learn.demos.read.dataset_files import open_parquet, read_table
 from hrc_learn.demos.read.dataset_folder import DatasetFolder, open_folder, recorded_statistics
@@ -58,7 +58,6 @@ def write_copy(
     out: Path,
     episodes: Iterable[Rewritten],
     tasks: Sequence[str],
-    contract: Contract | None,
     notes_of: Path | None = None,
 ) -> None:
     """Write rewritten episodes into a new dataset.
@@ -67,7 +66,6 @@ def write_copy(
         out: Folder of the new dataset, which must not exist.
         episodes: The episodes, all of one header.
         tasks: Task texts in order of their indices.
-        contract: Contract of the new dataset; its fingerprint is renewed.
         notes_of: Dataset whose card, licence and metadata of other programs are copied.
 
     Raises:
@@ -90,7 +88,8 @@ def write_copy(
         assemble(paths, target, videos=videos, tasks=tasks)
         if notes_of is not None:
             _copy_notes(notes_of, target)
-        if contract is not None:
+        contract = read_sidecar(target).contract
+        if contract.components:
             renewed = fingerprint(open_folder(target))
             keep_contract(target, replace(contract, fingerprint=renewed))
         shutil.rmtree(staging)
@@ -115,7 +114,7 @@ def listed_tasks(folder: DatasetFolder) -> list[str]:
 def new_header(
     dataset: OpenedDataset,
     units: Mapping[str, str],
-    segments: Mapping[int, Segments],
+    cameras: Collection[str],
     *,
     fps: float | int | None = None,
     add_time: bool = False,
@@ -124,13 +123,12 @@ def new_header(
 
     Args:
         dataset: The old dataset.
-        units: Units from the caller.
-        segments: Video segments by episode index; cameras without any are left out.
+        units: Units from the caller, also in the contract.
+        cameras: Videos that are copied.
         fps: Rate that episodes are resampled to [1/s]; None for the old one.
         add_time: Add the old stamps as `time`.
     """
     folder, old, features = dataset.folder, dataset.sidecar, {}
-    cameras = {key for shown in segments.values() for key in shown}
     for key, feature in folder.features.items():
         declared = folder.info["features"][key]
         if key in INDEX_KEYS or (feature.dtype == "video" and key not in cameras):
@@ -145,11 +143,19 @@ def new_header(
         if columns:
             columns["time"] = SidecarColumn(key=recorded.TIME_KEY, names=("time",))
             declared_units["time"] = "s"
+    given = {
+        column: unit
+        for role, unit in units.items()
+        if role in dataset.columns.selections
+        for column in dataset.columns.selections[role].columns
+    }
+    parts = [replace(p, unit=given.get(p.column, p.unit)) for p in old.contract.components]
+    contract = replace(old.contract, components=tuple(parts))
     return recorded.RecordingHeader(
         fps=float(fps or folder.fps),
         robot_type=folder.robot_type or "unknown",
         features={**features, **INDEX_FEATURES},
-        sidecar=replace(old, columns=columns, units=declared_units),
+        sidecar=replace(old, columns=columns, units=declared_units, contract=contract),
     )
 
 
@@ -192,8 +198,8 @@ class ColumnRewriter:
         for key in self._cameras:
             if key not in found:
                 raise edit.fault(
-                    "the video of this episode is missing: leave out the videos "
-                    "(videos=False), or the episode (drop_bad_episodes)",
+                    "the video of this episode is missing: copy it, or leave out the videos "
+                    "(--no-videos) or the episode (drop_bad_episodes)",
                     key=key,
                 )
         if self._cameras and (edit.resampled or (np.diff(edit.kept) != 1).any()):

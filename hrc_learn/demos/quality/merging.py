@@ -17,7 +17,7 @@ from hrc_learn.demos.read.quantities import INDEX_KEYS
 from hrc_learn.demos.read.source import OpenedDataset, open_dataset
 from hrc_learn.demos.read.units import UnitDecision, unit_factor
 from hrc_learn.demos.recorded_episode import RecordingHeader
-from hrc_learn.demos.videos import Segments, read_segments, video_keys
+from hrc_learn.demos.videos import read_segments
 
 _ESSENTIAL = ("action", "observation.state")
 """Features without which no policy learns; others may be left out."""
@@ -131,7 +131,7 @@ class _Source:
         """Columns of an episode in the order and units of the first dataset."""
         made: RawFrames = {}
         for key, places in self.places.items():
-            values = frames[key].reshape(len(frames[key]), -1)[:, places]
+            values = frames[key][:, places]
             if (self.factors[key] != 1).any():
                 values = values * self.factors[key]
             made[key] = values.astype(features[key]["dtype"])
@@ -248,41 +248,25 @@ class _Merge:
 
     def write(self) -> None:
         """Write the merged dataset."""
-        report, segments = self.report, [self._segments(source) for source in self.sources]
+        report = self.report
         tasks = [
             *dict.fromkeys(
                 t for source in self.sources for t in copying.listed_tasks(source.folder)
             )
         ]
-        header = self._header(copying.new_header(self.first.dataset, {}, segments[0]))
-        contract = self.first.dataset.contract
-        if contract is not None:
-            parts = tuple(part for part in contract.components if part.key in self.features)
-            contract = replace(contract, components=parts)
+        header = self._header(copying.new_header(self.first.dataset, {}, self.features))
 
         def rewritten() -> Iterator[copying.Rewritten]:
-            for source, shown in zip(self.sources, segments, strict=True):
+            for source in self.sources:
+                shown = read_segments(source.folder) if self.videos else {}
                 writer = copying.ColumnRewriter(source.folder, header, shown)
                 for edit in self._episodes(source, header.features):
                     report.episodes += 1
                     report.frames += len(edit)
                     yield writer.rewritten(edit)
 
-        copying.write_copy(report.path, rewritten(), tasks, contract)
+        copying.write_copy(report.path, rewritten(), tasks)
         report.tasks = len(tasks)
-
-    def _segments(self, source: _Source) -> dict[int, Segments]:
-        """Video segments of a dataset, of the cameras that all have."""
-        folder = source.folder
-        kept: dict[int, Segments] = {
-            index: {key: segment for key, segment in shown.items() if key in self.features}
-            for index, shown in (read_segments(folder) if self.videos else {}).items()
-        }
-        for key in video_keys(folder):
-            if key in self.features and not any(key in shown for shown in kept.values()):
-                text = "its videos are missing: copy them, or leave all out (--no-videos)"
-                raise source.fault(text, key)
-        return kept
 
     def _header(self, own: RecordingHeader) -> RecordingHeader:
         """Header of the first dataset without the features that are left out."""
@@ -292,8 +276,12 @@ class _Merge:
             others = [source.folder.info["features"].get(key, {}) for source in self.sources]
             if any(other.get("info") != feature.get("info") for other in others):
                 feature.pop("info", None)  # of the videos; LeRobot finds it anew
-        columns = {r: c for r, c in own.sidecar.columns.items() if c.key in features}
-        return replace(own, features=features, sidecar=replace(own.sidecar, columns=columns))
+        old = own.sidecar
+        columns = {role: c for role, c in old.columns.items() if c.key in features}
+        parts = tuple(part for part in old.contract.components if part.key in features)
+        contract = replace(old.contract, components=parts)
+        sidecar = replace(old, columns=columns, contract=contract)
+        return replace(own, features=features, sidecar=sidecar)
 
     def _episodes(self, source: _Source, features: Mapping[str, dict]) -> Iterator[EpisodeEdit]:
         """Episodes of a dataset as those of the first one, unedited."""

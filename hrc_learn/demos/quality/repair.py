@@ -1,7 +1,7 @@
 """Repaired and curated copies of a dataset, and the decisions kept next to it."""
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +11,6 @@ from hrc_learn.demos.issues import DatasetError
 from hrc_learn.demos.quality import column_rewriter as copying
 from hrc_learn.demos.quality import episode_edits as edits
 from hrc_learn.demos.read.columns import MappingSpec
-from hrc_learn.demos.read.contract import Contract
 from hrc_learn.demos.read.dataset_folder import EpisodeEntry, Progress, open_folder
 from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps, select_quantities
 from hrc_learn.demos.read.quantities import INDEX_KEYS
@@ -133,7 +132,7 @@ def repair_dataset(
             pass
     else:
         root = dataset.folder.root
-        copying.write_copy(Path(out), rewritten, repair.tasks, repair.contract(), notes_of=root)
+        copying.write_copy(Path(out), rewritten, repair.tasks, notes_of=root)
     return repair.report
 
 
@@ -147,7 +146,7 @@ class _Repair:
         units: Mapping[str, str],
         kept: Mapping[int, slice] | None,
     ):
-        self.dataset, self.folder, self.units, self.kept = dataset, dataset.folder, units, kept
+        self.dataset, self.folder, self.kept = dataset, dataset.folder, kept
         self.options, self.tasks = options, copying.listed_tasks(dataset.folder)
         self._regular = True
         """True if the increasing stamps of LeRobot are 1/fps apart in all episodes."""
@@ -160,9 +159,8 @@ class _Repair:
             and (options.drop_bad_frames or options.drop_repeats or not self._regular)
         )
         segments = read_segments(self.folder) if options.videos else {}
-        header = copying.new_header(
-            dataset, units, segments, fps=options.fps, add_time=add_time
-        )
+        cameras = {key for shown in segments.values() for key in shown}
+        header = copying.new_header(dataset, units, cameras, fps=options.fps, add_time=add_time)
         self.writer = copying.ColumnRewriter(self.folder, header, segments)
         self.report = RepairReport(notes=self._notes(header.features), dry_run=options.dry_run)
 
@@ -260,23 +258,6 @@ class _Repair:
         wanted[part] = True
         return edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
 
-    def contract(self) -> Contract | None:
-        """The old dataset's contract, in the units given."""
-        contract, selections = self.dataset.contract, self.dataset.columns.selections
-        if contract is None:
-            return None
-        given = {
-            column: unit
-            for role, unit in self.units.items()
-            if role in selections
-            for column in selections[role].columns
-        }
-        parts = tuple(
-            replace(part, unit=given.get(part.column, part.unit))
-            for part in contract.components
-        )
-        return replace(contract, components=parts)
-
 
 Verdict = Literal["accept", "cut", "reject"]
 
@@ -355,8 +336,6 @@ def write_curated(
     out: str | Path,
     decisions: Mapping[int, Decision],
     *,
-    mapping: MappingSpec | None = None,
-    units: Mapping[str, str] | None = None,
     progress: Progress | None = None,
 ) -> RepairReport:
     """Write the accepted and cut episodes into a new dataset of version 3.0.
@@ -368,8 +347,6 @@ def write_curated(
         path: The dataset.
         out: Folder of the new dataset, which must not exist.
         decisions: Decisions by episode; episodes without one are accepted.
-        mapping: Columns by role, as in `load_demos`.
-        units: Units on disk by role, as in `load_demos`.
         progress: Wraps the episodes, as in `repair_dataset`.
 
     Raises:
@@ -387,6 +364,4 @@ def write_curated(
     if not kept:
         raise DatasetError("every episode is rejected: nothing is left to write", file=path)
     options = RepairOptions(trim=False, drop_late=False, unwrap=False, fix_signs=False)
-    return repair_dataset(
-        path, out, options, mapping=mapping, units=units, progress=progress, kept=kept
-    )
+    return repair_dataset(path, out, options, progress=progress, kept=kept)
