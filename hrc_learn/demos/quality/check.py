@@ -92,19 +92,26 @@ def check_dataset(
 
 
 def _first_pass(
-    dataset: OpenedDataset, report: ValidationReport, profiles: dict[int, EpisodeProfile]
+    dataset: OpenedDataset,
+    report: ValidationReport,
+    profiles: list[EpisodeProfile],
+    sound: list[EpisodeEntry],
 ) -> Iterator[tuple[EpisodeEntry, Quantities]]:
-    """Run the checks that need no units, fill in the profiles, and give the quantities."""
+    """Run the checks that need no units, and give the quantities of the sound episodes.
+
+    The profiles of all episodes and the entries of the sound ones are appended to the lists.
+    """
     folder, columns = dataset.folder, dataset.columns
     for entry, frames in read_sound_episodes(folder, report):
         for check in RAW_EPISODE_CHECKS:
             report.run(check, folder, entry, frames)
         report.episodes += 1
         report.frames += entry.length
-        sound = _is_sound(frames, columns)
-        found = select_quantities(frames, columns.selections) if sound else {}
-        profiles[entry.index] = profile_episode(entry.index, frames, found, folder.fps)
-        if sound:
+        is_sound = _is_sound(frames, columns)
+        found = select_quantities(frames, columns.selections) if is_sound else {}
+        profiles.append(profile_episode(entry, frames, found, folder.fps))
+        if is_sound:
+            sound.append(entry)
             report.run(episode_checks.quaternion_signs, entry, found)
             yield entry, found
 
@@ -118,29 +125,23 @@ def _check_content(
         DatasetError: The units are wrong.
     """
     folder, columns = dataset.folder, dataset.columns
-    profiles: dict[int, EpisodeProfile] = {}
+    profiles: list[EpisodeProfile] = []
+    sound: list[EpisodeEntry] = []
     if dataset.contract_note is not None:
         report.add(warning(message=dataset.contract_note, file=SIDECAR_PATH))
-    sound: list[EpisodeEntry] = []
-
-    def episodes() -> Iterator[tuple[EpisodeEntry, Quantities]]:
-        for entry, quantities in _first_pass(dataset, report, profiles):
-            sound.append(entry)
-            yield entry, quantities
-
-    decisions, faults = dataset.units_from(episodes(), units)
+    episodes = _first_pass(dataset, report, profiles, sound)
+    decisions, faults = dataset.units_from(episodes, units)
     for fault in faults:
         report.add_error(fault)
     report.run(_meaning, columns, decisions if profiles else {})
-    entries = {entry.index: entry for entry in folder.episodes}
-    features = [*feature_profiles(folder, entries, profiles)]
+    features = [*feature_profiles(folder, profiles)]
     usual = _usual_motion(columns, decisions, {f.key: f for f in features})
     doubtful = {fault.episode for fault in faults}
     _check_motions(dataset, sound, decisions, report, usual, doubtful)
     report.run(consistency.column_ranges, features)
     report.run(structure_checks.statistics_fit, folder, features)
-    report.run(consistency.lengths, [entries[i] for i in profiles])
-    commands = consistency.command_profiles(folder, columns, entries, profiles)
+    report.run(consistency.lengths, [profile.entry for profile in profiles])
+    commands = consistency.command_profiles(folder, columns, profiles)
     if commands is not None:
         report.run(consistency.velocity_commands, commands)
         report.run(consistency.command_tracking, commands)
@@ -150,7 +151,7 @@ def _check_content(
         for check in CONSISTENCY_CHECKS:
             if len(feature.entries) >= consistency.FEWEST:
                 report.run(check, feature)
-    report.contract = infer_contract(folder, columns, decisions, features, [*profiles.values()])
+    report.contract = infer_contract(folder, columns, decisions, features, profiles)
     if dataset.contract is not None:
         report.contract = report.contract.keeping(dataset.contract)
 

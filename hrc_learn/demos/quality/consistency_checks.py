@@ -1,6 +1,6 @@
 """Checks of one episode against the others: sizes, rests, noise, columns and commands."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -296,11 +296,10 @@ class CommandProfiles:
 def command_profiles(
     folder: DatasetFolder,
     mapping: ColumnMapping,
-    entries: Mapping[int, EpisodeEntry],
-    profiles: Mapping[int, EpisodeProfile],
+    profiles: Sequence[EpisodeProfile],
 ) -> CommandProfiles | None:
     """Tracking of the commands in all episodes; None without commands."""
-    known = [p for p in profiles.values() if "command_position" in p.tracking]
+    known = [p for p in profiles if "command_position" in p.tracking]
     if not known:
         return None
     command = mapping.selections["command_position"]
@@ -309,7 +308,7 @@ def command_profiles(
         names=command.labels,
         states=mapping.selections["joint_position"].columns,
         fps=folder.fps,
-        entries=[entries[p.index] for p in known],
+        entries=[p.entry for p in known],
         trackings=[p.tracking["command_position"] for p in known],
         rates=[p.tracking["rates"] for p in known if "rates" in p.tracking],
     )

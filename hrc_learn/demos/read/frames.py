@@ -331,9 +331,7 @@ def to_numpy(
             raise fault(at * rows // len(array), "holds no value (null)")
         if isinstance(array, pa.ExtensionArray):
             array = array.storage
-        elif pa.types.is_fixed_size_list(array.type):
-            array = array.flatten()
-        elif pa.types.is_list(array.type) or pa.types.is_large_list(array.type):
+        elif isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
             widths = _without_pandas(array.value_lengths())
             differing = np.flatnonzero(widths != widths[0]) if len(widths) else []
             if len(differing):

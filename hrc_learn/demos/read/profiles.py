@@ -99,8 +99,7 @@ class Tracking:
 class EpisodeProfile:
     """Statistics of one episode."""
 
-    index: int
-    length: int
+    entry: EpisodeEntry
     columns: dict[str, ColumnProfile]
     """Profile of each feature."""
     tracking: dict[str, Tracking] = field(default_factory=dict)
@@ -124,12 +123,11 @@ def profile_columns(
 
 
 def profile_episode(
-    index: int, frames: RawFrames, quantities: Quantities, fps: float
+    entry: EpisodeEntry, frames: RawFrames, quantities: Quantities, fps: float
 ) -> EpisodeProfile:
     """Profile of an episode; without quantities, its tracking is empty."""
     return EpisodeProfile(
-        index=index,
-        length=len(next(iter(frames.values()))),
+        entry=entry,
         columns=profile_columns(frames),
         tracking=track_quantities(quantities, fps),
     )
@@ -253,21 +251,19 @@ def listed(names: Sequence[str], places: Sequence[int] | np.ndarray) -> str:
 
 
 def feature_profiles(
-    folder: DatasetFolder,
-    entries: Mapping[int, EpisodeEntry],
-    profiles: Mapping[int, EpisodeProfile],
+    folder: DatasetFolder, profiles: Sequence[EpisodeProfile]
 ) -> Iterator[FeatureProfiles]:
     """Profiles of all episodes, feature by feature."""
     for key, declared in folder.features.items():
-        known = [p for p in profiles.values() if key in p.columns and key not in INDEX_KEYS]
+        known = [p for p in profiles if key in p.columns and key not in INDEX_KEYS]
         widths = {p.columns[key].start.shape for p in known}
         if widths != {(declared.width,)}:
             continue  # reported with the columns
-        discrete = np.mean([is_discrete(p.columns[key], p.length) for p in known], axis=0)
+        discrete = np.mean([is_discrete(p.columns[key], p.entry.length) for p in known], axis=0)
         yield FeatureProfiles(
             key=key,
             fps=folder.fps,
-            entries=[entries[p.index] for p in known],
+            entries=[p.entry for p in known],
             profiles=[p.columns[key] for p in known],
             names=[declared.component(i) for i in range(declared.width)],
             smooth=discrete < 0.5,

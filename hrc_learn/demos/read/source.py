@@ -285,6 +285,15 @@ class DemonstrationSource(Sequence[Demonstration]):
     to other processes.
 
     Attributes:
+        folder: Metadata of the dataset.
+        columns: Columns of each quantity.
+        entries: Episodes of the sequence, as the metadata list them.
+        units: Unit on disk of each quantity, and its evidence.
+        joint_names: Names of the joints.
+        joint_unit: Unit of the joints as read: "rad", or "1" for a fraction of a range.
+        lengths: Number of frames of each demonstration.
+        frames: Number of frames of all demonstrations together.
+        fps: Nominal frame rate [1/s].
         notes: Guesses and conversions of the reader, one sentence each, for the user.
         source: Folder of the dataset.
     """
@@ -304,10 +313,14 @@ class DemonstrationSource(Sequence[Demonstration]):
             joint_names: Joints wanted; None takes all in their order.
         """
         columns, root = dataset.columns, dataset.folder.root
-        self._dataset, self._entries = dataset, tuple(entries)
-        self._decisions = dict(decisions)
+        self._dataset, self.folder, self.columns = dataset, dataset.folder, columns
+        self.entries, self.units = tuple(entries), dict(decisions)
         names = columns.joint_names if joint_names is None else joint_names
         self.joint_names, self.source = tuple(names), str(root)
+        joint = self.units.get("joint_position")
+        self.joint_unit = "rad" if joint is None else joint.si_unit
+        self.lengths = tuple(entry.length for entry in self.entries)
+        self.frames, self.fps = sum(self.lengths), dataset.folder.fps
         noted = [*columns.notes]
         noted += [f"{role} {note}" for role, note in columns.unmatched.items()]
         noted += [dataset.contract_note, *(d.note for d in decisions.values())]
@@ -324,29 +337,26 @@ class DemonstrationSource(Sequence[Demonstration]):
     def __getitem__(self, index: slice) -> "DemonstrationSource": ...
     def __getitem__(self, index):
         if isinstance(index, slice):
-            return self._part(self._entries[index])
-        (demo,) = self._part([self._entries[index]])
+            return self._part(self.entries[index])
+        (demo,) = self._part([self.entries[index]])
         return demo
 
     def spread(self, most: int) -> "DemonstrationSource":
         """Subset of `most` demonstrations, spread evenly over the sequence and still unread."""
-        return self._part(_spread(self._entries, most))
+        return self._part(_spread(self.entries, most))
 
-    def _part(self, entries: Iterable[EpisodeEntry]) -> "DemonstrationSource":
-        return DemonstrationSource(
-            self._dataset, tuple(entries), self._decisions, self.joint_names
-        )
+    def _part(self, entries: Sequence[EpisodeEntry]) -> "DemonstrationSource":
+        return DemonstrationSource(self._dataset, entries, self.units, self.joint_names)
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self.entries)
 
     def __iter__(self) -> Iterator[Demonstration]:
         return raising(self.each())
 
     def each(self) -> Iterator[Demonstration | DatasetError]:
         """Every demonstration, or the error of one that cannot be read."""
-        dataset = self._dataset
-        for found in read_quantities(dataset.folder, dataset.columns, self._entries):
+        for found in read_quantities(self.folder, self.columns, self.entries):
             try:
                 yield found if isinstance(found, DatasetError) else self._convert(found)
             except DatasetError as error:
@@ -357,47 +367,6 @@ class DemonstrationSource(Sequence[Demonstration]):
             f"DemonstrationSource({self.source!r}: {len(self)} demonstrations, "
             f"{self.frames} frames, joints: {', '.join(self.joint_names) or 'none'})"
         )
-
-    @property
-    def folder(self) -> DatasetFolder:
-        """Metadata of the dataset."""
-        return self._dataset.folder
-
-    @property
-    def columns(self) -> ColumnMapping:
-        """Columns of each quantity."""
-        return self._dataset.columns
-
-    @property
-    def entries(self) -> Sequence[EpisodeEntry]:
-        """Episodes of the sequence, as the metadata list them."""
-        return self._entries
-
-    @property
-    def units(self) -> Mapping[str, UnitDecision]:
-        """Unit on disk of each quantity, and its evidence."""
-        return self._decisions
-
-    @property
-    def joint_unit(self) -> str:
-        """Unit of the joint positions as read: "rad", or "1" for a fraction of a range."""
-        decision = self._decisions.get("joint_position")
-        return "rad" if decision is None else decision.si_unit
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """Number of frames of each demonstration."""
-        return tuple(entry.length for entry in self._entries)
-
-    @property
-    def frames(self) -> int:
-        """Number of frames of all demonstrations together."""
-        return sum(self.lengths)
-
-    @property
-    def fps(self) -> float:
-        """Nominal frame rate [1/s]."""
-        return self._dataset.folder.fps
 
     def load(self) -> DemonstrationSet:
         """Read all demonstrations into memory.
@@ -415,12 +384,11 @@ class DemonstrationSource(Sequence[Demonstration]):
         Raises:
             DatasetError: Its stamps do not increase, or its orientations are invalid.
         """
-        folder, columns = self._dataset.folder, self._dataset.columns
         entry, frames, values = episode.entry, episode.frames, {}
         for role, on_disk in episode.quantities.items():
-            factor = self._decisions[role].factor
+            factor = self.units[role].factor
             values[role] = on_disk if np.all(factor == 1) else on_disk * factor
-        time = frame_timestamps(folder, entry, frames, values.get("time"))
+        time = frame_timestamps(self.folder, entry, frames, values.get("time"))
         fields = {r: values[r] for r in (*JOINT_FIELDS, "position", "feature") if r in values}
         if "gripper" in values:
             fields["gripper"] = values["gripper"][:, 0]
@@ -428,15 +396,15 @@ class DemonstrationSource(Sequence[Demonstration]):
             fields["feature_visible"] = values["feature_visible"][:, 0] > 0
         task = entry.tasks[0] if entry.tasks else ""
         if not entry.tasks and "task_index" in frames:
-            task = folder.tasks.get(int(frames["task_index"][0, 0]), "")
+            task = self.folder.tasks.get(int(frames["task_index"][0, 0]), "")
         demo = Demonstration(
             time=time - time[0],
             start_time=float(time[0]),
-            fps=folder.fps,
+            fps=self.fps,
             episode=entry.index,
             task=task,
-            joint_names=columns.joint_names,
-            extra={key: frames[key].astype(float) for key in columns.extra},
+            joint_names=self.columns.joint_names,
+            extra={key: frames[key].astype(float) for key in self.columns.extra},
             **fields | self._pose(episode, values),
         )
         if self._extracted is not None:
@@ -459,5 +427,5 @@ class DemonstrationSource(Sequence[Demonstration]):
             raise episode.entry.error(str(error), key=role) from error
         if is_matrix and "position" not in values:
             translation = transforms(numbers)[:, :3, 3].numpy()
-            pose["position"] = translation * self._decisions[role].factor
+            pose["position"] = translation * self.units[role].factor
         return pose
